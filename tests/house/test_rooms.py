@@ -242,7 +242,7 @@ def test_a_channel_that_nothing_renders_has_no_effects():
 
 def test_an_effect_without_a_cost_is_refused():
     effect = Effect("brighter", lambda frame, rng: frame, lambda scene: (), lambda scene: 1.0)
-    with pytest.raises(BadInput, match="effect brighter has the cost 0: a forecast would take it as free"):
+    with pytest.raises(BadInput, match="effect brighter has the cost 0, but it must be positive"):
         replace(ground.CHANNEL, effects={"science": (effect,)})
 
 

@@ -104,7 +104,7 @@ MISTAKES = {
         GROUND + 'dither = "S"\n', "observation[0].dither = 'S' is a Euclid pattern",
     ),
     "an offset of three numbers": (OWN + "dither = [[0, 0, 0]]\n", "observation[0].dither must be"),
-    "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: 126."),
+    "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: the pointing is 126."),
     "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
     "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT must be the only channel"),
     "no number of frames": (OWN + 'image_type = "bias"\n', "requires exposures"),
@@ -129,7 +129,7 @@ TABLES = {
     "a column of no name": ("ra,dec,mjd,angle\n53.1,-27.8,60905,0\n", "column angle is unknown"),
     "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is not one of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
-    "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: 126."),
+    "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: the pointing is 126."),
     "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this area is large enough: [area] cone"),
     "a line's detector": ("ra,dec,detectors\n53.1,-27.8,9-9\n", "no detector '9-9'"),
 }

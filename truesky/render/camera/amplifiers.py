@@ -1,18 +1,11 @@
-"""Amplifiers of a ground camera's detector: which pixels each reads, and where its raw file has them.
+"""Amplifiers of a ground camera's detector: the pixels that each one reads, and their positions in the raw file.
 
-In the file the pixels lie side by side as on the detector, so that one WCS holds for all; each amplifier's pre- and
-overscan columns lie beside them, those of the left half on the left, and its overscan rows above or below, as in the
-files of DECam and MegaCam.
+In the raw file the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. Pre- and
+overscan columns of amplifiers in the left half of the detector lie to the left of the pixels, the other ones to the
+right. Overscan rows lie below or above the pixels, as in the files of DECam and MegaCam.
 
-Amplifier      a part of a detector, and its output
-Layout         all of a detector, with pre- and overscan; None of a camera that has no table of them
-layout         of a detector, from the mission database;  full_size : of a whole one
-values         a parameter of each amplifier
-refuse_spread  gains and noises of amplifiers that differ too much
-couplings      crosstalk of each pair
-
-Readout order, as everywhere: [amplifier, row, column], where [0, 0] is read first. Columns: prescan, pixels, overscan;
-rows: pixels, overscan.
+Planes in readout order have the axes [amplifier, row, column], where [0, 0] is read first. Columns are prescan, pixels
+and overscan; rows are pixels and overscan.
 """
 
 from __future__ import annotations
@@ -35,20 +28,30 @@ from truesky.render.camera.sections import Section, Sections
 
 Number = TypeVar("Number", bound=np.generic)
 
-# Standard deviations at which an amplifier's own value ends: none is far off.
+# Deviations of single amplifiers from the mean are clipped at this number of standard deviations.
 _MAX_DEVIATION = 3.0
-# Crosstalk falls off with the distance of two outputs, in amplifiers, as so high a power, up to so many; outputs at the
-# other end of the columns are as much farther away (as measured in LSSTCam: less than 5e-5 beyond the neighbours).
+# Crosstalk falls off with this power of the distance between two outputs, in amplifiers, and is 0 beyond the maximum.
+# Outputs at opposite ends of the columns are farther apart by the last number. In LSSTCam, crosstalk beyond the
+# neighbours was measured to be below 5e-5.
 _FALLOFF_POWER, _MAX_DISTANCE, _OPPOSITE_END_DISTANCE = 2.6, 4.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Amplifier:
-    """A part of a detector.
+    """An amplifier and the pixels that it reads.
 
-    pixels     : of the detector
-    read_right : whether its first column to be read is the last;  read_top : likewise its row
-    relative   : its gain and its read noise over those of the table's first amplifier
+    Attributes
+    ----------
+    name : str
+        Name of the amplifier.
+    pixels : Section
+        Its pixels on the detector.
+    read_right : bool
+        True if its last column is read first.
+    read_top : bool
+        True if its last row is read first.
+    ratios_to_first : (float, float)
+        Its gain and its read noise, relative to the first amplifier in the camera's table.
     """
 
     name: str
@@ -60,10 +63,18 @@ class Amplifier:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A detector's amplifiers, all of one size, in the order in which arrays have them.
+    """Amplifiers of a detector, all with the same number of pixels, in the order in which arrays contain them.
 
-    nx, ny            : of the detector
-    prescan, overscan : columns that an amplifier reads before its pixels, and after them;  rows : after them
+    Attributes
+    ----------
+    nx, ny : int
+        Columns and rows of the detector.
+    prescan, overscan : int
+        Columns that an amplifier reads before and after its pixels.
+    overscan_rows : int
+        Rows that it reads after its pixels.
+    amplifiers : tuple of Amplifier
+        The amplifiers.
     """
 
     nx: int
@@ -75,37 +86,43 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Columns of an amplifier's pixels."""
+        """Number of pixel columns per amplifier."""
         return self.amplifiers[0].pixels.nx
 
     @property
     def height(self) -> int:
-        """Rows of them."""
+        """Number of pixel rows per amplifier."""
         return self.amplifiers[0].pixels.ny
 
     @property
     def scan_columns(self) -> int:
-        """Columns that are no pixels, of an amplifier."""
+        """Number of prescan and overscan columns per amplifier."""
         return self.prescan + self.overscan
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
-        """First row, the one past the last, and whether the register lies above them: of each piece of a column."""
+        """First row, row after the last, and True if the register lies above, for each segment of a column."""
         pieces = {(a.pixels.y, a.pixels.y + a.pixels.ny, a.read_top) for a in self.amplifiers}
         return tuple(sorted(pieces))
 
     @property
     def unread_pixels(self) -> Bool:
-        """[ny, nx] where no amplifier reads."""
+        """Mask [ny, nx] of the pixels that no amplifier reads."""
         out = np.ones((self.ny, self.nx), bool)
         for amplifier in self.amplifiers:
             out[amplifier.pixels.slices] = False
         return out
 
     def split(self, frame: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """[ny, nx] -> [q, rows, columns] in readout order, 0 in pre- and overscan."""
+        """Split a frame [ny, nx] into planes [amplifier, row, column] in readout order, with 0 in pre- and overscan.
+
+        Raises
+        ------
+        BadInput
+            If the shape of the frame is not (ny, nx).
+        """
         if frame.shape != (self.ny, self.nx):
-            raise BadInput(f"a frame of {frame.shape} pixels for amplifiers of {self.ny} x {self.nx}")
+            raise BadInput(f"frame has the shape {frame.shape}, but the amplifiers cover {self.ny} x {self.nx} pixels")
         shape = len(self.amplifiers), self.height + self.overscan_rows, self.scan_columns + self.width
         out = np.zeros(shape, frame.dtype)
         for plane, amplifier in zip(out, self.amplifiers, strict=True):
@@ -115,7 +132,7 @@ class Layout:
         return out
 
     def assemble(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """[q, rows, columns] in readout order -> [ny, nx], 0 where no amplifier reads."""
+        """Join planes [amplifier, row, column] in readout order to a frame [ny, nx]; pixels that are not read are 0."""
         out = np.zeros((self.ny, self.nx), planes.dtype)
         for plane, amplifier in zip(planes, self.amplifiers, strict=True):
             pixels = plane[: self.height, self.prescan : self.prescan + self.width]
@@ -124,48 +141,48 @@ class Layout:
 
     @property
     def data_section(self) -> Section:
-        """The pixels of the detector in its raw file."""
+        """Pixels of the detector in its raw file."""
         across, up = (len(starts) for starts in self._starts)
         return Section((across // 2) * self.scan_columns, (up // 2) * self.overscan_rows, self.nx, self.ny)
 
     @property
     def raw_shape(self) -> tuple[int, int]:
-        """ny, nx of the raw file."""
+        """Rows and columns of the raw file."""
         across, up = (len(starts) for starts in self._starts)
         return self.ny + up * self.overscan_rows, self.nx + across * self.scan_columns
 
     def amplifier_data_section(self, number: int) -> Section:
-        """An amplifier's pixels in the raw file."""
+        """Pixels of an amplifier in the raw file."""
         pixels, data = self.amplifiers[number].pixels, self.data_section
         return Section(data.x + pixels.x, data.y + pixels.y, pixels.nx, pixels.ny)
 
     def amplifier_bias_section(self, number: int) -> Section:
-        """Its overscan columns beside its pixels in the raw file; its prescan where it has no others."""
+        """Overscan columns in the rows of an amplifier's pixels, in the raw file; its prescan if it has no overscan."""
         first, count = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
         return self._scan_columns_section(number, first, count)
 
     def amplifier_prescan_section(self, number: int) -> Section:
-        """Its columns that are read before its pixels, in the raw file."""
+        """Prescan columns of an amplifier in the raw file."""
         return self._scan_columns_section(number, 0, self.prescan)
 
     def amplifier_overscan_section(self, number: int) -> Section:
-        """The rows that are read after its pixels, in the columns of these, in the raw file."""
+        """Overscan rows of an amplifier, in the columns of its pixels, in the raw file."""
         pixels, (_, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
         return Section(pixels.x, scan_y, pixels.nx, self.overscan_rows)
 
     def _scan_columns_section(self, number: int, first: int, count: int) -> Section:
-        """So many of what of an amplifier is no pixel, from one on as they are read."""
+        """Return `count` pre- or overscan columns of an amplifier in the raw file, from `first` in readout order."""
         amplifier, (scan_x, _) = self.amplifiers[number], self._scan_origin(number)
         if amplifier.read_right:
             first = self.scan_columns - first - count
         return Section(scan_x + first, self.amplifier_data_section(number).y, count, self.height)
 
     def to_detector_axes(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
-        """What an amplifier reads [rows, columns] in readout order -> as it lies on the detector."""
+        """Convert an amplifier's plane [row, column] from readout order to the orientation on the detector."""
         return _flip_to_readout_order(plane, self.amplifiers[number])
 
     def amplifier_sections(self, number: int) -> Sections:
-        """Of an amplifier's pixels with their pre- and overscan, as `placed` has them."""
+        """Sections of an array with an amplifier's pixels, pre- and overscan, oriented as by `to_detector_axes`."""
         amplifier = self.amplifiers[number]
         x = self.overscan if amplifier.read_right else self.prescan
         data = Section(x, self.overscan_rows if amplifier.read_top else 0, self.width, self.height)
@@ -177,11 +194,10 @@ class Layout:
         return Sections(data, amplifier.pixels, bias)
 
     def to_raw_image(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """[q, rows, columns] in readout order -> the raw file's image."""
+        """Convert planes [amplifier, row, column] in readout order to the image of the raw file."""
         out = np.zeros(self.raw_shape, planes.dtype)
         for number, (plane, amplifier) in enumerate(zip(planes, self.amplifiers, strict=True)):
             pixels, (scan_x, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
-            # In readout order, each with its place in the file.
             flipped = _flip_to_readout_order(plane, amplifier)
             columns = _scan_segments(self.prescan, self.width, self.overscan, pixels.x, scan_x, amplifier.read_right)
             rows = _scan_segments(0, self.height, self.overscan_rows, pixels.y, scan_y, amplifier.read_top)
@@ -193,12 +209,12 @@ class Layout:
 
     @property
     def _starts(self) -> tuple[list[int], list[int]]:
-        """First columns, and first rows, of the amplifiers' pixels."""
+        """First columns and first rows of the amplifiers' pixels, each in increasing order."""
         places = [amplifier.pixels for amplifier in self.amplifiers]
         return sorted({place.x for place in places}), sorted({place.y for place in places})
 
     def _scan_origin(self, number: int) -> tuple[int, int]:
-        """First column and row in the raw file of what of an amplifier is no pixel."""
+        """First pre- or overscan column, and first overscan row, of an amplifier in the raw file."""
         pixels, (across, up) = self.amplifiers[number].pixels, self._starts
         i, j = across.index(pixels.x), up.index(pixels.y)
         x = i * self.scan_columns + (self.nx if i >= len(across) // 2 else 0)
@@ -207,14 +223,14 @@ class Layout:
 
 
 def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> npt.NDArray[Number]:
-    """In readout order -> as it lies on the detector, and back."""
+    """Convert a plane from readout order to the orientation on the detector, or back."""
     return plane[:: -1 if amplifier.read_top else 1, :: -1 if amplifier.read_right else 1]
 
 
 def _scan_segments(
     n_before: int, pixels: int, n_after: int, pixels_start: int, scan_start: int, is_flipped: bool
 ) -> list[tuple[int, int, int]]:
-    """(first in the plane, first in the file, how many) of what lies before the pixels, of them, of what is after."""
+    """Return (start in the plane, start in the file, length) of prescan, pixels and overscan along one axis."""
     parts = [(n_before, scan_start), (pixels, pixels_start), (n_after, scan_start + n_before)]
     if is_flipped:
         parts = [(n_after, scan_start), (pixels, pixels_start), (n_before, scan_start + n_after)]
@@ -227,9 +243,17 @@ def _scan_segments(
 
 @lru_cache(maxsize=256)
 def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
-    """The amplifiers of a detector; None of a camera that has no table of them, or whose readout is its own.
+    """Amplifiers of a detector, or None if its camera has no table of amplifiers or has a special readout.
 
-    A detector of another size than its kind's is divided alike, as far as it goes: what is left over is not read.
+    Raises
+    ------
+    BadInput
+        If the detector is too small for its amplifiers.
+
+    Notes
+    -----
+    A detector that is smaller or larger than its type is divided in the same way, in whole pixels. The remainder is not
+    read.
     """
     rows = [row for row in _table(detector.section, mission) if row["type"] == detector.kind]
     if not rows:
@@ -242,7 +266,9 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
         width, height = detector.nx // len(across), detector.ny // len(up)
         across, up = [i * width for i in range(len(across))], [j * height for j in range(len(up))]
     if not (width and height):
-        raise BadInput(f"detector {detector.name}: {detector.nx} x {detector.ny} pixels for {len(rows)} amplifiers")
+        raise BadInput(
+            f"detector {detector.name}: {detector.nx} x {detector.ny} pixels are too few for {len(rows)} amplifiers"
+        )
     places = [sorted({int(row[axis]) for row in rows}) for axis in "xy"]
     reference = _table(detector.section, mission)[0]
     amplifiers = tuple(
@@ -259,19 +285,19 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
 
 
 def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, str], ...]:
-    """Rows of the amplifiers of a ground camera."""
+    """Rows of a ground camera's table of amplifiers, () if it has none with prescans."""
     key = f"{section}.amplifiers"
     rows = mission.rows(key) if section.startswith("ext.") and key in mission else ()
     return rows if rows and "prescan" in rows[0] else ()
 
 
 def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
-    """nx, ny of a ground camera's detectors of this kind, of which this one may be a part."""
+    """Columns and rows of a ground camera's detectors of this type; `detector` may be a part of one."""
     of_kind = (row for row in mission.rows(f"{detector.section}.layout") if row["type"] == detector.kind)
     return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
-# Of these the table has how an amplifier compares with the first.
+# Parameters for which the table has a value per amplifier, and their index in `Amplifier.ratios_to_first`.
 _RELATIVE = {"gain": 0, "read_noise": 1}
 
 
@@ -279,12 +305,30 @@ _RELATIVE = {"gain": 0, "read_noise": 1}
 def values(
     key: str, unit: str, detector: Detector, mission: MissionConfiguration, detector_layout: Layout
 ) -> float | Float:
-    """A parameter of each amplifier [q]; one number where all agree.
+    """Values of a parameter for each amplifier of a detector.
 
-    Of the parameters `key` and `key`_spread: mean, and rms between amplifiers, which differ in the same way in every
-    lake: they are hardware. A value that a request gives is taken as it is.
+    Parameters
+    ----------
+    key : str
+        Parameter within the camera's section, such as "gain".
+    unit : str
+        Unit of the parameter.
+    detector : Detector
+        The detector.
+    mission : MissionConfiguration
+        Mission database.
+    detector_layout : Layout
+        Amplifiers of the detector.
 
-    key, unit : within the camera's section;  detector, mission : whose;  own : the detector's amplifiers
+    Returns
+    -------
+    float or float array, shape (n_amplifiers,)
+        The values; one number if all are equal.
+
+    Notes
+    -----
+    The parameter `key` is the mean and `key` + "_spread" the rms between amplifiers. The deviations are a property of
+    the hardware and therefore the same in every lake. A value that a request sets is used without deviations.
     """
     name, spread = f"{detector.section}.{key}", f"{detector.section}.{key}_spread"
     rms = mission.value(spread, unit) if spread in mission else 0.0
@@ -303,12 +347,12 @@ def values(
     return results if np.ptp(results) > 0.0 else float(results[0])
 
 
-# What an amplifier's own value may not be below: as bounds.csv has it of the mean.
+# Unit and smallest allowed value for each amplifier, the same as the limits of the mean in bounds.csv.
 _MIN_VALUES = {"gain": ("electron / adu", 1e-3), "read_noise": ("electron", 0.0)}
 
 
 def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) -> None:
-    """BadInput names the first amplifier of a camera that would have no gain, or less than no noise."""
+    """Raise BadInput with the first amplifier whose gain or read noise would be below its limit."""
     for detector in detectors:
         detector_layout = layout(detector, mission)
         for key, (unit, minimum) in _MIN_VALUES.items() if detector_layout else ():
@@ -325,17 +369,34 @@ def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) 
             worst = int(np.argmin(amplifier_values))
             if amplifier_values[worst] < minimum:
                 label = f"amplifier {detector_layout.amplifiers[worst].name} of detector {detector.name}"
-                raise BadInput(f"mission: {name} = {rms:g}: {label} would have {amplifier_values[worst]:.3g} {unit}")
+                value = f"{amplifier_values[worst]:.3g} {unit}, at least {minimum:g} is allowed"
+                raise BadInput(f"mission: {name} = {rms:g}: {label} would have {value}")
 
 
 def crosstalk_couplings(median: float, largest: float, detector: Detector, detector_layout: Layout) -> Float:
-    """Crosstalk [q, q] of signal from the second index into the first, 0 on the diagonal.
+    """Crosstalk coefficients between the amplifiers of a detector.
 
-    Of neighbours log-normal about the median, 3 sigma at the largest; it falls off with distance, and is the camera's
-    own: the same in every lake.
+    Parameters
+    ----------
+    median : float
+        Median coefficient of neighbouring amplifiers, as a fraction of the signal.
+    largest : float
+        Largest coefficient, as a fraction of the signal.
+    detector : Detector
+        The detector.
+    detector_layout : Layout
+        Its amplifiers.
 
-    median, largest : of the signal
-    detector, own   : whose
+    Returns
+    -------
+    float array, shape (n_amplifiers, n_amplifiers)
+        Fraction of the signal in the amplifier of the second index that appears in that of the first; 0 on the
+        diagonal.
+
+    Notes
+    -----
+    Coefficients of neighbours are log-normal about the median, with the largest at 3 sigma. They fall off with
+    distance. They are a property of the camera, and the same in every lake.
     """
     places = np.array(
         [[a.pixels.x / detector_layout.width, a.pixels.y / detector_layout.height] for a in detector_layout.amplifiers]

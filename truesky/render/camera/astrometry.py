@@ -1,14 +1,9 @@
-"""Astrometry: the world coordinate system of a detector, from pixels to the sky and back.
+"""World coordinate systems (WCS) of detectors: conversion between pixels and the sky, and FITS cards.
 
-Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
-inside: with y to the north, x points west (east is left).  Where the optics distort, they are those of the
-detectors' own places, and `distortion` tells what is seen there.  Pixel coordinates (column, row) are 0-based,
-and whole at a pixel's centre.
-
-wcs             the world coordinate system of a detector (astropy): TAN, with SIP where the optics distort
-sky_of_pixel, pixel_of_sky, jacobian   by a system
-corners, centre, s_region      of a detector on the sky
-cards, shifted, from_cards     a system as FITS cards, and back
+Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, with the sky seen from the inside:
+if y points north, x points west (east is left). If the optics distort, they are the positions of the detectors, and
+`distortion` gives the sky positions seen there. Pixel coordinates (column, row) are 0-based, with integers at pixel
+centres.
 """
 
 from __future__ import annotations
@@ -32,13 +27,24 @@ from truesky.render.camera.pointing import ARCSEC
 
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
-    """The world coordinate system of a detector: ICRS, TAN about the boresight, and the distortion as SIP.
+    """World coordinate system of a detector: ICRS, TAN about the boresight, with the distortion as SIP.
 
-    ra, dec        : deg, boresight
-    position_angle : deg, of the focal plane's y axis at the boresight, north through east
+    Parameters
+    ----------
+    detector : Detector
+        The detector.
+    ra, dec : float
+        Boresight, deg.
+    position_angle : float
+        Angle of the focal plane's y axis at the boresight, deg from north through east.
+
+    Returns
+    -------
+    WCS
+        The system, with the projection TAN or, if the optics distort, TAN-SIP.
     """
     angle, turn = np.radians(position_angle), np.radians(detector.rotation)
-    # Columns: the directions (east, north) of the focal plane's x and y axes.
+    # The columns of `axes` are the directions (east, north) of the focal plane's x and y axes.
     axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     from_centre = matrices.matmul(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
@@ -50,7 +56,7 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
     system.wcs.cd = matrices.matmul(axes, rotation) * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
-    # Else north would be turned by 180 deg for a boresight at the pole itself.
+    # With the default, north would be turned by 180 deg for a boresight exactly at the pole.
     system.wcs.lonpole = 180.0
     if has_distortion:
         system.sip = Sip(
@@ -60,7 +66,7 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     return system
 
 
-# Without and with SIP.
+# Projections without and with SIP.
 _PROJECTIONS = ("TAN", "TAN-SIP")
 
 
@@ -69,15 +75,38 @@ def _crpix(system: WCS) -> Float:
 
 
 def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
-    """0-based pixel coordinates [n] -> ra [n] in [0, 360), dec [n], deg."""
+    """Convert 0-based pixel coordinates to positions on the sky.
+
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the detector.
+    column, row : array_like
+        0-based pixel coordinates.
+
+    Returns
+    -------
+    (float array, float array)
+        Right ascension in [0, 360) and declination, deg.
+    """
     ra, dec = system.all_pix2world(np.asarray(column, float), np.asarray(row, float), 0)
     return sky.wrap_angle(ra), np.asarray(dec)
 
 
 def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ra, dec [n] deg -> 0-based column [n], row [n]; only for positions within 90 deg of the boresight.
+    """Convert positions on the sky to 0-based pixel coordinates.
 
-    Error : 1e-8 pixels (rounding)
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the detector.
+    ra, dec : array_like
+        Positions within 90 deg of the boresight, deg.
+
+    Returns
+    -------
+    (float array, float array)
+        Columns and rows, 0-based, with rounding errors of 1e-8 pixels.
     """
     column, row = system.wcs_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
     if system.sip is None:
@@ -88,11 +117,23 @@ def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Fl
 
 
 def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
-    """Derivative of the local tangent plane (u west, v north), arcsec, by pixel coordinates.
+    """Derivative of the local tangent plane (u west, v north) with respect to pixel coordinates.
 
-    column, row : [n] 0-based
-    returns     : [n, 2, 2] ((du/dx, du/dy), (dv/dx, dv/dy))
-    Error       : 2e-8 relative (central difference of one pixel; rounding of the positions)
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the detector.
+    column, row : array_like, shape (n,)
+        0-based pixel coordinates.
+
+    Returns
+    -------
+    float array, shape (n, 2, 2)
+        ((du/dx, du/dy), (dv/dx, dv/dy)) in arcsec per pixel.
+
+    Notes
+    -----
+    The relative error is 2e-8, from the central difference over one pixel and from rounding of positions.
     """
     x, y = np.asarray(column, float), np.asarray(row, float)
     east, north, _ = pointing.basis(*sky_of_pixel(system, x, y))
@@ -110,25 +151,30 @@ def _direction(system: WCS, x: Float, y: Float) -> Float:
 
 
 def corners(detector: Detector, system: WCS) -> Float:
-    """[4, 2] ra, dec deg of the detector's outer corners, in order around it."""
+    """Right ascension and declination [4, 2] of the detector's outer corners, in order around it, deg."""
     x = np.array([-0.5, detector.nx - 0.5, detector.nx - 0.5, -0.5])
     y = np.array([-0.5, -0.5, detector.ny - 0.5, detector.ny - 0.5])
     return np.stack(sky_of_pixel(system, x, y), axis=1)
 
 
 def centre(detector: Detector, system: WCS) -> tuple[float, float]:
-    """ra, dec of the detector's centre, deg."""
+    """Right ascension and declination of the detector's centre, deg."""
     ra, dec = sky_of_pixel(system, [(detector.nx - 1) / 2], [(detector.ny - 1) / 2])
     return float(ra[0]), float(dec[0])
 
 
 def s_region(detector: Detector, system: WCS) -> str:
-    """The footprint as an STC-S polygon.  Error: its sides are straight; VIS's are bent by 2 pixels, HSC's by 7."""
+    """Footprint of a detector as an STC-S polygon.
+
+    Notes
+    -----
+    The sides are straight; the true edges deviate by up to 2 pixels for VIS and 7 for HSC.
+    """
     return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
 
 
 def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
-    """The world coordinate system as FITS cards (a card holds 16 characters of a number: 1e-14)."""
+    """FITS cards of a world coordinate system; a card stores 16 characters of a number, 1e-14 in relative terms."""
     header, has_distortion = system.wcs, system.sip is not None
     projection = "gnomonic projection" + (", distortion as SIP" if has_distortion else "")
     return (
@@ -152,7 +198,7 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
 
 
 def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
-    """Polynomials of SIP, terms that are not 0."""
+    """Yield the cards of the SIP polynomials, without terms that are 0."""
     for name, coefficients in (("A", sip.a), ("B", sip.b)):
         yield f"{name}_ORDER", len(coefficients) - 1, f"distortion of {'columns' if name == 'A' else 'rows'}"
         for p, q in np.argwhere(coefficients).tolist():
@@ -160,7 +206,20 @@ def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
 
 
 def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
-    """The same sky on a frame in which every pixel lies so many columns and rows farther on."""
+    """World coordinate system of a frame in which all pixel coordinates are larger by given numbers.
+
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the original frame.
+    columns, rows : float
+        Numbers added to the pixel coordinates.
+
+    Returns
+    -------
+    WCS
+        The shifted system.
+    """
     out = system.deepcopy()
     out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
     if out.sip is not None:
@@ -170,7 +229,13 @@ def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
 
 
 def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
-    """The world coordinate system that `cards` wrote, or `tpv.cards` of them."""
+    """Build the world coordinate system from cards of `cards`, or from the same cards after `tpv.from_sip`.
+
+    Raises
+    ------
+    BadInput
+        If a card is missing.
+    """
     values = {keyword: value for keyword, value, _ in header}
     try:
         system = WCS(naxis=2)

@@ -1,8 +1,4 @@
-"""Passbands of the cameras.
-
-of_ground   those of a ground camera, which the mission database has zero points of
-of_one      those of a channel that has one camera
-"""
+"""Names of the passbands of cameras."""
 
 from __future__ import annotations
 
@@ -13,12 +9,12 @@ from lake_schema.mission.parameter import SPACE_CAMERAS
 
 
 def ground_bands(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Names of a ground camera's passbands; () of any other camera."""
+    """Passbands of a ground camera that have a zero point in the mission database, () for any other camera."""
     prefix = f"ext.{camera}."
     keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
     return () if camera in SPACE_CAMERAS else tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
 
 
 def single_camera_bands(only_camera: str, *bands: str) -> Callable[[str, MissionConfiguration], tuple[str, ...]]:
-    """(camera, mission) -> these passbands of the camera `only`; () of any other camera."""
+    """Return a function (camera, mission) that gives `bands` for the camera `only_camera` and () for any other."""
     return lambda camera, mission: bands if camera == only_camera else ()

@@ -1,7 +1,4 @@
-"""A camera's detectors: where they lie in the focal plane, how they are turned, how many pixels they have.
-
-detectors       the detectors of a camera, from the layout rules
-"""
+"""Detectors of a camera: position and rotation in the focal plane, number of pixels, distortion."""
 
 from __future__ import annotations
 
@@ -18,16 +15,22 @@ from truesky.render.camera import distortion
 # VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
 # Document, LE1 VIS).
 _VIS_FIRST_ROTATED_COLUMN = 4
-# NISP detectors of the lower half likewise (Euclid Data Product Description Document, LE1 NISP).
+# NISP detectors of the lower half are also mounted upside down (Euclid Data Product Description Document, LE1 NISP).
 _NISP_FIRST_ROTATED_ROW = 3
 
 
 @dataclass(frozen=True, slots=True)
 class FilterWheel:
-    """What a tilt of a camera's filter does (filter_wheel.py).
+    """Effects of a tilt of a camera's filter, see `filter_wheel`.
 
-    error : rad rms;  shift : arcsec on the sky for a tilt of 1 rad
-    bend  : the same times the square of the distance from the axis, rad on the sky
+    Attributes
+    ----------
+    tilt_rms : float
+        Rms tilt of the filter, rad.
+    shift : float
+        Shift of the image, arcsec on the sky per rad of tilt.
+    bend : float
+        Distortion in arcsec on the sky per rad of tilt and per squared distance from the axis in rad^2.
     """
 
     tilt_rms: float
@@ -39,15 +42,28 @@ class FilterWheel:
 class Detector:
     """One detector of a camera.
 
-    section     : prefix of its parameters in the mission database, "vis", "nisp" or "ext.lsstcam"
-    nx, ny      : columns and rows of its image
-    middle      : of the rows, those of charge injection between its halves, which are not read
-    x, y        : arcsec, its centre in the focal plane
-    rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
-    pixel_scale : arcsec
-    bending     : distortion of its camera's optics
-    wheel       : of its camera's filters; None: they stand still
-    kind        : of a ground camera's, what its layout calls its type
+    Attributes
+    ----------
+    name : str
+        Name of the detector.
+    section : str
+        Prefix of its parameters in the mission database: "vis", "nisp" or, for instance, "ext.lsstcam".
+    nx, ny : int
+        Columns and rows of its image.
+    x, y : float
+        Position of its centre in the focal plane, arcsec.
+    rotation : float
+        Rotation of its columns and rows against the focal plane, from x to y, deg.
+    pixel_scale : float
+        Arcsec per pixel.
+    distortion_terms : distortion.Terms
+        Distortion of its camera's optics.
+    injection_rows : int
+        Charge injection rows between its halves. They are included in `ny` and are not read.
+    filter_wheel : FilterWheel or None
+        Filter wheel of its camera; None if the filters do not tilt.
+    kind : str
+        Type of the detector in the layout of a ground camera; "" for VIS and NISP.
     """
 
     name: str
@@ -65,19 +81,21 @@ class Detector:
 
     @property
     def upside_down(self) -> bool:
-        """Whether it is mounted so."""
+        """True if the detector is mounted upside down."""
         return float(np.cos(np.radians(self.rotation))) < 0.0
 
     @property
     def half_diagonal(self) -> float:
-        """Centre to corner, arcsec."""
+        """Distance from centre to corner, arcsec."""
         return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))
 
 
 def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """The detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
+    """Detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
 
-    Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
+    References
+    ----------
+    Scaramella et al. 2022, Table 1 (gaps of VIS and NISP); layouts of ground cameras in the mission database.
     """
     camera_detectors = _load_detectors(camera, mission)
     farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in camera_detectors)
@@ -98,7 +116,27 @@ def _load_detectors(camera: str, mission: MissionConfiguration) -> tuple[Detecto
 
 
 def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
-    """One detector of a camera by name."""
+    """Return the detector of a camera with a given name.
+
+    Parameters
+    ----------
+    camera : str
+        "vis", "nisp" or a ground camera.
+    name : str
+        Name of the detector.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Detector
+        The detector.
+
+    Raises
+    ------
+    BadInput
+        If the camera has no detector of that name.
+    """
     for candidate in detectors(camera, mission):
         if candidate.name == name:
             return candidate
@@ -106,7 +144,7 @@ def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
 
 
 def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
-    """Detectors are read as four equal quadrants."""
+    """Raise BadInput if a number of pixels is odd, since detectors are read as four equal quadrants."""
     for name in ("nx", "ny", "charge_injection_rows"):
         count = mission.value(f"{section}.fpa.{name}", "pix")
         if count % 2.0:
@@ -116,7 +154,7 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
 def _grid_detectors(
     section: str, is_upside_down: Callable[[int, int], bool], mission: MissionConfiguration
 ) -> tuple[Detector, ...]:
-    """As mounted, behind the optics of their camera."""
+    """Return the detectors of a grid with metrology, distortion and filter wheel."""
     designed, distortion_terms = _designed_grid(mission, section, is_upside_down), distortion.terms(section, mission)
     wheel = _load_filter_wheel(section, mission)
     return tuple(
@@ -126,7 +164,7 @@ def _grid_detectors(
 
 
 def _load_filter_wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
-    """A filter is a plane-parallel plate in the beam between collimator and camera."""
+    """Effects of a tilted filter: a plane-parallel plate in the beam between collimator and camera."""
     if f"{section}.filter_wheel_error" not in mission:
         return None
     thickness, refractive_index = (
@@ -149,10 +187,10 @@ def _load_filter_wheel(section: str, mission: MissionConfiguration) -> FilterWhe
 def _designed_grid(
     mission: MissionConfiguration, section: str, is_upside_down: Callable[[int, int], bool]
 ) -> Iterator[Detector]:
-    """Rows from the top, columns from the left; upside_down : row, column -> whether one is mounted so.
+    """Yield the detectors of a grid, rows from the top and columns from the left.
 
-    The pitch is of the published rows, without those of charge injection, and gaps: VIS fills 0.7781 deg.
-    Error : VIS, 0.4": so much less than the published gap is left between the images of neighbours in a column
+    The pitch is the sum of published pixels, without charge injection rows, and published gaps: VIS spans 0.7781 deg.
+    For VIS the gap between images of neighbours in a column is therefore smaller than the published gap by 0.4 arcsec.
     """
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
@@ -176,7 +214,7 @@ def _designed_grid(
 
 
 def _apply_metrology(designed: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
-    """Detectors as they were mounted: shifted and turned a little, each in its own way."""
+    """Shift and rotate each detector by its measured mounting error."""
     key = f"{section}.fpa.metrology"
     if key not in mission:
         yield from designed
@@ -193,7 +231,7 @@ def _apply_metrology(designed: Iterable[Detector], section: str, mission: Missio
 
 
 def _read_layout(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """Detectors of a layout in millimetres."""
+    """Return the detectors of a layout in millimetres."""
     distortion_terms = distortion.terms(section, mission)
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")

@@ -1,16 +1,12 @@
-"""Geometric distortion: the optics put a place of the sky a little off where a perfect camera would.
+"""Geometric distortion of optics, as a polynomial in the focal plane and as SIP in pixels.
 
-A focal-plane position P (arcsec) looks where a perfect camera has P + D(P); D is a polynomial without constant and
-linear terms, so that the boresight stays, and the scale there. In pixels it is the polynomial of the SIP convention.
+A focal-plane position P (arcsec) receives the light that a perfect camera would image at P + D(P). The polynomial D has
+no constant and no linear terms, so that it preserves the boresight and the scale there. In pixels, D becomes the
+polynomial of the SIP convention.
 
-terms      a camera's polynomial, from the mission database: any, or one of the distance from the axis
-joined     the sum of two
-bent       P -> P + D(P)
-sip        the same in a detector's pixels: coefficients of the header's cards
-stretch    what it does to a pixel's area
-straight   what SIP makes of pixels, undone, as far as `one_to_one`
-
-Ref : Shupe et al. 2005 (SIP)
+References
+----------
+Shupe et al. 2005 (SIP).
 """
 
 from __future__ import annotations
@@ -26,35 +22,41 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.numerics import matrices
 
-# Of each term: powers of x and y; what it adds to x and to y, arcsec^(1 - powers).
+# Each term contains the powers of x and y, and its coefficients for x and y, arcsec^(1 - sum of powers).
 Terms = tuple[tuple[int, int, float, float], ...]
 
 _ARCSEC = 3600.0
-# The inverse: pixels that it is exact to, steps it may take (each doubles the digits), and from where on there is no
-# camera, pixels from the boresight: what lies there is left where a perfect camera has it.
+# Inversion: tolerance in pixels, maximum number of steps (each doubles the digits), and the largest distance from the
+# boresight of any camera, in pixels. Positions beyond it are not corrected.
 _TOLERANCE, _MAX_STEPS, _MAX_RADIUS = 1e-9, 30, 6e4
-# It is sought where a pixel keeps more than this part of its area; distances and directions that are tried.
+# The inverse exists if a pixel keeps more than this fraction of its area. Numbers of distances and directions to test.
 _MIN_AREA, _RINGS, _RAYS = 0.1, 60, 24
 
 
 def terms(section: str, mission: MissionConfiguration) -> Terms:
-    """A camera's distortion; none where the database has no polynomial, or its strength is 0."""
+    """Distortion of a camera; () if the mission database has no polynomial or its strength is 0.
+
+    Raises
+    ------
+    BadInput
+        If the polynomial has a term below second order.
+    """
     key = f"{section}.fpa.distortion_polynomial"
     if key not in mission:
         return _radial_terms(section, mission)
     strength = mission.value(f"{section}.fpa.distortion", "")
-    # The polynomial is in degrees.
+    # The polynomial of the database is in degrees.
     all_terms = [
         (int(i), int(j), strength * to_x * _ARCSEC ** (1 - i - j), strength * to_y * _ARCSEC ** (1 - i - j))
         for i, j, to_x, to_y in mission.numbers(key)
     ]
     if any(i + j < 2 for i, j, _, _ in all_terms):
-        raise BadInput(f"mission model {key}: a term of less than second order moves the boresight or turns the camera")
+        raise BadInput(f"mission model {key}: terms below second order are not allowed, they move the boresight")
     return tuple(term for term in all_terms if term[2] or term[3])
 
 
 def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
-    """P times k r^n for each even power n that the mission has; r : of P in the focal plane, mm."""
+    """Return P times k r^n for each even power n in the mission database, with r the radius of P in mm."""
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     radial_terms: Terms = ()
@@ -67,13 +69,27 @@ def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
 
 
 def require_invertible(distortion_terms: Terms, radius: float, scale: float, camera: str) -> None:
-    """BadInput where detectors reach farther than the distortion can be undone.
+    """Raise BadInput if detectors reach farther from the boresight than the distortion can be inverted.
 
-    some : of the camera;  pixels : from the boresight to the farthest corner;  scale : arcsec of a pixel
+    Parameters
+    ----------
+    distortion_terms : Terms
+        Distortion of the camera.
+    radius : float
+        Distance from the boresight to the farthest corner, pixels.
+    scale : float
+        Arcsec per pixel.
+    camera : str
+        Name of the camera, for the message.
+
+    Raises
+    ------
+    BadInput
+        If `radius` is not below `invertible_radius`.
     """
     if distortion_terms and radius >= invertible_radius(*sip(distortion_terms, scale * np.eye(2))):
         raise BadInput(
-            f"camera {camera}: its distortion is so strong that places of the sky are seen twice, or nowhere"
+            f"camera {camera}: its distortion is so strong that some sky positions appear on several pixels or on none"
         )
 
 
@@ -90,7 +106,7 @@ _RADIAL_TERMS = {2: _terms_r2, 4: _terms_r4}
 
 
 def add_terms(first: Terms, second: Terms) -> Terms:
-    """The sum of two distortions."""
+    """Return the sum of two distortions."""
     total: dict[tuple[int, int], tuple[float, float]] = {}
     for i, j, to_x, to_y in (*first, *second):
         x, y = total.get((i, j), (0.0, 0.0))
@@ -99,7 +115,20 @@ def add_terms(first: Terms, second: Terms) -> Terms:
 
 
 def distort(x: npt.ArrayLike, y: npt.ArrayLike, distortion_terms: Terms) -> tuple[Float, Float]:
-    """Focal-plane positions [..], arcsec -> where a perfect camera has what is seen there."""
+    """Convert focal-plane positions to the positions where a perfect camera would image the same light.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Focal-plane positions, arcsec.
+    distortion_terms : Terms
+        Distortion of the camera.
+
+    Returns
+    -------
+    (float array, float array)
+        P + D(P), arcsec.
+    """
     x, y = np.asarray(x, float), np.asarray(y, float)
     to_x, to_y = np.zeros_like(x), np.zeros_like(y)
     for i, j, a, b in distortion_terms:
@@ -110,15 +139,25 @@ def distort(x: npt.ArrayLike, y: npt.ArrayLike, distortion_terms: Terms) -> tupl
 
 
 def sip(distortion_terms: Terms, matrix: Float) -> tuple[Float, Float]:
-    """Coefficients [order + 1, order + 1] of u^p v^q that SIP adds to columns and to rows.
+    """Convert a distortion to the SIP polynomials in pixels.
 
-    matrix : [2, 2] focal-plane arcsec of a pixel's step along columns (u) and rows (v)
+    Parameters
+    ----------
+    distortion_terms : Terms
+        Distortion of the camera.
+    matrix : float array, shape (2, 2)
+        Focal-plane steps, in arcsec, of one pixel along columns (u) and rows (v).
+
+    Returns
+    -------
+    (float array, float array), each of shape (order + 1, order + 1)
+        Coefficients of u^p v^q that are added to columns and to rows.
     """
     order = max(i + j for i, j, _, _ in distortion_terms)
     to_x, to_y = np.zeros((2, order + 1, order + 1))
     for i, j, a, b in distortion_terms:
         power = np.zeros((order + 1, order + 1))
-        # (m00 u + m01 v)^i (m10 u + m11 v)^j, each factor a homogeneous polynomial: a row of binomials.
+        # Each factor of (m00 u + m01 v)^i (m10 u + m11 v)^j is a homogeneous polynomial: a row of binomials.
         across, along = (_binomial(line, n) for line, n in ((matrix[0], i), (matrix[1], j)))
         for p, coefficient in enumerate(across):
             for q, another in enumerate(along):
@@ -130,9 +169,23 @@ def sip(distortion_terms: Terms, matrix: Float) -> tuple[Float, Float]:
 
 
 def area_change(distortion_terms: Terms, matrix: Float) -> Float:
-    """Coefficients [n, n] of u^p v^q: the area that a pixel sees over that at the boresight, less 1.
+    """Relative change of the sky area per pixel, as a polynomial.
 
-    matrix : as of `sip`, whose derivative's determinant it is
+    Parameters
+    ----------
+    distortion_terms : Terms
+        Distortion of the camera.
+    matrix : float array, shape (2, 2)
+        Same as for `sip`.
+
+    Returns
+    -------
+    float array, shape (n, n)
+        Coefficients of u^p v^q for the sky area of a pixel, divided by its area at the boresight, minus 1.
+
+    Notes
+    -----
+    The area is the determinant of the derivative of the mapping by `sip`.
     """
     a, b = sip(distortion_terms, matrix)
     (au, av), (bu, bv) = ([np.asarray(polynomial.polyder(c, axis=axis), float) for axis in (0, 1)] for c in (a, b))
@@ -154,14 +207,29 @@ _CONSTANT_POLYNOMIAL = np.ones((1, 1))
 
 
 def _binomial(line: Float, n: int) -> Float:
-    """Coefficients by the power of u of (line[0] u + line[1] v)^n."""
+    """Coefficients of (line[0] u + line[1] v)^n by the power of u."""
     return np.asarray(polynomial.polypow([line[1], line[0]], n), float) if n else np.ones(1)
 
 
 def undo_sip(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
-    """(u, v) [n] pixels from the boresight with u + a(u, v), v + b(u, v) as given, by Newton's rule.
+    """Invert the SIP polynomials by Newton's method.
 
-    Error : 1e-9 pixels; beyond any camera (see above), and where places are seen twice, nothing is undone
+    Parameters
+    ----------
+    u, v : float array, shape (n,)
+        Distorted positions u + a(u, v) and v + b(u, v), pixels from the boresight.
+    a, b : float array, shape (n, n)
+        SIP coefficients for columns and rows.
+
+    Returns
+    -------
+    (float array, float array)
+        Positions u and v to 1e-9 pixels. Positions outside `invertible_radius` are returned unchanged.
+
+    Raises
+    ------
+    BadInput
+        If the iteration does not converge.
     """
     distorted = np.stack([np.asarray(u, float), np.asarray(v, float)])
     undistorted = distorted.copy()
@@ -181,15 +249,15 @@ def undo_sip(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
         if np.abs(step).max(initial=0.0) < _TOLERANCE:
             break
     else:
-        raise BadInput("the distortion is so strong that places of the sky are seen twice, or nowhere")
+        raise BadInput("the distortion is so strong that some sky positions appear on several pixels or on none")
     undistorted[:, is_invertible] = estimate
     return undistorted[0], undistorted[1]
 
 
 def invertible_radius(a: Float, b: Float) -> float:
-    """Pixels from the boresight within which each place of the sky is seen once; at most those of any camera.
+    """Distance from the boresight, in pixels, within which each sky position appears on one pixel only.
 
-    a, b : as of `straight`, coefficients [n, n]
+    Parameters `a` and `b` are SIP coefficients [n, n]. The result is at most the largest radius of any camera.
     """
     return _invertible_radius(a.tobytes(), b.tobytes(), a.shape, b.shape)
 
@@ -197,7 +265,7 @@ def invertible_radius(a: Float, b: Float) -> float:
 @lru_cache(maxsize=512)
 def _invertible_radius(a: bytes, b: bytes, shape_a: tuple[int, int], shape_b: tuple[int, int]) -> float:
     polynomials = np.frombuffer(a).reshape(shape_a), np.frombuffer(b).reshape(shape_b)
-    # As far on the detectors as the sky goes that may be asked for, even where they see less of it.
+    # The factor 2 covers all requested sky positions, also if a detector position maps to a smaller sky radius.
     radius = np.linspace(0.0, 2.0 * _MAX_RADIUS, _RINGS + 1)[:, None]
     ray = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
     places = np.stack([radius * np.cos(ray), radius * np.sin(ray)])

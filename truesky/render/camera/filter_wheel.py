@@ -1,21 +1,19 @@
-"""A filter that its wheel leaves a little tilted displaces the image, and bends it.
+"""Shift and distortion of the image by a filter that its wheel leaves slightly tilted.
 
-A plane-parallel plate of thickness t, index n and normal N displaces a ray of direction d, both of length 1, across
-itself by
+A plane-parallel plate of thickness t, index n and unit normal N displaces a ray of unit direction d perpendicular to
+itself by::
 
     w = t (1 - sqrt((1 - s^2) / (n^2 - s^2))) (N - (N d) d),   s^2 = 1 - (N d)^2
       = t (a + c s^2) (N - (N d) d),   a = 1 - 1 / n,   c = (n^2 - 1) / (2 n^3)
 
-to the order s^4.  The chief ray of a place in the field has the components phi across the axis, m times its angle on
-the sky, m the telescope's focal length over the collimator's.  On a screen across the axis, what w changes by where
-the normal leans by the small vector delta is
+to the order s^4. The chief ray of a field position has the components phi perpendicular to the axis. They are m times
+its angle on the sky, where m is the focal length of the telescope divided by that of the collimator. If the normal
+leans by the small vector delta, w changes on a screen perpendicular to the axis by::
 
     D(phi) = t ((a + c |phi|^2) delta + 2 c (phi delta) phi)
 
-a shift of the whole image and, a hundredth of it at the field's corners, a distortion of second order.  Both are known:
-the world coordinate system of an exposure has them.
-
-tilted      a detector behind the filter of an exposure;  displaced : of a given tilt
+This is a shift of the whole image and a distortion of second order, which reaches one hundredth of the shift at the
+corners of the field. The world coordinate system of an exposure includes both.
 """
 
 from __future__ import annotations
@@ -29,12 +27,26 @@ from truesky.render.camera.pointing import ARCSEC
 
 
 def apply_random_tilt(detector: Detector, exposure: str, seed: int) -> Detector:
-    """The detector as the exposure's filter lets it see: displaced, and behind another distortion.
+    """Return the detector with the shift and distortion that the filter causes in an exposure.
 
-    The tilt is normally distributed, of the wheel's error in both directions together.
-    Error : 3e-4 of the shift, of fourth order in the angle of the ray
+    Parameters
+    ----------
+    detector : Detector
+        The detector behind an untilted filter.
+    exposure : str
+        Identifier of the exposure, from which the tilt is drawn.
+    seed : int
+        Seed of the request.
 
-    detector : of the camera;  exposure : what its tilt is keyed by;  seed : of the request
+    Returns
+    -------
+    Detector
+        The detector at its apparent position, with the additional distortion terms.
+
+    Notes
+    -----
+    The tilt is normally distributed. The rms of the wheel is for both directions together. The relative error of the
+    shift is 3e-4, of fourth order in the angle of the ray.
     """
     filter_wheel = detector.filter_wheel
     if filter_wheel is None or not filter_wheel.tilt_rms:
@@ -45,10 +57,23 @@ def apply_random_tilt(detector: Detector, exposure: str, seed: int) -> Detector:
 
 
 def apply_tilt(detector: Detector, tilt_x: float, tilt_y: float) -> Detector:
-    """The same for a tilt (rad) by which the filter's normal leans along the focal plane's x and y axes.
+    """Return the detector with the shift and distortion of a filter with a given tilt.
 
-    A place of the detector sees what, without the tilt, is seen so much before it.
-    detector : of the camera;  across, up : of the tilt
+    Parameters
+    ----------
+    detector : Detector
+        The detector behind an untilted filter.
+    tilt_x, tilt_y : float
+        Angles by which the filter's normal leans along the focal plane's x and y axes, rad.
+
+    Returns
+    -------
+    Detector
+        The detector at its apparent position, with the additional distortion terms.
+
+    Notes
+    -----
+    The filter displaces the image by D. Without the tilt, the light at a detector position P would fall on P - D.
     """
     filter_wheel = detector.filter_wheel
     if filter_wheel is None:

@@ -1,7 +1,4 @@
-"""Footprints of detectors on the sky.
-
-counts     of places: how many of the planned detectors see each
-"""
+"""Coverage of sky positions by the footprints of detectors."""
 
 from __future__ import annotations
 
@@ -15,7 +12,20 @@ from truesky.render.camera import pointing
 
 
 def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """[n] How many footprints of the tasks hold each place, gaps between detectors left out; ra, dec : [n] deg."""
+    """Number of detector footprints that contain each position; gaps between detectors are not covered.
+
+    Parameters
+    ----------
+    tasks : pyarrow.Table
+        Planned detectors, with the columns `ra`, `dec`, `radius` (deg) and `s_region`.
+    ra, dec : array_like, shape (n,)
+        Positions, deg.
+
+    Returns
+    -------
+    int array, shape (n,)
+        Number of footprints.
+    """
     from scipy.spatial import cKDTree
 
     places = pointing.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T

@@ -1,9 +1,4 @@
-"""A grism as its wheel leaves it: turned a little from where it was asked for, and away from the beam of the field.
-
-tilt       by which a grism is turned for its spectra to run at an angle
-turned     the same, with the wheel's error in an exposure
-vignetted  what a turned grism lets through of a source's light
-"""
+"""Tilt of a grism by its wheel, with its random error, and the vignetting that the tilt causes."""
 
 from __future__ import annotations
 
@@ -14,16 +9,32 @@ from lake_schema.mission.configuration import MissionConfiguration
 from truesky.randomness import rng
 from truesky.render.camera import traces
 
-# Spectra are followed along the columns: a grism that is turned by more is none of NISP's, deg.
+# Largest tilt, deg. Spectra are traced along the columns, and no NISP grism is turned by more.
 MAX_TILT = 45.0
 
 
 def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) -> float:
-    """By which a grism is turned from its own direction, deg, -180 .. 180.
+    """Tilt of a grism for spectra at a given angle.
 
-    grism, angle     : its name, and the angle at which its spectra run in the focal plane, deg
-    section, mission : of the camera in the mission database
-    Errors           : BadInput for a grism that the database does not have
+    Parameters
+    ----------
+    grism : str
+        Name of the grism.
+    angle : float
+        Angle of its spectra in the focal plane, deg.
+    section : str
+        Prefix of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Rotation from the grism's nominal direction, deg in [-180, 180).
+
+    Notes
+    -----
+    `traces.direction` raises BadInput if the database does not contain the grism.
     """
     return (angle - traces.direction(grism, section, mission) + 180.0) % 360.0 - 180.0
 
@@ -31,10 +42,25 @@ def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) 
 def tilt_with_error(
     requested_tilt: float, exposure: str, section: str, mission: MissionConfiguration, seed: int
 ) -> float:
-    """The tilt that a grism has in an exposure, deg: as asked for, and the wheel's error.
+    """Tilt of a grism in an exposure: the requested tilt plus the random error of the wheel.
 
-    asked            : deg;  exposure : what the error is keyed by, with the seed of the request
-    section, mission : of the camera in the mission database
+    Parameters
+    ----------
+    requested_tilt : float
+        Requested tilt, deg.
+    exposure : str
+        Identifier of the exposure, from which the error is drawn.
+    section : str
+        Prefix of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    float
+        Tilt, deg.
     """
     error = mission.value(f"{section}.grism_wheel_error", "deg")
     return requested_tilt + float(rng.stream(seed, "grism_wheel", exposure).normal(0.0, error))
@@ -43,13 +69,33 @@ def tilt_with_error(
 def vignetting_throughput(
     x: Float, y: Float, dispersion_angle: float, requested_tilt: float, section: str, mission: MissionConfiguration
 ) -> Float:
-    """[n] part of the light of sources at places (x, y) [n] arcsec of the focal plane that a grism lets through.
+    """Fraction of the light of sources that a tilted grism transmits.
 
-    x, y             : of the undispersed images;  along : the angle at which spectra run, deg
-    asked            : the grism's tilt, deg: what it loses goes with it, on the side that it is turned to
-    section, mission : of the camera in the mission database
-    Assumed          : the side, and the law of other tilts than the one that was measured
-    Ref              : Serrano et al. 2024 (10 % at 0.385 deg, none at 0.17 deg)
+    Parameters
+    ----------
+    x, y : float array, shape (n,)
+        Focal-plane positions of the undispersed images, arcsec.
+    dispersion_angle : float
+        Angle of the spectra in the focal plane, deg.
+    requested_tilt : float
+        Tilt of the grism, deg. The loss is proportional to it and lies on the side to which the grism is turned.
+    section : str
+        Prefix of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Transmitted fraction, 0 to 1.
+
+    Notes
+    -----
+    The side, and the scaling to tilts other than the measured ones, are assumptions.
+
+    References
+    ----------
+    Serrano et al. 2024 (10 % at 0.385 deg, none at 0.17 deg).
     """
     key = f"{section}.vignetting"
     low, high = (mission.value(f"{key}.angle_{end}", "arcsec") for end in ("low", "high"))

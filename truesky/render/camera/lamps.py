@@ -1,14 +1,14 @@
-"""The calibration lamps of VIS and NISP, and the dome's of ground cameras."""
+"""Calibration lamps of VIS and NISP, and dome lamps of ground cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-# Of the calibration unit (Serrano et al. 2024).
+# Light-emitting diodes of the VIS calibration unit (Serrano et al. 2024).
 LEDS = 6
 # Lamps of NISP's calibration unit (Serrano et al. 2024).
 NISP_LAMPS = 5
-# Of each camera how many it has, and the passbands of which the one that sees best tells how bright they are.
+# Number of lamps of each camera, and its passbands. The passband with the highest response defines their brightness.
 LAMPS: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "vis": (LEDS, ("euclid_vis",)),
     "nisp": (NISP_LAMPS, ("euclid_y", "euclid_j", "euclid_h")),
@@ -16,5 +16,5 @@ LAMPS: Mapping[str, tuple[int, tuple[str, ...]]] = {
 
 
 def count(section: str) -> int:
-    """Of a camera, "vis", "nisp" or "ext.decam": of a ground camera's dome one, which shines alike in all bands."""
+    """Number of lamps of a camera ("vis", "nisp" or, for instance, "ext.decam"); ground cameras have one white lamp."""
     return LAMPS[section][0] if section in LAMPS else 1

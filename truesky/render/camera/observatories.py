@@ -1,7 +1,4 @@
-"""What an instrument's files say of where it is, and what its pipeline reads.
-
-of  camera -> Observatory
-"""
+"""Names of telescopes and instruments, time scales, and distortion conventions for the files of each camera."""
 
 from __future__ import annotations
 
@@ -10,11 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Observatory:
-    """Of a camera.
+    """Observatory and file conventions of a camera.
 
-    telescope, instrument : as its files name them; "" = it is not told
-    convention            : how its pipeline tells the distortion of the optics, one of tpv.CONVENTIONS
-    time_scale            : of the times in its files;  ahead : s, of UTC
+    Attributes
+    ----------
+    telescope, instrument : str
+        Names in its files; "" if unknown.
+    convention : str
+        Convention of its pipeline for the distortion of the optics, one of `tpv.CONVENTIONS`.
+    time_scale : str
+        Scale of the times in its files.
+    seconds_ahead_of_utc : float
+        Difference between that scale and UTC, s.
     """
 
     telescope: str
@@ -24,10 +28,10 @@ class Observatory:
     seconds_ahead_of_utc: float = 0.0
 
 
-# TAI - UTC since 2017.
+# TAI - UTC since 2017, s.
 _TAI = 37.0
-# VIS: its distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model). LSST and
-# HSC share a pipeline, which writes SIP; those of the others are built about SCAMP and SWarp, which read TPV.
+# The VIS distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model). LSST and
+# HSC share a pipeline that writes SIP. The pipelines of the other cameras use SCAMP and SWarp, which read TPV.
 _OBSERVATORIES = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
@@ -41,5 +45,5 @@ _OBSERVATORIES = {
 
 
 def for_camera(camera: str) -> Observatory:
-    """Of a camera; of one that nothing is known of, with its name, somewhere."""
+    """Observatory of a camera; for an unknown camera, only the name of the instrument is set."""
     return _OBSERVATORIES.get(camera, Observatory("", camera, "sip"))

@@ -1,8 +1,4 @@
-"""From a boresight to the sky: the tangent plane, its basis, the outline of a field.
-
-boresight_for   the pointing that puts a detector's centre on a target
-sky_of_plane, outline    all detectors of an exposure at once
-"""
+"""Pointing of a camera: the boresight for a target, and positions of the tangent plane on the sky."""
 
 from __future__ import annotations
 
@@ -23,14 +19,27 @@ ARCSEC = np.pi / 180.0 / 3600.0
 
 
 def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
-    """The pointing that puts a detector's centre on a target.
+    """Boresight and position angle that put a detector's centre on a target.
 
-    ra, dec        : deg, target
-    position_angle : deg, of the focal plane's y axis *at the target*, north through east
-    returns        : ra, dec, position angle of the boresight, deg; the angle differs from the one at the
-                     target because meridians converge; defined everywhere, poles included
+    Parameters
+    ----------
+    detector : Detector
+        The detector.
+    ra, dec : float
+        Target, deg.
+    position_angle : float
+        Angle of the focal plane's y axis *at the target*, deg from north through east.
+
+    Returns
+    -------
+    (float, float, float)
+        Right ascension, declination and position angle of the boresight, deg.
+
+    Notes
+    -----
+    The two position angles differ because meridians converge. The result is defined everywhere, including the poles.
     """
-    # Right-handed: (east-like = -x, y, outward).
+    # Right-handed camera axes: (-x, which points east; y; outward).
     x, y = (float(place) for place in distortion.distort(detector.x, detector.y, detector.distortion_terms))
     centre = np.array([-x * ARCSEC, y * ARCSEC, 1.0])
     camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
@@ -48,10 +57,21 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
 def sky_of_plane(
     x: npt.ArrayLike, y: npt.ArrayLike, ra: float, dec: float, position_angle: float
 ) -> tuple[Float, Float]:
-    """Focal-plane coordinates [n] arcsec on the tangent plane -> ra [n] in [0, 360), dec [n], deg.
+    """Convert focal-plane coordinates on the tangent plane to positions on the sky.
 
-    ra, dec, position_angle : deg, of the boresight and of the y axis there
-    x, y                    : arcsec, x to the west where the position angle is 0
+    Parameters
+    ----------
+    x, y : array_like
+        Coordinates, arcsec; x points west if the position angle is 0.
+    ra, dec : float
+        Boresight, deg.
+    position_angle : float
+        Angle of the y axis at the boresight, deg from north through east.
+
+    Returns
+    -------
+    (float array, float array)
+        Right ascension in [0, 360) and declination, deg.
     """
     angle = np.radians(position_angle)
     u, v = np.asarray(x, float) * ARCSEC, np.asarray(y, float) * ARCSEC
@@ -64,7 +84,10 @@ def sky_of_plane(
 
 
 def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
-    """x, y [n, 5] arcsec on the tangent plane: what each detector's centre and corners see; corners as of `corners`."""
+    """Tangent-plane positions of the centres and corners of detectors, x and y [n, 5] in arcsec.
+
+    The centre comes first, then the corners in the order of `astrometry.corners`.
+    """
     column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
     row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
     width = np.array([[d.nx * d.pixel_scale] for d in detectors]) * column
@@ -79,7 +102,7 @@ def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
 
 
 def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """East, north and outward unit vectors [3, ...] at sky positions, deg."""
+    """East, north and outward unit vectors [3, ...] at positions on the sky (deg)."""
     lon, lat = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     zero = np.zeros_like(lon * lat)
     east = np.stack([-np.sin(lon) + zero, np.cos(lon) + zero, zero])
@@ -89,7 +112,7 @@ def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 
 def _triad(direction: Float, along: Float) -> Float:
-    """Orthonormal columns: direction, `along` made perpendicular to it, their cross product."""
+    """Orthonormal columns: the direction, the component of `along` perpendicular to it, and their cross product."""
     first = direction / np.sqrt(matrices.matmul(direction, direction))
     second = along - first * matrices.matmul(first, along)
     second = second / np.sqrt(matrices.matmul(second, second))

@@ -1,10 +1,8 @@
-"""Where the pixels of an array are: sections as FITS headers write them, of the array, the detector and the mosaic.
+"""Sections of an array, a detector and the mosaic of a camera, as in FITS headers.
 
-Section    a rectangle of an array
-Sections   which of an array's pixels are the detector's, which tell the bias
-in_mosaic  a section of a detector -> of the picture that all detectors of its camera are laid out on
-
-Ref : NOAO, mosaic data structures (Valdes 1998): DATASEC, BIASSEC, TRIMSEC, CCDSEC, DETSEC, DETSIZE
+References
+----------
+NOAO, mosaic data structures (Valdes 1998): DATASEC, BIASSEC, TRIMSEC, CCDSEC, DETSEC, DETSIZE.
 """
 
 from __future__ import annotations
@@ -14,13 +12,13 @@ from dataclasses import dataclass, replace
 
 from truesky.render.camera.detectors import Detector
 
-# Quarters of a turn by which columns lie along the mosaic's columns.
+# Rotations, in quarter turns, for which the columns of a detector are columns of the mosaic.
 _ALONG = (0, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Columns x to x + nx and rows y to y + ny of an array, from 0."""
+    """Columns x to x + nx and rows y to y + ny of an array, counted from 0."""
 
     x: int
     y: int
@@ -29,27 +27,33 @@ class Section:
 
     @property
     def text(self) -> str:
-        """As FITS headers have it: from 1, the last one included."""
+        """Text for a FITS header, counted from 1, with inclusive ends."""
         return f"[{self.x + 1}:{self.x + self.nx},{self.y + 1}:{self.y + self.ny}]"
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Of an array [rows, columns]."""
+        """Slices for an array [rows, columns]."""
         return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
 
     @classmethod
     def from_text(cls, text: str) -> Section:
-        """From a header's text."""
+        """Read a section from the text of a FITS header."""
         (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
         return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Of an array in the detector's own axes.
+    """Sections of an array that has the orientation of the detector.
 
-    data : the detector's pixels;  ccd : the same, on the detector
-    bias : columns that no light reaches, in all rows of the array, which tell its level; None: there are none
+    Attributes
+    ----------
+    data : Section
+        Pixels of the detector in the array.
+    ccd : Section
+        The same pixels on the detector.
+    bias : Section or None
+        Columns without light, in all rows of the array, that give its bias level; None if it has no such columns.
     """
 
     data: Section
@@ -58,18 +62,32 @@ class Sections:
 
     @classmethod
     def full_frame(cls, nx: int, ny: int) -> Sections:
-        """Of an array that is the detector's pixels."""
+        """Sections of an array that contains all pixels of a detector and nothing else."""
         section = Section(0, 0, nx, ny)
         return cls(section, section)
 
 
 def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[Detector]) -> str | None:
-    """A section of a detector's pixels as the mosaic's, whose pixels go on where the gaps are.
+    """Convert a section of a detector to the mosaic, whose pixel grid continues across the gaps.
 
-    every   : detectors of its camera, along most of which the mosaic's columns are, and whose first corner is its
-    returns : from high to low where the detector is mounted upside down; None where it lies across: what are its
-              columns there are no columns here
-    Error   : half a pixel, and what detectors are turned by besides quarters of a turn
+    Parameters
+    ----------
+    detector : Detector
+        The detector.
+    section : Section
+        Section of its pixels.
+    detectors : sequence of Detector
+        Detectors of its camera. The mosaic has the orientation of most of them and begins at the first corner.
+
+    Returns
+    -------
+    str or None
+        Section in the mosaic, from high to low if the detector is mounted upside down. None if the detector is turned
+        by 90 deg, since its columns are rows of the mosaic.
+
+    Notes
+    -----
+    Positions are rounded to whole pixels, an error of up to half a pixel, and rotations to quarter turns.
     """
     aligned_detector, *aligned_camera = _align_to_mosaic((detector, *detectors))
     if _quarter_turns(aligned_detector) not in _ALONG:
@@ -87,7 +105,7 @@ def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[
 
 
 def mosaic_size(detectors: Sequence[Detector]) -> str:
-    """The mosaic of these detectors as DETSIZE."""
+    """Size of the mosaic of these detectors, as the card DETSIZE."""
     aligned = _align_to_mosaic(detectors)
     right, top = (
         max(round(_corner(d)[axis] - first) + _sides(d)[axis] for d in aligned)
@@ -97,7 +115,7 @@ def mosaic_size(detectors: Sequence[Detector]) -> str:
 
 
 def _align_to_mosaic(detectors: Sequence[Detector]) -> Sequence[Detector]:
-    """Detectors on axes along which most of them lie: those of the focal plane, or a quarter of a turn from them."""
+    """Return the detectors in the focal plane's axes, or in axes turned by 90 deg if most detectors lie along these."""
     if 2 * sum(_quarter_turns(d) in _ALONG for d in detectors) >= len(detectors):
         return detectors
     return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in detectors]
@@ -108,13 +126,13 @@ def _quarter_turns(detector: Detector) -> int:
 
 
 def _sides(detector: Detector) -> tuple[int, int]:
-    """Columns and rows of the mosaic that it fills."""
+    """Columns and rows that the detector covers in the mosaic."""
     along = _quarter_turns(detector) in _ALONG
     return (detector.nx, detector.ny) if along else (detector.ny, detector.nx)
 
 
 def _corner(detector: Detector) -> tuple[float, float]:
-    """Where it begins, pixels."""
+    """Position of the detector's first corner, pixels."""
     nx, ny = _sides(detector)
     return detector.x / detector.pixel_scale - nx / 2, detector.y / detector.pixel_scale - ny / 2
 

@@ -1,12 +1,12 @@
-"""The world coordinate system TAN-SIP as TPV, which SourceExtractor, SCAMP and SWarp read: they pass over SIP.
+"""Conversion of world coordinate systems between TAN-SIP and TPV.
 
-SIP bends pixels (u, v), CD turns them into the tangent plane; TPV bends the tangent plane.  With x = CD (u, v) the
-polynomials of SIP are rewritten in x, and CD applied to them: a linear map of coefficients, exact, as its inverse is.
+SourceExtractor, SCAMP and SWarp read TPV and ignore SIP. SIP distorts pixels (u, v), which the matrix CD maps to the
+tangent plane; TPV distorts the tangent plane. With x = CD (u, v), the SIP polynomials are rewritten in x and CD is
+applied to them. This is an exact linear map of coefficients, and so is its inverse.
 
-cards       SIP cards -> TPV cards
-sip_of      TPV cards -> coefficients of SIP
-
-Ref : Shupe et al. 2005 (SIP); Shupe et al. 2012 (TPV)
+References
+----------
+Shupe et al. 2005 (SIP); Shupe et al. 2012 (TPV).
 """
 
 from __future__ import annotations
@@ -24,26 +24,27 @@ from truesky.render.camera import distortion
 Card = tuple[str, Any, str]
 
 CONVENTIONS = ("sip", "tpv")
-# Number of the first PV of each order; within an order by the power of the second coordinate. Between them lie those of
-# the radius, which are not used.
+# Number of the first PV card of each order. Within an order, numbers increase with the power of the second coordinate.
+# The numbers between the orders are radial terms, which are not used.
 _FIRST = (0, 1, 4, 7, 12, 17, 24, 31)
 
 
 def from_sip(header: Sequence[Card]) -> tuple[Card, ...]:
-    """A header with SIP -> the same with TPV in its place; a header without SIP as it is.
+    """Convert the cards of a header from SIP to TPV; a header without SIP is returned unchanged.
 
-    header : cards of an image
-    Errors : BadInput where the polynomial is of a higher order than TPV has
+    Raises
+    ------
+    BadInput
+        If the order of the polynomial is higher than TPV allows.
     """
     values = {keyword: value for keyword, value, _ in header}
     if not str(values.get("CTYPE1", "")).endswith("-SIP"):
         return tuple(header)
-    # From the tangent plane to pixels.
     inverse = matrices.inverse(_cd(values))
     tpv_terms = _change_basis(_sip_coefficients(values, "A"), _sip_coefficients(values, "B"), inverse)
     order = len(tpv_terms[0]) - 1
     if order >= len(_FIRST):
-        raise BadInput(f"the distortion is of order {order}: TPV has orders up to {len(_FIRST) - 1}; take SIP")
+        raise BadInput(f"the distortion is of order {order}: TPV has orders up to {len(_FIRST) - 1}, use SIP instead")
     out: list[Card] = []
     for keyword, value, comment in header:
         if keyword in ("CTYPE1", "CTYPE2"):
@@ -56,18 +57,18 @@ def from_sip(header: Sequence[Card]) -> tuple[Card, ...]:
 
 
 def to_sip(values: Mapping[str, Any]) -> tuple[Float, Float]:
-    """Coefficients [n, n] of u^p v^q that SIP has where a header has these PV."""
+    """SIP coefficients [n, n] of u^p v^q, for columns and rows, of a header with PV cards."""
     polynomials = [_pv_coefficients(values, axis) for axis in (1, 2)]
     side = max(len(each) for each in polynomials)
     to_x, to_y = (np.pad(each, (0, side - len(each))) for each in polynomials)
-    # What PV has of first order beyond the identity is the plane itself.
+    # SIP has no identity term, but the linear terms of TPV include it.
     to_x[1, 0] -= 1.0
     to_y[0, 1] -= 1.0
     return _change_basis(to_x, to_y, _cd(values))
 
 
 def _change_basis(to_x: Float, to_y: Float, matrix: Float) -> tuple[Float, Float]:
-    """Polynomials added to a vector, written in another basis: matrix [2, 2] from the new coordinates to the old."""
+    """Write polynomials that are added to a vector in another basis; matrix [2, 2] maps new to old coordinates."""
     terms = tuple(
         (int(p), int(q), float(to_x[p, q]), float(to_y[p, q])) for p, q in np.argwhere((to_x != 0) | (to_y != 0))
     )
@@ -84,13 +85,13 @@ def _sip_coefficients(values: Mapping[str, Any], name: str) -> Float:
 
 
 def is_sip(keyword: str) -> bool:
-    """Whether a card is of a distortion as SIP."""
+    """Return True if the card belongs to a SIP distortion."""
     name, *powers = keyword.split("_")
     return name in ("A", "B") and (powers == ["ORDER"] or (len(powers) == 2 and all(p.isdigit() for p in powers)))
 
 
 def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
-    """PV of an axis, whose own coordinate comes first, with the identity; terms that are not 0."""
+    """PV cards of an axis, including the identity, without terms that are 0; the coordinate of the axis comes first."""
     full = np.array(coefficients if axis == 1 else coefficients.T)
     full[1, 0] += 1.0
     first, second = ("xi", "eta") if axis == 1 else ("eta", "xi")
@@ -101,7 +102,7 @@ def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
 
 
 def _pv_coefficients(values: Mapping[str, Any], axis: int) -> Float:
-    """Coefficients [n, n] by the powers of the first and the second coordinate."""
+    """Coefficients [n, n] by the powers of the first and second coordinate."""
     terms = {
         (order - q, q): float(values[key])
         for order, first in enumerate(_FIRST)

@@ -1,20 +1,17 @@
-"""Where a grism puts light: traces of its orders, as polynomials.
+"""Traces of grism orders as polynomials: the pixels that receive the light of each wavelength.
 
-An order m puts light of wavelength lambda at (x0 + X(t), y0 + Y(t)), (x0, y0) the place of the undispersed image,
-t = (lambda - first) / (last - first) exactly linear in the wavelength, and
+An order m puts light of wavelength lambda at (x0 + X(t), y0 + Y(t)), where (x0, y0) is the undispersed image and
+t = (lambda - first) / (last - first) is exactly linear in wavelength. The polynomials have the form of grismconf::
 
-    X(t; x0, y0) = sum_i t^i (a_i0 + a_i1 x0 + a_i2 y0),    Y likewise
+    X(t; x0, y0) = sum_i t^i (a_i0 + a_i1 x0 + a_i2 y0)
+    Y(t; x0, y0) = sum_i t^i (b_i0 + b_i1 x0 + b_i2 y0)
 
-as grismconf has it.  In the mission database the coefficients are along the dispersion and across it, over the focal
-plane; a grism that is turned turns them, and a detector has them in its own pixels.
+In the mission database the coefficients are along and across the dispersion, over the whole focal plane. They are
+rotated with the grism and converted to the pixels of each detector.
 
-Trace             one order on a detector
-traces            of all orders of a grism
-direction         in which a grism disperses
-throughput        how much light an order has
-source_rectangle  where sources lie whose light reaches a detector
-
-Ref : Pirzkal & Ryan 2017, STScI WFC3 ISR 2017-01 (the form); laws of the orders, the mission database
+References
+----------
+Pirzkal & Ryan 2017, STScI WFC3 ISR 2017-01 (form of the polynomials); the mission database (their coefficients).
 """
 
 from __future__ import annotations
@@ -34,11 +31,16 @@ from truesky.render.camera.detectors import Detector, detectors
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """One order of a grism on a detector.
+    """Trace of one grism order on a detector.
 
-    order       : -1, 0, 1, 2
-    first, last : wavelengths of t = 0 and 1, A
-    x, y        : float64[i, 3] pixels: coefficients of t^i, and of 1, x0, y0 (0-based pixels)
+    Attributes
+    ----------
+    order : int
+        Diffraction order: -1, 0, 1 or 2.
+    first, last : float
+        Wavelengths of t = 0 and t = 1, Angstrom.
+    x, y : float array, shape (n_powers, 3)
+        Coefficients of t^i and of 1, x0, y0 (0-based pixels) for columns and rows, pixels.
     """
 
     order: int
@@ -48,28 +50,57 @@ class Trace:
     y: Float
 
     def offsets(self, column: float, row: float, wavelength: npt.ArrayLike) -> tuple[Float, Float]:
-        """(columns, rows) [n] from the undispersed place (column, row) to light of wavelengths [n] A."""
+        """Offsets from the undispersed image of a source to its light at given wavelengths.
+
+        Parameters
+        ----------
+        column, row : float
+            Undispersed image, 0-based pixels.
+        wavelength : array_like, shape (n,)
+            Wavelengths, Angstrom.
+
+        Returns
+        -------
+        (float array, float array), each of shape (n,)
+            Offsets in columns and rows, pixels.
+        """
         t = (np.asarray(wavelength, float) - self.first) / (self.last - self.first)
         along, across = self.polynomials(column, row)
         columns, rows = (np.asarray(np.polynomial.polynomial.polyval(t, part), float) for part in (along, across))
         return columns, rows
 
     def polynomials(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
-        """Coefficients [i] of t^i of a source's own trace, columns and rows, pixels; [i, n] of n sources."""
+        """Coefficients of t^i for the trace of a source, for columns and rows, pixels: [i], or [i, n] for n sources."""
         place = np.array([np.ones_like(column, float), column, row])
         return np.asarray(matrices.matmul(self.x, place)), np.asarray(matrices.matmul(self.y, place))
 
 
 def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfiguration) -> tuple[Trace, ...]:
-    """Of all orders of a grism that is turned by `tilt` deg from its own direction, by falling order.
+    """Traces of all orders of a tilted grism on a detector.
 
-    grism, tilt       : its name, and by how much it is turned
-    detector, mission : of the camera, and the mission database
-    Error : field coordinates of a source are those of its pixel, without the optics' distortion
+    Parameters
+    ----------
+    grism : str
+        Name of the grism.
+    tilt : float
+        Rotation of the grism from its nominal direction, deg.
+    detector : Detector
+        The detector.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    tuple of Trace
+        Traces from the highest to the lowest order.
+
+    Notes
+    -----
+    The field coordinates of a source are taken from its pixel, without the distortion of the optics.
     """
     rows = _grism_rows(grism, detector.section, mission)
     to_field = _to_field_matrix(detector, mission)
-    # From the grism's direction to the detector's columns and rows.
+    # Angle from the detector's columns to the dispersion.
     turn = np.radians(float(rows[0]["direction_deg"]) + tilt - detector.rotation)
     cosine, sine = float(np.cos(turn)), float(np.sin(turn))
     order_traces = []
@@ -83,12 +114,27 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
 
 
 def direction(grism: str, section: str, mission: MissionConfiguration) -> float:
-    """Of the spectra of a grism that is not turned, deg from the focal plane's x axis to y."""
+    """Direction of the spectra of an untilted grism, deg from the focal plane's x axis to the y axis.
+
+    Parameters
+    ----------
+    grism : str
+        Name of the grism.
+    section : str
+        Prefix of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Direction, deg.
+    """
     return float(_grism_rows(grism, section, mission)[0]["direction_deg"])
 
 
 def _grism_rows(grism: str, section: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
-    """Of a grism's laws; BadInput where there is none of that name."""
+    """Rows of a grism in the table of traces. Raises BadInput if the table does not contain the grism."""
     rows = mission.rows(f"{section}.traces")
     grism_rows = [row for row in rows if row["grism"] == grism]
     if not grism_rows:
@@ -97,18 +143,17 @@ def _grism_rows(grism: str, section: str, mission: MissionConfiguration) -> list
 
 
 def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to_field: Float) -> Float:
-    """float64[highest + 1, 3] pixels of t^i, of (1, x0, y0)."""
+    """Coefficients [highest + 1, 3] of t^i and of (1, x0, y0), pixels."""
     powers = {int(row["power"]): row for row in rows if row["axis"] == axis}
     out = np.zeros((highest + 1, 3))
     for power, row in powers.items():
-        # Of 1, and of both field coordinates.
         field_terms = np.array([float(row[name]) for name in ("constant", "slope_x", "slope_y")])
         out[power] = matrices.matmul(field_terms, to_field)
     return out
 
 
 def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float:
-    """float64[3, 3]: (1, x0, y0) -> 1 and the field coordinates, -1 .. 1 over the detectors' outer edges."""
+    """Matrix [3, 3] from (1, x0, y0) to 1 and the field coordinates, which run from -1 to 1 between the outer edges."""
     all_detectors = detectors(detector.section, mission)
     turn = np.radians(detector.rotation)
     half = np.array([(detector.nx - 1) / 2, (detector.ny - 1) / 2])
@@ -121,10 +166,25 @@ def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float
 
 
 def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration) -> Float:
-    """float64[n] light of an order at wavelengths [n] A, of what the passband of the first order detects there.
+    """Light of an order relative to the light that the passband of the first order detects.
 
-    grism, order      : its name, and which;  wavelength : float64[n] A
-    detector, mission : of the camera, and the mission database
+    Parameters
+    ----------
+    grism : str
+        Name of the grism.
+    order : int
+        Diffraction order.
+    wavelength : float array, shape (n,)
+        Wavelengths, Angstrom.
+    detector : Detector
+        A detector of the camera.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Relative throughput; 1 if the database has none for this order.
     """
     rows = [
         (float(row["wavelength_nm"]) * 10.0, float(row["throughput"]))
@@ -140,10 +200,25 @@ def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mi
 def source_rectangle(
     trace: Trace, nx: int, ny: int, wavelength: tuple[float, float]
 ) -> tuple[float, float, float, float]:
-    """(left, right, low, high) pixels within which sources lie whose light in a stretch of A falls onto nx x ny pixels.
+    """Rectangle that contains all sources whose light of an order falls on a detector.
 
-    trace : of an order;  nx, ny : columns and rows;  wavelength : first and last, A
-    The field's slopes are taken at the detector's corners: farther out the trace differs by less than a pixel in 100.
+    Parameters
+    ----------
+    trace : Trace
+        Trace of the order.
+    nx, ny : int
+        Columns and rows of the detector.
+    wavelength : (float, float)
+        First and last wavelength, Angstrom.
+
+    Returns
+    -------
+    (float, float, float, float)
+        Left, right, lower and upper limit of the undispersed images, pixels.
+
+    Notes
+    -----
+    The slopes across the field are taken at the corners. Farther out the trace differs by less than 0.01 pixels.
     """
     waves = np.linspace(*wavelength, 33)
     corners = [(x, y) for x in (0.0, nx - 1.0) for y in (0.0, ny - 1.0)]

@@ -1,1 +1,1 @@
-"""What differs from channel to channel: effects and their order, PSF, readout, sky, measured costs."""
+"""Channels: their effects in order, PSF, readout, sky and measured costs."""

@@ -1,4 +1,4 @@
-"""A detector of an exposure, as it looks at the sky."""
+"""A detector of an exposure with its world coordinate system, passband, channel and effects."""
 
 from __future__ import annotations
 
@@ -19,11 +19,22 @@ from truesky.render.effects.effect import Effect
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """What looks where, through what.
+    """Detector of an exposure, with everything that defines its view of the sky.
 
-    exposure : a row of the table `exposures`
-    band     : its passband
-    effects  : of its channel for its image type, in their order
+    Attributes
+    ----------
+    exposure : ExposureRow
+        Row of the table `exposures`.
+    detector : Detector
+        The detector.
+    wcs : WCS
+        World coordinate system of the detector.
+    band : Passband
+        Passband of the exposure.
+    channel : Channel
+        Channel of the exposure.
+    effects : tuple of Effect
+        Effects of the channel for the image type, in order.
     """
 
     exposure: ExposureRow
@@ -42,17 +53,35 @@ class Aim:
         seed: int = 0,
         readout_name: str = "raw",
     ) -> Aim:
-        """Of a planned exposure; BadInput where nothing renders it.
+        """Build the aim of a detector for a planned exposure.
 
-        exposure : its row;  detector : of its camera
-        band     : None = the embedded one of its name;  seed : of the request
-        way      : in which its files are wanted (Channel.read_as)
+        Parameters
+        ----------
+        exposure : ExposureRow
+            Row of the table `exposures`.
+        detector : Detector
+            Detector of its camera.
+        band : Passband, optional
+            Passband; by default the embedded one with the name in the row.
+        seed : int
+            Seed of the request.
+        readout_name : str
+            Requested format of the files, see `Channel.with_readout`.
+
+        Returns
+        -------
+        Aim
+            The aim.
+
+        Notes
+        -----
+        `registry.find_channel` raises BadInput if no channel renders the exposure.
         """
         kind = exposure.image_type
         channel = registry.find_channel(exposure.channel, kind, f"exposure {exposure.exposure_id}").with_readout(
             readout_name
         )
-        # Exposures that differ in their noise alone see alike; no filter is in front of a grism.
+        # Exposures that differ only in their noise have the same tilt. A grism is used without a filter.
         identity = image_types.identity(replace(exposure, realisation=None))
         tilted_detector = (
             filter_wheel.apply_random_tilt(detector, identity, seed) if channel.dispersion is None else detector
@@ -63,15 +92,15 @@ class Aim:
 
     @property
     def sees_sky(self) -> bool:
-        """Whether sources shine on the detector."""
+        """True if light of astronomical sources reaches the detector."""
         return self.channel.sees_sky(self.exposure.image_type)
 
     @property
     def electrons_per_microjansky(self) -> float:
-        """Expected of a source of one microjansky in the exposure."""
+        """Expected electrons in the exposure from a source of one microjansky."""
         return electron_rate(self.exposure) * self.exposure.exposure_time_s
 
 
 def electron_rate(exposure: ExposureRow) -> float:
-    """Electrons a second of a source of one microjansky."""
+    """Electrons per second from a source of one microjansky."""
     return float(10.0 ** (0.4 * (exposure.zero_point - units.AB_UJY)))

@@ -1,4 +1,4 @@
-"""What an instrument's mode is to the renderer."""
+"""Properties of an instrument mode that planning and rendering use."""
 
 from __future__ import annotations
 
@@ -24,17 +24,23 @@ from truesky.render.sky.diffuse_light import SkyBand
 
 @dataclass(frozen=True, slots=True)
 class Dispersion:
-    """How a channel spreads the light of sources out, without a slit.
+    """Slitless dispersion of the light of sources by a channel.
 
-    traces     : (exposure, detector, mission, seed of the request) -> where each order puts it
-    throughput : (exposure, order, wavelengths [n] A, detector, mission) -> [n] light of an order, of what the
-                 passband detects
-    vignetted  : (exposure, detector, columns [n], rows [n] of undispersed images, mission) -> [n] part of the sources'
-                 light that is let through
-    psf        : (detector, wavelengths [n] A, mission, positions on the detector) -> PSF
-    reach      : (section, mission) -> arcsec beyond a detector, as far as all sources are read: those whose first order
-                 is on it
-    chosen_by  : band in which sources are bright enough, where the mission says how bright they are to be
+    Attributes
+    ----------
+    traces : callable
+        (exposure, detector, mission, seed of the request) -> trace of each order.
+    throughput : callable
+        (exposure, order, wavelengths [n] in Angstrom, detector, mission) -> light of an order [n], relative to the
+        light that the passband detects.
+    vignetting : callable
+        (exposure, detector, columns [n] and rows [n] of undispersed images, mission) -> transmitted fraction [n].
+    psf : callable
+        (detector, wavelengths [n] in Angstrom, mission, number of positions on the detector) -> PSF.
+    reach : callable
+        (section, mission) -> largest distance from a detector of a source whose first order falls on it, arcsec.
+    selection_band : str
+        Band of the flux limit for sources, if the mission sets one.
     """
 
     traces: Callable[[ExposureRow, Detector, MissionConfiguration, int], tuple[Trace, ...]]
@@ -47,27 +53,49 @@ class Dispersion:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """All that differs from channel to channel while a detector is planned and rendered.
+    """Everything that distinguishes a channel while a detector is planned and rendered.
 
-    effects    : image type -> its effects, in the order of physics
-    psf        : (exposure, detector, band, mission, positions on the detector) -> PSF
-    readout    : how its detectors are read, and which arrays their files have
-    bands      : (camera, mission) -> names of the camera's passbands; () where the channel has no such camera
-    sky        : (detector, name of a band, mission, its passband, None = the embedded one) -> the diffuse sky of a band
-    cost       : of a detector, measured
-    on_ground  : whether it looks where it wants: a spacecraft keeps its side to the Sun
-    sky_types  : image types in which sources shine on the detectors
-    drawn      : effect that is part of the pixel's transfer function: it acts while sources are drawn
-    pupil      : (detector, band, mission) -> diffraction far from a star; None: not drawn
-    moving     : whether bodies of the Solar System are drawn
-    own_light  : effects that fill pixels besides the sky and its sources: lamps, injected charge
-    tracks     : effects that leave tracks of charge, in the dark, too
-    scattered  : whether bright sources beside a pixel shine into it: ghosts, stray light
-    ramp       : which of the mission's ramps its detectors are read up (Scene.ramp); "" = they are read once
-    remembers  : effect that brings what earlier exposures left; None: they leave nothing
-    coloured   : effect by which pixels see the colours of sources (Scene.tints); None: all see them alike
-    readouts   : other ways in which a request may have its detectors' files, by their names
-    disperses  : how the light of sources is spread out; None: it is not
+    Attributes
+    ----------
+    effects : mapping
+        Effects of each image type, in the order of physics.
+    psf : callable
+        (exposure, detector, band, mission, number of positions on the detector) -> PSF.
+    readout : ReadoutMode
+        Readout of its detectors, and the arrays in its files.
+    bands : callable
+        (camera, mission) -> names of the camera's passbands; () if the channel does not use the camera.
+    sky : callable
+        (detector, name of a band, mission, its passband or None for the embedded one) -> diffuse sky of the band.
+    cost : Cost
+        Measured costs per detector.
+    on_ground : bool
+        True if the telescope may point in any direction; a spacecraft must keep its orientation to the Sun.
+    sky_types : tuple of str
+        Image types in which light of astronomical sources reaches the detectors.
+    transfer_effect : Effect or None
+        Effect that is a part of the pixel's transfer function and is applied while sources are drawn.
+    diffraction_edges : callable or None
+        (detector, band, mission) -> edges of the pupil whose diffraction is drawn far from stars; None if it is not
+        drawn.
+    draws_moving_bodies : bool
+        True if bodies of the Solar System are drawn.
+    non_source_effects : tuple of Effect
+        Effects that fill pixels without light of the sky, such as lamps and injected charge.
+    track_effects : tuple of Effect
+        Effects that leave tracks of charge, also in the dark.
+    has_scattered_light : bool
+        True if bright sources scatter light to distant pixels: ghosts and stray light.
+    ramp_name : str
+        Ramp of the mission with which its detectors are read (`Scene.ramp`); "" if they are read once.
+    persistence_effect : Effect or None
+        Effect that adds the persistence of earlier exposures; None if there is no persistence.
+    chromatic_effect : Effect or None
+        Effect that depends on the colours of sources (`Scene.chromatic_light`); None if no effect does.
+    dispersion : Dispersion or None
+        Dispersion of the light of sources; None for direct images.
+    alternative_readouts : mapping
+        Other formats of the files that a request may choose, by name.
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
@@ -94,11 +122,11 @@ class Channel:
         for effects in self.effects.values():
             for effect in effects:
                 if not effect.cost > 0.0:
-                    problem = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
-                    raise BadInput(f"{problem}; python -m benchmarks.effects measures it")
+                    problem = f"effect {effect.name} has the cost {effect.cost:g}, but it must be positive"
+                    raise BadInput(f"{problem}: measure it by python -m benchmarks.effects")
 
     def with_readout(self, readout_name: str) -> Channel:
-        """With the files that a request asks for; as it is where it has no other way of that name."""
+        """Return the channel with a requested file format; unchanged if the channel has no alternative of that name."""
         if readout_name not in self.alternative_readouts:
             return self
         mode = self.alternative_readouts[readout_name]
@@ -109,14 +137,14 @@ class Channel:
         return replace(self, readout=mode, effects=effects)
 
     def sees_sky(self, image_type: str) -> bool:
-        """Whether sources shine on the detectors."""
+        """Return True if light of astronomical sources reaches the detectors in this image type."""
         return image_type in self.sky_types
 
     def margin(self, section: str, mission: MissionConfiguration) -> float:
-        """How far beyond a detector all sources are read, arcsec; section : of its camera in the mission database."""
+        """Distance beyond a detector up to which all sources are read, arcsec; `section` is the camera's prefix."""
         spread = 0.0 if self.dispersion is None else self.dispersion.reach(section, mission)
         return mission.value("survey.selection_margin", "arcsec") + spread
 
     def sees_bodies(self, image_type: str) -> bool:
-        """Whether moving bodies are drawn."""
+        """Return True if bodies of the Solar System are drawn in this image type."""
         return self.draws_moving_bodies and self.sees_sky(image_type)

@@ -1,4 +1,4 @@
-"""What a detector of a channel costs, measured: seconds, memory, bytes."""
+"""Measured costs of a detector of a channel: time, memory and file size."""
 
 from __future__ import annotations
 
@@ -7,14 +7,24 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Of a channel's detectors, its effects left out; python -m benchmarks.planner measures it.
+    """Costs of the detectors of a channel without effects, measured by python -m benchmarks.planner.
 
-    frame_s      : s of any frame: its task, its writing;  sky_s : more, where the sky is drawn
-    galaxy_s, star_s : s of a source drawn with the accuracy "survey"
-    base_gb      : of a worker before it draws
-    held, held_sky : bytes a pixel while a frame is made, without and with a sky
-    written      : bytes a pixel of the image, pre- and overscan counted
-    again_s      : s of a frame of the sky that is drawn again, for what it left in a later one
+    Attributes
+    ----------
+    frame_s : float
+        Time per frame for its task and for writing, s.
+    sky_s : float
+        Additional time if the sky is drawn, s.
+    galaxy_s, star_s : float
+        Time per source drawn with the accuracy "survey", s.
+    base_gb : float
+        Memory of a worker before it draws, GB.
+    bytes_per_pixel, sky_bytes_per_pixel : float
+        Memory per pixel while a frame is made, without and with sky.
+    file_bytes_per_pixel : float
+        Written bytes per pixel of the image, including pre- and overscan.
+    redraw_s : float
+        Time to draw a sky frame again for its persistence in a later one, s.
     """
 
     frame_s: float

@@ -1,4 +1,4 @@
-"""Ground cameras: the order of physics."""
+"""Channel of ground cameras: effects in the order of physics, costs."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ SKY = (
 
 
 def _effects_from(first: Effect) -> tuple[Effect, ...]:
-    """Of the effects on the sky's light this one, and those after it."""
+    """Return an effect on the sky's light and all later ones."""
     return SKY[SKY.index(first) :]
 
 
-# Of the dome, by day: no sky, and no stars. The lamp's light comes through the telescope, as theirs does.
+# Dome flats are taken by day, without sky and stars. The light of the lamp passes through the telescope like starlight.
 FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_effects_from(pixel_response.EFFECT))
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
@@ -83,8 +83,8 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 }
 
 
-# As VIS, of a detector of each camera but HSC with every effect (benchmarks/ext.py; 1.1e4 to 1.4e5 sources): most of
-# sky_s is reading of catalogues, colours of galaxies, PSFs.
+# Measured as for VIS, for one detector of each camera except HSC, with all effects (benchmarks/ext.py; 1.1e4 to 1.4e5
+# sources). Most of sky_s is spent on reading catalogues, on colours of galaxies and on PSFs.
 COST = Cost(
     frame_s=0.2,
     sky_s=1.9,

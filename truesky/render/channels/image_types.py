@@ -1,8 +1,4 @@
-"""Image types of the sky; whose random numbers an exposure has.
-
-identity       what tells an exposure's random numbers from those of all others
-family         what exposures of one sequence have in common of their settings
-"""
+"""Image types with sky, and the identity of an exposure from which its random numbers are drawn."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ from lake_schema.tables.exposures import ExposureRow
 
 SKY_TYPES = ("science", "deep", "self_calibration")
 
-# In settings before the name of a parameter that is an exposure's own, and no value that a request explores.
+# Prefix, in `settings`, of parameters that belong to a single exposure and are not explored by a request.
 EXPOSURE_ONLY_PREFIX = "own:"
 
 
@@ -24,11 +20,13 @@ def section(camera: str) -> str:
 
 
 def identity(exposure: ExposureRow) -> str:
-    """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan.
+    """Return the text from which an exposure's random numbers are drawn.
 
-    A grism and its angle are a part of it: the band alone does not tell how spectra run.
-
-    Of several alike the first has the numbers that it has alone.
+    Notes
+    -----
+    It depends on pointing, time, band and grism, but not on the position of the exposure in a plan. The grism and its
+    angle are included because the band does not define the direction of spectra. The first of several identical
+    exposures has the same random numbers as a single one.
     """
     places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
     grism = () if exposure.grism is None else (exposure.grism, (exposure.grism_angle or 0.0).hex())
@@ -39,7 +37,10 @@ def identity(exposure: ExposureRow) -> str:
 
 @lru_cache(maxsize=1024)
 def shared_settings(settings: str | None) -> str | None:
-    """Settings of an exposure without what is its own alone: those of the variant of an exploration."""
+    """Settings of an exposure (JSON) without the parameters that belong to it alone; None if none remain.
+
+    The result identifies the variant of an exploration.
+    """
     values = json.loads(settings) if settings else {}
     shared = {key: value for key, value in values.items() if not key.startswith(EXPOSURE_ONLY_PREFIX)}
     return json.dumps(shared, sort_keys=True) if shared else None

@@ -1,7 +1,7 @@
-"""Euclid NISP-P: the order of physics.
+"""Channel NISP-P of Euclid: effects in the order of physics, costs.
 
-Light and dark current are expected electrons until they are counted up the ramp; then charge of its groups, as every
-pixel and its neighbours see it and as it is read; then the signal that is estimated of them on board, and its quality.
+Light and dark current are expected electrons until they are counted up the ramp. The charge of the ramp's groups is
+then changed by pixels, their neighbours and the readout. Finally the signal and its quality are estimated as on board.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _LIGHT = (
     background.EFFECT,
     pixel_area.EFFECT,
 )
-# Of any of the channels that these detectors are read for.
+# Effects of all channels that use these detectors.
 CURRENT = (
     dark_map.EFFECT,
     persistence.EFFECT,
@@ -67,7 +67,7 @@ RAMP = (
 )
 
 SKY = (*_LIGHT, chromatic_response.EFFECT, pixel_response.EFFECT, *CURRENT, *RAMP)
-# Assumed to be taken on the way from field to field: neither sky nor stars are in a flat.
+# Flats are assumed to be taken during slews, without sky and stars.
 FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *CURRENT, *RAMP)
 DARK = (*CURRENT, *RAMP)
 
@@ -88,9 +88,10 @@ def _psf(
     return euclid.nisp_psf(detector, band, mission, positions)
 
 
-# Of the demo's sky (1.2e4 predicted sources): 1.5 s of CPU and 1.2 GB on an AMD EPYC, which takes half of the time of
-# the machine that costs are of (forecasting/speed.py).  Again: the last image of a visit of four dithers takes 10.5 s
-# of CPU there, of which 0.28 s are for each of eleven images of NISP-P before it, and 0.6 s for each of four of NISP-S.
+# Measured for the sky of the demo (1.2e4 predicted sources): 1.5 s of CPU time and 1.2 GB on an AMD EPYC, which needs
+# half the time of the reference machine (forecasting/speed.py). For redraw_s: the last image of a visit with four
+# dithers takes 10.5 s of CPU time there, 0.28 s for each of eleven earlier NISP-P images and 0.6 s for each of four
+# NISP-S images.
 COST = Cost(
     frame_s=0.05,
     sky_s=0.3,

@@ -1,6 +1,6 @@
-"""Euclid NISP-S: the light of all sources, spread out by a grism; then as NISP-P, up a longer ramp.
+"""Channel NISP-S of Euclid: light dispersed by a grism, then the effects of NISP-P with a longer ramp.
 
-No ghosts and no stray light about bright sources: what they would be through a grism is not known.
+Ghosts and stray light of bright sources are not simulated, since their form through a grism is unknown.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ SKY = (
     *nisp_p.CURRENT,
     *nisp_p.RAMP,
 )
-# With the grism in: of a lamp that lights the whole field evenly its orders overlap, and a pixel sees all of it.
+# Flats are taken with the grism in the beam. The lamp fills the field, so the orders overlap and every pixel receives
+# the whole spectrum.
 FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *nisp_p.CURRENT, *nisp_p.RAMP)
 DARK = (*nisp_p.CURRENT, *nisp_p.RAMP)
 
@@ -54,10 +55,10 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 
 
 def _grism_and_tilt(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
-    """(grism, the tilt that was asked for, deg); BadInput for an exposure without a grism, or one that is across."""
+    """Grism and requested tilt (deg). Raises BadInput if the exposure has no grism or if the tilt is too large."""
     where = f"exposure {exposure.exposure_id}"
     if exposure.grism is None or exposure.grism_angle is None:
-        raise BadInput(f"{where}: a spectrum wants a grism and its angle")
+        raise BadInput(f"{where}: a spectrum requires a grism and its angle")
     requested_tilt = grism_wheel.tilt(exposure.grism, exposure.grism_angle, section, mission)
     if abs(requested_tilt) > grism_wheel.MAX_TILT:
         angle = f"grism_angle = {exposure.grism_angle:g} deg"
@@ -69,7 +70,7 @@ def _grism_and_tilt(exposure: ExposureRow, section: str, mission: MissionConfigu
 
 def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int) -> tuple[Trace, ...]:
     grism, requested_tilt = _grism_and_tilt(exposure, detector.section, mission)
-    # Exposures that differ in their noise alone see alike.
+    # Exposures that differ only in their noise have the same error of the grism wheel.
     identity = image_types.identity(replace(exposure, realisation=None))
     return traces.traces(
         grism, grism_wheel.tilt_with_error(requested_tilt, identity, detector.section, mission, seed), detector, mission
@@ -98,7 +99,7 @@ def _vignetting_throughput(
 
 
 def _reach(section: str, mission: MissionConfiguration) -> float:
-    """Of the first order of any of the grisms."""
+    """Largest distance from a detector, in arcsec, of a source whose first order falls on it, for all grisms."""
     first = detectors(section, mission)[0]
     distances = [
         abs(edge - inside)
@@ -117,22 +118,22 @@ def _reach(section: str, mission: MissionConfiguration) -> float:
 def _psf(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
 ) -> Psf:
-    """Of the middle of a band."""
+    """PSF at the mean wavelength of a band."""
     middle = np.array([np.average(band.wavelength, weights=band.response)])
     return _psf_at(detector, middle, mission, positions)
 
 
 def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int) -> Psf:
-    """Diffraction at the pupil, or the two Gaussians of Serrano et al. 2024, as the mission says."""
+    """PSF by diffraction at the pupil or the double Gaussian of Serrano et al. 2024, as the mission selects."""
     if mission.value(f"{detector.section}.spectra.psf", "") < 0.5:
         return euclid.nisp_psf_at(detector, waves, mission, positions)
     return double_gaussian.psf_at(detector, waves, mission)
 
 
-# Of the demo's sky (1.1e4 predicted sources, as many drawn): 17.2 s of CPU, 1.3 s of it spectra, and 1.5 GB on a busy
-# AMD EPYC, which takes half of the time of the machine that costs are of (forecasting/speed.py); 16.9 s and 1.6 GB are
-# foreseen.  By Spark, with eight maps of truth of which four are orders: 1.55 to 1.71 GB; darks and flats with four
-# maps 1.39 to 1.49 GB.  Again: as nisp_p.py says.
+# Measured for the sky of the demo (1.1e4 predicted sources, all drawn): 17.2 s of CPU time, with 1.3 s for spectra, and
+# 1.5 GB on a busy AMD EPYC, which needs half the time of the reference machine (forecasting/speed.py). The forecast is
+# 16.9 s and 1.6 GB. Spark tasks with eight truth maps, four of them orders, use 1.55 to 1.71 GB; darks and flats with
+# four maps use 1.39 to 1.49 GB. For redraw_s, see nisp_p.py.
 COST = Cost(
     frame_s=0.05,
     sky_s=0.5,

@@ -1,13 +1,8 @@
-"""How a detector is read: the arrays that it gives, each with its unit and cards, and back from its files.
+"""Readout modes of detectors: from the charge in pixels to the arrays of a file, and back from the file.
 
-FRAME       one array of pixels
-RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
-RAMP_AND_CHI2  the same, with chi^2 itself
-QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan
-BY_AMPLIFIER  an array of each amplifier, in the detector's own axes with its pre- and overscan
-ELECTRONS   what lies in the pixels before they are read
-AMPLIFIERS  one array: the pixels of all amplifiers as they lie on the detector, their pre- and overscans around them
-planes, pixels  a frame by quadrants or amplifiers, in the order in which they are read, and back
+Each array has a unit and FITS cards. The modes are FRAME (one array), RAMP and RAMP_AND_CHI2 (signal of a ramp with a
+quality flag or with chi^2), QUADRANTS (four arrays), AMPLIFIERS (all amplifiers in one array), BY_AMPLIFIER (one array
+per amplifier) and ELECTRONS (charge in the pixels before readout).
 """
 
 from __future__ import annotations
@@ -34,14 +29,22 @@ from truesky.render.effects.scene import Frame, Scene
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """An array of a readout; its dtype is the file's: a slope may have 16 bits, the quality of its fit 8.
+    """An array of a readout, with the data type of the file.
 
-    name      : of its extension; "" = the only array of its file
-    data      : [ny, nx], or [n, ny, nx], such as the groups of a ramp
-    unit      : as FITS writes it; "" = none, of a flag
-    cards     : of it alone
-    amplifier : the number of the one that it is read through; None = of several
-    sections  : which of its pixels are the detector's; None: it is not told
+    Attributes
+    ----------
+    name : str
+        Name of the extension; "" if it is the only array of its file.
+    data : array, shape (ny, nx) or (n, ny, nx)
+        Pixels, or n planes such as the groups of a ramp. The signal of a ramp has 16 bits, its quality 8.
+    unit : str
+        Unit in FITS notation; "" for a flag.
+    cards : tuple of Card
+        Cards of this extension.
+    amplifier : int or None
+        Number of the amplifier through which the array is read; None for several amplifiers.
+    sections : Sections or None
+        Section that contains the pixels of the detector; None if it is unknown.
     """
 
     name: str
@@ -56,9 +59,16 @@ class Extension:
 class Readout:
     """The arrays of a detector.
 
-    raw     : as the last effect leaves them, in readout order
-    pixels  : [ny, nx] those of the detector alone, in its own axes
-    cards   : for all arrays
+    Attributes
+    ----------
+    extensions : tuple of Extension
+        Arrays of the file.
+    raw : array
+        Result of the last effect, in readout order.
+    pixels : array, shape (ny, nx)
+        Pixels of the detector without pre- and overscan, in its orientation.
+    cards : tuple of Card
+        Cards that apply to all arrays.
     """
 
     extensions: tuple[Extension, ...]
@@ -68,23 +78,31 @@ class Readout:
 
     @property
     def unit(self) -> str | None:
-        """Of all arrays; None where they differ."""
+        """Unit of all arrays; None if their units differ."""
         units = {extension.unit for extension in self.extensions}
         return units.pop() if len(units) == 1 else None
 
 
 @dataclass(frozen=True, slots=True)
 class ReadoutMode:
-    """How a detector is read, and how what was written of it is read back.
+    """Conversion of a detector's pixels to the arrays of a file, and back.
 
-    arrays    : (what the last effect leaves, scene, name of the detector, WCS) -> the arrays of its file
-    assembled : (array with the axes of what any effect leaves, scene) -> [ny, nx] the detector's pixels, in its own
-                axes; the array itself where it is that already
-    pixels    : images of a file -> [ny, nx] its pixels as stored
-    electrons : images of a file -> float64[ny, nx] its pixels in e-, the bias subtracted
-    before    : the effect from which on nothing of a channel is applied; "" = all of it is
-    written   : bytes of a file for each of the detector's pixels; None = as measured (channels/cost.py)
-    apart     : ([ny, nx] of the detector, scene) -> what is read at a time side by side, in readout order
+    Attributes
+    ----------
+    make_readout : callable
+        (result of the last effect, scene, name of the detector, WCS) -> arrays of the file.
+    assemble : callable
+        (array with the axes of any effect's result, scene) -> pixels [ny, nx] of the detector in its orientation.
+    read_pixels : callable
+        (images of a file) -> pixels [ny, nx] as stored.
+    read_electrons : callable
+        (images of a file) -> pixels [ny, nx] in electrons, with the bias subtracted.
+    stop_before : str
+        First effect of a channel that is not applied; "" if all effects are applied.
+    file_bytes_per_pixel : int or None
+        Bytes of the file per pixel of the detector; None for the measured value in `Cost`.
+    split : callable
+        (array [ny, nx] of the detector, scene) -> planes that are read at the same time, in readout order.
     """
 
     make_readout: Callable[[Frame, Scene, str, WCS], Readout]
@@ -100,7 +118,7 @@ class ReadoutMode:
 
 
 def _frame(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """[ny, nx] ADU, in as many bits as the converter wants."""
+    """Make one array [ny, nx] in ADU, with the data type of the converter."""
     raw = adc.to_file_type(frame, scene)
     return Readout((Extension("", raw, "adu", sections=Sections.full_frame(*raw.shape[::-1])),), raw, raw)
 
@@ -120,19 +138,18 @@ FRAME = ReadoutMode(
 
 # ---------------------------------------------------------------------------------------------- the signal of a ramp
 
-# Of eight bits.
+# Largest value of eight bits.
 _MAX_CHI2 = 255.0
 
 
 def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bool) -> Readout:
-    """Signal uint16 ADU and quality uint8, 1 where the ramp does not fit; two groups have no quality.
+    """Make the signal (uint16, ADU) and the quality (uint8) of a ramp; a ramp of two groups has no quality.
 
-    whole : the quality is chi^2 itself, rounded, 255 = as much or more
-
-    Error : reads that are correlated, and expected noise, make of a chance of 1e-3 up to 8e-3
+    The quality is 1 if the ramp does not fit, or chi^2, rounded and at most 255, if `store_chi2` is set. Correlated
+    reads and the use of the expected noise raise a nominal probability of 1e-3 to up to 8e-3.
     """
     mode, border = ramp.mode_of_scene(scene), int(scene.value("fpa.reference_border", "pix"))
-    # Of n differences one number, the signal, is estimated: n - 1 degrees of freedom.
+    # One number, the signal, is estimated from n differences, which leaves n - 1 degrees of freedom.
     limit = float(scipy.special.chdtri(max(mode.groups - 2, 1), scene.value("quality_chance", "")))
     signal = frame[0].astype(np.uint16)
     level = np.uint16(scene.value("reference_level", "adu"))
@@ -163,7 +180,7 @@ def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bo
 
 
 def _signal(read: Sequence[Image]) -> Array:
-    """Of the extensions after the header the first is the signal."""
+    """Signal without the border of reference pixels, from the first extension after the header."""
     border, data = int(_header(read[0])["REFPIX"]), np.asarray(read[1].data)
     return data[border : len(data) - border, border : data.shape[1] - border]
 
@@ -186,7 +203,7 @@ RAMP_AND_CHI2 = replace(RAMP, make_readout=partial(_ramp, store_chi2=True))
 
 
 def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """[4, rows, columns] ADU as stored, extensions named detector.quadrant."""
+    """Make four extensions in ADU, named detector.quadrant, each with its pre- and overscan."""
     raw = adc.to_file_type(frame, scene)
     prescan, overscan, rows, middle = sizes = layout.overscan_sizes(scene)
     scans = (
@@ -197,7 +214,7 @@ def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
     )  # fmt: skip
     extensions = []
     for number, name in enumerate(layout.NAMES):
-        # Of the detector's first pixel in the extension, from 0.
+        # Position of the detector's first pixel in the extension, counted from 0.
         across, up = layout.pixel_offset(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shift_pixels(system, across, up))
         cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant"), *scans, *place)
@@ -219,19 +236,19 @@ def _quadrant_pixels(read: Sequence[Image]) -> Array:
 
 
 def _quadrant_electrons(read: Sequence[Image]) -> Float:
-    """Above the level of each amplifier."""
+    """Electrons above the overscan level of each quadrant."""
     raw, sizes = _read_quadrants(read)
-    # In the extension's header where the amplifiers have different gains.
+    # GAIN is in the headers of the extensions if the amplifiers have different gains.
     headers = [{**_header(read[0]), **_header(unit)} for unit in read[1:]]
     gain = np.array([float(cards["GAIN"]) for cards in headers]).reshape(-1, 1, 1)
     _, overscan, rows, _ = sizes
-    # The last half of the columns after the pixels: charge that traps gave back is in the first.
+    # Only the last half of the overscan columns is used, since the first half contains charge released by traps.
     level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
     return layout.assemble((raw - level) * gain, *sizes)
 
 
 def _read_quadrants(read: Sequence[Image]) -> tuple[Array, tuple[int, int, int, int]]:
-    """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
+    """Return quadrants in readout order, and (prescan, overscan, overscan rows, rows between the halves)."""
     header = _header(read[0])
     raw = np.stack([layout.to_detector_axes(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
     prescan, overscan, rows, between = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS"))
@@ -259,7 +276,7 @@ QUADRANTS = ReadoutMode(
 
 
 def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """[q, rows, columns] ADU as stored; its file has one array, and for each amplifier, from 1, where its parts are."""
+    """Make one array in ADU, with cards for the sections of each amplifier, numbered from 1."""
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
     cards: list[Card] = [
@@ -281,7 +298,7 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
             (f"BSEC{n}", amplifier_layout.amplifier_bias_section(number).text, "columns of bias beside them"),
             *((f"{key}{n}", float(np.broadcast_to(value, len(raw))[number]), text) for key, value, text in numbers),
         ]
-        # Letters, as DECam's and MegaCam's files have them.
+        # Amplifiers named by letters have the keywords of DECam and MegaCam in addition.
         if len(amplifier.name) == 1:
             cards += [
                 (
@@ -309,7 +326,7 @@ def _assemble_amplifiers(array: Array, scene: Scene) -> Array:
 
 
 def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """[q, rows, columns] ADU as stored; extensions named as LSST's segments, or as the amplifiers."""
+    """Make one extension in ADU per amplifier, named like LSST's segments or like the amplifier."""
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
     extensions = []
@@ -328,7 +345,10 @@ def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Rea
 
 
 def _assemble_extensions(read: Sequence[Image], calibrate: Callable[[Array, dict[str, Any]], Array]) -> Array:
-    """Extensions of a file -> [ny, nx] the detector's pixels; level : (array, its cards) -> what is taken of them."""
+    """Assemble the pixels [ny, nx] of a detector from the extensions of a file.
+
+    `calibrate` is a function (array of an extension, its cards) -> values of the pixels.
+    """
     parts = [(unit, {**_header(read[0]), **_header(unit)}) for unit in read[1:]]
     places = [Section.from_text(header["CCDSEC"]) for _, header in parts]
     arrays = [
@@ -346,12 +366,12 @@ def _above_bias(array: Array, header: dict[str, Any]) -> Float:
     return np.asarray((array - level) * float(header["GAIN"]))
 
 
-# An amplifier of LSSTCam is a segment of its sensor.
+# Names of LSSTCam's amplifiers, which are called segments in its files.
 _SEGMENT = re.compile(r"^C(?=[01][0-7]$)")
 
 
 def _amplifier_pixels(read: Sequence[Image]) -> Array:
-    """The detector's pixels; all of a file that has nothing else."""
+    """Pixels of the detector, or the whole array if the file has no sections."""
     if read[0].data is None:
         return _assemble_extensions(read, lambda array, header: array)
     header, array = _header(read[0]), np.asarray(read[0].data)
@@ -359,7 +379,7 @@ def _amplifier_pixels(read: Sequence[Image]) -> Array:
 
 
 def _amplifier_electrons(read: Sequence[Image]) -> Float:
-    """Above the level of each amplifier's bias columns, where there are some."""
+    """Electrons above the level of each amplifier's bias columns, or above the bias card if it has no bias columns."""
     if read[0].data is None:
         return _assemble_extensions(read, _above_bias)
     header, array = _header(read[0]), np.asarray(read[0].data)
@@ -387,7 +407,7 @@ BY_AMPLIFIER = replace(AMPLIFIERS, make_readout=_by_amplifier)
 
 
 def _electrons(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """float32[ny, nx] e-, the sky and what else has come in them."""
+    """Make one float32 array [ny, nx] of the electrons in the pixels before readout."""
     pixels = frame.astype(np.float32)
     extension = Extension("", pixels, "electron", sections=Sections.full_frame(*pixels.shape[::-1]))
     return Readout((extension,), pixels, pixels)
@@ -400,14 +420,14 @@ ELECTRONS = replace(AMPLIFIERS, make_readout=_electrons, stop_before=layout.AMPL
 
 
 def split_frame(frame: Float, scene: Scene) -> Float:
-    """[ny, nx] -> [q, rows, columns] in readout order; 0 in the pre- and overscan that a layout has."""
+    """Split a frame [ny, nx] into planes [amplifier, row, column] in readout order, with 0 in pre- and overscan."""
     if scene.layout is not None:
         return scene.layout.split(frame)
     return layout.apply(frame, 0, 0, 0, scene.injection_rows)
 
 
 def assemble_frame(amplifier_planes: Array, scene: Scene) -> Array:
-    """[q, rows, columns] as `planes` makes them -> [ny, nx], 0 where nothing is read."""
+    """Join planes [amplifier, row, column] of `split_frame` to a frame [ny, nx]; pixels that are not read are 0."""
     if scene.layout is not None:
         return scene.layout.assemble(amplifier_planes)
     return layout.assemble(amplifier_planes, 0, 0, 0, scene.injection_rows)

@@ -1,4 +1,4 @@
-"""The channels that are rendered, by their name in the table `exposures`."""
+"""Channels that can be rendered, by their name in the table `exposures`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,27 @@ CHANNELS: Mapping[str, Channel] = {
 
 
 def find_channel(name: str, image_type: str, where: str) -> Channel:
-    """A channel by its name; BadInput where nothing renders this kind of image."""
+    """Return a channel that renders an image type.
+
+    Parameters
+    ----------
+    name : str
+        Name of the channel.
+    image_type : str
+        Type of the images.
+    where : str
+        Place in the user's input, for the message.
+
+    Returns
+    -------
+    Channel
+        The channel.
+
+    Raises
+    ------
+    BadInput
+        If there is no channel of that name, or if it does not render the image type.
+    """
     if name not in CHANNELS:
         raise BadInput(f"{where}: channel {name!r} is not one of {', '.join(CHANNELS)}")
     effects_by_type = CHANNELS[name].effects
@@ -28,11 +48,30 @@ def find_channel(name: str, image_type: str, where: str) -> Channel:
 
 
 def find_effects(name: str, image_type: str, where: str) -> tuple[Effect, ...]:
-    """The effects of a kind of image, in their order; BadInput where nothing renders it."""
+    """Return the effects of an image type.
+
+    Parameters
+    ----------
+    name : str
+        Name of the channel.
+    image_type : str
+        Type of the images.
+    where : str
+        Place in the user's input, for the message.
+
+    Returns
+    -------
+    tuple of Effect
+        Effects in order.
+
+    Notes
+    -----
+    `find_channel` raises BadInput if no channel renders the image type.
+    """
     return find_channel(name, image_type, where).effects[image_type]
 
 
 def find_effects_or_none(name: str, image_type: str) -> tuple[Effect, ...] | None:
-    """The same, None where nothing renders it."""
+    """Return the effects of an image type in order, or None if no channel renders it."""
     channel = CHANNELS.get(name)
     return None if channel is None else channel.effects.get(image_type)

@@ -1,7 +1,7 @@
-"""Euclid VIS: the order of physics.
+"""Channel VIS of Euclid: effects in the order of physics, costs.
 
-Light is expected electrons until it is counted; then charge, whole electrons on the detector; then four quadrants in
-the order in which they are read; then what the electronics make of them.
+Light is expected electrons until it is counted; then charge is whole electrons on the detector. The detector is read as
+four quadrants, and the last effects belong to the electronics.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from truesky.render.psf import euclid
 from truesky.render.psf.model import Psf
 from truesky.render.sky import diffuse_light
 
-# What the pixels do to the light while sources are drawn: part of their transfer function.
+# Effect of the pixels that is a part of their transfer function and is applied while sources are drawn.
 TRANSFER_EFFECT = intra_pixel.EFFECT
 
 _LIGHT = (
@@ -88,8 +88,8 @@ _READOUT = (
 )
 
 SKY = (*_LIGHT, illumination.SHUTTER, *_COUNTED, *_CHARGE, *_READOUT)
-# The shutter stays open: sky and stars are in a flat, and what they leave on the way to the register; the lamp is out
-# by then, and how long it shone is its own affair.
+# Flats are taken with an open shutter. They contain sky and stars, and the trails of both during readout. The lamp is
+# switched off before the readout, and its brightness does not depend on the exposure time.
 FLAT = (
     *_LIGHT,
     readout_trail.EFFECT,
@@ -101,9 +101,9 @@ FLAT = (
 DARK = (*_CHARGE, *_READOUT)
 _INJECTED = (charge_injection.EFFECT, charge_injection.NOISE)
 INJECTION = (*_INJECTED, bleeding.EFFECT, *_READOUT)
-# It takes minutes, behind a closed shutter.
+# Trap pumping takes minutes with a closed shutter, so dark current and cosmic rays accumulate.
 PUMPING = (*_INJECTED, trap_pumping.EFFECT, *_CHARGE, *_READOUT)
-# Besides surveys and self-calibration, what the sky is looked at for.
+# Other image types with sky, in addition to surveys and self-calibration.
 _CHECKS = ("defocus", "bleeding", "stray_light", "white_dwarf")
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
@@ -125,8 +125,8 @@ def _psf(
     return euclid.vis_psf(detector, band, mission, positions)
 
 
-# CPU of the demo's detector 3-4 (5.5e3 predicted sources), of others with 3e2 and 2.7e4, of bias, dark and flat frames:
-# Intel Xeon 2.5 GHz, 2 shared cores.
+# CPU time of detector 3-4 of the demo (5.5e3 predicted sources), of detectors with 3e2 and 2.7e4 sources, and of bias,
+# dark and flat frames on an Intel Xeon 2.5 GHz with 2 shared cores.
 COST = Cost(
     frame_s=0.05,
     sky_s=1.5,
@@ -145,7 +145,7 @@ CHANNEL = Channel(
     bands=bands.single_camera_bands("vis", "euclid_vis"),
     sky=diffuse_light.starlit_sky,
     cost=COST,
-    # A flat is taken with the shutter open.
+    # Flats are taken with an open shutter.
     sky_types=(*SKY_TYPES, *_CHECKS, "flat"),
     transfer_effect=TRANSFER_EFFECT,
     diffraction_edges=euclid.vis_edges,

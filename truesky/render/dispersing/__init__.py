@@ -1,1 +1,1 @@
-"""Spectra without a slit: every source's light, spread out by a grism."""
+"""Slitless spectra: the light of every source, dispersed by a grism."""

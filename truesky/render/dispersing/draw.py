@@ -1,11 +1,7 @@
-"""Drawing spectra: every source's light, spread along the traces of a grism's orders, summed onto a frame.
+"""Draw slitless spectra: the light of sources, spread along the traces of a grism's orders and summed onto a frame.
 
-Order             a trace, and what it detects of a photon
-Settings          what decides how much of a spectrum is drawn;  settings_for : an accuracy
-Dispersed         what a grism makes of sources
-draw              sources -> frame;  Tally : with what each brought, by order
-
-A galaxy that no stamp holds is drawn in two parts (giants.py), a trail in pieces, each on a stamp of its own.
+A galaxy that exceeds the largest stamp is drawn in two parts (large_galaxies.py). A trail is drawn in pieces, each on a
+separate stamp.
 """
 
 from __future__ import annotations
@@ -30,23 +26,31 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import Accuracy
 
-# Sources whose spectra are held at a time, and samples of their images.
+# Number of sources whose spectra are in memory at a time, and number of samples of their images.
 _BATCH_SOURCES, _BATCH_SAMPLES = 256, 1 << 17
-# Places at which it is seen where a trace goes, and whether it is straight: its slope, rows a column, is nowhere
-# farther from that of all. Of wings as r^-3, moved by a first derivative, that leaves 6 times its square: 0.5 %.
+# Number of positions at which a trace is sampled. A trace counts as straight if its slope (rows per column) deviates
+# from the common slope by at most the second value. Wings that fall as r^-3 and are moved by a first derivative then
+# have a relative error of 6 times its square, 0.5 %.
 _PLACES, _STRAIGHT = 33, 0.03
-# Rows a column up to which images are sheared: they ring by 7e-5 of their peak at 4 deg, 2e-4 at 8, 2e-3 at 30.
+# Largest slope, in rows per column, for sheared images. They ring by 7e-5 of their peak at 4 deg, by 2e-4 at 8 deg and
+# by 2e-3 at 30 deg.
 _STEEPEST = 0.15
-# Of the largest stamp, that an order must want to be drawn on it, too.
+# An order is drawn on the largest stamp of its source if its stamp has at least this fraction of that side.
 _SHARED_FRACTION = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Where an order puts light, and how much of it is detected.
+    """Trace and response of a grism order.
 
-    response : float64[w] electrons for each unit of the spectrum at whole angstroms from `first`; below 0 they are
-               taken off
+    Attributes
+    ----------
+    trace : Trace
+        Trace of the order.
+    first : int
+        Wavelength of the first element of the response, Angstrom.
+    response : float array, shape (w,)
+        Electrons per unit of the spectrum, in steps of 1 Angstrom. Negative values subtract electrons.
     """
 
     trace: Trace
@@ -55,20 +59,32 @@ class Order:
 
     @property
     def wavelength(self) -> Float:
-        """float64[w] A."""
+        """Wavelengths [w] of the response, Angstrom."""
         return self.first + np.arange(float(len(self.response)))
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What decides how much of a spectrum is drawn, and how finely.
+    """Limits for neglected light of a spectrum, and sampling of its image.
 
-    edge   : largest light in a row at a stamp's edge, of a pixel's noise
-    faint  : an order whose brightest column has less of a pixel's noise is not drawn; the first, if less than `edge`
-    least  : smallest side of a stamp, pixels
-    along, across : samples a pixel of a stamp
-    block  : A of a spectrum that share one PSF; 0: each has its own, and its own rows, which is slow
-    nodes  : wavelengths that the PSF is computed at;  positions : places of it on a detector, one of euclid.DEGREES
+    Attributes
+    ----------
+    edge : float
+        Largest light in a row at the edge of a stamp, as a fraction of the pixel noise.
+    faint : float
+        An order is not drawn if the light of its brightest column is below this fraction of the pixel noise; `edge` is
+        the limit for the first order.
+    min_size : int
+        Smallest side of a stamp, pixels.
+    along, across : int
+        Samples per pixel of a stamp, along and across the trace.
+    block : float
+        Range of wavelengths with a common PSF, Angstrom. With 0, each wavelength has its PSF and its rows, which is
+        slow.
+    nodes : int
+        Number of wavelengths at which the PSF is computed.
+    positions : int
+        Number of PSF positions on a detector, one of `euclid.DEGREES`.
     """
 
     edge: float = 0.003
@@ -81,19 +97,19 @@ class Settings:
     positions: int = 9
 
 
-# What it is for, of a pixel's noise, and as measured by benchmarks/_dispersion.py.
+# Settings with the allowed background error (fractions of the pixel noise), measured by benchmarks/_dispersion.py.
 TABLE = Path(__file__).with_name("settings.csv")
 
 
 @cache
 def settings_for(requested: Accuracy) -> Settings:
-    """The cheapest settings that are for an accuracy, else the best."""
+    """Return the fastest settings for an accuracy, or the most accurate ones if no settings are sufficient."""
     table = read_settings()
     return settings_from_row(next((row for row in table if row["allowed"] <= requested.background), table[-1]))
 
 
 def read_settings() -> list[dict[str, float]]:
-    """The table of settings, the cheapest first."""
+    """Read the table of settings, sorted from the fastest to the most accurate."""
     with TABLE.open(newline="", encoding="utf-8") as lines:
         read = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     settings_rows = [{name: float(value) for name, value in row.items()} for row in read]
@@ -101,23 +117,29 @@ def read_settings() -> list[dict[str, float]]:
 
 
 def settings_from_row(row: dict[str, float]) -> Settings:
-    """Of a row of the table."""
+    """Return the settings in a row of the table."""
     values: dict[str, Any] = {name: row[name] for name in ("edge", "faint", "block")}
     values |= {name: int(row[name]) for name in ("min_size", "along", "across", "nodes", "positions")}
     return Settings(**values)
 
 
 Spectra = Callable[[Int], Float32]
-# Of a PSF, by how stamps are sampled.
+# Planes of a PSF by the sampling of stamps.
 PlanesCache = dict[Sampling, Planes]
 
 
 @dataclass(frozen=True, slots=True)
 class DispersedSources:
-    """What a grism makes of sources.
+    """Spectra of sources, orders of a grism, and settings.
 
-    spectra : of some of the sources, float32[n, w] at the wavelengths of the orders
-    orders  : of one grism, with the same wavelengths;  settings : of drawing
+    Attributes
+    ----------
+    spectra : callable
+        (indices of n sources) -> float32[n, w] spectra at the wavelengths of the orders.
+    orders : tuple of Order
+        Orders of one grism, with the same wavelengths.
+    settings : Settings
+        Settings of drawing.
     """
 
     spectra: Spectra
@@ -127,11 +149,18 @@ class DispersedSources:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What each source brought, filled by `draw`.
+    """Light of each source by order, filled by `draw`.
 
-    electrons : float64[n, orders] that fell onto the frame;  expected : on it and beside it
-    peak      : float64[n, orders] e- of its brightest column, where some of it is drawn
-    sizes     : int64[n] side of its largest stamp, pixels; 0 = none was drawn
+    Attributes
+    ----------
+    electrons : float array, shape (n, orders)
+        Electrons on the frame.
+    expected : float array, shape (n, orders)
+        Electrons on and outside the frame.
+    peak : float array, shape (n, orders)
+        Electrons of the brightest column, 0 if the order is not drawn.
+    sizes : int array, shape (n,)
+        Side of the largest stamp, pixels; 0 if nothing was drawn.
     """
 
     electrons: Float
@@ -141,12 +170,12 @@ class Tally:
 
     @classmethod
     def empty(cls, sources: int, orders: int) -> Tally:
-        """Of so many sources and orders, before anything is drawn."""
+        """Return a tally of zeros for given numbers of sources and orders."""
         shape = sources, orders
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(sources, np.int64))
 
     def add(self, pieces: Tally, parent: Int) -> None:
-        """Of pieces [p] of sources `whole` [p]."""
+        """Add the tally of pieces [p] to that of their sources `parent` [p]."""
         np.add.at(self.electrons, parent, pieces.electrons)
         np.add.at(self.expected, parent, pieces.expected)
         np.add.at(self.peak, parent, pieces.peak)
@@ -157,13 +186,31 @@ def draw(
     sources: Sources, dispersed: DispersedSources, psf: Psf, shape: tuple[int, int], noise: float,
     tally: Tally | None = None, layers: dict[int, Float] | None = None, planes_cache: PlanesCache | None = None,
 ) -> Float:  # fmt: skip
-    """Expected electrons of the sources alone, float64[ny, nx].
+    """Draw the expected electrons of dispersed sources, without sky.
 
-    sources   : places of their undispersed images, pixels, and their shapes
-    dispersed : their spectra, and where they lie;  psf : its wavelengths are the nodes
-    shape     : ny, nx;  noise : of a pixel, e-;  tally : to be filled
-    layers    : to be filled with the frame of each order, whose sum the result is; None: they are not told apart
-    known     : what calls with the same PSF and orders share, filled on the way
+    Parameters
+    ----------
+    sources : Sources
+        Positions of the undispersed images, pixels, and shapes.
+    dispersed : DispersedSources
+        Spectra of the sources and orders of the grism.
+    psf : Psf
+        PSF of the detector; its wavelengths are the nodes.
+    shape : (int, int)
+        Rows and columns of the frame.
+    noise : float
+        Noise per pixel, electrons.
+    tally : Tally, optional
+        Filled with the light of each source.
+    layers : dict, optional
+        Filled with the frame of each order, whose sum is the result; None to draw all orders on one frame.
+    planes_cache : PlanesCache, optional
+        Planes that calls with the same PSF and orders share; filled when needed.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons.
     """
     frames = [np.zeros(shape, np.int64)]
     orders, settings = dispersed.orders, dispersed.settings
@@ -171,12 +218,12 @@ def draw(
         frames += [np.zeros(shape, np.int64) for _ in orders[1:]]
     order_frames = frames if layers is not None else frames * len(orders)
     slope = _slope(next((order for order in orders if order.trace.order == 1), orders[0]).trace)
-    # What moves far is drawn in pieces, each with a part of the light.
+    # Long trails are drawn in pieces, each with a part of the light.
     pieces, trail, parent = stamps.split_into_pieces(sources)
     pieces = pieces if sources.trail is None else replace(pieces, trail=trail)
     sizes = Sizes.from_sources(pieces, psf, settings.edge * noise, settings.min_size)
     plans = [_OrderPlan.from_order(order, psf, settings, slope) for order in orders]
-    # Orders share images: where one of them is straight, in the coordinates in which it is a row.
+    # Orders share images. If one of the orders is straight, these have the coordinates in which it is a row.
     straight = any(plan.tile > 0 for plan in plans)
     source_images = _SourceImages(
         pieces, psf, sizes, settings, (slope, straight), shape, {} if planes_cache is None else planes_cache
@@ -196,14 +243,14 @@ def draw(
         tally.add(piece_tally, parent)
     if layers is not None:
         layers.update({order.trace.order: frame / FIXED_POINT for order, frame in zip(orders, frames, strict=True)})
-    # Of whole numbers: the same whether orders are told apart or not.
+    # The sum of integers does not depend on whether the orders have separate frames.
     return sum(frames[1:], frames[0]) / FIXED_POINT
 
 
 def _slope(trace: Trace) -> float:
-    """Rows a column along the first order, at the middle of the detector: of all orders, but for their curvature.
+    """Slope of the first order at the middle of the detector, rows per column; 0 if it is not along the columns.
 
-    0 where light is not spread along the columns.
+    Apart from their curvature, all orders have this slope.
     """
     along, across = (float(part[1:].sum()) for part in trace.polynomials(0.0, 0.0))
     return across / along if abs(along) > abs(across) else 0.0
@@ -211,11 +258,20 @@ def _slope(trace: Trace) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _OrderPlan:
-    """What of an order is the same for all sources.
+    """Properties of an order that are the same for all sources.
 
-    angstrom : of a pixel along the trace;  tile : pixels that share a PSF, where it is straight; 0 = it never is
-    share    : float64[w, b] of the PSF's wavelengths
-    t        : of the first wavelength, and from one to the next
+    Attributes
+    ----------
+    order : Order
+        The order.
+    angstrom_per_pixel : float
+        Dispersion along the trace.
+    tile : int
+        Pixels along a straight trace with a common PSF; 0 if no trace of this order is straight.
+    share : float array, shape (w, b)
+        Shares of the PSF's wavelengths.
+    t : (float, float)
+        Trace parameter t of the first wavelength, and its step.
     """
 
     order: Order
@@ -240,12 +296,20 @@ class _OrderPlan:
 
 @dataclass(frozen=True, slots=True)
 class _OrderBatch:
-    """One order of some of the sources, [k] each.
+    """One order of k sources.
 
-    along, across : float64[k, i] polynomials of their traces
-    sizes    : of their stamps, 0 = nothing of it is drawn
-    tiles    : pixels that share a PSF; 0 where the trace is not straight
-    expected : electrons, on the frame and beside it;  peak : in the brightest column
+    Attributes
+    ----------
+    along, across : float array, shape (k, i)
+        Polynomials of the traces for columns and rows.
+    sizes : int array, shape (k,)
+        Sides of the stamps, pixels; 0 if the order is not drawn.
+    tiles : int array, shape (k,)
+        Pixels with a common PSF; 0 if the trace is not straight.
+    expected : float array, shape (k,)
+        Electrons on and outside the frame.
+    peak : float array, shape (k,)
+        Electrons of the brightest column.
     """
 
     along: Float
@@ -291,7 +355,7 @@ class _OrderBatch:
 
 
 class _SourceImages:
-    """Sources through the PSF."""
+    """Images of sources through the PSF."""
 
     def __init__(
         self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: tuple[float, bool],
@@ -303,7 +367,7 @@ class _SourceImages:
         self.profiles = images.source_profiles(sources, self.slope if self.straight else 0.0)
         assert psf.planes is not None
         count = len(psf.planes.wavelength)
-        # How the PSF changes is known on the detector alone.
+        # The variation of the PSF is defined only on the detector.
         column, row = np.clip(sources.column, 0.0, shape[1] - 1.0), np.clip(sources.row, 0.0, shape[0] - 1.0)
         node_weights = [
             transfer.basis_weights(psf, np.tile(part, (len(sources), 1)), column, row) for part in np.eye(count)
@@ -312,12 +376,12 @@ class _SourceImages:
         self._planes = planes_cache
 
     def stamp_sampling(self, size: int, smooth: bool = False) -> Sampling:
-        """Of stamps of `size` pixels; smooth : of what giants.add draws."""
+        """Sampling of stamps of `size` pixels; `smooth` selects the part drawn by `large_galaxies.add`."""
         template = Sampling(size, self.settings.along, self.settings.across, self.slope, self.straight)
         return large_galaxies.stamp_sampling(size, template, smooth)
 
     def images(self, batch: Int, sampling: Sampling) -> Float32:
-        """Coefficients [m, b, n along, n across] of sources on stamps."""
+        """Spline coefficients [m, b, n along, n across] of sources on stamps."""
         if sampling not in self._planes:
             self._planes[sampling] = images.planes(self.psf, sampling)
         stamp_planes = self._planes[sampling]
@@ -325,7 +389,7 @@ class _SourceImages:
         return images.coefficients(stamp_planes, self.weights[batch], self.profiles.take(batch), transforms)
 
     def batch_size(self, sampling: Sampling) -> int:
-        """How many stamps are held at a time."""
+        """Number of stamps that are in memory at a time."""
         samples = self.weights.shape[1] * sampling.n**2 * sampling.along * sampling.across
         return max(int(_BATCH_SAMPLES // samples), 1)
 
@@ -338,9 +402,9 @@ def _add_orders(
     order_frames: list[Int],
     tally: Tally,
 ) -> None:
-    """Orders of some of the sources onto their frames."""
+    """Add the orders of a batch of sources to their frames."""
     sizes = np.stack([part.sizes for _, part in orders])
-    # Orders that want stamps of nearly one size share the largest.
+    # Orders with stamps of similar size share the largest.
     largest = sizes.max(axis=0)
     sizes = np.where((sizes > 0) & (sizes >= _SHARED_FRACTION * largest), largest, sizes)
     tally.sizes[batch] = np.maximum(tally.sizes[batch], largest)

@@ -1,9 +1,4 @@
-"""Traces and sensitivities of a grism as files that extraction software reads: grismconf's text and its FITS tables.
-
-configuration   the text file
-sensitivity     of an order, a table of two columns
-write           all of them into a folder
-"""
+"""Write traces and sensitivities of a grism in the format of grismconf: a text file and FITS tables."""
 
 from __future__ import annotations
 
@@ -31,22 +26,34 @@ SENSITIVITY = Table(
     "Electrons a second for each erg s-1 cm-2 A-1, of an order of a grism.",
     key=("WAVELENGTH",),
 )
-# Of 1, x, y, x^2, x y, y^2: grismconf has no polynomial of four powers of t without the squares.
+# Number of terms 1, x, y, x^2, x y, y^2. grismconf requires the squares in polynomials of four powers of t.
 _TERMS = 6
 
 
 def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
-    """Text of a configuration.
+    """Text of a configuration file.
 
-    name, traces : of the grism and detector, and its orders;  shape : ny, nx
-    files        : of the sensitivity of each order
-    Offsets are from the undispersed image's place, 0-based pixels; wavelengths in A.
+    Parameters
+    ----------
+    name : str
+        Name of the grism and the detector.
+    traces : sequence of Trace
+        Traces of the orders.
+    shape : (int, int)
+        Rows and columns of the detector.
+    files : sequence of str
+        Names of the files with the sensitivity of each order.
+
+    Returns
+    -------
+    str
+        Text of the file. Offsets are in 0-based pixels from the undispersed image; wavelengths are in Angstrom.
     """
     ny, nx = shape
     lines = [f"# {name}, simulated", f"NAXIS {ny} {nx}"]
     for trace, file in zip(traces, files, strict=True):
         label = f"{trace.order:+d}" if trace.order else "0"
-        # A source may lie outside the detector and its light on it.
+        # The light of a source outside the detector may fall on the detector.
         reach = float(np.abs(trace.polynomials(0.0, 0.0)[0]).sum())
         lines += ["", f"BEAM_{label}", f"SENSITIVITY_{label} {file}"]
         lines += [f"XRANGE_{label} {-reach:.1f} {reach:.1f}", f"YRANGE_{label} {-reach:.1f} {reach:.1f}"]
@@ -61,10 +68,10 @@ def _terms(row: Float) -> str:
 
 
 def sensitivity(order: Order) -> pa.Table:
-    """Rows of SENSITIVITY.
+    """Sensitivity of an order as rows of SENSITIVITY.
 
-    order : whose response is electrons a second in 1 A for each erg s-1 cm-2 A-1
-    The first and the last two values are 0: extraction software sets them so.
+    The response of `order` must be electrons per second in 1 Angstrom, per erg s-1 cm-2 A-1. The first and last two
+    values are 0, because extraction software sets them to 0.
     """
     response = np.pad(order.response, 2)
     wavelength = order.first - 2 + np.arange(float(len(response)))
@@ -73,9 +80,23 @@ def sensitivity(order: Order) -> pa.Table:
 
 
 def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, int]) -> Path:
-    """Writes tables and, after them, their configuration, each replaced in one rename; returns the configuration.
+    """Write the tables and then the configuration, each replaced atomically.
 
-    folder : where to;  name : of its files;  orders : as of `sensitivity`;  shape : ny, nx
+    Parameters
+    ----------
+    folder : Path
+        Folder of the files.
+    name : str
+        Prefix of their names.
+    orders : sequence of Order
+        Orders, with responses as for `sensitivity`.
+    shape : (int, int)
+        Rows and columns of the detector.
+
+    Returns
+    -------
+    Path
+        The configuration file.
     """
     files = [f"{name}_{order.trace.order:+d}.fits" for order in orders]
     for order, file in zip(orders, files, strict=True):

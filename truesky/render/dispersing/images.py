@@ -1,22 +1,20 @@
-"""Images of sources in the light of a few wavelengths, as spline coefficients: what is spread along a trace.
+"""Images of sources at a few wavelengths, as spline coefficients that can be spread along a trace.
 
-The PSF at a wavelength is sum_b l_b(lambda) PSF_b, l_b the Lagrange polynomials of a few nodes.  Of a stamp of N
-pixels, periodic, the image through each PSF_b,
+The PSF at a wavelength is sum_b l_b(lambda) PSF_b, where l_b is the Lagrange polynomial of a few nodes. On a periodic
+stamp of N pixels, the image through each PSF_b is::
 
-    I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r),
+    I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r)
 
-is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the columns and oy across,
-unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so
-that C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.
-The quintic spline lies along the trace, of slope s: f = fx + s fy.
+It is needed at any position, not only at pixels. It is stored with ox samples per pixel along the columns and oy
+across, without aliasing (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines::
 
-Where traces are straight the image is held in coordinates in which they are rows, u = x and v = y - s x: then
-kx = ku - s kv, ky = kv, and f = fu.  What is summed along u is put in its place across at once, column by column.
+    I = sum_j C_j B5(ox x - j) B3(oy y - j)
+    C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4),   f = k / 2 pi
 
-Nodes, nodes       wavelengths of the PSFs, and the share of each at any wavelength
-Planes, planes     PSF times pixel over splines, for stamps of a size
-Bodies, bodies     profiles of sources, in such coordinates
-coefficients       of sources
+so that the splines do not reduce the resolution. The quintic spline lies along the trace, of slope s: f = fx + s fy.
+
+For straight traces the image is stored in the coordinates u = x and v = y - s x, in which the traces are rows. Then
+kx = ku - s kv, ky = kv and f = fu. Sums along u are moved to their position across the trace column by column.
 """
 
 from __future__ import annotations
@@ -36,20 +34,34 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources import galaxy_shapes, sersic
 from truesky.render.sources.source_list import Sources
 
-# Degrees of the splines along and across.
+# Degrees of the splines along and across the trace.
 ALONG, ACROSS = 5, 3
-# Cycles a sample: beyond, next to nothing passes the PSF, and is not divided by next to nothing.
+# Frequency, in cycles per sample, beyond which the PSF passes little light. The spline's transform is constant beyond
+# it, to avoid a division by small numbers.
 _FARTHEST = 0.6
 
 
 def nodes(first: float, last: float, count: int) -> Float:
-    """float64[count] A: Chebyshev's, where the largest error of Lagrange's polynomials between is least."""
+    """Chebyshev nodes [count] between two wavelengths, for the smallest maximum error of Lagrange interpolation.
+
+    Parameters
+    ----------
+    first, last : float
+        Range of wavelengths, Angstrom.
+    count : int
+        Number of nodes.
+
+    Returns
+    -------
+    float array, shape (count,)
+        Wavelengths in increasing order, Angstrom.
+    """
     angle = np.pi * (2 * np.arange(count)[::-1] + 1) / (2 * count)
     return np.asarray(0.5 * (first + last) + 0.5 * (last - first) * np.cos(angle))
 
 
 def shares(wavelength: Float, at: Float) -> Float:
-    """float64[n, b]: Lagrange's polynomials of nodes `at` [b] at wavelengths [n]; each row sums to 1."""
+    """Lagrange polynomials [n, b] of nodes `at` [b] at wavelengths [n]; each row sums to 1."""
     out = np.ones((len(wavelength), len(at)))
     for b in range(len(at)):
         for other in range(len(at)):
@@ -60,12 +72,23 @@ def shares(wavelength: Float, at: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """n pixels of a stamp's side, even; samples a pixel along and across; slope of the trace, rows a column.
+    """Sampling of a stamp.
 
-    straight : in coordinates in which the trace is a row
-    step     : of the detector's pixels in a pixel of the stamp, which then has a cubic spline's coefficient
-    split    : pixels; of the smooth part of an image and of the rest, of which the smooth part is drawn with a step
-               above 1; 0 = of the whole image
+    Attributes
+    ----------
+    n : int
+        Side of the stamp, pixels; even.
+    along, across : int
+        Samples per pixel, along and across the trace.
+    slope : float
+        Slope of the trace, rows per column.
+    straight : bool
+        True for coordinates in which the trace is a row.
+    step : int
+        Detector pixels per pixel of the stamp. If it is above 1, the pixels contain coefficients of a cubic spline.
+    split : float
+        Scale that separates the smooth part of an image from the rest, pixels. A step above 1 selects the smooth part,
+        a step of 1 the rest; 0 selects the whole image.
     """
 
     n: int
@@ -78,26 +101,32 @@ class Sampling:
 
     @property
     def shear(self) -> float:
-        """Rows by which a row of the image rises in a column of the detector."""
+        """Rise of a row of the image, in rows per column of the detector."""
         return self.slope if self.straight else 0.0
 
     @property
     def rows(self) -> tuple[float, float]:
-        """(slope, shear)."""
+        """Slope and shear."""
         return self.slope, self.shear
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(n, along, across)."""
+        """Values of n, along and across."""
         return self.n, self.along, self.across
 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """PSF times pixel over splines on a stamp's Fourier grid.
+    """PSF times pixel divided by the splines, on a stamp's Fourier grid.
 
-    ku, kv : float32[rows], float32[columns] radian / pixel
-    planes : complex64[p, rows, columns], of all planes of the PSF
+    Attributes
+    ----------
+    sampling : Sampling
+        Sampling of the stamp.
+    ku, kv : float32 array, shape (rows,) and (columns,)
+        Frequencies, radian / pixel.
+    planes : complex64 array, shape (p, rows, columns)
+        All planes of the PSF.
     """
 
     sampling: Sampling
@@ -107,7 +136,7 @@ class Planes:
 
 
 def planes(psf: Psf, sampling: Sampling) -> Planes:
-    """Of a PSF with planes, whose wavelengths are the nodes."""
+    """Planes for stamps of one sampling, for a PSF with planes whose wavelengths are the nodes."""
     assert psf.planes is not None
     n, count = sampling.n, sampling.n * sampling.along
     iu, iv = scipy.fft.fftfreq(count, 1.0 / count).astype(int), np.arange(n * sampling.across // 2 + 1)
@@ -121,7 +150,7 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     factor *= _split(sampling, fx / step, fy / step)
     if step > 1:
         factor /= _spline_transfer(fx) * _spline_transfer(fy)
-    # Of the lowest frequencies alone the PSF's pixels tell as much as its samples.
+    # For the lowest frequencies, the PSF may be binned to pixels.
     fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
     factor /= _bin_transfer(fx / step, fold) * _bin_transfer(fy / step, fold)
     images = [*psf.planes.images, *psf.planes.drift]
@@ -135,7 +164,7 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
 
 
 def _bin_pixels(image: Float32, fold: int) -> Float32:
-    """An image [n, n], n odd, on pixels of fold x fold samples, odd, one of them about its middle: triangles' sums."""
+    """Bin an image [n, n] to pixels of fold x fold samples with triangular weights; n and fold are odd."""
     middle = len(image) // 2
     count = -(-middle // fold)
     padded = np.pad(image, fold * count + fold // 2 - middle)
@@ -145,20 +174,21 @@ def _bin_pixels(image: Float32, fold: int) -> Float32:
 
 
 def _bin_transfer(f: Float, fold: int) -> Float:
-    """What such sums leave of f cycles a pixel: of what is beyond half a cycle little folds onto the lowest."""
+    """Transfer function of this binning at f cycles per pixel; aliasing onto the lowest frequencies is small."""
     return np.asarray((np.sinc(f) / np.sinc(f / fold)) ** 2)
 
 
 def _spline_transfer(f: Float) -> Float:
-    """Of f cycles a pixel: what a cubic spline is at the pixels, of its coefficients there."""
+    """Transfer function, at f cycles per pixel, from the coefficients of a cubic spline to its values at the pixels."""
     return np.asarray((2.0 + np.cos(2 * np.pi * f)) / 3.0)
 
 
 def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
-    """The share of the smooth part, or of the rest, by cycles a pixel.
+    """Transfer function of the smooth part of an image or of the rest, by cycles per pixel.
 
-    The smooth part is the image behind 2 g - g^2, g a Gaussian of `split` pixels. The rest, behind (1 - g)^2, is the
-    fourth derivative of the image where that is smooth on this scale: next to nothing far from the middle.
+    The smooth part is the image convolved with 2 g - g^2, where g is a Gaussian of `split` pixels. The rest, convolved
+    with (1 - g)^2, is proportional to the fourth derivative of an image that is smooth on this scale, and is negligible
+    far from the middle.
     """
     if sampling.split == 0.0:
         return np.ones(())
@@ -168,11 +198,18 @@ def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """Profiles of n sources, as kernels.zones takes them.
+    """Profiles of n sources, as arguments of `kernels.zones`.
 
-    body     : bool[n] False for a point;  fraction : float64[n] of the light in the bulge
-    bulge, disk, thick : [n, 2, 2], [n, 2, 2], [n, 2] of galaxy_shapes.Forms
-    row, row_weights   : int64[n], float64[n, 4] of sersic.row_of
+    Attributes
+    ----------
+    body : bool array, shape (n,)
+        False for point sources.
+    fraction : float array, shape (n,)
+        Fraction of the light in the bulge.
+    bulge, disk, thick : float array, shape (n, 2, 2), (n, 2, 2) and (n, 2)
+        Matrices and vectors of `galaxy_shapes.Forms`.
+    row, row_weights : array, shape (n,) and (n, 4)
+        First row and weights from `sersic.interpolation_weights`.
     """
 
     body: Bool
@@ -184,12 +221,12 @@ class Profiles:
     row_weights: Float
 
     def take(self, selected: Int) -> Profiles:
-        """Some of them."""
+        """Return the selected profiles."""
         return Profiles(*(getattr(self, field.name)[selected] for field in fields(self)))
 
 
 def source_profiles(sources: Sources, shear: float) -> Profiles:
-    """Of sources, in coordinates whose rows rise by `shear` rows a column."""
+    """Profiles of sources in coordinates whose rows rise by `shear` rows per column."""
     n, body = len(sources), sources.shape >= 0
     shapes = sources.shapes.take(sources.shape[body])
     form = galaxy_shapes.forms(shapes, shear_jacobian(sources.jacobian[body], shear))
@@ -201,12 +238,27 @@ def source_profiles(sources: Sources, shear: float) -> Profiles:
 
 
 def shear_jacobian(jacobian: Float, shear: float) -> Float:
-    """[.., 2, 2] arcsec by (u, v) of arcsec by pixels."""
+    """Convert a Jacobian [.., 2, 2] in arcsec per pixel to the sheared coordinates (u, v)."""
     return np.asarray(matrices.matmul(jacobian, np.array([[1.0, 0.0], [shear, 1.0]])), float)
 
 
 def spread_transform(stamp_planes: Planes, sources: Sources, i: int) -> Array | None:
-    """[rows, columns] transform of a picture, or of a trail, over which source i's light is spread; None: nothing."""
+    """Transform [rows, columns] of the picture or trail of source `i`, or None for other sources.
+
+    Parameters
+    ----------
+    stamp_planes : Planes
+        Planes of the stamp.
+    sources : Sources
+        List of sources.
+    i : int
+        Number of the source.
+
+    Returns
+    -------
+    array, shape (rows, columns), or None
+        The transform.
+    """
     picture, trail, shear = sources.picture_of(i), sources.trail, stamp_planes.sampling.shear
     if picture is None and (trail is None or not trail[i].any()):
         return None
@@ -225,10 +277,23 @@ def _sersic() -> Float32:
 
 
 def coefficients(stamp_planes: Planes, weights: Float, profiles: Profiles, transforms: list[Array | None]) -> Float32:
-    """float32[m, b, n along, n across] of kernels.spread: of m sources of one electron.
+    """Spline coefficients of the images of m sources of one electron, for `spreading.spread`.
 
-    some : the planes;  weights : [m, b, p] of them, for each node;  of : the sources
-    over : what each is spread over, of `spread_over`
+    Parameters
+    ----------
+    stamp_planes : Planes
+        Planes of the stamps.
+    weights : float array, shape (m, b, p)
+        Weights of the planes for each node.
+    profiles : Profiles
+        Profiles of the sources.
+    transforms : list of array or None
+        Result of `spread_transform` for each source.
+
+    Returns
+    -------
+    float32 array, shape (m, b, n along, n across)
+        The coefficients.
     """
     zones = np.empty((*weights.shape[:2], *stamp_planes.planes.shape[1:]), np.complex64)
     kernels.zones(

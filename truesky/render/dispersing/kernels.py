@@ -1,9 +1,4 @@
-"""The inner loops of dispersing before light is on a frame, compiled.
-
-zones      profile x PSF of sources on a stamp's Fourier grid
-brightest  how bright spectra are in a column
-lay        what is detected of a spectrum onto the samples of its trace, by quintic splines
-"""
+"""Compiled inner loops of dispersing, before the light is added to a frame."""
 
 from __future__ import annotations
 
@@ -16,7 +11,7 @@ from truesky.numerics.compiling import jit
 from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.kernels.frame import min_singular_squared
 
-# Wavelengths that are taken together.
+# Number of wavelengths that are processed together.
 _WAVES = 64
 
 
@@ -25,10 +20,20 @@ def zones(
     planes: Any, weights: Float32, ku: Float32, kv: Float32, body: Bool, fraction: Float, bulge: Float, disk: Float,
     thick: Float, sersic: Float32, row: Int, row_weights: Float, out: Any,
 ) -> None:  # fmt: skip
-    """Fills out [m, b, rows, columns] with profile x sum of planes [p, rows, columns] by weights [m, b, p].
+    """Fill `out` with the product of profiles and weighted sums of planes on a stamp's Fourier grid.
 
-    ku, kv : [rows], [columns] radian / pixel
-    body, fraction, bulge, disk, thick, sersic, row, row_weights : [m] of fourier.nyquist_zones
+    Parameters
+    ----------
+    planes : complex array, shape (p, rows, columns)
+        Planes of the PSF.
+    weights : float32 array, shape (m, b, p)
+        Weights of the planes for each source and node.
+    ku, kv : float32 array, shape (rows,) and (columns,)
+        Frequencies, radian / pixel.
+    body, fraction, bulge, disk, thick, sersic, row, row_weights : array
+        Profiles of m sources, see `fourier.nyquist_zones`.
+    out : complex array, shape (m, b, rows, columns)
+        Result.
     """
     rows, columns = len(ku), len(kv)
     square, high = np.empty(columns, np.float32), np.empty(columns, np.float32)
@@ -67,10 +72,20 @@ def zones(
 def measure_peak_and_total(
     spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float
 ) -> None:
-    """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
+    """Measure the electrons of spectra: the sum, and the largest sum in a window that moves by half its width.
 
-    factor : [k] of each spectrum;  response : [w] electrons for each of its units, or less than none
-    peak, total : [k], all of them counted as electrons
+    Parameters
+    ----------
+    spectra : float32 array, shape (k, w)
+        Spectra.
+    factor : float array, shape (k,)
+        Factor of each spectrum.
+    response : float array, shape (w,)
+        Electrons per unit of the spectrum; the sign is ignored.
+    window : int
+        Number of wavelengths in the window.
+    peak, total : float array, shape (k,)
+        Results, electrons.
     """
     half = max(window // 2, 1)
     for k in range(len(spectra)):
@@ -91,11 +106,30 @@ def add_to_trace(
     electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
     out: Float,
 ) -> None:  # fmt: skip
-    """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [b, w].
+    """Add the electrons of each wavelength to the samples of a trace.
 
-    along   : coefficients of t^i, pixels from `start`;  times : t of the first wavelength, and its step
-    samples : a pixel;  first : place of out's first sample, in samples;  share : of each PSF, by wavelength
-    A quintic spline keeps the total, the mean and the higher moments.
+    Parameters
+    ----------
+    electrons : float array, shape (w,)
+        Electrons by wavelength.
+    along : float array, shape (i,)
+        Coefficients of t^i for the columns, pixels.
+    times : (float, float)
+        Trace parameter t of the first wavelength, and its step.
+    start : float
+        Column of the undispersed image, pixels.
+    samples : int
+        Samples per pixel.
+    share : float array, shape (b, w)
+        Share of each PSF by wavelength.
+    first : int
+        Position of the first element of `out`, samples.
+    out : float array, shape (b, m)
+        Samples of the trace, changed in place.
+
+    Notes
+    -----
+    The quintic spline conserves the total, the mean and the higher moments.
     """
     count, places, low = out.shape[1], np.empty(_WAVES), np.empty(_WAVES, np.int64)
     weights = np.empty((6, _WAVES))
@@ -104,7 +138,7 @@ def add_to_trace(
         batch = electrons[begin : begin + _WAVES]
         if np.max(np.abs(batch)) == 0.0:
             continue
-        # By whole vectors; then each to its samples.
+        # Positions are computed for whole vectors, before the light is added to samples.
         places[:] = along[len(along) - 1]
         for j in range(len(along) - 2, -1, -1):
             for i in range(_WAVES):
@@ -123,7 +157,7 @@ def add_to_trace(
             w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
         group_start, stop = 0, 0
         while group_start < len(batch):
-            # Those that lie between the same samples are added up first.
+            # Wavelengths between the same samples are summed first.
             at, stop = low[group_start], group_start + 1
             while stop < len(batch) and low[stop] == at:
                 stop += 1
@@ -137,7 +171,7 @@ def add_to_trace(
 
 @jit
 def _add_weighted(weights: Float, share: Float, out: Float) -> None:
-    """Adds weights [6, k] by shares [k] to out [6]."""
+    """Add the products of weights [6, k] and shares [k] to `out` [6]."""
     w0, w1, w2, w3, w4, w5 = weights
     s0 = s1 = s2 = s3 = s4 = s5 = 0.0
     for i in range(len(share)):

@@ -1,11 +1,8 @@
-"""The smooth light of galaxies that no stamp holds, spread along their traces.
+"""Smooth light of galaxies that exceed the largest stamp, spread along their traces.
 
-A giant is drawn in two parts (images.Sampling): what is sharp on its own stamp, which holds it, and what is smooth on a
-frame of pixels COARSE times as wide, by a stamp so much larger.  What is drawn there are coefficients of a cubic spline
-through the coarse pixels, which the detector's are taken from.
-
-sampling     of the stamps of a side
-add          the smooth part of an order of a giant, onto the frame
+Such a galaxy is drawn in two parts (`images.Sampling`). The sharp part is drawn on a stamp that contains it. The smooth
+part is drawn with a larger stamp on a frame of pixels that are COARSE times as wide. These coarse pixels contain the
+coefficients of a cubic spline, which is evaluated at the detector's pixels.
 """
 
 from __future__ import annotations
@@ -20,16 +17,28 @@ from truesky.render.dispersing.images import Sampling
 from truesky.render.dispersing.stamp_sizes import COARSE, LARGE_GALAXY_SIZES, LARGEST
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 
-# Pixels: the smooth part is nothing but what a Gaussian of this width leaves, two and a half nodes of the coarse frame.
-# Its samples a node, along the trace and across: with one along, the middle of a bright bulge is wrong by 5 % of its
-# noise; with two, or with more of both, by 1.6 %.
+# Width of the Gaussian that separates the smooth part, pixels: two and a half coarse pixels. Samples per coarse pixel
+# along and across the trace. With one sample along, the middle of a bright bulge has an error of 5 % of its noise; with
+# two, or more in both directions, 1.6 %.
 _SPLIT, _ALONG, _ACROSS = 2.5 * COARSE, 2, 1
 
 
 def stamp_sampling(size: int, template: Sampling, smooth: bool = False) -> Sampling:
-    """Of stamps of one of SIZES; of GIANTS: the sharp part, or the smooth one, which is drawn sample by sample.
+    """Sampling of stamps of a given side.
 
-    like : samples a pixel and slope
+    Parameters
+    ----------
+    size : int
+        Side, one of SIZES or LARGE_GALAXY_SIZES.
+    template : Sampling
+        Samples per pixel and slope.
+    smooth : bool
+        For LARGE_GALAXY_SIZES: True for the smooth part, which is drawn sample by sample, and False for the sharp part.
+
+    Returns
+    -------
+    Sampling
+        The sampling.
     """
     if size < LARGE_GALAXY_SIZES[0]:
         return replace(template, n=size)
@@ -41,13 +50,33 @@ def add(
     image: Float32, electrons: tuple[Float32, float, Float], share: Float, polynomials: tuple[Float, Float],
     times: tuple[float, float], place: tuple[float, float], stamp_sampling: Sampling, frame: Int,
 ) -> float:  # fmt: skip
-    """Adds the smooth part of an order of a giant to the frame, in FIXED_POINT of an electron; returns what fell there.
+    """Add the smooth part of an order of a large galaxy to the frame.
 
-    image       : float32[b, n along, n across] spline coefficients of its smooth part;  like : their sampling
-    electrons   : spectrum, factor and response of spreading.spread;  share, times : as there
-    polynomials : of columns and of rows along the trace, pixels;  place : column and row of the undispersed image
+    Parameters
+    ----------
+    image : float32 array, shape (b, n along, n across)
+        Spline coefficients of the smooth part.
+    electrons : (float32 array, float, float array)
+        Spectrum, factor and response of `spreading.spread`.
+    share : float array, shape (w, b)
+        Share of each PSF by wavelength.
+    polynomials : (float array, float array)
+        Coefficients of t^i for columns and rows along the trace, pixels.
+    times : (float, float)
+        Trace parameter t of the first wavelength, and its step.
+    place : (float, float)
+        Column and row of the undispersed image.
+    stamp_sampling : Sampling
+        Sampling of the image.
+    frame : int array, shape (ny, nx)
+        Frame in FIXED_POINT units per electron, changed in place.
+
+    Returns
+    -------
+    float
+        Electrons that were added to the frame.
     """
-    # A node before the first of the frame's pixels and two behind the last.
+    # The spline needs one node before the frame's first pixel and two after the last.
     rows, columns = ((n - 1) // COARSE + 4 for n in frame.shape)
     coarse = np.zeros((rows, columns), np.int64)
     along, across = (part / COARSE for part in polynomials)

@@ -1,10 +1,7 @@
-"""A source's image spread along the trace of an order, onto a frame, compiled.
+"""Compiled loops that spread the image of a source along the trace of an order onto a frame.
 
-follow     a source's image at every sample of its trace, each in its own rows
-convolve   a source's image, along a straight trace, by a few samples at a time;  settle : into rows
-spread     a source's order onto the frame, in one of the two ways
-add        a piece of the image onto the frame, in fixed point
-refine     a frame of wider pixels onto the frame
+Along a curved trace, each sample of the trace has its PSF and its rows. Along a straight trace, the image is convolved
+for a few samples at a time and then moved into rows.
 """
 
 from __future__ import annotations
@@ -15,15 +12,15 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics.compiling import jit
 from truesky.render.dispersing.kernels import add_to_trace
 
-# Places along a trace between which it is taken as straight.
+# Number of positions along a trace, between which it is treated as straight.
 _NODES = 129
-# Pixels of a trace that are taken together; numbers of an image seen through one PSF that are held close at hand.
+# Number of pixels of a trace that are processed together, and number of image values that fit into the cache.
 STEP, _CLOSE = 4, 24_000
 
 
 @jit
 def _path(along: Float, across: Float, times: tuple[float, float], count: int, start: tuple[float, float]) -> Float:
-    """[3, nodes] columns, ascending, rows and numbers of wavelengths at places of a trace."""
+    """Columns (ascending), rows and wavelength numbers [3, nodes] at positions along a trace."""
     out = np.empty((3, _NODES))
     for i in range(_NODES):
         number = (count - 1.0) * i / (_NODES - 1.0)
@@ -41,7 +38,7 @@ def _path(along: Float, across: Float, times: tuple[float, float], count: int, s
 
 @jit
 def _interpolate_path(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
-    """(row, number of the wavelength, rows a column) of a path at column x; ends : rows a column before and behind."""
+    """Row, wavelength number and slope of a path at column x, with the slopes `ends` before and after the path."""
     columns = path[0]
     last = len(columns) - 1
     if x <= columns[0]:
@@ -63,7 +60,7 @@ def _interpolate_path(path: Float, x: float, ends: tuple[float, float]) -> tuple
 
 @jit
 def _slope(path: Float, i: int) -> float:
-    """Rows a column from place i of a path to the next."""
+    """Slope of a path from position i to the next, rows per column."""
     return float((path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12))
 
 
@@ -79,13 +76,28 @@ def add_samples(
     corner: tuple[int, int],
     out: Float32,
 ) -> None:
-    """Adds a source's image at every sample of its trace to out [h, w], with a PSF and rows of its own.
+    """Add the image of a source at every sample of its trace, each with its PSF and its rows.
 
-    images : [b, n along, n across] spline coefficients of the source seen through PSF b, of a stamp of n pixels; the
-             stamp's middle is sample n / 2 of each axis
-    laid   : [b, m] electrons;  first : place of its first sample, in samples along
-    path   : of `_path`;  slope : rows a column before and behind it;  shear : by which a row of the image rises
-    shape  : n, samples a pixel along, across;  corner : column and row of out's first pixel
+    Parameters
+    ----------
+    images : float32 array, shape (b, n along, n across)
+        Spline coefficients of the source through PSF b; the middle of the stamp is at sample n / 2 of each axis.
+    trace_electrons : float array, shape (b, m)
+        Electrons by sample of the trace.
+    first : int
+        Position of the first sample of the trace, samples.
+    path : float array, shape (3, nodes)
+        Result of `_path`.
+    slope : float
+        Slope of the trace before and after the path, rows per column.
+    shear : float
+        Rise of a row of the image, rows per column.
+    shape : (int, int, int)
+        Side of the stamp in pixels, and samples per pixel along and across.
+    corner : (int, int)
+        Column and row of the first pixel of `out`.
+    out : float32 array, shape (h, w)
+        Piece of the frame, changed in place.
     """
     n, ox, oy = shape
     line = np.empty(n * oy, np.float32)
@@ -114,7 +126,7 @@ def add_samples(
 def _add_line(
     line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
 ) -> None:
-    """Adds a column of an image, oy samples a row, its middle at `row`, to out [h] from row `low` on."""
+    """Add a column of an image, with `oy` samples per row and its middle at `row`, to `out` [h] from row `low`."""
     tall, begin = len(line), int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
     floor_v = int(np.floor(v))
@@ -123,12 +135,12 @@ def _add_line(
     w0, w3 = np.float32(s * s * s / 6.0), np.float32(t * t * t / 6.0)
     w1 = np.float32((4.0 + t * t * (3.0 * t - 6.0)) / 6.0)
     w2 = np.float32((4.0 + s * s * (3.0 * s - 6.0)) / 6.0)
-    # Periodic.
+    # The column is periodic.
     wrapped[0] = line[tall - 1]
     wrapped[1 : tall + 1] = line
     wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
     a0, a1, a2, a3 = wrapped[floor_v:], wrapped[floor_v + 1 :], wrapped[floor_v + 2 :], wrapped[floor_v + 3 :]
-    # Of every sample, in whole vectors, which is faster than of every row.
+    # Computing all samples in whole vectors is faster than computing only the rows.
     for i in range(len(fine) - oy + 1):
         fine[i] = w0 * a0[i] + w1 * a1[i] + w2 * a2[i] + w3 * a3[i]
     for r in range(max(0, low - begin), min(n, low + len(out) - begin)):
@@ -148,11 +160,30 @@ def convolve_trace(
     low: int,
     out: Float32,
 ) -> None:
-    """Adds a source's image at every sample of its trace to out [w, n across]: columns from `low` on, about the trace.
+    """Add the image of a source at every sample of a straight trace to columns in trace coordinates.
 
-    images : of `follow`, in coordinates that rise by `slope` rows a column;  laid : [m] electrons
-    first, path, shape : of `follow`
-    share  : [wavelengths, b] of each PSF;  tile : pixels that share one, a multiple of STEP
+    Parameters
+    ----------
+    images : float32 array, shape (b, n along, n across)
+        Images as for `add_samples`, in coordinates that rise by `slope` rows per column.
+    trace_electrons : float array, shape (m,)
+        Electrons by sample of the trace.
+    first : int
+        Position of the first sample of the trace, samples.
+    path : float array, shape (3, nodes)
+        Result of `_path`.
+    slope : float
+        Slope of the coordinates, rows per column.
+    share : float array, shape (wavelengths, b)
+        Share of each PSF.
+    shape : (int, int, int)
+        Side of the stamp in pixels, and samples per pixel along and across.
+    tile : int
+        Pixels with a common PSF, a multiple of STEP.
+    low : int
+        Column of the first element of `out`.
+    out : float32 array, shape (w, n across)
+        Columns across the trace, changed in place.
     """
     n, ox, oy = shape
     tall = n * oy
@@ -160,7 +191,7 @@ def convolve_trace(
     _steepness_image(images[len(images) // 2], ox, oy, steep)
     count = (n * ox * tall + _CLOSE - 1) // _CLOSE
     for k in range(count):
-        # By some of the samples across, which then stay in the processor's cache.
+        # Only as many samples across the trace as fit into the processor's cache are used at a time.
         begin, end = k * tall // count, (k + 1) * tall // count
         parts = _by_phase(images, steep, ox, begin, end)
         lines = np.zeros((len(out), end - begin), np.float32)
@@ -170,7 +201,7 @@ def convolve_trace(
 
 @jit
 def _by_phase(images: Float32, steep: Float32, ox: int, begin: int, end: int) -> Float32:
-    """[b + 1, ox, n x samples across] some samples across of images [b, n along, n across], and `steep`."""
+    """Strip [b + 1, ox, n x samples across] of images [b, n along, n across] and of `steep`, sorted by phase."""
     n, wide = images.shape[1] // ox, end - begin
     out = np.empty((len(images) + 1, ox, n * wide), np.float32)
     for b in range(len(out)):
@@ -193,7 +224,7 @@ def _convolve_strip(
     low: int,
     out: Float32,
 ) -> None:
-    """Adds to out [w, wide] what `convolve` does, of parts [b + 1, ox, n x wide] of `_by_phase`."""
+    """Add the result of `convolve_trace` for one strip, from the parts of `_by_phase`, to `out` [w, wide]."""
     n, ox, _ = shape
     tall, pad = out.shape[1], STEP - 1
     mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)
@@ -210,7 +241,7 @@ def _convolve_strip(
         if total == 0.0:
             continue
         _, number, rise = _interpolate_path(path, (first + mean / total) / ox, ends)
-        # A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
+        # If a trace is steeper by d than the image's rows, its image is I(u, v + d u), approximately I + d u dI / dv.
         amounts[:-1], amounts[-1] = share[int(number)], rise - slope
         for phase in range(ox):
             _mix(parts, phase, amounts, mixed[phase, pad * tall : (pad + n) * tall])
@@ -232,7 +263,7 @@ def _convolve_strip(
 
 @jit
 def _steepness_image(image: Float32, ox: int, oy: int, out: Float32) -> None:
-    """Fills out [n along, n across] with u dI / dv of an image I: what it gains where its trace is steeper."""
+    """Fill `out` [n along, n across] with u dI / dv of an image I, the change of the image for a steeper trace."""
     tall = image.shape[1]
     out[:] = np.float32(0.0)
     for j in range(len(image)):
@@ -247,7 +278,7 @@ def _steepness_image(image: Float32, ox: int, oy: int, out: Float32) -> None:
 
 @jit
 def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
-    """Fills out [e] with the sum of parts [k, phase, e] by amounts [k]: of three at a time."""
+    """Fill `out` [e] with the sum of parts [k, phase, e] times amounts [k], three terms at a time."""
     last = len(parts) - 1
     for k in range(0, len(parts), 3):
         a0, a1, a2 = parts[k, phase], parts[min(k + 1, last), phase], parts[min(k + 2, last), phase]
@@ -266,9 +297,22 @@ def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
 def add_lines(
     lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
 ) -> None:
-    """Adds columns of `convolve`, the first column `low`, to out [h, w], where the trace has them.
+    """Add columns of `convolve_trace` to a piece of the frame, at the rows of the trace.
 
-    lines : [w, n across];  path, shape, corner : of `follow`
+    Parameters
+    ----------
+    lines : float32 array, shape (w, n across)
+        Columns across the trace.
+    low : int
+        Column of the first of these.
+    path : float array, shape (3, nodes)
+        Result of `_path`.
+    shape : (int, int, int)
+        Side of the stamp in pixels, and samples per pixel along and across.
+    corner : (int, int)
+        Column and row of the first pixel of `out`.
+    out : float32 array, shape (h, w)
+        Piece of the frame, changed in place.
     """
     n, _, oy = shape
     wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
@@ -280,9 +324,23 @@ def add_lines(
 
 @jit
 def add_piece(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> float:
-    """Adds piece [h, w] with its first pixel at corner (column, row) to the frame, `unit` to an electron.
+    """Add a piece of an image to the frame.
 
-    returns : electrons that fell there
+    Parameters
+    ----------
+    piece : float32 array, shape (h, w)
+        Electrons.
+    corner : (int, int)
+        Column and row of its first pixel on the frame.
+    unit : float
+        Units of the frame per electron.
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+
+    Returns
+    -------
+    float
+        Electrons that were added to the frame.
     """
     ny, nx = frame.shape
     first, stop = max(0, -corner[0]), min(piece.shape[1], nx - corner[0])
@@ -299,9 +357,21 @@ def add_piece(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) 
 
 @jit
 def add_refined(coarse: Int, step: int, frame: Int) -> int:
-    """Adds a cubic spline to the frame: coarse [h, w] its coefficients, of pixels as wide as `step` of the frame's.
+    """Add a cubic spline with nodes on coarse pixels to the frame.
 
-    The frame's first pixel is at (1, 1), and what is added to it is a share of a coarse one; returns the units added.
+    Parameters
+    ----------
+    coarse : int array, shape (h, w)
+        Coefficients of the spline, units of the frame per coarse pixel.
+    step : int
+        Width of a coarse pixel, pixels of the frame.
+    frame : int array, shape (ny, nx)
+        Frame, changed in place; its first pixel is at the node (1, 1).
+
+    Returns
+    -------
+    int
+        Units that were added to the frame.
     """
     ny, nx = frame.shape
     weights, wide, total = np.empty((step, 4)), np.empty(coarse.shape[1]), np.int64(0)
@@ -337,13 +407,43 @@ def spread(
     times: tuple[float, float], start: tuple[float, float], slope: float, shear: float, shape: tuple[int, int, int],
     tile: int, unit: float, frame: Int,
 ) -> float:  # fmt: skip
-    """An order of a source onto the frame, `unit` to an electron; returns the electrons that fell there.
+    """Spread an order of a source onto the frame.
 
-    images   : of `follow`, or of `convolve` for tile > 0: the pixels that share a PSF
-    spectrum : [w], `factor` x `response` [w] electrons for each unit;  share : [w, b] of each PSF
-    along, across, times : of kernels.lay, and the same of rows;  start : column and row of the undispersed image
-    slope    : rows a column of the trace before and behind it;  shear : of a row of the images
-    shape    : n, samples a pixel along, across
+    Parameters
+    ----------
+    images : float32 array, shape (b, n along, n across)
+        Spline coefficients for `add_samples` or, if `tile` is positive, for `convolve_trace`.
+    spectrum : float32 array, shape (w,)
+        Spectrum.
+    factor : float
+        Factor of the spectrum.
+    response : float array, shape (w,)
+        Electrons per unit of the spectrum times `factor`.
+    share : float array, shape (w, b)
+        Share of each PSF by wavelength.
+    along, across : float array, shape (i,)
+        Coefficients of t^i for columns and rows, pixels.
+    times : (float, float)
+        Trace parameter t of the first wavelength, and its step.
+    start : (float, float)
+        Column and row of the undispersed image.
+    slope : float
+        Slope of the trace before and after the order, rows per column.
+    shear : float
+        Rise of a row of the images, rows per column.
+    shape : (int, int, int)
+        Side of the stamp in pixels, and samples per pixel along and across.
+    tile : int
+        Pixels with a common PSF; 0 if each sample of the trace has its PSF.
+    unit : float
+        Units of the frame per electron.
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+
+    Returns
+    -------
+    float
+        Electrons that were added to the frame.
     """
     n, ox, oy = shape
     ny, nx = frame.shape
@@ -355,7 +455,7 @@ def spread(
     bottom, top = np.min(path[1]), np.max(path[1])
     first = int(np.floor(ox * x_first)) - 3
     trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 - first))
-    # One that is straight has the shares of its tiles.
+    # Straight traces apply the shares per tile instead.
     wave_share = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
     add_to_trace(electrons, along, times, start[0], ox, wave_share, first, trace_electrons)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))

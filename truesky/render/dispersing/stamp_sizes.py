@@ -1,9 +1,7 @@
-"""How large the stamps are that spectra are drawn on: as large as their light asks for.
+"""Sizes of the stamps for spectra, which depend on the light of each source.
 
-A stamp is periodic: what a galaxy has beyond it comes in at the opposite edge, and is as bright there as what it has
+A stamp is periodic: the light of a galaxy beyond it is aliased to the opposite edge, where it is as bright as the light
 at the edge itself. The PSF is cut to the stamp.
-
-Sizes        of the stamps of some sources
 """
 
 from __future__ import annotations
@@ -18,28 +16,38 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Sides of stamps whose transforms are fast.
+# Sides of stamps with fast transforms, pixels.
 SIZES = np.array([16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512])
-# The largest of them for a galaxy.  One that is wider is a giant (giants.py): it is drawn in two parts, what is smooth
-# on a stamp of one of the sides that follow, of pixels COARSE times as wide.
+# Largest side for a galaxy. Larger galaxies are drawn in two parts (large_galaxies.py): the smooth part uses a stamp
+# with one of LARGE_GALAXY_SIZES and pixels that are COARSE times as wide.
 LARGEST, COARSE = 256, 4
 LARGE_GALAXY_SIZES = COARSE * np.array([160, 256, 512, 1024])
 _ALL_SIZES = np.concatenate([SIZES, LARGE_GALAXY_SIZES])
-# Of a galaxy's light, at most in a row at the stamp's edge: a sum over many columns would show it. But for a galaxy so
-# faint that such a sum is not seen in a single pixel.
+# Largest fraction of a galaxy's light in a row at the edge of the stamp, since a sum over many columns would show it.
+# Galaxies that are so faint that this sum is negligible in a single pixel are exempt.
 _MAX_EDGE_FRACTION = 5e-4
-# Of a galaxy's light in a row, what no brightness shows.
+# Fraction of a galaxy's light in a row that is negligible for any brightness.
 _DARK = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Of n sources.
+    """Light of n sources at the edges of stamps, from which their sizes follow.
 
-    point : float64[s] fraction of a point's light in a row at the edge of each of SIZES and GIANTS
-    body  : float32[n, s] of a galaxy's, with what comes in there; 0 of a point;  galaxy : bool[n] which are galaxies
-    wider : float64[n] pixels that a stamp is wider, of pictures and trails
-    limit : electrons of a row that are not seen;  least : smallest side, pixels
+    Attributes
+    ----------
+    point : float array, shape (s,)
+        Fraction of a point source's light in a row at the edge, for each of SIZES and LARGE_GALAXY_SIZES.
+    body : float32 array, shape (n, s)
+        Fraction of a galaxy's light, including aliased light; 0 for point sources.
+    galaxy : bool array, shape (n,)
+        True for galaxies.
+    extra_pixels : float array, shape (n,)
+        Additional width of the stamps for pictures and trails, pixels.
+    limit : float
+        Electrons in a row that are not noticeable.
+    min_size : int
+        Smallest side, pixels.
     """
 
     point: Float
@@ -51,12 +59,29 @@ class Sizes:
 
     @classmethod
     def from_sources(cls, sources: Sources, psf: Psf, limit: float, min_size: int) -> Sizes:
-        """Of sources.  psf : of the detector;  limit, least : electrons of a row, pixels"""
+        """Compute the light of sources at the edges of stamps.
+
+        Parameters
+        ----------
+        sources : Sources
+            n sources.
+        psf : Psf
+            PSF of the detector.
+        limit : float
+            Electrons in a row that are not noticeable.
+        min_size : int
+            Smallest side, pixels.
+
+        Returns
+        -------
+        Sizes
+            The light.
+        """
         reach = len(psf.surface) - 1
         x = np.arange(-reach, reach + 1)
         point = [psf.surface[np.rint(np.hypot(x, size / 2)).astype(int).clip(0, reach)].sum() for size in _ALL_SIZES]
         if psf.planes is not None:
-            # A point has no light beyond its planes.
+            # A point source has no light beyond its planes.
             point = [0.0 if size >= psf.side else light for size, light in zip(_ALL_SIZES, point, strict=True)]
         galaxy = sources.shape >= 0
         body = np.zeros((len(sources), len(_ALL_SIZES)), np.float32)
@@ -68,9 +93,21 @@ class Sizes:
         return cls(np.array(point), body, galaxy, extra_pixels + sources.trail_length, limit, min_size)
 
     def size(self, selected: Int, peak: Float, total: Float) -> Int:
-        """[k] For spectra of some sources, of so many electrons a column at most, and in all columns.
+        """Sides of the stamps for the spectra of some sources.
 
-        One of SIZES; of galaxies up to LARGEST, or one of GIANTS
+        Parameters
+        ----------
+        selected : int array, shape (k,)
+            Indices of the sources.
+        peak : float array, shape (k,)
+            Largest number of electrons in a column.
+        total : float array, shape (k,)
+            Electrons in all columns.
+
+        Returns
+        -------
+        int array, shape (k,)
+            Sides, pixels: from SIZES, for galaxies up to LARGEST, or from LARGE_GALAXY_SIZES.
         """
         body = self.body[selected]
         dark = (self.point + body) * peak[:, None] < self.limit
@@ -84,10 +121,10 @@ class Sizes:
 
 
 def _edge_light(shapes: Shapes, pixel_scale: float) -> Float32:
-    """float32[n, s] of a galaxy's light in a row at the edges of stamps, twice: with what comes in there."""
+    """Fraction of galaxies' light [n, s] in a row at the edges of stamps, doubled for the aliased light."""
     edge_fractions, remaining = np.zeros((len(shapes), len(_ALL_SIZES)), np.float32), np.arange(len(shapes))
     for column, size in enumerate(_ALL_SIZES.tolist()):
-        # A pixel farther in, for the width of the PSF's core.
+        # The light is taken one pixel farther in, for the width of the PSF's core.
         light = galaxy_shapes.line_brightness(shapes.take(remaining), (0.5 * size - 1.0) * pixel_scale)
         edge_fractions[remaining, column] = 2.0 * pixel_scale * light
         remaining = remaining[light * pixel_scale > _DARK]

@@ -1,1 +1,1 @@
-"""The light of sources onto a frame."""
+"""Drawing of the light of sources onto a frame."""

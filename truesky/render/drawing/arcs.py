@@ -1,11 +1,11 @@
-"""Sources that are a picture: the arcs of strong lenses, the structure of discs.
+"""Fourier transforms of sources that are pictures: arcs of strong lenses and the structure of discs.
 
-transform       its Fourier transform where the kernel takes its samples
-through         a PSF's planes with the picture behind them
+Between its pixels, a picture is interpolated by the quintic interpolant. Its transform is the transform of the pixels
+multiplied by that of the interpolant.
 
-Between its pixels a picture is what the quintic interpolant makes of them; its transform is then that of the pixels
-times the interpolant's own.
-Ref : Bernstein & Gruen 2014, PASP 126, 287 (the interpolant)
+References
+----------
+Bernstein & Gruen 2014, PASP 126, 287 (the interpolant).
 """
 
 from __future__ import annotations
@@ -19,29 +19,45 @@ from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.transfer import Grid, Transfer
 from truesky.render.sources.lensed_arcs import Picture
 
-# Of the transform at frequencies between those of the padded picture: it is padded to twice its side, WIDTH samples
-# are taken a direction, under the window exp(SLOPE (sqrt(1 - z^2) - 1)); the error is 1e-7 of the picture's flux.
-# Ref : Barnett, Magland & af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479
+# The picture is padded to twice its side. Between the frequencies of the padded picture, the transform is interpolated
+# from _WIDTH samples per direction with the window exp(_SLOPE (sqrt(1 - z^2) - 1)). The error is 1e-7 of the flux.
+# Barnett, Magland & af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479.
 _WIDTH = 8
 _SLOPE = 2.30 * _WIDTH
-# Where q / sinh q is 1.
+# Smallest q for q / sinh q, which is 1 there.
 _THIN = 1e-9
-# Nodes of the integral that is the window's transform.
+# Nodes of the integral for the window's transform.
 _NODES = 64
 
 
 def quintic(frequency: Array) -> Array:
-    """The interpolant's transform at radian / pixel.  Ref: Bernstein & Gruen 2014, appendix"""
+    """Transform of the quintic interpolant at a frequency in radian / pixel.
+
+    References
+    ----------
+    Bernstein & Gruen 2014, appendix.
+    """
     half = 0.5 * frequency
     s, c = np.sinc(half / np.pi), np.cos(half)
     return np.asarray(s**5 * (s * (55.0 - 19.0 * half**2) + 2.0 * c * (half**2 - 27.0)))
 
 
 def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
-    """complex128[s]: the picture's transform, about its middle, at (kx, ky) radian / pixel of the detector.
+    """Fourier transform of a picture about its middle, at frequencies of the detector.
 
-    jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
-    Error    : 1e-6 of the flux (tests/truesky/render/drawing/test_arcs.py)
+    Parameters
+    ----------
+    picture : Picture
+        The picture.
+    jacobian : float array, shape (2, 2)
+        d(u, v) / d(column, row), arcsec per pixel, with u to the west.
+    kx, ky : float array, shape (s,)
+        Frequencies, radian per pixel of the detector.
+
+    Returns
+    -------
+    complex array, shape (s,)
+        The transform, with an error of 1e-6 of the flux.
     """
     on_sky = matrices.matmul(matrices.inverse(jacobian).T, np.stack([kx, ky]).astype(float))
     across, up = matrices.matmul(picture.matrix.T, on_sky)
@@ -49,18 +65,33 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     values = np.empty(len(kx), complex)
     fourier.interpolate_spectrum(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, values)
     if rows % 2 == 0 or columns % 2 == 0:
-        # The middle lies between pixels.
+        # With an even number of pixels, the middle lies between pixels.
         values *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
     values = values * quintic(across) * quintic(up)
     if picture.thick is not None:
-        # q / sinh q, as of the disc's smooth light.
+        # The factor q / sinh q is the same as for the smooth light of the disc.
         q = np.maximum(np.abs(matrices.matmul(picture.thick, on_sky)), _THIN)
         values = values * (2.0 * q * np.exp(-q) / -np.expm1(-2.0 * q))
     return np.asarray(values)
 
 
 def apply_picture(psf_transfer: Transfer, picture: Picture, jacobian: Float) -> Transfer:
-    """One plane, as of a point -> as of the picture."""
+    """Convert the transfer function of a point source (one plane) to that of a picture.
+
+    Parameters
+    ----------
+    psf_transfer : Transfer
+        One plane of the PSF and the pixel.
+    picture : Picture
+        The picture.
+    jacobian : float array, shape (2, 2)
+        d(u, v) / d(column, row), arcsec per pixel, with u to the west.
+
+    Returns
+    -------
+    Transfer
+        The plane, multiplied by the transform of the picture.
+    """
     grid: Grid = psf_transfer.grid
     picture_transform = transform(picture, jacobian, grid.kx, grid.ky)
     re, im = psf_transfer.planes[0].astype(float)
@@ -74,7 +105,7 @@ def apply_picture(psf_transfer: Transfer, picture: Picture, jacobian: Float) -> 
 
 
 def _spectrum(image: Array) -> Array:
-    """Transform of the picture about its middle pixel, padded to twice its side, the window's part undone."""
+    """Transform of the picture about its middle pixel, padded to twice its side and divided by that of the window."""
     middle = [n // 2 for n in image.shape]
     period = [2 * scipy.fft.next_fast_len(max(n, _WIDTH)) for n in image.shape]
     rows, columns = (_window_transform(np.arange(n) - n // 2, p) for n, p in zip(image.shape, period, strict=True))
@@ -84,7 +115,7 @@ def _spectrum(image: Array) -> Array:
 
 
 def _window_transform(place: Array, period: int) -> Array:
-    """What the window about a frequency makes of a pixel at `place`."""
+    """Transform of the frequency window at the pixel `place`."""
     z, weights = matrices.gauss_legendre(_NODES)
     window = weights * np.exp(_SLOPE * (np.sqrt((1 - z) * (1 + z)) - 1.0))
     half = 0.5 * _WIDTH

@@ -1,7 +1,4 @@
-"""What drawing takes: floating-point work, seconds and memory.
-
-work, seconds, memory    what it goes through, and takes
-"""
+"""Predicted cost of drawing: work, CPU time and memory."""
 
 from __future__ import annotations
 
@@ -15,20 +12,34 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources import selection
 from truesky.render.sources.source_list import Sources
 
-# Bytes while drawing, measured, of what is drawn to the PSF's last frequency: of a frame's pixel (integers and result),
-# of a pixel of the largest stamp (its plane and transforms) in single and double precision, and where it is followed
-# farther, of a source (its form and
-# weights), of all else (planes of the small stamps).
+# Measured memory of drawing, bytes: per pixel of the frame (integers and result); per pixel of the largest stamp (its
+# plane and transforms) in single precision, in double precision and if it is followed beyond the PSF's last frequency;
+# per source (its form and weights); and for everything else (planes of the small stamps).
 _FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _DEEP_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 470, 900, 40_000_000
-# The same of a pixel of the largest stamp of a picture.
+# Measured bytes per pixel of the largest stamp of a picture.
 _PICTURE_BYTES = 370
-# CPU s while drawing, measured (2.5 GHz, one core): of a pixel of a stamp, of a plane of the PSF on a stamp's grid and
-# of the frame; of a block that a galaxy's light beyond its stamp may reach; of all else.
+# Measured CPU time of drawing, s (2.5 GHz, one core): per pixel of a stamp, of a PSF plane on a stamp's grid and of the
+# frame; per block that a galaxy's light beyond its stamp may reach; and for everything else.
 _STAMP_S, _PLANE_S, _FRAME_S, _BLOCK_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 1.5e-8, 0.01
 
 
 def count_work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
-    """(pixels of stamps, samples' places of the PSF's planes) that `draw` goes through, before anything is drawn."""
+    """Amount of work of `stamps.draw`, before anything is drawn.
+
+    Parameters
+    ----------
+    sources : Sources
+        Sources at rest, or pieces of trails.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+
+    Returns
+    -------
+    (int, int)
+        Number of stamp pixels, and number of grid points of transformed PSF planes.
+    """
     planes, transformed = transfer.plane_count(psf), 0
     for size in np.unique(sizes).tolist():
         individual, sharing = stamps.split_by_size(sources, sizes, psf, size, stamps.in_double_precision(sources, None))
@@ -37,10 +48,23 @@ def count_work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
 
 
 def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
-    """CPU s that `draw` takes, predicted from the sources and their stamps.
+    """Predicted CPU time of `stamps.draw`, s.
 
-    sources, sizes : as of `draw`;  psf : of the detector;  nx, ny : its pixels
-    Error : between half and twice of what the machine takes that it was measured on
+    Parameters
+    ----------
+    sources : Sources
+        Sources to be drawn.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+    nx, ny : int
+        Columns and rows of the detector.
+
+    Returns
+    -------
+    float
+        CPU time, s, accurate to a factor of 2 on the machine of the measurements.
     """
     pieces, trail, parent = stamps.split_into_pieces(sources)
     sizes = sizes[parent]
@@ -60,11 +84,24 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
 
 
 def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:
-    """Bytes that `draw` takes at its peak on top of its arguments, predicted from the stamps alone.
+    """Predicted peak memory of `stamps.draw` in addition to its arguments, from the stamps alone.
 
-    picture : of Sources
-    electrons, sizes : float64[n], int64[n] stamps' sides;  nx, ny : pixels of the detector
-    Error : the peak is between a third of it and all of it: what is faint is not followed to the last frequency
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons of the sources.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    nx, ny : int
+        Columns and rows of the detector.
+    picture : int array, shape (n,), optional
+        Number of the picture of each source, -1 for none; None if no source has a picture.
+
+    Returns
+    -------
+    float
+        Bytes. The true peak is between a third of this and this, since faint sources are not followed to the PSF's last
+        frequency.
     """
     bright = electrons > BRIGHT
     pictured = np.zeros(len(sizes), bool) if picture is None else picture >= 0

@@ -1,22 +1,18 @@
-"""Light that the pupil's edges diffract far from a bright star, where its PSF's plane has ended.
+"""Light diffracted by the pupil's edges far from a bright star, beyond the plane of its PSF.
 
-Star             one of them
-add              what a star shines outside the plane, onto a frame
-remove_aliased   what of it the plane has inside, taken off
-left             how the plane fades there
-seconds, remove_aliased_seconds   what `add` and `remove_aliased` take
+Rings fall off as r^-3 and an aureole as r^-2; spikes are tabulated (psf/spikes.py). The plane of side N fades over 24
+pixels by the smooth step s(z) = z^2 (3 - 2 z) in columns and in rows. `add` draws the fraction 1 - s s of the light
+there and all light farther out, so that the sum has no seam. A moving star is drawn as points along its trail, which
+are closer than the finest fringe lambda / l of a bar.
 
-Rings fall as r^-3, an aureole as r^-2, spikes are tabulated (psf/spikes.py).  The plane of side N fades over 24 pixels
-by the smooth step s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it
-farther out, so that the sum has no seam.
+The plane is a discrete transform of the pupil with a period Q. A pixel at r from the middle therefore also contains the
+light of the positions r + Q m (m is a pair of integers). The softened edges of the sampled pupil weaken that light to
+sinc^2(|r + Q m| / Q), relative to sinc^2(|r| / Q) for the light at r itself. `remove_aliased` multiplies each pixel by
+direct / (direct + aliased) light.
 
-A star that moves is drawn as points along its trail, closer than the finest fringe lambda / l of a bar.
-
-The plane itself is a discrete transform of the pupil and repeats itself after a period Q: a pixel at r of the middle
-holds what belongs at r + Q m, too (m whole numbers), weakened by the softened edges of the sampled pupil to
-sinc^2(|r + Q m| / Q) against sinc^2(|r| / Q) of its own.  `remove_aliased` keeps of each pixel own / (own + folded).
-
-Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out)
+References
+----------
+Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out).
 """
 
 from __future__ import annotations
@@ -33,27 +29,37 @@ from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.psf import spikes
 from truesky.render.psf.spikes import ARCSEC, FARTHEST, LONG, STEP, Edges
 
-# Light is drawn to where it is this part of what may be left out: its border is not to be seen.
+# Light is drawn down to this fraction of the negligible light, so that its border is invisible.
 _FAINTEST = 0.5
-# Of the finest fringe, between points along a trail: where a spike's table ends, a point more or less is a step.
+# Spacing of points along a trail, in finest fringes. It is below 1 to reduce steps at the end of a spike's table.
 _ALONG = 0.6
-# Pixels between points along a piece of a trail where a plane is unfolded, of which a share is asked for.
+# Spacing of points along a piece of a trail when aliased light is removed, pixels. Only a ratio is needed there.
 _POINT_SPACING = 4.0
-# CPU s, measured (2.5 GHz, one core), of a frame's pixel: about a star, and for each pixel of a trail's length; and of
-# a stamp's pixel and part of a piece.
+# Measured CPU time, s (2.5 GHz, one core): per pixel of the frame for a star, and in addition per pixel of a trail's
+# length; per pixel of a stamp and point along a piece.
 _STAR_S, _LONGER_S, _UNFOLD_S = 7e-9, 1.6e-9, 5e-8
 
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """A point that shines beyond its PSF's plane.
+    """A point source that shines beyond the plane of its PSF.
 
-    column, row : pixels, of its middle where it moves;  electrons : expected
-    photons : [w] share of each sub-band, None = equal
-    size    : of the plane, pixels
-    least   : electrons in a pixel that may be left out
-    edges   : what diffracts; None: nothing does
-    trail   : [2] pixels that it moves by, with its plane; None: it is at rest
+    Attributes
+    ----------
+    column, row : float
+        Position, or the middle of its trail, pixels.
+    electrons : float
+        Expected electrons.
+    photons : float array, shape (w,), or None
+        Fraction of the photons in each sub-band; None if all are equal.
+    size : int
+        Side of the plane, pixels.
+    negligible_electrons : float
+        Electrons per pixel that may be neglected.
+    edges : Edges or None
+        Diffracting edges of the pupil; None if there is no diffraction.
+    trail : float array, shape (2,), or None
+        Displacement of the star and its plane during the exposure, pixels; None if it is at rest.
     """
 
     column: float
@@ -67,7 +73,17 @@ class Star:
 
 
 def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
-    """Adds what a star shines outside its plane, which fades by `left`, to a frame that has `unit` of an electron."""
+    """Add the light of a star outside its plane, which fades by `fading_window`, to a frame.
+
+    Parameters
+    ----------
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+    star : Star
+        The star.
+    unit : float
+        Units of the frame per electron.
+    """
     if star.edges is None:
         return
     edges = star.edges
@@ -80,11 +96,11 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     lines = star.electrons * spikes.spike_light(edges, photons, max(farthest, edges.period))
     faintest = _FAINTEST * star.negligible_electrons
     halo, core = star.electrons * edges.aureole[0], edges.aureole[1]
-    # Where each of the two is as faint.
+    # Radius at which rings and aureole have both become negligible.
     radius = max((level / faintest) ** (1.0 / 3.0), (halo / faintest) ** 0.5) if faintest > 0.0 else farthest
     radius = min(radius, farthest)
     inner = star.size / 2 - SPARED
-    # What a spike shows outside the plane: so far out, so wide.
+    # Length and half width of the visible part of the spikes outside the plane.
     visible = lines[:, int(inner / LONG) :] > faintest
     out, across = (np.flatnonzero(visible.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     spike_reach = min(inner + LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
@@ -98,17 +114,29 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
 
 
 def _farthest_corner(frame: Int, x: Float, y: Float) -> float:
-    """Pixels from points to beyond the farthest corner's pixel."""
+    """Largest distance from the points to a corner of the frame, plus a pixel."""
     ny, nx = frame.shape
     return float(np.hypot(max(x.max() + 1.0, nx - x.min()), max(y.max() + 1.0, ny - y.min())))
 
 
 def remove_aliased(star: Star, stamp: Array, x0: int, y0: int, nx: int, ny: int) -> None:
-    """Takes off a star's stamp, in place, what its plane's transform had folded into it: a fifth of its corners.
+    """Remove the aliased light of a star's plane from its stamp, up to a fifth of the light in the corners.
 
-    left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done
-    Of each pixel it is the share that folded light has in all that should be there: the two run through each other, and
-    where they cancel there is less than of either.
+    Parameters
+    ----------
+    star : Star
+        The star.
+    stamp : array, shape (N, N)
+        Stamp, changed in place.
+    x0, y0 : int
+        First column and row of the stamp on the frame.
+    nx, ny : int
+        Columns and rows of the frame. Pixels outside the frame are not changed.
+
+    Notes
+    -----
+    Each pixel is multiplied by the direct fraction of the expected direct and aliased light. The two interfere, and
+    where they cancel, both are smaller.
     """
     if star.edges is None or star.edges.period == 0.0:
         return
@@ -124,26 +152,36 @@ def remove_aliased(star: Star, stamp: Array, x0: int, y0: int, nx: int, ny: int)
 
 
 def seconds(length: Float, nx: int, ny: int) -> float:
-    """CPU s that `add` takes for trails of lengths, pixels, of which 0 are at rest.
+    """Predicted CPU time of `add`.
 
-    Error : half and twice; less where little of them is noticed
+    Parameters
+    ----------
+    length : float array, shape (n,)
+        Lengths of trails, pixels; 0 for stars at rest.
+    nx, ny : int
+        Columns and rows of the frame.
+
+    Returns
+    -------
+    float
+        CPU time, s, accurate to a factor of 2. If the light is hardly noticeable, the true time is shorter.
     """
     return float((_STAR_S + _LONGER_S * length).sum()) * nx * ny
 
 
 def remove_aliased_seconds(length: Float, sizes: Int) -> float:
-    """CPU s that `remove_aliased` takes for pieces of trails on stamps of sides, pixels."""
+    """Predicted CPU time of `remove_aliased`, s, for pieces of trails [n] of given lengths and stamp sides, pixels."""
     return float((_UNFOLD_S * sizes.astype(float) ** 2 * np.maximum(np.ceil(length / _POINT_SPACING), 1.0)).sum())
 
 
 def _photons_and_directions(photons: Float | None, edges: Edges) -> tuple[Float, Float]:
-    """(photons [w], bars' directions [b, 2])."""
+    """Photons by sub-band [w], and directions of the bars [b, 2]."""
     photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
     return photons, np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
 
 
 def _trail_points(star: Star, spacing: float) -> tuple[Float, Float]:
-    """Columns and rows [p] of points along a trail, at most so many pixels apart; one, if it is no longer than that."""
+    """Columns and rows [p] of points along a trail, at most `spacing` pixels apart; one point if it is shorter."""
     length = 0.0 if star.trail is None else float(np.hypot(*star.trail))
     if star.trail is None or length <= spacing:
         return np.array([star.column]), np.array([star.row])
@@ -153,14 +191,26 @@ def _trail_points(star: Star, spacing: float) -> tuple[Float, Float]:
 
 
 def _finest_fringe(edges: Edges) -> float:
-    """Pixels between points that shine as an even line does: across a spike no frequency is higher."""
+    """Width of the finest fringe across a spike, pixels; points at this spacing look like a continuous line."""
     return float(edges.wavelength.min() * 1e-7 / edges.bars[:, 2].max() / (edges.pixel_scale * ARCSEC))
 
 
 def fading_window(size: int, samples: int, count: int) -> Float:
-    """float64[count] what a star's plane is multiplied with along each axis, to fade into `add`'s light.
+    """Factors by which a star's plane is multiplied along each axis, to fade into the light of `add`.
 
-    size : of the plane, pixels;  samples : a pixel;  count : of samples, its middle in the middle
+    Parameters
+    ----------
+    size : int
+        Side of the plane, pixels.
+    samples : int
+        Samples per pixel.
+    count : int
+        Number of samples, centred on the plane.
+
+    Returns
+    -------
+    float array, shape (count,)
+        Factors from 0 to 1.
     """
     distance = np.abs(np.arange(count) - count // 2) / samples
     return np.array([far_light.fading_compiled(float(d), size / 2 - SPARED) for d in distance])

@@ -1,16 +1,13 @@
-"""The outer light of the largest galaxies, in real space: those that the largest stamp does not hold.
+"""Outer light of galaxies that are larger than the largest stamp, in real space.
 
-A stamp is periodic. Of a galaxy that outgrows it, what comes in at its edges is taken off, and what belongs outside is
-drawn there, pixel by pixel: there is no limit to how large a galaxy may be. So far out its profile is smooth on the
-scale of a pixel, and is evaluated in closed form (a bulge) or from a table (a disc, integrated along the line of
-sight). What the PSF does to it is small and smoother still: on blocks of pixels.
+A stamp is periodic. For a galaxy that exceeds it, the aliased light is removed from the stamp, and the light outside
+the stamp is drawn pixel by pixel. The size of a galaxy is therefore not limited. At these distances the profile is
+smooth on the scale of a pixel. A bulge is evaluated in closed form, and a disc from a table of its light integrated
+along the line of sight. The effect of the PSF is small and even smoother; it is evaluated on blocks of pixels.
 
-Outskirts     of one galaxy;  of_galaxy : the profile, PSF and all
-take_in       what came into its stamp, taken off;  add : what belongs outside, onto a frame
-surface_disk  light of an inclined disc of finite thickness
-reach         how far out a galaxy is noticed;  least_electrons : and what it takes
-
-Ref : van der Kruit & Searle 1981 (the disc's scale height)
+References
+----------
+van der Kruit & Searle 1981 (scale height of discs).
 """
 
 from __future__ import annotations
@@ -35,38 +32,49 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.selection import FARTHEST
 
-# CPU s, measured (2.5 GHz, one core), of a frame's pixel and of one of the stamp.
+# Measured CPU time, s (2.5 GHz, one core), per pixel of the frame and of the stamp.
 FRAME_S, STAMP_S = 6e-8, 4e-7
-# Part of a pixel's noise that is noticed of a galaxy: less than of an effect, for it is the same in many pixels.
+# Light of a galaxy is noticeable above this fraction of the pixel noise. The limit is lower than for effects, since the
+# light is coherent over many pixels.
 _NOTICED = 1e-2
-# Pixels between the nodes of what the PSF does, at most and at least; axis ratio for which the most will do; so many
-# nodes from a galaxy to the end of its light at most, if they are nearer to each other than that.
+# Spacing of the nodes for the effect of the PSF: largest and smallest, pixels; axis ratio from which the largest is
+# sufficient; largest number of nodes from a galaxy to the end of its light for smaller spacings.
 _BLOCK, _FINEST_BLOCK, _SLIM, _MOST_NODES = 8, 2, 0.025, 1536
-# Images of a galaxy are summed ring by ring about its stamp, to the last at most, until so many rings like one would
-# differ from even light by less than this, electrons a pixel.
+# Periodic images of a galaxy are summed in rings around its stamp, at most this number. The sum ends when the number of
+# the ring times its deviation from uniform light is below the second value, electrons per pixel.
 _RINGS, _UNEVEN = 64, 0.05
-# Pixels between the nodes of a ring: at least, of a stamp's side at most, and of the width of an ellipse so far out.
+# Spacing of the nodes in a ring: smallest, pixels; largest, in sides of a stamp; and as a fraction of the width of the
+# ellipse at that distance.
 _FINEST, _COARSEST, _SPACING_FRACTION = 4, 1.0 / 16.0, 0.2
-# A PSF without planes is looked at so far, pixels: behind an atmosphere 1e-5 of the light lies farther out.
+# Radius up to which a PSF without planes is evaluated, pixels. For an atmosphere, 1e-5 of the light lies beyond it.
 _MOFFAT = 128
-# Of a disc's table: nodes a direction, t of u = sinh t between them, points along the line of sight, scale lengths and
-# scale heights as far as which there is light, the least of it.
+# Table of a disc: nodes per axis; spacing of t, with u = sinh t; points along the line of sight; extent of the disc in
+# scale lengths and in scale heights; smallest light.
 _NODES, _STEP, _POINTS, _LENGTHS, _HEIGHTS, _DARK = 76, 1.0 / 16.0, 512, 45.0, 20.0, 1e-40
-# Light that is less than this, electrons a pixel, is left out.
+# Light below this is neglected, electrons per pixel.
 _NEGLIGIBLE = 1e-4
-# Axis ratio of the thinnest sources, bulges.
+# Smallest axis ratio of all sources, reached by bulges.
 _THINNEST = 0.02
-# Directions in which a profile is summed beyond a square.
+# Number of directions for the integral of a profile outside a square.
 _DIRECTIONS = 1440
 
 
 @dataclass(frozen=True, slots=True)
 class Outskirts:
-    """Of one galaxy, by pixels (x, y) from its middle.
+    """Light of one galaxy as a function of the pixel offset (x, y) from its middle.
 
-    light  : float64[11] of galaxy_shapes.on_the_sky, electrons; of the disc, matrix and light of the disc face-on
-    disk   : float64[n, n] log of the disc's light by u, v = sinh of the nodes;  across : v over the table's
-    blurred : float64[m, m] what the PSF adds to each pixel, on nodes `block` pixels apart, the galaxy in the middle
+    Attributes
+    ----------
+    light : float array, shape (11,)
+        Row of `galaxy_shapes.real_space_profile`, electrons, with matrix and light of the disc seen face-on.
+    disk : float array, shape (n, n)
+        Logarithm of the disc's light at u = sinh and v = w sinh of the nodes.
+    across : float
+        Ratio w of v to the sinh of the nodes, see `surface_disk`.
+    blurred : float array, shape (m, m)
+        Light that the PSF adds to a pixel, at nodes `block` pixels apart with the galaxy in the middle.
+    block : int
+        Spacing of these nodes, pixels.
     """
 
     light: Float
@@ -77,11 +85,30 @@ class Outskirts:
 
 
 def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
-    """Of a galaxy, the only one of `shape` and `form`.
+    """Compute the outskirts of a galaxy.
 
-    electrons : expected;  psf : of the detector;  weights : [planes] of transfer.basis_weights
-    farthest  : pixels, along columns or rows, that it is asked for
-    Error     : next to the stamp 1e-3 of the light there; of bulges slimmer than 1 : 50 along the axis a few per cent
+    Parameters
+    ----------
+    shape, form : Shapes, Forms
+        Shape and form of one galaxy.
+    electrons : float
+        Expected electrons.
+    psf : Psf
+        PSF of the detector.
+    weights : float array, shape (planes,)
+        Weights of `transfer.basis_weights`.
+    farthest : float
+        Largest distance along columns or rows at which light is needed, pixels.
+
+    Returns
+    -------
+    Outskirts
+        The outer light.
+
+    Notes
+    -----
+    The error next to the stamp is 1e-3 of the light there. For bulges thinner than 1 : 50 it is a few per cent along
+    the major axis.
     """
     light = galaxy_shapes.real_space_profile(shape, form)[0].copy()
     inclination = float(shape.inclination[0])
@@ -104,18 +131,30 @@ def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights:
 
 @lru_cache(maxsize=16)
 def surface_disk(inclination: float) -> tuple[Float, float]:
-    """(log of the light of a disc of scale length 1 and flux 1 at u, v = (sinh t, w sinh t); w).
+    """Table of the light of an inclined disc of finite thickness, with scale length 1 and flux 1.
 
-    exp(-R) sech^2(z / h) along the line of sight; t from -1 step on: the table goes on beyond its axes
-    inclination : deg;  returns : float64[u, v], along the major and the minor axis
-    Error : 1e-4, at the axes within half a scale length of the middle 3e-3, at the cusp of a disc seen face-on, which
-            lies in the stamp, 8e-3 within a fifth of a scale length
+    Parameters
+    ----------
+    inclination : float
+        Inclination, deg.
+
+    Returns
+    -------
+    (float array, float)
+        Logarithm of the light at u, v = (sinh t, w sinh t) along the major and minor axes, and w. The nodes of t start
+        one step below 0, so that the table extends beyond its axes.
+
+    Notes
+    -----
+    The light is the integral of exp(-R) sech^2(z / h) along the line of sight. The error is 1e-4. It is 3e-3 at the
+    axes within half a scale length of the middle. It is 8e-3 within a fifth of a scale length of the cusp of a face-on
+    disc, which lies inside the stamp.
     """
     cosine, sine = (float(f(np.radians(inclination))) for f in (np.cos, np.sin))
     wide = float(np.hypot(cosine, DISK_SCALE_HEIGHT))
     along = np.sinh(_STEP * np.abs(np.arange(-1, _NODES - 1)))
     u, v = along[:, None, None], wide * along[None, :, None]
-    # Where the line of sight is in the disc.
+    # Section of the line of sight inside the disc.
     thick = _HEIGHTS * DISK_SCALE_HEIGHT
     inverse = 1.0 / max(cosine, 1e-9), 1.0 / max(sine, 1e-9)
     first = np.maximum((-thick - v * sine) * inverse[0], (v * cosine - _LENGTHS) * inverse[1])
@@ -123,7 +162,7 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
     length = np.maximum(last - first, 0.0)
     s = first + length * (np.arange(_POINTS) + 0.5) / _POINTS
     height = np.abs(v * sine + s * cosine) / DISK_SCALE_HEIGHT
-    # sech^2, without an overflow.
+    # This form of sech^2 does not overflow.
     fading = np.exp(-2.0 * height)
     light = np.exp(-np.hypot(u, v * cosine - s * sine)) * 4.0 * fading / (1.0 + fading) ** 2
     total = light.sum(axis=2) * length[..., 0] / _POINTS / (4.0 * np.pi * DISK_SCALE_HEIGHT)
@@ -131,7 +170,7 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
 
 
 def _block(slim: float, farthest: float) -> int:
-    """Pixels between the nodes of what the PSF does to a galaxy of axis ratio `slim`, drawn to `farthest` pixels."""
+    """Spacing of the nodes for the PSF's effect, pixels, for axis ratio `slim` and light up to `farthest` pixels."""
     block = _BLOCK
     while block > _FINEST_BLOCK and slim < _SLIM * block / _BLOCK and farthest <= _MOST_NODES * (block // 2):
         block //= 2
@@ -139,9 +178,10 @@ def _block(slim: float, farthest: float) -> int:
 
 
 def _cells(psf: Psf, weights: Float, block: int) -> Float:
-    """What a PSF does to light on nodes `block` apart: itself, without what stays where it is.
+    """PSF minus a delta function, on nodes `block` pixels apart.
 
-    Each of its samples is shared among five nodes a direction, its moments up to the fourth kept, the pixel's added.
+    Each of its samples is distributed to five nodes per direction, which preserves moments up to the fourth and
+    includes the pixel.
     """
     if psf.planes is None:
         side = 2 * _MOFFAT * SAMPLES + 1
@@ -157,13 +197,13 @@ def _cells(psf: Psf, weights: Float, block: int) -> Float:
 
 
 def _shares(length: int, block: int, samples: int) -> Float:
-    """[length, nodes] of a line of samples about its middle one, `samples` of them a pixel."""
+    """Shares [length, nodes] of a line of samples in the nodes, about the middle, with `samples` per pixel."""
     place = (np.arange(length) - length // 2) / (samples * block)
     node = np.rint(place).astype(int)
     off, pixel = place - node, 1.0 / (12.0 * block**2)
     half = int(np.abs(node).max()) + 2
     out = np.zeros((length, 2 * half + 1))
-    # The moments of a pixel about the sample.
+    # Moments of a pixel about the node.
     first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
     fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
     for step, share in (
@@ -178,7 +218,17 @@ def _shares(length: int, block: int, samples: int) -> Float:
 
 
 def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
-    """Takes off a stamp [N, N], in place, what has come in at its edges of `some` galaxy at (x, y) of it, pixels."""
+    """Subtract the aliased light of a galaxy from its stamp.
+
+    Parameters
+    ----------
+    galaxy : Outskirts
+        Light of the galaxy.
+    stamp : array, shape (N, N)
+        Stamp, changed in place.
+    x, y : float
+        Position of the galaxy in the stamp, pixels.
+    """
     size, middle = len(stamp), galaxy.block * (len(galaxy.blurred) // 2)
     aliased, blurred, pixels = (
         distant_image_light(galaxy, size, x, y),
@@ -193,12 +243,26 @@ def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
 
 
 def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Float:
-    """What comes into a stamp of a galaxy at (x, y) from all of its images but those in the eight stamps next to it.
+    """Light in a stamp from all periodic images of a galaxy except those in the eight neighbouring stamps.
 
-    An ellipse's images are even light only where they are as wide as a stamp: the slimmer it is, the farther out.
-    size    : a power of two;  returns : float64[size, size] electrons
-    some    : the galaxy's outskirts
-    Error   : 0.05 electrons; of axis ratio 0.02 1e-3 of the light
+    Parameters
+    ----------
+    galaxy : Outskirts
+        Light of the galaxy.
+    size : int
+        Side of the stamp, pixels; a power of two.
+    x, y : float
+        Position of the galaxy in the stamp, pixels.
+
+    Returns
+    -------
+    float array, shape (size, size)
+        Electrons, with an error of 0.05 electrons; 1e-3 of the light for axis ratio 0.02.
+
+    Notes
+    -----
+    The images of an ellipse add up to uniform light only if they are wider than a stamp. This happens farther out for
+    thinner ellipses.
     """
     slim, pixels = slimness(galaxy.light, galaxy.across), np.arange(size)
     out, ring_sum, step = np.zeros((size, size)), np.zeros((1, 1)), 0
@@ -224,13 +288,13 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
 
 
 def _spline(values: Float, step: int) -> RectBivariateSpline:
-    """Through nodes `step` apart, the first at 0, in both directions."""
+    """Spline through nodes `step` apart in both directions, the first of them at 0."""
     nodes = step * np.arange(len(values))
     return RectBivariateSpline(nodes, nodes, values)
 
 
 def slimness(light: Float, across: float) -> float:
-    """Axis ratio on the pixels of the slimmer component;  light, across : of Outskirts."""
+    """Axis ratio of the thinner component on the pixels, for `light` and `across` of `Outskirts`."""
     out = 1.0
     for middle, first, width in ((BULGE, BULGE_FORM, 1.0), (DISK, DISK_FORM, across)):
         if light[middle] > 0.0:
@@ -244,10 +308,27 @@ def add(
     galaxy: Outskirts, frame: Int, column: float, row: float, hole: tuple[int, int, int], unread_rows: tuple[int, int],
     unit: float,
 ) -> int:  # fmt: skip
-    """Adds a galaxy at (column, row) to a frame of `unit` an electron, but for a stamp; returns how many units.
+    """Add a galaxy to a frame, except within its stamp.
 
-    hole : the stamp's first column and row, its side;  unread : rows of the frame that do not count, as of stamps.draw
-    some : the galaxy's outskirts;  frame : integers
+    Parameters
+    ----------
+    galaxy : Outskirts
+        Light of the galaxy.
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+    column, row : float
+        Position of the galaxy, pixels.
+    hole : (int, int, int)
+        First column, first row and side of the stamp.
+    unread_rows : (int, int)
+        Rows that are not counted in the result, see `stamps.Tally`.
+    unit : float
+        Units of the frame per electron.
+
+    Returns
+    -------
+    int
+        Light on the counted rows, in units.
     """
     return int(
         _add_galaxy(
@@ -267,10 +348,25 @@ def add(
 
 
 def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, min_radius: float) -> Float:
-    """float64[n] arcsec as far as which galaxies are noticed, from `least` in steps of a tenth, at most FARTHEST.
+    """Radius up to which galaxies are noticeable.
 
-    electrons   : float64[n] expected;  shapes : of the n galaxies
-    pixel_scale : arcsec;  noise : of a pixel, electrons;  least : arcsec
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons.
+    shapes : Shapes
+        Shapes of the n galaxies.
+    pixel_scale : float
+        Arcsec per pixel.
+    noise : float
+        Noise per pixel, electrons.
+    min_radius : float
+        Smallest radius, arcsec.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Radius in arcsec, `min_radius` to FARTHEST in steps of 10 %.
     """
     out, remaining = np.full(len(electrons), min(min_radius, FARTHEST)), np.arange(len(electrons))
     while len(remaining):
@@ -285,15 +381,27 @@ def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, mi
 
 
 def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float) -> float:
-    """Electrons of a galaxy that may be noticed at a distance, arcsec: no profile rises outward."""
+    """Smallest number of electrons of a galaxy that could be noticeable at a distance.
+
+    Parameters
+    ----------
+    distance : float
+        Distance from the galaxy, arcsec.
+    pixel_scale : float
+        Arcsec per pixel.
+    noise : float
+        Noise per pixel, electrons.
+
+    Returns
+    -------
+    float
+        Electrons. The limit uses that no profile rises outward.
+    """
     return float(_NOTICED * noise * np.pi * _THINNEST * (distance / pixel_scale) ** 2)
 
 
 def _light_outside_square(light: Float, across: float, half: float) -> float:
-    """Electrons outside a square of a half side about the middle, pixels.
-
-    across : of Outskirts. Error : the disc is thin
-    """
+    """Electrons outside a centred square of a given half side in pixels, for a thin disc."""
     angle = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)])
     total = 0.0
@@ -310,13 +418,13 @@ def _light_outside_square(light: Float, across: float, half: float) -> float:
 
 
 def _log_bulge_total(n: float) -> float:
-    """Log of all of a bulge's light over that in the middle, where exp(-(u^2 + v^2)^p), p = 1 / 2n."""
+    """Logarithm of a bulge's total light over that in the middle, for exp(-(u^2 + v^2)^p) with p = 1 / 2n."""
     return float(np.log(2 * np.pi * n) + gammaln(2 * n))
 
 
 @jit
 def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
-    """Electrons in a pixel at (x, y) of a galaxy's middle, as if there were no PSF."""
+    """Electrons in a pixel at an offset (x, y) from a galaxy's middle, without PSF."""
     out = 0.0
     if light[BULGE] > 0.0:
         u = light[BULGE_FORM] * x + light[BULGE_FORM + 1] * y
@@ -332,8 +440,8 @@ def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
 
 @jit
 def _from_table(disk: Float, u: float, v: float) -> Any:
-    """exp of the table between its nodes, cubic in both directions; nothing beyond it."""
-    # The first node lies one before the axis.
+    """Interpolate the table of a disc (cubic in both directions) and return its exponential; 0 beyond the table."""
+    # The axis is at node 1.
     a, b = u / _STEP + 1.0, v / _STEP + 1.0
     i, j = int(a), int(b)
     if i + 2 >= len(disk) or j + 2 >= len(disk):
@@ -351,7 +459,7 @@ def _from_table(disk: Float, u: float, v: float) -> Any:
 
 @jit
 def _cubic(part: float, node: int) -> Any:
-    """Share of a node, of four, in what lies `part` of the way from the second to the third."""
+    """Weight of one of four nodes for cubic interpolation at the fraction `part` between the second and third."""
     if node == 0:
         return -part * (part - 1.0) * (part - 2.0) / 6.0
     if node == 1:
@@ -363,7 +471,7 @@ def _cubic(part: float, node: int) -> Any:
 
 @jit
 def _bilinear(nodes: Float, x: float, y: float) -> Any:
-    """Linear between nodes a pixel of theirs apart; nothing beyond them."""
+    """Interpolate linearly between nodes at integer coordinates; 0 beyond them."""
     i, j = int(np.floor(y)), int(np.floor(x))
     if i < 0 or j < 0 or i + 1 >= nodes.shape[0] or j + 1 >= nodes.shape[1]:
         return 0.0
@@ -374,7 +482,7 @@ def _bilinear(nodes: Float, x: float, y: float) -> Any:
 
 @jit
 def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
-    """Electrons in a pixel at (x, y) from a galaxy's middle."""
+    """Electrons in a pixel at an offset (x, y) from a galaxy's middle."""
     middle = blurred.shape[0] // 2
     blur_light = _bilinear(blurred, x / block + middle, y / block + middle)
     return max(_light(light, disk, across, x, y) + blur_light, 0.0)
@@ -382,7 +490,7 @@ def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block
 
 @jit
 def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: float, out: Float) -> None:
-    """Adds the light of a galaxy at (x, y) to nodes `step` pixels apart, the first at 0."""
+    """Add the light of a galaxy at (x, y) to nodes `step` pixels apart, the first of them at 0."""
     for r in range(out.shape[0]):
         for c in range(out.shape[1]):
             out[r, c] += _light(light, disk, across, step * c - x, step * r - y)

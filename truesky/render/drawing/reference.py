@@ -1,7 +1,4 @@
-"""One source by GalSim's drawImage: what `stamps.draw` is held against.
-
-reference       one source by galsim's own drawImage: what `draw` is held against
-"""
+"""Draw a source by GalSim's drawImage, as a reference for `stamps.draw`."""
 
 from __future__ import annotations
 
@@ -15,19 +12,34 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.lensed_arcs import Picture
 from truesky.render.sources.source_list import Sources
 
-# What galsim takes for a point in the reference, arcsec.
+# Size of a point source in the reference, arcsec.
 _POINT = 1e-6
 
 
 def draw_reference(
     sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4
 ) -> Float:
-    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
+    """Draw a source by galsim.Convolve and drawImage with tight thresholds, independently of `stamps.draw`.
 
-    folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
-                        the middle of bright discs
-    sources, i : the list, and which of it;  psf : of the detector;  size : side of the image, pixels
-    returns : float64[size, size], lower left pixel at round(position) - size / 2
+    Parameters
+    ----------
+    sources : Sources
+        List of sources.
+    i : int
+        Number of the source in the list.
+    psf : Psf
+        PSF of the detector.
+    size : int
+        Side of the image, pixels.
+    folding : float
+        galsim's folding_threshold.
+    highest : float
+        galsim's maxk_threshold. A cut at 1e-4 changes the middle of bright discs by 3e-3 of the noise.
+
+    Returns
+    -------
+    float array, shape (size, size)
+        Electrons; the lower left pixel is at round(position) - size / 2.
     """
     settings = galsim.GSParams(
         folding_threshold=folding, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
@@ -38,7 +50,7 @@ def draw_reference(
     picture = sources.picture_of(i)
     if sources.shape[i] >= 0 or picture is not None:
         profile = _profile(sources, i)
-        # World frame, arcsec -> pixels, the flux kept.
+        # Convert from the world frame in arcsec to pixels, with constant flux.
         parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
     convolved = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
     x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
@@ -49,7 +61,7 @@ def draw_reference(
 
 
 def _profile(sources: Sources, i: int) -> galsim.GSObject:
-    """Of flux 1, world frame, arcsec; the structure of a disc as if it were thin."""
+    """Profile of flux 1 in the world frame, arcsec; the structure of a disc is treated as thin."""
     picture = sources.picture_of(i)
     if sources.shape[i] < 0 and picture is not None:
         return _galsim_image(picture, picture.image)
@@ -57,14 +69,14 @@ def _profile(sources: Sources, i: int) -> galsim.GSObject:
     smooth = galaxy_shapes.profile(shape, galaxy, _POINT)
     if picture is None:
         return smooth
-    # galsim has no image of flux 0: what is added, and what is taken.
+    # galsim does not allow images of flux 0, so positive and negative pixels are separate.
     positive, negative = (_galsim_image(picture, np.maximum(sign * picture.image, 0.0)) for sign in (1.0, -1.0))
     return smooth + (positive - negative) * (1.0 - float(shape.bulge_fraction[galaxy]))
 
 
 def _galsim_image(picture: Picture, pixels: Float32) -> galsim.GSObject:
-    """Some pixels of a picture as galsim interpolates them, world frame (u to the west), of the flux that they have."""
+    """Convert pixels of a picture to a galsim object of the same flux in the world frame (u to the west)."""
     image = galsim.Image(np.ascontiguousarray(pixels, float), scale=1.0)
-    # Padded more than by default: the transform is as good as the reference should be.
+    # More padding than the default gives the transform the accuracy of the reference.
     plain = galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)
     return plain.transform(*picture.matrix.ravel()).withFlux(float(pixels.sum(dtype=float)))

@@ -1,7 +1,4 @@
-"""The settings of drawing that an accuracy asks for, from the measured tables.
-
-settings_for, seconds_for   what an accuracy takes, from the measured table
-"""
+"""Settings of drawing for a requested accuracy, from the measured table."""
 
 from __future__ import annotations
 
@@ -14,14 +11,23 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What decides how much of a source is drawn.
+    """Limits for the light of a source that is neglected when it is drawn.
 
-    edge  : largest light at a stamp's edge, of a pixel's noise: the source's own, and of the PSF's spikes there
-    aliased : largest fraction of a source's flux that is aliased into its own aperture: a stamp is periodic
-    floor : Fourier samples of less than this are left out, 1 at k = 0
-    least : smallest side of a stamp, arcsec: what of the PSF a source keeps
-    positions : of the PSF on a detector, one of euclid.DEGREES
-    colours : that the PSF is made of, a divisor of sub_bands.PARTS
+    Attributes
+    ----------
+    edge : float
+        Largest light at the edge of a stamp, from the source and the spikes of its PSF, as a fraction of the pixel
+        noise.
+    aliased : float
+        Largest fraction of a source's flux that is aliased into its aperture, since a stamp is periodic.
+    floor : float
+        Fourier samples below this are neglected, relative to the sample at k = 0.
+    min_size_arcsec : float
+        Smallest side of a stamp, arcsec, to which the PSF of a source is cut.
+    positions : int
+        Number of PSF positions on a detector, one of `euclid.DEGREES`.
+    colours : int
+        Number of colours of the PSF, a divisor of `sub_bands.N_SUB_BANDS`.
     """
 
     edge: float
@@ -33,16 +39,16 @@ class Settings:
 
 
 def settings_for(requested: Accuracy) -> Settings:
-    """The cheapest settings whose measured errors are within an accuracy; BadInput where none are."""
+    """Return the fastest settings whose measured errors are within an accuracy, or raise BadInput."""
     return from_row(accuracy.fastest_row(requested))
 
 
 def from_row(row: Mapping[str, float]) -> Settings:
-    """Settings of a row of the measured table."""
+    """Return the settings in a row of the measured table."""
     integers = {name: int(row[name]) for name in ("positions", "colours")}
     return Settings(row["edge"], row["aliased"], row["floor"], row["min_size_arcsec"], **integers)
 
 
 def seconds_for(requested: Accuracy) -> float:
-    """CPU s of the sources of a VIS detector, measured with these settings."""
+    """Measured CPU time for the sources of a VIS detector with the fastest settings for an accuracy, s."""
     return accuracy.fastest_row(requested)["seconds"]

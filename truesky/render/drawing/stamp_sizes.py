@@ -1,25 +1,21 @@
-"""How large a source's stamp is, and how far beyond it the source may shine.
-
-stamp_sizes     pixels, from flux, shape, PSF, noise and settings
-reach, least_electrons   how far a source may show, and what it takes to show there
-touching_frame  sources that `draw` puts light of onto a frame
-has_far_light   points that do so beyond their stamps;  reaches : and how far
+"""Sizes of the stamps of sources, and the distance up to which sources shine beyond them.
 
 A stamp of side N is periodic: a pixel at x from the source's middle has F sum_m f(x + N m) electrons, where F is the
-flux, f(r) its fraction in a pixel at r, and m runs over pairs of whole numbers. A side is large enough if
+flux, f(r) its fraction in a pixel at r, and m runs over pairs of integers. A side is large enough if
 
-1. the light at the edge, F f(N / 2), is less than `edge` of a pixel's noise: a cut that is seen is a square around the
-   source. Of a PSF with spikes f(N / 2) is the largest along columns and rows; over a galaxy it is smeared.
-2. what is aliased is less than `aliased` of the flux in an aperture of area a about the source. There x is small, and
-   for f = c r^-k the sum over m other than 0 is c N^-k Z(k), with the lattice sum Z(k) = sum |m|^-k: 9.03 for the PSF's
-   k = 3, and no more than 6 for the flattest wings of galaxies. So a Z f(N) < aliased.
-   What biases shear is the part of it that changes with shear, d ln f / d gamma = k; from k = 3 on this counts for more
-   than the flux, and Z is multiplied by k / 3, k being taken between N and 1.05 N.
-3. it has the least side that an accuracy asks for, for the PSF's wings are drawn as a point's beyond the stamp
-   (wings.py): 4 half-light radii more for a galaxy.
+1. the light at the edge, F f(N / 2), is less than `edge` times the pixel noise, since a visible cut appears as a square
+   around the source. For a PSF with spikes, f(N / 2) is the largest value along columns and rows; over a galaxy it is
+   smeared.
+2. aliased light is less than `aliased` times the flux in an aperture of area a about the source. There x is small, and
+   for f = c r^-k the sum over m other than 0 is c N^-k Z(k), with the lattice sum Z(k) = sum |m|^-k. It is 9.03 for k =
+   3 of the PSF, and at most 6 for the flattest wings of galaxies. So a Z f(N) < aliased. Shear is biased by the part
+   that changes with shear, d ln f / d gamma = k. From k = 3 this matters more than the flux, and Z is multiplied by k /
+   3, with k measured between N and 1.05 N.
+3. it is at least the smallest side for an accuracy, plus 4 half-light radii for a galaxy, since the PSF's wings beyond
+   the stamp are drawn as for a point source (wings.py).
 
-A PSF in planes is cut to the stamp; its wings are not aliased. A cut by noise alone would bias faint sources, since
-what is aliased is coherent: condition 2 does not know the noise.
+A PSF in planes is cut to the stamp, and its wings are not aliased. A limit by noise alone would bias faint sources,
+since aliased light is coherent; condition 2 does not depend on the noise.
 """
 
 from __future__ import annotations
@@ -38,35 +34,35 @@ from truesky.render.sources import galaxy_shapes, selection
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
+# Sides with fast transforms. The last one limits the memory (its planes have 134 MB).
 SIZES = np.array(
     [32, 40, 48, 56, 64, 72, 80, 96, 112, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024, 1280, 1536, 2048]
 )
-# Light that wraps is counted in this aperture about the source: radius, arcsec.
+# Radius of the aperture about the source in which aliased light is counted, arcsec.
 _APERTURE = 1.0
-# A source's light a stamp's side away, times this, is what all its periodic images bring to its middle: the sum of
-# r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
+# Light of all periodic images in the middle of a source, relative to its light one stamp's side away: the sum of r^-3
+# over the square lattice (wings of the PSF), and the sum for the flattest wings of galaxies.
 _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
-# Logarithmic slope of the light that wraps from which on its response to shear is what counts, not its flux; and the
-# ratio of radii between which the slope is taken.
+# Logarithmic slope of aliased light from which its response to shear matters more than its flux; and the ratio of radii
+# between which the slope is measured.
 _RESPONSE, _SLOPE_RATIO = 3.0, 1.05
-# Of a galaxy's half-light radius, that its stamp is wider than a point's.
+# Additional width of a galaxy's stamp, in half-light radii.
 _EXTENT = 4.0
-# Axis ratio of the thinnest sources: discs of the scale height galaxy_shapes.py draws, seen edge-on.
+# Axis ratio of the thinnest sources: edge-on discs with the scale height of galaxy_shapes.py.
 _THINNEST = 0.1
-# Above this many electrons the rounding of single precision would show; and where no pixel may miss more than this of a
-# source's flux.
+# Double precision is needed for sources with more than BRIGHT electrons, and for sources of which less than the
+# fraction ROUNDING of the flux may be neglected.
 BRIGHT, ROUNDING = 1e7, 2.5e-8
-# Of a point behind good seeing, how much higher than the largest sample that is left out the rest may ring.
+# Amplitude of the ringing, relative to the largest neglected sample, for a point source in good seeing.
 _RINGING = 1.5
-# A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
+# Trails are drawn in pieces of at most this length, pixels, each on a separate stamp.
 _PIECE = 64.0
-# Of a galaxy's light, what may stay where it comes in at the stamp's edges: about what single precision sums to.
+# Fraction of a galaxy's light that may stay aliased at the edges of its stamp: about the error of single precision.
 _OUTSIDE = 2e-6
-# Of a galaxy's light, what may lie nearer than it should, beyond the stamp: a tenth of the 3e-3 that circles about it
-# are known to.
+# Fraction of a galaxy's light beyond its stamp that may be drawn too close to it: a tenth of the error 3e-3 of the
+# light in circles about the galaxy.
 _LOST = 3e-4
-# Half stamps, and pixels, as far as which it is drawn.
+# Distances up to which that light is drawn, in half stamps, and the largest one, pixels.
 _STEPS, _FARTHEST = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0), 2048.0
 
 
@@ -79,19 +75,36 @@ def stamp_sizes(
     settings: Settings,
     extra_pixels: Float | None = None,
 ) -> Int:
-    """Side of each source's stamp, pixels: int64[n], one of SIZES.
+    """Sides of the stamps of sources.
 
-    wider : float64[n] pixels that a stamp is wider than a point's: the length of a piece of a trail, a picture's side
-    noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
-            condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
-    electrons : float64[n] expected;  shape : int64[n] number in `shapes` of galaxies, -1 of points
-    psf       : of the detector;  settings : of the accuracy
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons.
+    shape : int array, shape (n,)
+        Number of the galaxy in `shapes`, -1 for point sources.
+    shapes : Shapes
+        Shapes of galaxies.
+    psf : Psf
+        PSF of the detector.
+    noise : float
+        Noise per pixel, electrons.
+    settings : Settings
+        Settings for the accuracy.
+    extra_pixels : float array, shape (n,), optional
+        Pixels by which a stamp must be wider than that of a point source: length of a piece of a trail, or side of a
+        picture.
+
+    Returns
+    -------
+    int array, shape (n,)
+        Sides in pixels, from SIZES.
     """
-    # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
+    # Beyond a stamp the PSF's wings are drawn as for a point source, so larger galaxies need wider stamps.
     min_size = np.full(len(shape), float(settings.min_size_arcsec))
     body = shape >= 0
     min_size[body] += _EXTENT * galaxy_shapes.half_light(shapes)[shape[body]]
-    # Of a galaxy the PSF's spikes, as wide as its core, are smeared over its width.
+    # The PSF's spikes are as wide as its core, and a galaxy smears them over its width.
     smeared, core = np.ones(len(shape)), psf.fwhm / psf.pixel_scale
     smeared[body] = core / (core + 2.0 * galaxy_shapes.half_light(shapes)[shape[body]] / psf.pixel_scale)
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
@@ -106,9 +119,9 @@ def stamp_sizes(
             light[body] = galaxy_shapes.surface_brightness(shapes.take(shape[remaining[body]]), at) * psf.pixel_scale**2
         edge, one_side_away, farther_away = light.T
         steepness = np.log(np.maximum(one_side_away, 1e-300) / np.maximum(farther_away, 1e-300))
-        # What shear makes of the light that wraps goes with how steeply it falls.
+        # The effect of shear on aliased light is proportional to its slope.
         steeper = np.maximum(steepness / (_RESPONSE * np.log(_SLOPE_RATIO)), 1.0)
-        # A PSF in planes is cut to the stamp and does not wrap.
+        # A PSF in planes is cut to the stamp and is not aliased.
         wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
         wrapped = (wings + _LATTICE_GALAXY * steeper * one_side_away) * aperture
         enough = (electrons[remaining] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.aliased)
@@ -123,53 +136,103 @@ def stamp_sizes(
 
 
 def smallest_allowed_sizes(sizes: Int, min_sides: Float) -> Int:
-    """Sides [n], one of SIZES, that are no smaller; wanted : [n] pixels that they hold besides, as far as any does."""
+    """Return the smallest allowed sides [n] of at least `sizes` and `min_sides` pixels, or the largest allowed one."""
     return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, np.maximum(sizes, min_sides)), len(SIZES) - 1)])
 
 
 def reach(pixel_scale: float) -> float:
-    """How far from a source it may shine, arcsec: beyond the corners of the largest stamp. So far sources are read."""
+    """Largest distance from a source at which its light is drawn, beyond the corners of the largest stamp, arcsec.
+
+    Sources up to this distance from a detector are read.
+    """
     return _FARTHEST * pixel_scale
 
 
 def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float, settings: Settings) -> float:
-    """Electrons of which a source must have more to show at a distance, arcsec, from its middle.
+    """Smallest number of electrons with which a source may be noticeable at a distance.
 
-    No profile rises outward: at its edge an ellipse is no brighter than all of the light spread over it.
-    pixel_scale : arcsec;  noise : of a pixel, electrons;  settings : of the accuracy
-    Error : of a source thinner than 1 : 10, the edge-on disc, what shows may be left out
+    Parameters
+    ----------
+    distance : float
+        Distance from the middle of the source, arcsec.
+    pixel_scale : float
+        Arcsec per pixel.
+    noise : float
+        Noise per pixel, electrons.
+    settings : Settings
+        Settings for the accuracy.
+
+    Returns
+    -------
+    float
+        Electrons.
+
+    Notes
+    -----
+    No profile rises outward: at its edge, an ellipse is no brighter than all its light spread over its area. Noticeable
+    light of sources thinner than 1 : 10, the edge-on disc, may be missed.
     """
     pixels = np.pi * _THINNEST * (distance / pixel_scale) ** 2
     return float(settings.edge * noise * pixels)
 
 
 def _extrapolate_profile(psf: Psf, light: Float, radius: Int) -> Float:
-    """psf.surface or psf.rim at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
+    """Values of `psf.surface` or `psf.rim` at any radius in pixels: wings of r^-3 beyond the table, 0 beyond planes."""
     last = len(light) - 1
     wing = light[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
     return np.where((radius < psf.side) | (psf.planes is None), wing, 0.0)
 
 
 def neglected_flux(electrons: Float, noise: float, settings: Settings) -> Float:
-    """Per source, the Fourier samples that `draw` may leave out: of its flux, and in the noise."""
+    """Fourier samples that may be neglected for each source, as a fraction of its flux.
+
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons.
+    noise : float
+        Noise per pixel, electrons.
+    settings : Settings
+        Settings for the accuracy: limits relative to the flux and to the noise.
+
+    Returns
+    -------
+    float array, shape (n,)
+        The fractions.
+    """
     return np.minimum(settings.floor, settings.edge * noise / np.maximum(_RINGING * electrons, 1e-30))
 
 
 def piece_length(length: Float) -> Float:
-    """Of the pieces that trails [n] of a length are drawn in, pixels."""
+    """Lengths of the pieces of trails [n], pixels."""
     return np.asarray(length / piece_count(length))
 
 
 def piece_count(length: Float) -> Int:
-    """How many they are [n]."""
+    """Numbers of the pieces of trails [n] of given lengths in pixels."""
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
 def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> Bool:
-    """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
+    """Find the sources at rest whose light may be noticeable on the frame, from their stamps or beyond them.
 
-    noise : of a pixel, electrons
-    sources, sizes : n sources and their stamps' sides;  psf : of the detector;  nx, ny : its pixels
+    Parameters
+    ----------
+    sources : Sources
+        n sources.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+    noise : float
+        Noise per pixel, electrons.
+    nx, ny : int
+        Columns and rows of the frame.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True if light may be noticeable.
     """
     column, row, electrons, shape, shapes = (
         sources.column, sources.row, sources.electrons, sources.shape, sources.shapes,
@@ -181,7 +244,7 @@ def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int
     )
     visible_sides_of_sources[largest] = np.ceil(2.0 * farthest / psf.pixel_scale).astype(np.int64)
     on_frame = selection.overlaps_frame(column, row, visible_sides_of_sources, nx, ny)
-    # What else of a galaxy may be seen there is looked at closer.
+    # Galaxies outside the frame are included if their light beyond the stamp reaches it.
     max_sides = 2.0 * np.minimum(_STEPS[-1] * sizes / 2, _FARTHEST)
     candidates = np.flatnonzero(~on_frame & (shape >= 0) & ~largest)
     candidates = candidates[
@@ -195,10 +258,25 @@ def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int
 
 
 def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
-    """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on.
+    """Find the point sources that are bright enough to shine beyond the PSF's plane.
 
-    electrons, sizes : float64[n] expected, int64[n] stamps' sides;  psf : of the detector
-    shape, picture   : int64[n] as of Sources, -1 of points; picture None: there are none
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    shape : int array, shape (n,)
+        Number of the shape, -1 for point sources.
+    picture : int array, shape (n,), or None
+        Number of the picture, -1 for none; None if no source has a picture.
+    psf : Psf
+        PSF of the detector.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True for these point sources.
     """
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
     return np.asarray(point & (sizes >= psf.side) & (electrons > BRIGHT) & (psf.edges is not None))
@@ -213,13 +291,35 @@ def visible_sides(
     noise: float,
     length: Float | None = None,
 ) -> Int:
-    """Sides of the squares about sources outside which none of their light is noticed, pixels: int64[n].
+    """Sides of the squares about sources outside which their light is not noticeable.
 
-    Of stamps, and of the PSF's wings beyond them; about points that shine beyond these all that is read of the sky
-    around (`reach`), and for their spikes more: to where no pixel has a tenth of its noise. Of a galaxy's own light
-    beyond its stamp `touching_frame` knows.
-    length : float64[n] of trails, pixels;  noise : of a pixel, electrons
-    electrons, sizes, shape, picture, psf : as of `has_far_light`
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Expected electrons.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    shape : int array, shape (n,)
+        Number of the shape, -1 for point sources.
+    picture : int array, shape (n,), or None
+        Number of the picture, -1 for none; None if no source has a picture.
+    psf : Psf
+        PSF of the detector.
+    noise : float
+        Noise per pixel, electrons.
+    length : float array, shape (n,), optional
+        Lengths of trails, pixels.
+
+    Returns
+    -------
+    int array, shape (n,)
+        Sides, pixels.
+
+    Notes
+    -----
+    The squares contain the stamps and the PSF's wings beyond them. For points with far light they contain all sky that
+    is read (`reach`), or more if the spikes exceed a tenth of the pixel noise beyond it. `touching_frame` takes into
+    account light of galaxies beyond their stamps.
     """
     length = np.zeros(len(sizes)) if length is None else length
     pieces = piece_count(length)
@@ -232,14 +332,31 @@ def visible_sides(
 
 
 def on_largest(shape: Int, sizes: Int) -> Bool:
-    """[n] True of galaxies that no stamp holds."""
+    """Mask [n] of the galaxies that are larger than the largest stamp."""
     return np.asarray((shape >= 0) & (sizes >= SIZES[-1]))
 
 
 def light_beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
-    """Of galaxies [n], (how far their light is drawn, pixels, 0 where none is beyond its stamp; the part of it there).
+    """Reach and fraction of the light of galaxies beyond their stamps.
 
-    Until no more than _LOST of the light lies farther out.
+    Parameters
+    ----------
+    shapes : Shapes
+        Shapes of n galaxies.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    pixel_scale : float
+        Arcsec per pixel.
+
+    Returns
+    -------
+    (float array, float array)
+        Distance up to which the light is drawn, pixels, 0 if there is no light beyond the stamp; and the fraction of
+        the light outside the stamp.
+
+    Notes
+    -----
+    At most the fraction _LOST of the light lies farther out.
     """
     half = sizes / 2
     outside_fraction = galaxy_shapes.flux_outside(shapes, half * pixel_scale)

@@ -1,14 +1,13 @@
-"""Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
+"""Draw sources on stamps in Fourier space, each with its PSF, and add them to a frame.
 
-A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
-that belongs outside its stamp comes in at the opposite edge. What of it reaches the middle is taken off and drawn where
-it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise,
-and where a PSF that has no planes leaves all of its wings (transfer.py).
-A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. A galaxy that the
-largest does not hold has its outer light from real space (outskirts.py). Nothing is lost, nothing is rescaled. A source
-whose stamp lies beside the frame sends in what is drawn beyond its stamp.
+The image of a stamp is the inverse transform of profile(k) PSF(k) pixel(k) on the k grid of the stamp. Light of a
+galaxy outside its stamp is aliased to the opposite edge. The part that reaches the middle is removed and drawn at its
+correct position, as are the PSF's wings beyond the stamp (wings.py). The rest stays at the edge, where it is below the
+noise. A PSF without planes leaves all of its wings there (transfer.py).
 
-draw            sources -> frame;  Tally : with what each brought
+A stamp is large enough that all aliased light is below a given fraction of the flux in the source's aperture. For a
+galaxy that exceeds the largest stamp, the outer light is drawn in real space (outskirts.py). No light is lost and no
+light is rescaled. A source whose stamp lies outside the frame contributes the light drawn beyond its stamp.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ from truesky.render.sources import galaxy_shapes, selection, sersic
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.source_list import Sources
 
-# In Fourier space such sources are followed to so many times what may be left out of them: at the most three
-# thousandths of what is cut off ring (seeing of two pixels).
+# Bright sources are followed in Fourier space down to this multiple of their neglected flux, since at most 0.3 % of the
+# part that is cut off rings (for seeing of two pixels).
 _RINGS = 1e2
-# Larger stamps are followed no farther than others.
+# Largest side of the stamps of sources that are followed beyond the default frequency, pixels.
 DEEP = 1024
-# Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
+# Stamps with larger sides sum the PSF's planes for each source, since all planes would not fit into memory.
 _SHARED = 512
-# For fewer than this a plane the planes are not worth their transforms.
+# With fewer sources per plane than this, transforming all planes takes longer than summing them for each source.
 _FEW = 0.5
-# Pixels of stamps that are transformed together.
+# Number of stamp pixels that are transformed together.
 _BATCH = 1 << 17
 
 
@@ -53,14 +52,30 @@ def draw(
     neglected: Float | None = None,
     tally: Tally | None = None,
 ) -> Float:
-    """Expected electrons of the sources alone.
+    """Draw the expected electrons of sources, without sky.
 
-    sizes    : int[n] from stamp_sizes;  neglected : float[n] from `neglected_flux`, None: nothing is left out
-    progress : called now and then with the number of sources drawn
-    tally    : to be filled with what of each source's stamp fell onto the frame
-    sources  : to be drawn;  psf : of the detector;  nx, ny : its pixels
-    returns  : float64[ny, nx], to half a unit of fourier.units_of a source (5e-7 electrons for all but the brightest);
-               the same, bit by bit, in any order of the sources
+    Parameters
+    ----------
+    sources : Sources
+        Sources to be drawn.
+    sizes : int array, shape (n,)
+        Sides of their stamps from `stamp_sizes`, pixels.
+    psf : Psf
+        PSF of the detector.
+    nx, ny : int
+        Columns and rows of the detector.
+    progress : callable, optional
+        Called repeatedly with the number of sources drawn.
+    neglected : float array, shape (n,), optional
+        Fourier samples that may be neglected, from `neglected_flux`; None to neglect nothing.
+    tally : Tally, optional
+        Filled with the light of each source's stamp on the frame.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons, rounded per source to half a unit of `fourier.units_of` (5e-7 electrons for all but the brightest
+        sources). The result does not depend on the order of the sources.
     """
     pieces, trail, parent = split_into_pieces(sources)
     piece_neglected = None if neglected is None else neglected[parent]
@@ -84,10 +99,14 @@ def draw(
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What of each source's stamp fell onto the frame.
+    """Light of each source's stamp that falls onto the frame.
 
-    electrons : float64[n], filled by `draw`
-    unread    : of the frame, the first row that does not count, and the first behind that counts again
+    Attributes
+    ----------
+    electrons : float array, shape (n,)
+        Filled by `draw`.
+    unread_rows : (int, int)
+        First row of the frame that is not counted, and the row after the last.
     """
 
     electrons: Float
@@ -95,9 +114,17 @@ class Tally:
 
 
 def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
-    """(what is drawn: each piece of a trail as a source [p], its own trail [p, 2] pixels, whose piece it is [p]).
+    """Split trails into pieces, and structured discs into the smooth source and the structure.
 
-    The structure of a disc is a piece besides.
+    Parameters
+    ----------
+    sources : Sources
+        n sources.
+
+    Returns
+    -------
+    (Sources, float array, int array)
+        The p pieces as sources; the trail of each piece [p, 2], pixels; the number of its source [p].
     """
     structured = np.flatnonzero(sources.has_structure)
     if len(structured):
@@ -107,7 +134,7 @@ def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
     count = stamp_sizes.piece_count(sources.trail_length)
     parent = np.repeat(np.arange(len(sources)), count)
     number = np.arange(len(parent)) - np.repeat(np.cumsum(count) - count, count)
-    # From the middle of the trail to that of the piece, in lengths of the trail.
+    # Offset from the middle of the trail to that of the piece, in lengths of the trail.
     along = (number + 0.5) / count[parent] - 0.5
     trail = sources.trail[parent]
     pieces = replace(
@@ -121,7 +148,7 @@ def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
 
 
 def _net_electrons(pieces: Sources) -> Float:
-    """[p] electrons that each brings: a disc's structure none, in the sum."""
+    """Net electrons of each piece [p]; 0 for the structure of a disc."""
     if pieces.picture is None or not any(picture.is_structure for picture in pieces.pictures):
         return pieces.electrons
     is_structure = np.array([*(picture.is_structure for picture in pieces.pictures), False])
@@ -129,7 +156,7 @@ def _net_electrons(pieces: Sources) -> Float:
 
 
 def _split_with_structure(sources: Sources, structured: Int) -> tuple[Sources, Float, Int]:
-    """`in_pieces` where some discs [m] have a structure: the sources without, then it, of the light of the discs."""
+    """Result of `split_into_pieces` if discs have a structure: first the smooth sources, then the structures."""
     assert sources.picture is not None
     bare = sources.picture.copy()
     bare[structured] = -1
@@ -145,17 +172,44 @@ def _split_with_structure(sources: Sources, structured: Int) -> tuple[Sources, F
 
 @dataclass(frozen=True, slots=True)
 class _PreparedSources:
-    """What is known of the pieces [p] before any is drawn.
+    """Properties of the pieces [p] that are computed before drawing.
 
-    trail, whole   : [p, 2] pixels that each moves by, whose piece it is;  sizes : of their stamps
-    weights        : [p, planes] of transfer.basis_weights
-    shapes, form   : of those that have a shape;  bodies, table : the kernel's arguments for each profile
-    cut, deep, reach : how far each is followed in Fourier space, whether farther than others, how far others are
-    left_out       : Fourier samples that may be left out of each
-    outside        : light of galaxies that is drawn beyond their stamps, of which `_draw_some` tells what was taken off
-    curve          : of kernels.frame.aliased_light
-    far, largest   : points that shine beyond the PSF's planes, galaxies that no stamp holds
-    unit           : of the frame's integers to an electron
+    Attributes
+    ----------
+    sources : Sources
+        The pieces.
+    trail : float array, shape (p, 2)
+        Displacement of each piece, pixels.
+    parent : int array, shape (p,)
+        Number of its source.
+    sizes : int array, shape (p,)
+        Sides of the stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+    weights : float array, shape (p, planes)
+        Weights of `transfer.basis_weights`.
+    shapes, form : Shapes, Forms
+        Shapes and forms of the pieces that have a shape.
+    profile_arguments, table : array
+        Arguments of the kernel for each profile, and the table of Sersic transforms.
+    cut : float array, shape (p,)
+        Frequency up to which each piece is followed, radian / pixel.
+    deep : bool array, shape (p,)
+        True for pieces that are followed beyond the default frequency.
+    reach : float
+        Default frequency, radian / pixel.
+    left_out : float array, shape (p,)
+        Fourier samples that may be neglected.
+    outside : wings.OutsideLight
+        Light of galaxies that is drawn beyond their stamps; `_draw_batch` stores the removed light in it.
+    curve : float array, shape (p, 5)
+        Result of `kernels.frame.aliased_light`.
+    has_far_light : bool array, shape (p,)
+        True for points that shine beyond the PSF's planes.
+    largest : bool array, shape (p,)
+        True for galaxies that are larger than the largest stamp.
+    unit : float
+        Units of the frame per electron.
     """
 
     sources: Sources
@@ -179,7 +233,7 @@ class _PreparedSources:
     unit: float
 
     def star(self, parts: Int) -> far_light.Star:
-        """A point at rest, or pieces of one trail."""
+        """Star for a point at rest, or for the pieces of one trail."""
         sources, first = self.sources, parts[0]
         electrons = float(sources.electrons[parts].sum())
         photons = None if sources.photons is None else sources.photons[first]
@@ -190,11 +244,11 @@ class _PreparedSources:
         )  # fmt: skip
 
     def outskirts(self, i: int, nx: int, ny: int) -> outskirts.Outskirts:
-        """Of galaxy i."""
+        """Outskirts of galaxy `i`."""
         sources = self.sources
         shape_row = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
         x, y = sources.column[i], sources.row[i]
-        # The corners of the stamps about its own, and of the frame.
+        # Distance to the corners of the neighbouring stamps and of the frame.
         farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
         galaxy_form = Forms(*(getattr(self.form, part.name)[shape_row] for part in fields(Forms)))
         light = float(sources.electrons[i])
@@ -231,7 +285,8 @@ def _prepare(
         deep=_extend_reach(cut, sources.electrons, sizes, left_out, psf, reach_arguments),
         reach=transfer.STEP * len(max_transfer),
         left_out=left_out,
-        # Of stamps that are not drawn, what would come in: 5 % from what would be taken off, 0.1 % of many together.
+        # For stamps that are not drawn, the aliased light approximates the removed light: to 5 % for single sources,
+        # and to 0.1 % for many together.
         outside=wings.OutsideLight(profile, curve[:, -1].copy(), farthest),
         curve=curve,
         has_far_light=stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf),
@@ -241,9 +296,9 @@ def _prepare(
 
 
 def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Iterator[tuple[Int, Transfer, Array]]:
-    """(sources of one size, the PSF's planes that they go through, their shares [n, planes]) of those on the frame.
+    """Yield (pieces of one stamp size, planes of their PSF, weights [n, planes]) for the stamps on the frame.
 
-    precise : those that are drawn in double precision
+    Pieces of the mask `precise` are drawn in double precision.
     """
     sources, psf = prepared.sources, prepared.psf
     for size in np.unique(prepared.sizes).tolist():
@@ -273,7 +328,7 @@ def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Itera
 def _add_outskirts(
     prepared: _PreparedSources, i: int, light: outskirts.Outskirts, frame: Int, unread_rows: tuple[int, int]
 ) -> float:
-    """What galaxy i has outside its stamp, onto the frame; returns the electrons that fell there."""
+    """Add the light of galaxy `i` outside its stamp to the frame, and return its electrons there."""
     place, size = (float(prepared.sources.column[i]), float(prepared.sources.row[i])), int(prepared.sizes[i])
     x_first, y_first = (int(np.rint(at)) - size // 2 for at in place)
     return float(
@@ -284,9 +339,9 @@ def _add_outskirts(
 def _draw_light_beyond_stamps(
     prepared: _PreparedSources, on_frame: Bool, frame: Int, fallen: Float, unread_rows: tuple[int, int]
 ) -> None:
-    """What galaxies have outside stamps that are not `here`, and points beyond the PSF's planes.
+    """Draw galaxies whose stamps are outside the frame, and points beyond the PSF's planes.
 
-    fallen : float64[p] electrons on the frame, to which the galaxies' are added
+    Electrons of these galaxies on the frame are added to `fallen` [p].
     """
     ny, nx = frame.shape
     for i in np.flatnonzero(prepared.largest & ~on_frame).tolist():
@@ -299,11 +354,10 @@ def _draw_light_beyond_stamps(
 def _extend_reach(
     cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf, reach_arguments: tuple[Array, ...]
 ) -> Bool:
-    """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
+    """Extend `cut` for bright sources until ringing is not noticeable, and return the mask [n] of these sources.
 
-    A hard edge in Fourier space rings by up to three thousandths of what it cuts off. Planes end by themselves.
-    left_out : of `neglected_flux`, what may be left out of a source, 0 = as of others
-    bodied   : arguments of fourier.reaches
+    A sharp edge in Fourier space rings by up to 0.3 % of the part that is cut off. Planes have a last frequency. In
+    `left_out`, 0 stands for the default limit. `reach_arguments` are arguments of `fourier.fourier_reach`.
     """
     floor = np.where(
         left_out > 0.0, np.clip(_RINGS * left_out, transfer.NEGLIGIBLE_DOUBLE, transfer.NEGLIGIBLE), transfer.NEGLIGIBLE
@@ -315,23 +369,38 @@ def _extend_reach(
         body, fraction, bulge, disk, table, row = reach_arguments
         arguments = body[indices], fraction[indices], bulge[indices], disk[indices], table, row[indices]
         new_reach = fourier.fourier_reach(max_transfer, transfer.STEP, *arguments, floor[indices])
-        # What memory holds: the largest stamps are followed as far as any.
+        # The limited memory does not allow a larger reach for the largest stamps.
         new_reach[sizes[indices] > DEEP] = np.minimum(new_reach[sizes[indices] > DEEP], transfer.HIGHEST)
         cut[indices] = np.maximum(cut[indices], new_reach)
     return deep
 
 
 def in_double_precision(sources: Sources, neglected: Float | None) -> Bool:
-    """[n] True of those that are drawn in double precision; neglected : of `draw`."""
+    """Mask [n] of the sources that are drawn in double precision; `neglected` is the argument of `draw`."""
     is_precise = np.zeros(len(sources), bool) if neglected is None else neglected < ROUNDING
     return np.asarray(is_precise | (sources.electrons > BRIGHT))
 
 
 def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bool) -> tuple[Int, Int]:
-    """Sources of a size that are drawn each through a PSF of its own, and those that share planes.
+    """Find sources of one stamp size that have individual PSFs, and sources that share the PSF's planes.
 
-    sources, sizes : n sources and their stamps' sides;  size : of the stamps that are wanted
-    psf            : of the detector;  precise : bool[n] drawn in double precision
+    Parameters
+    ----------
+    sources : Sources
+        n sources.
+    sizes : int array, shape (n,)
+        Sides of their stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+    size : int
+        Side of the selected stamps, pixels.
+    precise : bool array, shape (n,)
+        True for sources that are drawn in double precision.
+
+    Returns
+    -------
+    (int array, int array)
+        Indices of sources with individual PSFs, and of sources that share planes.
     """
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
@@ -348,7 +417,7 @@ def _draw_batch(
     frame: Int,
     unread_rows: tuple[int, int],
 ) -> Float:
-    """Stamps of one size through one set of planes, onto the frame; returns each source's electrons there."""
+    """Draw stamps of one size with one set of planes onto the frame, and return each source's electrons there."""
     sources, size = prepared.sources, psf_transfer.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
@@ -376,7 +445,7 @@ def _draw_batch(
     subtract_aliased(stamps, column - x0, row - y0, prepared.curve[chosen], removed)
     prepared.outside.electrons[chosen] = removed
     first, stamp_x, stamp_y, (ny, nx) = int(chosen[0]), int(x0[0]), int(y0[0]), frame.shape
-    # Of these, which are alone, what comes in at the stamp's edges is taken off.
+    # Sources with outskirts or far light are alone in their batch; their aliased light is removed here.
     outer = prepared.outskirts(first, nx, ny) if prepared.largest[first] else None
     if outer is not None:
         outskirts.remove_aliased(outer, stamps[0], float(column[0]) - stamp_x, float(row[0]) - stamp_y)
@@ -396,7 +465,7 @@ def _forms(sources: Sources) -> tuple[Shapes, Forms]:
 
 
 def _profile_arguments(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
-    """The kernel's arguments of each source's profile: body, fraction, bulge, disk, thick, row, row_weights."""
+    """Arguments of the kernel for each profile: body, fraction, bulge, disk, thick, row, row_weights."""
     n, body = len(sources), sources.shape >= 0
     fraction, row, row_weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
     bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
@@ -409,15 +478,15 @@ def _profile_arguments(sources: Sources, shapes: Shapes, form: Forms) -> tuple[A
 def _light_outside(
     sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float
 ) -> tuple[Float, Float, Float]:
-    """Of sources [n], what leaves their stamps.
+    """Light of sources [n] outside their stamps.
 
-    returns : ([n, 11] galaxy_shapes.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far,
-              pixels: until no more than _LOST of the light lies farther out; [n] electrons at most)
+    Returns the profiles [n, 11] of `galaxy_shapes.real_space_profile`, in electrons and 0 if no light leaves the stamp;
+    the distances [n] up to which the light is drawn, pixels; and upper limits [n] of the light, electrons.
     """
     body = sources.shape >= 0
     profile, light_reach, max_electrons = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
     light_reach[body], outside_fraction = stamp_sizes.light_beyond_stamps(shapes, sizes[body], pixel_scale)
-    # The largest have outskirts.
+    # The outer light of the largest galaxies is drawn by outskirts.py.
     light_reach[stamp_sizes.on_largest(sources.shape, sizes)] = 0.0
     sky = galaxy_shapes.real_space_profile(shapes, form)
     sky[:, [BULGE, DISK]] *= np.where(light_reach[body] > 0, sources.electrons[body], 0.0)[:, None]

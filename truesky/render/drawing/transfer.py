@@ -1,16 +1,4 @@
-"""What passes a PSF and the pixels: transfer functions on the Fourier grids of stamps.
-
-basis_weights what each source takes of the PSF's planes: its colour, its place on the detector
-plane_count   how many there are
-passing       how much passes at most, by frequency
-folding       how much less may be left out where pixels are coarse
-grid          the samples of a stamp's half plane inside a disc, in the order in which the kernel takes them
-transfer      all planes of a PSF on such a grid
-collapsed     the one of a single source
-image_of      its image
-sheared_spectrum  of a plane, in coordinates that a row rises in
-profile_of    the same as a galsim object, for the reference
-"""
+"""Transfer functions of the PSF and the pixel on the Fourier grids of stamps."""
 
 from __future__ import annotations
 
@@ -29,30 +17,40 @@ from truesky.render.drawing.kernels import fourier
 from truesky.render.effects.light import intra_pixel
 from truesky.render.psf.model import SIDE, Planes, Psf, galsim_profile, profile_spectrum
 
-# radian / pixel between the samples of `passing`: those of a stamp of 32 pixels.
+# Spacing of the samples of `max_transfer`, radian / pixel: the frequency step of a stamp of 32 pixels.
 STEP = 2 * np.pi / 32
-# What passes less than this in single precision passes nothing; in double precision that is less than this.
+# Transfer functions below this are negligible, in single and in double precision.
 NEGLIGIBLE, NEGLIGIBLE_DOUBLE = 1e-7, 1e-14
-# Frequencies beyond this are not looked at through a PSF without planes, which has no last frequency: two and a half
-# times the Nyquist frequency; of bright sources four times.
+# A PSF without planes has no last frequency. It is followed up to 2.5 times the Nyquist frequency, and up to 4 times
+# for bright sources.
 HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
-# Samples that the kernel takes together: their planes stay in the cache.
+# Number of samples that the kernel processes together, so that their planes stay in the cache.
 _PIECE_SAMPLES = 1024
-# A PSF, pixel included, of fewer pixels FWHM passes so much beyond half a cycle a pixel that what is left out there
-# folds onto the frequencies that sizes and shapes are measured at; and the part that may still be left out. Chosen on
-# 144 sources through NISP's PSF in Y and H: their R2 is then wrong by 1.2e-4 at the most, their ellipticity by 3.7e-5
-# (3.2e-4, 1.7e-4 with all of it), in no more time.
+# A PSF, including the pixel, with a FWHM below the first number of pixels is coarsely sampled: samples neglected above
+# the Nyquist frequency alias onto the frequencies of sizes and shapes. Only the second fraction of the usual limit may
+# then be neglected. It was chosen for 144 sources with NISP's PSF in Y and H: errors of R2 are at most 1.2e-4, errors
+# of the ellipticity at most 3.7e-5 (3.2e-4 and 1.7e-4 with the usual limit), without more CPU time.
 _COARSE, _FOLDING = 1.3, 0.1
-# Stamp that `passing` is measured on, pixels.
+# Side of the stamp on which `max_transfer` is measured, pixels.
 _PROBE = 64
 
 
 def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
-    """float64[n, planes]: the share of each plane of `transfer` in each source's PSF.
+    """Weights of the PSF's planes for each source, from its colour and its position on the detector.
 
-    photons     : [n, w] fraction of its photons in each sub-band; None: flat f_nu
-    column, row : [n] pixels
-    psf         : of the detector
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    photons : float array, shape (n, w), or None
+        Fraction of the source's photons in each sub-band; None for flat f_nu.
+    column, row : float array, shape (n,)
+        Positions, pixels.
+
+    Returns
+    -------
+    float array, shape (n, planes)
+        Weights of the planes of `transfer`.
     """
     planes, n = psf.planes, len(column)
     if planes is None:
@@ -60,9 +58,9 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
     waves = planes.wavelength
     if photons is None:
         photons = np.full((n, len(waves)), 1.0 / len(waves))
-    # Of neighbouring sub-bands the PSF may have one plane.
+    # Neighbouring sub-bands may share one plane of the PSF.
     photons = photons.reshape(n, len(waves), photons.shape[1] // len(waves)).sum(axis=2)
-    # Beyond the border the polynomial is held.
+    # Beyond the border of the detector, the polynomial is constant.
     x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
     y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
     redder = matrices.matmul(photons, waves) - waves.mean()
@@ -72,16 +70,26 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The samples of a stamp's Fourier half plane inside a disc, and of its aliases: s samples, in pieces of runs.
+    """Samples of a stamp's Fourier half plane inside a disc, and of its aliases: s samples, in pieces of runs.
 
-    A sample lies at (ix, iy) times 2 pi / size radian / pixel and adds to the half plane's place (iy, ix) modulo
-    size. Runs are of samples with one iy and consecutive ix; pieces are whole runs of about one |k|, which a source
-    that reaches less far leaves out.
+    Attributes
+    ----------
+    size : int
+        Side of the stamp, pixels.
+    kx, ky : float32 array, shape (s,)
+        Frequencies, radian / pixel.
+    runs : int array, shape (r + 1, 3)
+        First sample, its ix and its iy for each run; the last row contains s.
+    pieces : int array, shape (p + 1,)
+        First run of each piece.
+    inner : float array, shape (p,)
+        Smallest |k| in the piece, radian / pixel.
 
-    kx, ky : float32[s] radian / pixel
-    runs   : int64[r + 1, 3] first sample, its ix, its iy; the last is s
-    pieces : int64[p + 1] first run
-    inner  : float64[p] smallest |k|, radian / pixel
+    Notes
+    -----
+    A sample lies at (ix, iy) times 2 pi / size radian / pixel and is added to the half plane at (iy, ix) modulo size. A
+    run contains samples with one iy and consecutive ix. A piece contains whole runs with similar |k|, and is omitted
+    for sources with a smaller reach.
     """
 
     size: int
@@ -94,14 +102,22 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """PSF times pixel on a grid: planes float[b, 2, s], real and imaginary parts."""
+    """Product of the transforms of PSF and pixel on a grid.
+
+    Attributes
+    ----------
+    grid : Grid
+        The samples.
+    planes : float array, shape (b, 2, s)
+        Real and imaginary parts of each plane.
+    """
 
     grid: Grid
     planes: Array
 
 
 def grid(size: int, reach: float) -> Grid:
-    """Samples of a stamp of `size` pixels at |k| <= reach, radian / pixel."""
+    """Samples of a stamp of `size` pixels with |k| <= reach, in radian / pixel."""
     return _cached_grid(size, reach) if size <= SIDE else _grid(size, reach)
 
 
@@ -118,7 +134,7 @@ def _grid(size: int, reach: float) -> Grid:
     fourier.runs(size, reach / step, shells, runs)
     runs[-1] = samples, 0, 0, shells
     first, ix, iy, shell = runs.T
-    # A piece is full after so many samples, or at the end of its shell.
+    # A piece ends after _PIECE_SAMPLES samples, or at the end of its shell.
     start = first[np.searchsorted(shell, shell)]
     part = (first - start) // _PIECE_SAMPLES + shell * (samples // _PIECE_SAMPLES + 1)
     pieces = np.concatenate([[0], np.flatnonzero(np.diff(part)) + 1]).astype(np.int64)
@@ -130,21 +146,32 @@ def _grid(size: int, reach: float) -> Grid:
 
 
 def plane_count(psf: Psf) -> int:
-    """How many planes `transfer` has."""
+    """Number of planes of `transfer`."""
     return 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
 
 
 def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
-    """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; less than `least` beyond.
+    """Largest modulus of the transforms of PSF times pixel at |k| = i STEP radian / pixel.
 
-    least : below NOTHING of a PSF without planes, for what is drawn in double precision
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    min_value : float
+        The result ends where the modulus is smaller than this. Values below NEGLIGIBLE are for double precision and a
+        PSF without planes.
+
+    Returns
+    -------
+    float array
+        The moduli.
     """
     bright = min_value < NEGLIGIBLE
     probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else psf.planes.max_frequency if psf.planes else HIGHEST)
     if psf.planes is None:
         planes = _planes(psf, probe, np.float64 if bright else np.float32)
     else:
-        # A smooth edge: a sharp one passes some of every frequency.
+        # The window has a smooth edge, since a sharp edge contains all frequencies.
         samples = psf.planes.samples
         window = np.hanning(samples * _PROBE + 1).astype(np.float32)
         middle = _middle(psf.planes.images, samples * _PROBE)
@@ -157,42 +184,72 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
 
 
 def neglect_factor(psf: Psf) -> float:
-    """Of the Fourier samples that may be left out of a source, the part that may be through this PSF."""
+    """Factor of the negligible Fourier samples of a source for this PSF: below 1 if the pixels are coarse."""
     return _FOLDING if psf.fwhm < _COARSE * psf.pixel_scale else 1.0
 
 
 def transfer(psf: Psf, size: int, reach: float) -> Transfer:
-    """All planes of a PSF for stamps of `size` pixels, single precision, up to |k| = reach."""
+    """All planes of a PSF for stamps of one size, in single precision.
+
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    size : int
+        Side of the stamps, pixels.
+    reach : float
+        Largest |k|, radian / pixel.
+
+    Returns
+    -------
+    Transfer
+        The planes.
+    """
     stamp_grid = grid(size, reach)
     return Transfer(stamp_grid, _planes(psf, stamp_grid, np.float32))
 
 
 def source_transfer(psf: Psf, weights: Float, stamp_grid: Grid, dtype: type[Any], fading: bool = False) -> Transfer:
-    """One plane: a source's own PSF, for large stamps or in double precision (float64).
+    """Transfer function of one source, for large stamps or for double precision.
 
-    weights : [planes] from basis_weights;  fading : towards its border, into what far_light.py draws
-    psf     : of the detector;  some : the stamp's Fourier grid;  dtype : of the plane
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    weights : float array, shape (planes,)
+        Weights of `basis_weights`.
+    stamp_grid : Grid
+        Fourier grid of the stamp.
+    dtype : type
+        Data type of the plane, float32 or float64.
+    fading : bool
+        True to fade the PSF towards its border, where far_light.py draws the rest.
+
+    Returns
+    -------
+    Transfer
+        One plane.
     """
     if psf.planes is None:
         return Transfer(stamp_grid, _planes(psf, stamp_grid, dtype))
     samples = psf.planes.samples
     image = _sum_planes(psf.planes, weights, samples * stamp_grid.size).astype(dtype)
     if fading:
-        # A stamp may be wider than the plane, for a trail.
+        # The stamp of a trail may be wider than the plane.
         window = far_light.fading_window(psf.side, samples, len(image))
         image *= window[:, None] * window
     return Transfer(stamp_grid, _on_grid([image], samples, stamp_grid, psf.intra_pixel, dtype))
 
 
 def profile_of(psf: Psf, weights: Float) -> Any:
-    """A source's own PSF as a galsim object, arcsec."""
+    """PSF of a source with given weights of the planes, as a galsim object in arcsec."""
     if psf.planes is None:
         return psf.profile
     return galsim_profile(image_of(psf.planes, weights), psf.pixel_scale / psf.planes.samples, exact=True)
 
 
 def image_of(planes: Planes, weights: Float) -> Float32:
-    """A source's own PSF in the planes' samples."""
+    """PSF of a source with given weights, in the samples of the planes."""
     return _sum_planes(planes, weights, planes.images.shape[1])
 
 
@@ -210,16 +267,15 @@ def _planes(psf: Psf, stamp_grid: Grid, dtype: type[Any]) -> Array:
 
 
 def _move_wings_to_edges(spectrum: Array, psf: Psf, size: int) -> None:
-    """The wings that come into a stamp at its edges leave its middle for its edges: no light is lost.
+    """Move the aliased wings of the PSF from the middle of a stamp to its edges without loss of light.
 
-    Harmonics of the stamp, one (cos u + cos v) + both cos u cos v, are added that cancel them in the middle to second
-    order in u, v = 2 pi x / size, 2 pi y / size.
-    spectrum : of spectrum_of
+    The added harmonics of the stamp, a (cos u + cos v) + b cos u cos v with u, v = 2 pi x / size, 2 pi y / size, cancel
+    the wings in the middle to second order. The spectrum is that of `profile_spectrum`, changed in place.
     """
     axis_distance, diagonal_step = size / 8.0, size / 8.0 / np.sqrt(2.0)
     middle = _image_light(psf, size, 0.0, 0.0)
     off = 0.5 * (_image_light(psf, size, axis_distance, 0.0) + _image_light(psf, size, diagonal_step, diagonal_step))
-    # The images' light is middle + slope (u^2 + v^2).
+    # The light of the images is middle + slope (u^2 + v^2).
     slope = (off - middle) / (2 * np.pi / 8.0) ** 2
     axis_amplitude, product_amplitude = -middle - 2.0 * slope, middle + 4.0 * slope
     for iy in (-1, 0, 1):
@@ -229,7 +285,7 @@ def _move_wings_to_edges(spectrum: Array, psf: Psf, size: int) -> None:
 
 
 def _image_light(psf: Psf, size: int, x: float, y: float) -> float:
-    """Of a star's light, that of its images in the stamps about, two deep, in a pixel at (x, y) from its middle."""
+    """Light of a star's images in the two rings of stamps around its stamp, in a pixel at (x, y) from its middle."""
     steps = [n * size for n in range(-2, 3)]
     places = [(x - c, y - r) for r in steps for c in steps if r or c]
     light = [psf.profile.xValue(u * psf.pixel_scale, v * psf.pixel_scale) for u, v in places]
@@ -246,7 +302,7 @@ def _on_grid(images: list[Array], samples: int, stamp_grid: Grid, strength: floa
 
 
 def _pixel(stamp_grid: Grid, strength: float | None) -> Float:
-    """The pixel's transfer function at |iy|, |ix|; strength : of its response, 0 = even all over, None = 1."""
+    """Transfer function [|iy|, |ix|] of the pixel; a strength of 0 is a uniform response, and None gives 1."""
     step = 2 * np.pi / stamp_grid.size
     columns, rows = (
         np.arange(round(float(np.abs(k).max(initial=0.0)) / step) + 1) for k in (stamp_grid.kx, stamp_grid.ky)
@@ -257,7 +313,7 @@ def _pixel(stamp_grid: Grid, strength: float | None) -> Float:
 
 
 def _sum_planes(planes: Planes, weights: Float, side: int) -> Float32:
-    """The planes' sum, cut to `side` samples or one more."""
+    """Weighted sum of the planes, cut to `side` samples or one more."""
     images, drift = _middle(planes.images, side), _middle(planes.drift, side)
     image = np.zeros(images.shape[1:], np.float32)
     margin = (len(image) - drift.shape[1]) // 2
@@ -267,16 +323,32 @@ def _sum_planes(planes: Planes, weights: Float, side: int) -> Float32:
 
 
 def _middle(images: Float32, side: int) -> Float32:
-    """The middle of square planes [b, s, s], `side` samples or one more."""
+    """Middle of square planes [b, s, s], with `side` samples or one more."""
     margin = max((images.shape[1] - side) // 2, 0)
     return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
 
 
 def spectrum(image: Array, period: int, columns: int) -> Array:
-    """Fourier transform of a plane on the grid of a stamp of `period` samples: complex[period, columns], the first.
+    """Fourier transform of a plane on the grid of a stamp.
 
-    A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge. Rows and columns that
-    are empty, or not asked for, are not transformed.
+    Parameters
+    ----------
+    image : array, shape (s, s)
+        The plane.
+    period : int
+        Side of the stamp, samples.
+    columns : int
+        Number of columns of the result.
+
+    Returns
+    -------
+    complex array, shape (period, columns)
+        The first columns of the transform.
+
+    Notes
+    -----
+    The plane is cut to the stamp, since its wings would otherwise be aliased. Rows and columns that are empty, or not
+    needed, are not transformed.
     """
     image = _middle(image[None], period)[0]
     lines = scipy.fft.rfft(_from_middle(image, period, 1), axis=1)[:, :columns]
@@ -284,7 +356,24 @@ def spectrum(image: Array, period: int, columns: int) -> Array:
 
 
 def sheared_spectrum(image: Array, period: int, columns: int, shear: float) -> Array:
-    """The same of an image in coordinates u = x, v = y - shear x, transposed: complex[period, columns], v's first."""
+    """Fourier transform of a plane in the coordinates u = x, v = y - shear x, transposed.
+
+    Parameters
+    ----------
+    image : array, shape (s, s)
+        The plane.
+    period : int
+        Side of the stamp, samples.
+    columns : int
+        Number of columns of the result.
+    shear : float
+        Shear of the coordinates.
+
+    Returns
+    -------
+    complex array, shape (period, columns)
+        Frequencies of u in rows, and the first frequencies of v in columns.
+    """
     image = _middle(image[None], period)[0]
     middle = np.arange(image.shape[1]) - image.shape[1] // 2
     lines = scipy.fft.rfft(_from_middle(image, period, 0), axis=0)[:columns]
@@ -295,7 +384,7 @@ def sheared_spectrum(image: Array, period: int, columns: int, shear: float) -> A
 
 
 def _from_middle(image: Array, period: int, axis: int) -> Array:
-    """Filled up to the period along an axis, the middle first; of one too many the last is added to the first."""
+    """Pad an axis to the period and roll its middle to index 0; a surplus last sample is added to the first."""
     shape = list(image.shape)
     shape[axis] = period
     out = np.zeros(shape, image.dtype)

@@ -1,8 +1,9 @@
-"""The light of the PSF beyond the stamps: faint, smooth, and too far out to be drawn for each source.
+"""Light of the PSF beyond the stamps, drawn for all sources together.
 
-A stamp is as large as the noise and the source's own light ask for, and the PSF is cut to it. What is cut off (in VIS
-2 % of the light, beyond 3") lies below the noise of a pixel, but it belongs to the sky: of all sources together it is
-drawn here on blocks of pixels, through the mean PSF. So is what the stamps of galaxies do not hold of their own light.
+The size of a stamp depends on the noise and on the source's profile, and the PSF is cut to it. The light that is cut
+off (2 % in VIS, beyond 3 arcsec) lies below the noise of a pixel, but it is a part of the sky. For all sources together
+it is drawn here on blocks of pixels, with the mean PSF. Light of galaxies outside their stamps is drawn in the same
+way.
 """
 
 from __future__ import annotations
@@ -16,24 +17,46 @@ from truesky.render.drawing.kernels import frame
 from truesky.render.psf.model import SIDE, Psf
 from truesky.render.sources import selection
 
-# Side of a block, pixels; all stamps are whole numbers of them.
+# Side of a block, pixels. All stamps consist of whole blocks.
 BLOCK = 8
-# Blocks from a point to where its wings end, and as many are there beyond the frame: who draws has to name the sources
-# that lie so far out.
+# Number of blocks from a point to the end of its wings, and number of blocks on each side of the frame. The caller must
+# include the sources in these blocks.
 MARGIN = SIDE // 2 // BLOCK + 1
-# Pixels by which light on blocks is wider, to each side, than it is said to be: cut and interpolated between them.
+# Pixels by which light on blocks extends beyond its nominal square, to each side, because of whole blocks and
+# interpolation.
 _WIDER = 3.0 * BLOCK
 
 
 def wings(
     column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int, unit: float
 ) -> Float:  # fmt: skip
-    """Electrons a pixel of sources [n] beyond stamps of `sizes`, on blocks, MARGIN of them before the frame's first.
+    """Light of sources beyond their stamps, on blocks.
 
-    unit    : of the blocks' integers to an electron
-    column, row, electrons : float64[n] pixels, and expected;  psf : of the detector;  nx, ny : its pixels
-    returns : float64[blocks, blocks], the same in any order of the sources
-    Error   : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
+    Parameters
+    ----------
+    column, row : float array, shape (n,)
+        Positions, pixels.
+    electrons : float array, shape (n,)
+        Expected electrons.
+    sizes : int array, shape (n,)
+        Sides of the stamps, pixels.
+    psf : Psf
+        PSF of the detector.
+    nx, ny : int
+        Columns and rows of the detector.
+    unit : float
+        Units of the blocks' integers per electron.
+
+    Returns
+    -------
+    float array
+        Electrons per pixel on blocks, MARGIN of which lie before the first pixel of the frame. The result does not
+        depend on the order of the sources.
+
+    Notes
+    -----
+    The PSF of mean colour at the detector's centre is used, on blocks. The error is a few per cent of the light beyond
+    the stamp.
     """
     out = _layer(nx, ny)
     if psf.planes is None:
@@ -55,7 +78,14 @@ def _layer(nx: int, ny: int) -> Int:
 class OutsideLight(NamedTuple):
     """Light of galaxies [n] outside their stamps.
 
-    profile : float64[n, 11] galaxy_shapes.on_the_sky;  electrons : [n] that leave the stamp;  reach : [n] pixels
+    Attributes
+    ----------
+    profile : float array, shape (n, 11)
+        Rows of `galaxy_shapes.real_space_profile`.
+    electrons : float array, shape (n,)
+        Electrons outside the stamp.
+    reach : float array, shape (n,)
+        Distance up to which the light is drawn, pixels.
     """
 
     profile: Float
@@ -64,13 +94,30 @@ class OutsideLight(NamedTuple):
 
 
 def galaxies(column: Float, row: Float, outside: OutsideLight, sizes: Int, nx: int, ny: int, unit: float) -> Float:
-    """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
+    """Light of galaxies outside their stamps, on the blocks of `wings`.
 
-    column, row : float64[n] pixels;  outside : what is taken off their stamps
-    nx, ny      : pixels of the detector;  unit : of the blocks' integers to an electron
-    returns : float64[blocks, blocks], the same in any order of the galaxies
-    Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
-              a block has whole units a pixel: of the faintest little is seen
+    Parameters
+    ----------
+    column, row : float array, shape (n,)
+        Positions, pixels.
+    outside : OutsideLight
+        Light that was removed from their stamps.
+    sizes : int array, shape (n,)
+        Sides of the stamps, pixels.
+    nx, ny : int
+        Columns and rows of the detector.
+    unit : float
+        Units of the blocks' integers per electron.
+
+    Returns
+    -------
+    float array
+        Electrons per pixel on blocks. The result does not depend on the order of the galaxies.
+
+    Notes
+    -----
+    The effect of the PSF at these distances is neglected. Light that remains on the stamp is not moved. Blocks have
+    integer units per pixel, so that very faint light is lost.
     """
     out = _layer(nx, ny)
     selected = (outside.electrons > 0) & selection.overlaps_frame(column, row, region_side(2.0 * outside.reach), nx, ny)
@@ -82,12 +129,12 @@ def galaxies(column: Float, row: Float, outside: OutsideLight, sizes: Int, nx: i
 
 
 def region_side(sides: Float) -> Float:
-    """Sides of the squares, pixels, that light shows in that is drawn on blocks in squares of such sides."""
+    """Sides of the squares, in pixels, that receive light from blocks drawn in squares of given sides."""
     return sides + 2.0 * _WIDER
 
 
 def _half_block_sums(plane: Float32, samples: int) -> Float:
-    """A plane, `samples` a pixel, summed on squares of half a block, an even number of them about its middle."""
+    """Sums of a plane with `samples` per pixel over squares of half a block, in an even number about its middle."""
     middle, step = len(plane) // 2, samples * BLOCK // 2
     count = (middle // step - 1) // 2 * 2 + 1
     central = slice(middle - count * step, middle + count * step)
@@ -96,7 +143,7 @@ def _half_block_sums(plane: Float32, samples: int) -> Float:
 
 
 def _light_outside_square(cells: Float, size: int) -> Float:
-    """What lies outside a square of `size` pixels, on blocks about the middle one, and a border of nothing."""
+    """Light outside a square of `size` pixels, on blocks about the middle one, with a border of zeros."""
     middle, half = len(cells) // 2, min(size // BLOCK, len(cells) // 2)
     hollow = cells.copy()
     hollow[middle - half : middle + half, middle - half : middle + half] = 0.0

@@ -1,1 +1,1 @@
-"""Point spread functions."""
+"""Point-spread functions of all cameras."""

@@ -1,8 +1,4 @@
-"""Optics of a ground telescope as turbulent air lets them be seen: of its pupil, the overlap with itself.
-
-Telescope   its pupil;  clear : the transfer function of perfect optics
-Ratio       what aberrations make of it, at the small distances that the air leaves
-"""
+"""Transfer function of a ground telescope's optics, for the small pupil distances that turbulent air transmits."""
 
 from __future__ import annotations
 
@@ -17,17 +13,25 @@ from lake_schema.arrays import Complex, Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
-# Where the air passes less than this nothing is looked at: Fried lengths.
+# Largest distance in the pupil, in Fried lengths; the air transmits little beyond it.
 FARTHEST = 3.0
-# Samples across the pupil, of the transform that its overlaps are made by; steps of the lattice out to FARTHEST.
+# Samples across the pupil; samples of the transform for its overlaps; steps of the lattice up to FARTHEST.
 _ACROSS, _TRANSFORM, _LATTICE = 120, 256, 10
-# Distance at which the phase tells where the light's centroid is, m.
+# Distance at which the phase gives the centroid of the light, m.
 _CENTROID_LAG = 0.06
 
 
 @dataclass(frozen=True, slots=True)
 class Telescope:
-    """What is the same in all exposures: radii of the pupil's clear ring, and outer scale of the turbulence, m."""
+    """Properties of a telescope and its site that are the same in all exposures.
+
+    Attributes
+    ----------
+    radius, inner : float
+        Outer and inner radius of the clear ring of the pupil, m.
+    outer : float
+        Outer scale of the turbulence, m.
+    """
 
     radius: float
     inner: float
@@ -35,7 +39,13 @@ class Telescope:
 
     @classmethod
     def from_mission(cls, section: str, mission: MissionConfiguration) -> Telescope:
-        """Of a camera's section of the mission database; what is not clear of its aperture is in the middle."""
+        """Read a camera's section of the mission database; the obscured area is assumed to be a central circle.
+
+        Raises
+        ------
+        OutOfRange
+            If the collecting area is not positive or exceeds the aperture.
+        """
         radius = 0.5 * mission.value(f"{section}.aperture_diameter", "m")
         area = mission.value(f"{section}.collecting_area", "m2")
         if not 0.0 < area <= np.pi * radius**2:
@@ -46,16 +56,40 @@ class Telescope:
 
 @dataclass(frozen=True, slots=True)
 class TransferRatio:
-    """The optics' transfer function over that without aberrations: complex[2 m + 1, 2 m + 1] at lags `step` m apart."""
+    """Transfer function of the optics, divided by that without aberrations.
+
+    Attributes
+    ----------
+    values : complex array, shape (2 m + 1, 2 m + 1)
+        The ratio on a lattice of distances in the pupil.
+    step : float
+        Spacing of the lattice, m.
+    """
 
     values: Complex
     step: float
 
     @classmethod
     def from_wavefront(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> TransferRatio:
-        """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian.
+        """Compute the ratio for a wavefront, without the tilt that moves the centroid.
 
-        telescope : its pupil;  wave : A;  fried : m
+        Parameters
+        ----------
+        nm : float array
+            Coefficients by Noll number, nm.
+        telescope : Telescope
+            The telescope.
+        wave : float
+            Wavelength, Angstrom.
+        fried : float
+            Fried length, m.
+        turn : float
+            Rotation of the axes, radian.
+
+        Returns
+        -------
+        TransferRatio
+            The ratio.
         """
         step = 2.0 * telescope.radius / _ACROSS
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
@@ -78,7 +112,7 @@ class TransferRatio:
 
 @lru_cache(maxsize=8)
 def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
-    """(x, y in radii, what is clear [n, n], its overlap with itself by lags [_TRANSFORM, _TRANSFORM])."""
+    """Positions x, y in radii and transmission [n, n] of the pupil, and its overlap with itself by lags."""
     step = 2.0 / _ACROSS
     axis = (np.arange(_ACROSS + 4) - (_ACROSS + 3) / 2) * step
     x, y = np.meshgrid(axis, axis)
@@ -89,9 +123,19 @@ def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
 
 
 def ideal_transfer(distance: Float, radius: float, inner: float) -> Float:
-    """Overlap of a ring with itself, moved by a distance, of its area: the transfer function of perfect optics.
+    """Transfer function of perfect optics: the overlap of a ring with itself after a shift, divided by its area.
 
-    distance : [...] m;  radius, inner : of the ring, m
+    Parameters
+    ----------
+    distance : float array
+        Shift, m.
+    radius, inner : float
+        Outer and inner radius of the ring, m.
+
+    Returns
+    -------
+    float array
+        Transfer function, 0 to 1.
     """
     area = np.pi * (radius**2 - inner**2)
     overlap = (
@@ -103,7 +147,7 @@ def ideal_transfer(distance: Float, radius: float, inner: float) -> Float:
 
 
 def _circle_overlap(distance: Float, first_radius: float, second_radius: float) -> Float:
-    """Area that two circles have in common whose middles lie a distance apart."""
+    """Common area of two circles whose centres are a distance apart."""
     small = min(first_radius, second_radius)
     if small == 0.0:
         return np.zeros_like(distance)

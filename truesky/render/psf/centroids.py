@@ -1,11 +1,11 @@
-"""Where the light of a point lies by its centroid, beside the place that the PSF is held about.
+"""Offset of the centroid of a point source from the reference position of its PSF.
 
-Coma puts the light of VIS up to 12 mas from the chief ray, more or less with colour and place. What is told is the
-windowed centroid, which positions are measured by: that about which the light in a Gaussian window is even.
+Coma moves the light of VIS by up to 12 mas from the chief ray, depending on colour and position. The windowed centroid
+is used here, as in position measurements: the position about which the light in a Gaussian window is balanced.
 
-offsets    a point's centroid minus its place
-
-Ref : Bertin & Arnouts 1996, and the manual of SourceExtractor (XWIN_IMAGE: window of the half-light diameter)
+References
+----------
+Bertin & Arnouts 1996, and the manual of SourceExtractor (XWIN_IMAGE: window of the half-light diameter).
 """
 
 from __future__ import annotations
@@ -17,21 +17,34 @@ from lake_schema.arrays import Array, Float
 from truesky.numerics import matrices
 from truesky.render.psf.model import SAMPLES, Psf
 
-# Of a Gaussian's rms, its FWHM, which is also its half-light diameter.
+# FWHM of a Gaussian, which is also its half-light diameter, in units of its rms.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
-# Half the side of what is looked at of a plane, pixels: all of the windows, and the light whose half is taken.
+# Half side of the used part of a plane, pixels. It contains the windows, and its light defines the half-light diameter.
 _HALF = 32
 
 
 def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
-    """Along columns and rows [n], pixels, of points whose light is this mixture of the PSF's planes.
+    """Centroid of point sources relative to their positions.
 
-    weights : [n, planes], of drawing.transfer.basis_weights;  psf : of the detector
-    Error   : 3 % of the offset where it is a sixth of the window's rms (one step towards the even place); VIS, 0.5 mas,
-              as a tenth more of a window moves the centroid by 1.2 mas
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    weights : float array, shape (n, planes)
+        Weights of the planes, from `drawing.transfer.basis_weights`.
+
+    Returns
+    -------
+    (float array, float array), each of shape (n,)
+        Offsets along columns and rows, pixels.
+
+    Notes
+    -----
+    A single step of the iteration for the centroid is used. The error is 3 % of the offset if the offset is a sixth of
+    the window's rms. For VIS it is 0.5 mas, since a window that is wider by 10 % moves the centroid by 1.2 mas.
     """
     planes, samples = _sample_planes(psf)
-    # With the pixel, which all that is measured has in it; apertures take its light as even in it.
+    # Measured light includes the pixel, and apertures treat the light as uniform within a pixel.
     inside = 0 if psf.intra_pixel is None else 1
     image = np.sum(planes[: _colour_count(psf)], axis=0)
     for _ in range(1 + inside):
@@ -39,14 +52,14 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
     window = _half_light_diameter(image, samples) / _FWHM
     moments = np.stack([_moments(plane, samples, window, inside) for plane in planes])
     zeroth, x, y, xx, xy, yy = matrices.matmul(weights, moments).T
-    # How fast the window's first moments fall where it is moved.
+    # Rate of change of the windowed first moments when the window is moved.
     a, b, c = zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2
     scale = a * c - b * b
     return np.asarray((c * x - b * y) / scale), np.asarray((a * y - b * x) / scale)
 
 
 def _sample_planes(psf: Psf) -> tuple[list[Array], int]:
-    """The middle of the planes, and samples a pixel."""
+    """Middle part of the planes, and samples per pixel."""
     if psf.planes is not None:
         samples = psf.planes.samples
         return [_middle(plane, _HALF * samples) for plane in (*psf.planes.images, *psf.planes.drift)], samples
@@ -62,7 +75,7 @@ def _middle(plane: Array, reach: int) -> Array:
 
 
 def _average_over_pixel(plane: Array, samples: int, axis: int) -> Float:
-    """Over a pixel about each sample; of an even number of samples the outermost count half."""
+    """Average a plane over a pixel about each sample; the outermost of an even number of samples have half weight."""
     weights = np.full(samples + 1 - samples % 2, 1.0 / samples)
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
     return np.asarray(correlate1d(np.asarray(plane, float), weights, axis))
@@ -73,17 +86,17 @@ def _colour_count(psf: Psf) -> int:
 
 
 def _half_light_diameter(plane: Array, samples: int) -> float:
-    """Pixels, of the light of a plane.
+    """Half-light diameter of a plane, pixels.
 
-    Error : 0.5 % with five samples a pixel, 1.4 % with three: one at the edge counts as far as it is inside, along the
-            radius
+    The error is 0.5 % for five samples per pixel and 1.4 % for three. Samples at the edge count by their fraction
+    inside it, along the radius.
     """
     axis = (np.arange(len(plane)) - len(plane) // 2) / samples
     radius, light = np.hypot(axis, axis[:, None]).ravel(), np.asarray(plane, float).ravel()
     order = np.argsort(radius, kind="stable")
     grown = np.cumsum(light[order])
     half, half_radius = 0.5 * grown[-1], float(radius[order][np.searchsorted(grown, 0.5 * grown[-1])])
-    # What is farther from the edge is inside or outside, however far the edge is moved.
+    # Samples farther from the edge are always inside or outside.
     low, high = max(half_radius - 1.0 / samples, 0.0), half_radius + 1.0 / samples
     edge = (radius > low - 1.0 / samples) & (radius < high + 1.0 / samples)
     inside, radius, light = float(light[radius <= low - 1.0 / samples].sum()), radius[edge], light[edge]
@@ -95,16 +108,16 @@ def _half_light_diameter(plane: Array, samples: int) -> float:
 
 
 def _moments(plane: Array, samples: int, window: float, inside: int) -> Float:
-    """In a Gaussian window about the middle: 0th, along x and y, along xx, xy and yy; pixels.
+    """Moments 1, x, y, xx, xy and yy of a plane in a Gaussian window about its middle, in pixels.
 
-    inside : 1 where the plane is averaged over pixels first. The average is even, so that the window may be averaged
-             instead, which is a product of one axis' and the other's.
+    If `inside` is 1, the plane is averaged over pixels. Because the average is symmetric, it is applied to the window,
+    which is separable.
     """
     axis = (np.arange(len(plane)) - len(plane) // 2) / samples
     powers = np.exp(-0.5 * (axis / window) ** 2) * axis ** np.arange(3)[:, None]
     if inside:
         powers = _average_over_pixel(powers, samples, 1)
-    # [3, 3] along y, along x.
+    # m has the axes [power of y, power of x].
     along_x = (np.asarray(plane, float) * powers[:, None]).sum(axis=2)
     m = (powers[:, None] * along_x).sum(axis=2)
     return np.array([m[0, 0], m[0, 1], m[1, 0], m[0, 2], m[1, 1], m[2, 0]])

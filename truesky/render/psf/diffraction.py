@@ -1,8 +1,4 @@
-"""Diffraction at the pupil of Euclid's telescope: what its optics make of a point, before any blur.
-
-pupil        transmission of the pupil
-optics_of    -> Optics: the pupil as light of a wavelength samples it;  diffracted : its image through a wavefront
-"""
+"""Diffraction at the pupil of Euclid's telescope: the image of a point source through its optics, before any blur."""
 
 from __future__ import annotations
 
@@ -22,10 +18,19 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
     """Transmission of the entrance pupil: aperture stop, decentred central stop, three spider bars.
 
-    x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by
-               area)
-    mission  : the mission database
-    returns  : [...] 0 .. 1
+    Parameters
+    ----------
+    x, y : float array
+        Positions in the pupil, mm.
+    softness : float
+        Width of the edges, mm. With a width of one sample, edges cover their pixels by area.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array
+        Transmission, 0 to 1.
     """
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
@@ -35,7 +40,7 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
     for bar in ("spider1", "spider2", "spider3"):
         bar_x, bar_y = mission.value(f"plm.pupil.{bar}.x", "mm"), mission.value(f"plm.pupil.{bar}.y", "mm")
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
-        # Normal form: no singular angle.
+        # The normal form of a line has no singular angle.
         across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
         blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
         clear = clear * (1.0 - blocked)
@@ -48,10 +53,18 @@ def _step(depth: Float, softness: float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """The pupil as light of a wavelength samples it.
+    """The pupil, sampled for a wavelength.
 
-    transform    : side of the optical transform, samples
-    transmission : [n, n];  x, y : [lit samples] of its radius;  wavelength : A
+    Attributes
+    ----------
+    transform : int
+        Side of the optical transform, samples.
+    transmission : float array, shape (n, n)
+        Transmission of the pupil.
+    x, y : float array
+        Positions of the samples that transmit light, in radii of the pupil.
+    wavelength : float
+        Wavelength, Angstrom.
     """
 
     transform: int
@@ -62,10 +75,23 @@ class Optics:
 
 
 def optics_of(wavelength: float, sampling: float, mission: MissionConfiguration, transform: int) -> Optics:
-    """The pupil's sampling follows the wavelength, so that the image's does not; its edges are one sample wide.
+    """Sample the pupil for a wavelength, so that the sampling of the image does not depend on the wavelength.
 
-    wavelength : A;  sampling : of the image, arcsec;  transform : its side, samples
-    mission    : the mission database
+    Parameters
+    ----------
+    wavelength : float
+        Wavelength, Angstrom.
+    sampling : float
+        Sampling of the image, arcsec.
+    mission : MissionConfiguration
+        Mission database.
+    transform : int
+        Side of the image, samples.
+
+    Returns
+    -------
+    Optics
+        The sampled pupil; its edges are one sample wide.
     """
     step = wavelength * 1e-7 / (transform * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
@@ -78,10 +104,22 @@ def optics_of(wavelength: float, sampling: float, mission: MissionConfiguration,
 
 
 def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Float32:
-    """|FFT of the pupil|^2 of unit flux over the whole sky, the soft edges' loss made good: [side, side].
+    """Image of a point source through a wavefront, |FFT of the pupil|^2.
 
-    nm   : by Noll number;  side : samples about the middle, side // 2; None: the whole transform's
-    Error : 5e-4 of what is in a sample, 5e-6 in the core: it is in single precision
+    Parameters
+    ----------
+    nm : float array
+        Wavefront by Noll number, nm.
+    optics : Optics
+        The sampled pupil.
+    side : int, optional
+        Side of the result about the middle, samples; by default that of the whole transform.
+
+    Returns
+    -------
+    float32 array, shape (side, side)
+        Image with unit flux over the whole sky, corrected for the loss by soft edges. Because of single precision, the
+        relative error per sample is 5e-4, and 5e-6 in the core.
     """
     transmission, transform = optics.transmission, optics.transform
     side = transform if side is None else side
@@ -91,7 +129,7 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
     field.real[lit] = transmission[lit] * np.cos(phase)
     field.imag[lit] = transmission[lit] * np.sin(phase)
     middle = (np.arange(side) - side // 2) % transform
-    # First along the rows that have light; then the columns that are wanted.
+    # Rows with light are transformed first, and then only the columns in the result.
     lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)[:, middle]
     parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True)[middle].view(np.float32)
     parts *= parts
@@ -103,6 +141,6 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
 
 @lru_cache(maxsize=4)
 def _edge_gain(transform: int, side: int) -> Float32:
-    """One over what the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
+    """Inverse of the fraction of diffracted light that soft edges leave, by angle: 1 / sinc^2(angle / side)."""
     angle = (np.arange(side) - side // 2) / transform
     return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** -2.0, np.float32)

@@ -1,11 +1,12 @@
-"""A PSF as the sum of two round Gaussians, from the radii that hold half and four fifths of the light.
+"""PSF as the sum of two round Gaussians, from the radii that contain 50 and 80 % of the light.
+
+The encircled energy of the two Gaussians is::
 
     EE(r) = 1 - c exp(-r^2 / 2 s1^2) - (1 - c) exp(-r^2 / 2 s2^2)
 
-widths     s1, s2 of two radii
-psf_at     of NISP's detectors, by wavelength
-
-Ref : Serrano et al. 2024, section 4.2 (the form, of NISP-S); c, of the mission database, is assumed
+References
+----------
+Serrano et al. 2024, section 4.2 (the form, for NISP-S); c is assumed, see the mission database.
 """
 
 from __future__ import annotations
@@ -21,24 +22,37 @@ from truesky.render.psf import model
 from truesky.render.psf.euclid import NISP
 from truesky.render.psf.model import Planes, Psf
 
-# Wavelength that the mission's radii are of, A.
+# Wavelength of the radii in the mission database, Angstrom.
 _MIDDLE = 15_000.0
 
 
 def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
-    """(s1, s2), in the unit of the radii; one Gaussian of half of the light where its EE80 is as wide or wider.
+    """Widths s1 and s2 of the two Gaussians, in the unit of the radii.
 
-    ee50, ee80 : radii that hold 50 and 80 % of the light
-    part       : of the light in the core, c; only between 0.5 and 0.8 do such Gaussians exist
-    Errors : BadInput where the second radius is not the larger, or for another part
+    Parameters
+    ----------
+    ee50, ee80 : float
+        Radii that contain 50 and 80 % of the light.
+    part : float
+        Fraction c of the light in the core. The two Gaussians exist only if it is between 0.5 and 0.8.
+
+    Returns
+    -------
+    (float, float)
+        Widths s1 and s2, equal if a single Gaussian with this EE50 has an EE80 of at least `ee80`.
+
+    Raises
+    ------
+    BadInput
+        If `ee80` is not larger than `ee50`, or if `part` is outside its range.
     """
     if not 0.5 < part < 0.8:
-        raise BadInput(f"a core of {part:g} of the light is not between 0.5 and 0.8")
+        raise BadInput(f"the core must contain between 0.5 and 0.8 of the light, got {part:g}")
     if not 0.0 < ee50 < ee80:
-        raise BadInput(f"radii of 50 and 80 % of the light, {ee50:g} and {ee80:g}, do not rise")
+        raise BadInput(f"radii of 50 and 80 % of the light must be positive and increase, got {ee50:g} and {ee80:g}")
 
     def outer_width(core: float) -> float:
-        """s2, of what is left of the core's light beyond EE50."""
+        """Width s2 from the light that remains outside the core beyond EE50."""
         return float(ee50 / np.sqrt(-2.0 * np.log((0.5 - part * core) / (1.0 - part))))
 
     def core_width(core: float) -> float:
@@ -48,7 +62,7 @@ def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
         light = (part, core_width(core)), (1.0 - part, outer_width(core))
         return sum(fraction * float(np.exp(-0.5 * (ee80 / s) ** 2)) for fraction, s in light) - 0.2
 
-    # From a wider Gaussian without an end to two that are one.
+    # At the ends, the second Gaussian is infinitely wide or equal to the first.
     ends = (0.5 - (1.0 - part)) / part * (1.0 + 1e-9), 0.5
     if light_excess(ends[1]) >= 0.0:
         return core_width(0.5), core_width(0.5)
@@ -57,9 +71,21 @@ def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
 
 
 def psf_at(detector: Detector, waves: Float, mission: MissionConfiguration) -> Psf:
-    """One PSF for the whole detector, its radii linear in the wavelength; of all that blurs but the pixel.
+    """PSF of a detector at given wavelengths, including all blur except the pixel.
 
-    detector, waves : whose, and float64[w] A;  mission : the mission database
+    Parameters
+    ----------
+    detector : Detector
+        The detector.
+    waves : float array, shape (w,)
+        Wavelengths, Angstrom.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Psf
+        One PSF for the whole detector, with radii that are linear in wavelength.
     """
     samples, side, section = NISP.samples, NISP.side, detector.section
     core = mission.value(f"{section}.spectra.core", "")

@@ -1,10 +1,7 @@
-"""The point-spread function of Euclid's cameras: the optics from their pupil, jitter and charge diffusion.
+"""PSF of Euclid's cameras: optics from their pupil, jitter and charge diffusion.
 
-Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
-chief ray (coma moves the centroid by a few mas), that of NISP on its centroid.
-
-vis_psf, nisp_psf     -> Psf;  vis_edges, nisp_edges : their diffraction far from a star
-wavefront   of a field position;  centred : one whose light has its centroid at the source's place
+A PSF is stored in the axes of the detector (x along columns, y along rows), without the pixel. For VIS it is centred on
+the chief ray (coma moves the centroid by a few mas), and for NISP on its centroid.
 """
 
 from __future__ import annotations
@@ -33,13 +30,22 @@ from truesky.render.psf.sub_bands import sub_bands
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """How the PSF of a camera is computed.
+    """Sampling of the PSF of a camera.
 
-    samples         : a pixel;  side : of its planes, pixels
-    transform       : side of the optical transform, samples; the light beyond its border is absent (VIS: 0.15 %)
-    core_transform, core_side : the same, samples and pixels, for what changes across a detector: the core alone
-    window          : arcsec, rms of the Gaussian within which the centroid of the light lies at a source's place; 0 =
-                      the chief ray lies there
+    Attributes
+    ----------
+    samples : int
+        Samples per pixel.
+    side : int
+        Side of the planes, pixels.
+    transform : int
+        Side of the optical transform, samples. Light outside it is missing (0.15 % for VIS).
+    core_transform, core_side : int
+        Side of the transform (samples) and of the planes (pixels) for the drift across a detector, which needs only the
+        core.
+    window : float
+        Rms of the Gaussian window in which the centroid of the light lies at the source's position, arcsec. With 0, the
+        chief ray lies there.
     """
 
     samples: int
@@ -51,60 +57,145 @@ class Sampling:
 
 
 VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
-# The optics reach 1.84 cycles a pixel in Y: 0.37 a sample.
-# Its coma would put centroids tens of mas from the chief ray, and astrometry is calibrated by centroids: the window is
-# that of SourceExtractor for its light in a pixel.
+# In Y the optics reach 1.84 cycles per pixel, or 0.37 cycles per sample. Coma would move centroids tens of mas from the
+# chief ray, but astrometry is calibrated with centroids. The window is SourceExtractor's for the light in a pixel.
 NISP = Sampling(5, 256, 2048, 768, 96, window=0.2)
-# Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
+# Degrees of the polynomials in position, by the number of positions: for the drift of the mean PSF, and for that of its
+# slope with wavelength.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
-# Noll's number of defocus, which every wavefront has a coefficient of.
+# Noll number of defocus. All wavefronts have this coefficient.
 _DEFOCUS = 4
-# Of its rms, as far as which a window is looked through.
+# Half side of the region for a window, in units of its rms.
 _WINDOWS = 5.0
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """The Euclid PSF of a VIS detector: optics, pointing jitter, charge diffusion.
+    """PSF of a VIS detector: optics, pointing jitter, charge diffusion.
 
-    positions : where it is computed, one of DEGREES; polynomials lie between
-    detector  : of VIS;  band : passband;  mission : the mission database
-    Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
-    Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
+    Parameters
+    ----------
+    detector : Detector
+        A detector of VIS.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+    positions : int
+        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+
+    Returns
+    -------
+    Psf
+        The PSF.
+
+    Notes
+    -----
+    The number of wavelengths causes errors of 2e-4 of the second moments. Errors across the detector are measured in
+    psf_positions.csv.
+
+    References
+    ----------
+    Liaudat et al. 2023 (pupil); the mission database (wavefront and diffusion).
     """
     return _psf(VIS, detector, band, mission, positions)
 
 
 def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """The Euclid PSF of a NISP detector: optics, and pointing jitter with what else blurs.
+    """PSF of a NISP detector: optics, and pointing jitter together with all other blur.
 
-    detector, band, mission, positions : as of vis_psf
-    Error     : second moments 4e-4 from the number of wavelengths; across the detector as psf_positions_nisp.csv
-    Ref       : pupil, Liaudat et al. 2023; wavefront, the mission database
+    Parameters
+    ----------
+    detector : Detector
+        A detector of NISP.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+    positions : int
+        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+
+    Returns
+    -------
+    Psf
+        The PSF.
+
+    Notes
+    -----
+    The number of wavelengths causes errors of 4e-4 of the second moments. Errors across the detector are measured in
+    psf_positions_nisp.csv.
+
+    References
+    ----------
+    Liaudat et al. 2023 (pupil); the mission database (wavefront).
     """
     return _psf(NISP, detector, band, mission, positions)
 
 
 def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """That of a NISP detector at wavelengths `waves` [w] A, without what lies beyond its planes.
+    """PSF of a NISP detector at given wavelengths, without the light beyond its planes.
 
-    detector, mission, positions : as of vis_psf
+    Parameters
+    ----------
+    detector : Detector
+        A detector of NISP.
+    waves : float array, shape (w,)
+        Wavelengths, Angstrom.
+    mission : MissionConfiguration
+        Mission database.
+    positions : int
+        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+
+    Returns
+    -------
+    Psf
+        The PSF.
     """
     planes = _planes(NISP, detector, waves, mission, positions)
     return model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """What shines beyond the planes of the PSF of VIS."""
+    """Pupil edges for the light beyond the planes of the VIS PSF.
+
+    Parameters
+    ----------
+    detector : Detector
+        A detector of VIS.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Edges
+        The edges.
+    """
     return _edges(VIS, detector, band, mission)
 
 
 def nisp_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """What shines beyond the planes of the PSF of NISP."""
+    """Pupil edges for the light beyond the planes of the NISP PSF.
+
+    Parameters
+    ----------
+    detector : Detector
+        A detector of NISP.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Edges
+        The edges.
+    """
     return _edges(NISP, detector, band, mission)
 
 
 def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
-    # Second moments of diffraction go with the square of the wavelength.
+    # The second moments of diffraction are proportional to the square of the wavelength.
     parts = sub_bands(band)
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     planes = _planes(sampling, detector, waves, mission, positions)
@@ -123,9 +214,21 @@ def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: Miss
 
 
 def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -> Float:
-    """Zernike coefficients at a field position: index = Noll number, nm rms.
+    """Zernike coefficients of the wavefront at a field position.
 
-    x, y : -1 .. 1 across the focal plane;  section : of the mission database, of the camera
+    Parameters
+    ----------
+    x, y : float
+        Position in the focal plane, -1 to 1.
+    section : str
+        Prefix of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array
+        Coefficients, nm rms; the index is the Noll number.
     """
     terms = mission.numbers(f"{section}.psf.wavefront")
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
@@ -140,7 +243,7 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
 def _planes(
     camera_sampling: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
 ) -> Planes:
-    """Of wavelengths [w] A."""
+    """Planes of the PSF at the wavelengths `waves` [w], Angstrom."""
     section = detector.section
     nodes, powers = _nodes(positions), _powers(positions)
     places = [_field_position(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
@@ -162,7 +265,7 @@ def _planes(
             _plane(coefficients[0], w, camera_sampling, sampling, blur, mission)
             for w, blur in zip(waves, blurs, strict=True)
         ]
-        # Of the drift, a part in a hundred of the light, the mean's blur is blur enough.
+        # The drift is only one per cent of the light, so the mean blur is accurate enough.
         blur = tuple(np.mean(blurs, axis=0).tolist())
         return {
             "images": np.stack(centre).astype(np.float32),
@@ -173,7 +276,7 @@ def _planes(
 
     arrays = cache.cached_arrays(f"{section}_psf", key, make)
     axis_order = slice(None, None, -1 if detector.upside_down else 1)
-    # Upside down, both the planes and the places that the drift is written in are turned.
+    # If the detector is upside down, both the planes and the coordinates of the drift are inverted.
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
     drift = arrays["drift"][:, axis_order, axis_order] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
@@ -181,7 +284,7 @@ def _planes(
 
 
 def _field_position(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Field coordinates, -1 .. 1 over the focal plane's outer edges, of a place in half sides from the centre."""
+    """Field coordinates, -1 to 1 between the focal plane's outer edges, of a position in half sides from the centre."""
     all_detectors = detectors(detector.section, mission)
     half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
     reach_x, reach_y = (max(abs(getattr(d, axis)) for d in all_detectors) for axis in ("x", "y"))
@@ -194,10 +297,10 @@ def _field_position(detector: Detector, x: float, y: float, mission: MissionConf
 
 
 def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Variance along x and y, arcsec2: pointing jitter, and charge diffusion.
+    """Variance of pointing jitter and charge diffusion along x and y, arcsec^2, at a wavelength in Angstrom.
 
-    Charge spreads wider of blue light (A), and the wider the thicker the detector is. Where the database has one width
-    for all that blurs the optics' image, no charge spreads.
+    Charge diffuses farther for blue light and in thicker detectors. There is no separate diffusion if the mission
+    database contains one width for the whole blur of the optics.
     """
     section = detector.section
     if f"{section}.psf.jitter" in mission:
@@ -211,7 +314,7 @@ def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfi
 
 
 def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
-    """A detector's diffusion length over the mission's."""
+    """Diffusion length of a detector, divided by that of the mission."""
     key = f"{detector.section}.diffusion_detectors"
     if key not in mission:
         return 1.0
@@ -220,13 +323,13 @@ def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
-    """Where the PSF is computed across a detector, in half sides from its centre."""
+    """Positions at which the PSF is computed across a detector, in half sides from its centre."""
     axis = np.linspace(-1.0, 1.0, math.isqrt(positions)).tolist() if positions > 1 else []
     return tuple((x, y) for y in axis for x in axis)
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
-    """Planes.powers of the drift: of the mean PSF, then of its slope with wavelength."""
+    """Powers of the drift (`Planes.powers`): first for the mean PSF, then for its slope with wavelength."""
     return tuple(
         (degree - j, j, colour)
         for colour, max_degree in enumerate(DEGREES[positions])
@@ -244,7 +347,10 @@ def _drift(
     blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float:
-    """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
+    """Planes of the drift (`Planes.drift`) in the focal plane's axes, by least squares.
+
+    The coefficients are the wavefronts of the centre and of the nodes.
+    """
     powers, weights = _powers(positions), _blur_weights(blur, sampling)
     side = camera_sampling.core_side * camera_sampling.samples + 1
     if not powers:
@@ -265,7 +371,7 @@ def _drift(
         if terms:
             from_nodes = matrices.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
             change = matrices.matmul(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
-            # The blur is the same for all, and linear.
+            # The blur is linear and the same for all images.
             changes += [_blur_image(image, weights) for image in change]
     return np.stack(changes)
 
@@ -273,14 +379,29 @@ def _drift(
 def centre_wavefront(
     nm: Float, waves: Float, camera_sampling: Sampling, sampling: float, mission: MissionConfiguration
 ) -> Float:
-    """A wavefront with the tilt that puts the windowed centroid of its light in a pixel at the middle sample.
+    """Add the tilt that moves the windowed centroid of the light, within a pixel, to the middle sample.
 
-    nm : by Noll number;  waves : [w] A;  sampling : arcsec;  sampled, mission : of the camera
-    Error : 0.1 mas
+    Parameters
+    ----------
+    nm : float array
+        Wavefront by Noll number, nm.
+    waves : float array, shape (w,)
+        Wavelengths, Angstrom.
+    camera_sampling : Sampling
+        Sampling for the camera. Without a window, the wavefront is returned unchanged.
+    sampling : float
+        Sampling of the image, arcsec.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array
+        Wavefront by Noll number, nm, with an error of the centroid of 0.1 mas.
     """
     if not camera_sampling.window:
         return nm
-    # Of a band two wavelengths tell the mean.
+    # Two wavelengths are sufficient for the mean over a band.
     off = 0.58 * 0.5 * (waves.max() - waves.min())
     optics = [
         optics_of(float(waves.mean() + part), sampling, mission, camera_sampling.core_transform) for part in (-off, off)
@@ -311,7 +432,7 @@ def _plane(
     nm: Float, wavelength: float, camera_sampling: Sampling, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float32:  # fmt: skip
-    """One wavelength's PSF: [side * samples + 1] square, in the focal plane's axes."""
+    """PSF at one wavelength in the focal plane's axes, a square of side * samples + 1."""
     weights = _blur_weights(blur, sampling)
     optics = optics_of(wavelength, sampling, mission, camera_sampling.transform)
     return _blur_image(
@@ -321,9 +442,9 @@ def _plane(
 
 
 def _blur_image(image: Array, weights: tuple[Float, Float]) -> Float32:
-    """Diffracted light -> blurred by weights along x and y, without a margin.
+    """Blur diffracted light by weights along x and y, and cut the margin.
 
-    On the image: of a transform's rounding the bright core would cover the wings.
+    The convolution is done on the image, since rounding errors of a transform of the bright core would hide the wings.
     """
     across, along = (w.astype(np.float32) for w in weights)
     return _convolve_separable(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
@@ -331,7 +452,7 @@ def _blur_image(image: Array, weights: tuple[Float, Float]) -> Float32:
 
 @jit
 def _convolve_separable(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
-    """The middle [side, side] of an image, summed with weights [odd] along columns (across) and rows (along)."""
+    """Convolve an image with weights along columns (`across`) and rows (`along`); return the middle [side, side]."""
     margin, reach_x, reach_y = (len(image) - side) // 2, len(across) // 2, len(along) // 2
     out = np.zeros((side, side), np.float32)
     line = np.empty(len(image), np.float32)
@@ -359,9 +480,9 @@ def _blur_weights(blur: tuple[float, float], sampling: float) -> tuple[Float, Fl
 
 @lru_cache(maxsize=64)
 def _gaussian_weights(sigma: float) -> Float:
-    """float64[odd]: a Gaussian of sigma samples, for images without detail finer than _DETAIL; their sum is 1.
+    """Weights of a Gaussian of `sigma` samples, for images without detail finer than DETAIL; their sum is 1.
 
-    Error : of the transfer function, 1e-7
+    The number of weights is odd. The error of the transfer function is 1e-7.
     """
     k = np.linspace(0.0, 2 * np.pi * DETAIL, 400)
     lost, half = 1.0 - np.exp(-0.5 * (sigma * k) ** 2), 0

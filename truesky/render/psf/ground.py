@@ -1,20 +1,20 @@
-"""The PSF of a ground telescope: turbulent air, and the optics with their aberrations.
+"""PSF of a ground telescope: turbulent air, and optics with aberrations.
 
-through_air   -> Psf: planes by wavelength and place;  edges : what shines beyond them
-Air           what differs from exposure to exposure;  air_of : of an exposure
+A plane is the Fourier transform of the product of three functions of rho = wavelength x frequency::
 
-A plane is the Fourier transform of the product of
+    transfer(rho)       transfer function of the air (psf/atmosphere.py), for the seeing at this wavelength
+    clear(rho)          overlap of an annular pupil without aberrations with itself after a shift by rho
+    ratio(rho)          mean of exp(i phase difference) over that overlap: the aberrations of the optics
 
-    transfer(rho)       of the air at rho = wavelength x frequency (psf/atmosphere.py), for the wavelength's seeing
-    clear(rho)          the part of an unaberrated annular pupil that overlaps with itself moved by rho
-    ratio(rho)          mean of exp(i difference of phase) over that overlap: the optics' aberrations
+The air transmits nothing beyond a few Fried lengths, which is a small part of the pupil. There the ratio is smooth and
+can be interpolated from a coarse lattice. Its phase at small rho is removed, since astrometry is calibrated with
+centroids. The aureole, A / (r^2 + c^2) of a star's light per arcsec^2, and the spikes of the spider's vanes are added
+to the planes. A plane contains the light of a star that photometry calls its flux; light beyond the plane is
+additional.
 
-The air leaves nothing beyond a few Fried lengths, a small part of the pupil; there the ratio is smooth, and known on a
-coarse lattice it is interpolated.  Its phase at small rho is taken off, for astrometry is calibrated by centroids.  To
-the planes are added the aureole, A / (r^2 + c^2) of a star's light in an arcsec2, and the spikes of the spider's vanes.
-A plane holds a star's light: this is what photometry calls its flux; what lies beyond comes on top of it.
-
-Ref : King 1971, PASP 83, 199, and Racine 1996, PASP 108, 699 (aureole)
+References
+----------
+King 1971, PASP 83, 199, and Racine 1996, PASP 108, 699 (aureole).
 """
 
 from __future__ import annotations
@@ -40,29 +40,39 @@ from truesky.render.psf.model import Planes, Psf
 from truesky.render.psf.spikes import ARCSEC, LONG, STEP, Edges
 from truesky.render.psf.sub_bands import N_SUB_BANDS, sub_bands
 
-# Of the planes, and of what changes across a detector, pixels: beyond them the aureole is nearly all there is.
+# Sides of the planes and of the drift across a detector, pixels. Beyond the planes the aureole dominates.
 SIDE, _DRIFT_SIDE = 256, 64
-# Samples of a FWHM, at least: beyond their Nyquist frequency the air passes less than 1e-7. Samples of a pixel.
+# Smallest number of samples per FWHM: above their Nyquist frequency the air transmits less than 1e-7. Smallest and
+# largest number of samples per pixel.
 _SAMPLES_OF_FWHM, _LEAST_SAMPLES, _MOST_SAMPLES = 6.0, 2, 6
-# Bands whose light is redder are drawn by half as many wavelengths: refraction changes less there; A.
+# Bands with a larger mean wavelength (Angstrom) use half the number of wavelengths, since refraction varies less there.
 _REDDER = 5300.0
-# Of a seeing, arcsec: planes hold no more.
+# Largest seeing that fits into the planes, arcsec.
 _WORST = 10.0
-# Steps of the radial table.
+# Number of steps of the radial table.
 _TABLE = 4000
-# FWHM of a Gaussian in its standard deviations.
+# FWHM of a Gaussian in units of its standard deviation.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """What differs from exposure to exposure, in a detector's axes.
+    """State of the air during an exposure, in the axes of a detector.
 
-    seeing : FWHM, arcsec, at the mean wavelength of the band
-    shear  : (e1, e2) ellipticity of what the air does: along columns, along their diagonal
-    slope  : of the seeing's dependence on wavelength, a power
-    lift   : tangent of the zenith distance;  zenith : radian, where it lies, from x to y
-    height : of the observatory, m
+    Attributes
+    ----------
+    seeing : float
+        FWHM at the mean wavelength of the band, arcsec.
+    shear : (float, float)
+        Ellipticity (e1, e2) caused by the air: along columns, and along the diagonal.
+    slope : float
+        Exponent of the seeing's dependence on wavelength.
+    tan_zenith_distance : float
+        Tangent of the zenith distance, times the correction for refraction.
+    zenith : float
+        Direction of the zenith, radian from x to y.
+    height : float
+        Height of the observatory, m.
     """
 
     seeing: float
@@ -74,23 +84,35 @@ class Air:
 
 
 def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
-    """The air of an exposure; its ellipticity is drawn, the same for all detectors.
+    """State of the air during an exposure, with a random ellipticity that is the same for all detectors.
 
-    exposure : its row;  detector : of its camera;  mission : the mission database
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the table `exposures`.
+    detector : Detector
+        Detector of its camera.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Air
+        The state.
     """
     section = detector.section
-    # The seeing is drawn with the request's seed.
+    # The seeing already depends on the seed of the request.
     identity = (exposure.camera, exposure.band, *(x.hex() for x in (exposure.ra, exposure.dec, exposure.mjd)))
     rms = mission.value(f"{section}.psf.air_ellipticity", "")
     size, turn = rng.stream("psf.air", exposure.seeing.hex(), *identity).random(2)
-    # Two normal components have a size whose square is exponential.
+    # The squared size of two normal components is exponentially distributed.
     size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
     angle = 2.0 * (np.pi * float(turn) - np.radians(detector.rotation))
     shear = size * float(np.cos(angle)), size * float(np.sin(angle))
     slope = mission.value(f"{section}.psf.seeing_slope", "")
     if exposure.airmass is None or exposure.zenith is None:
         return Air(exposure.seeing, shear, slope)
-    # At position angle 0 the focal plane's x axis runs west.
+    # At position angle 0 the focal plane's x axis points west.
     zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
     tan_zenith_distance = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(
         f"{section}.psf.refraction", ""
@@ -99,9 +121,23 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
-    """Refuse a seeing, arcsec, finer than a pixel or than turbulence makes, and a pupil that has no such area.
+    """Refuse a seeing finer than a pixel or than turbulence allows, and a pupil with an impossible area.
 
-    detector : of the camera;  band : passband;  mission : the mission database
+    Parameters
+    ----------
+    seeing : float
+        Seeing, arcsec.
+    detector : Detector
+        Detector of the camera.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Raises
+    ------
+    OutOfRange
+        If the seeing, or the area of the pupil, is not allowed.
     """
     outer, slope = (
         Telescope.from_mission(detector.section, mission).outer,
@@ -115,12 +151,29 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
 
 
 def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
-    """The PSF of a detector of a ground camera.
+    """PSF of a detector of a ground camera.
 
-    air       : of the exposure;  positions : where it is computed, one of euclid.DEGREES; polynomials lie between
-    detector  : of the camera;  band : passband;  mission : the mission database
-    Errors    : OutOfRange for a seeing of less than a pixel, or that its air does not make
-    Error     : 1e-3 of the peak from the pupil's samples
+    Parameters
+    ----------
+    air : Air
+        State of the air.
+    detector : Detector
+        The detector.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+    positions : int
+        Number of positions at which the PSF is computed, one of `euclid.DEGREES`; polynomials interpolate.
+
+    Returns
+    -------
+    Psf
+        The PSF, with an error of 1e-3 of the peak because of the sampling of the pupil.
+
+    Notes
+    -----
+    `check` raises OutOfRange if the seeing is not allowed.
     """
     check(air.seeing, detector, band, mission)
     scale = detector.pixel_scale
@@ -154,14 +207,28 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
 
 
 def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """What shines beyond the planes: rings of the pupil's circles, spikes of the spider, the aureole.
+    """Sources of light beyond the planes: rings of the pupil's circles, spikes of the spider, the aureole.
 
-    air, detector, band, mission : as of `through_air`
+    Parameters
+    ----------
+    air : Air
+        State of the air.
+    detector : Detector
+        The detector.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Edges
+        The edges of the pupil, and the aureole.
     """
     section, telescope = detector.section, Telescope.from_mission(detector.section, mission)
     vanes = int(mission.value(f"{section}.pupil.vanes"))
     width = mission.value(f"{section}.pupil.vane_width", "mm")
-    # Of an altazimuth mount the spider keeps its place against the zenith.
+    # On an altazimuth mount, the spider has a fixed angle to the zenith.
     turn = air.zenith if mission.value(f"{section}.pupil.altazimuth") == 1.0 else -np.radians(detector.rotation)
     first = mission.value(f"{section}.pupil.vane_angle", "rad") + turn
     length = 1e3 * (telescope.radius - telescope.inner)
@@ -176,7 +243,7 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
 
 
 def _waves(band: Passband, air: Air) -> Float:
-    """[w] A: means of as many photons of flat f_nu; one where the air does the same to all."""
+    """Mean wavelengths [w] of sub-bands with equal photons for flat f_nu, Angstrom; one if the air is achromatic."""
     photons = band.response / band.wavelength
     mean = float((photons * band.wavelength).sum() / photons.sum())
     count = (
@@ -191,7 +258,7 @@ def _waves(band: Passband, air: Air) -> Float:
 
 
 def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> Float:
-    """By Noll number, nm, at a place on a detector in half sides from its middle."""
+    """Wavefront by Noll number, nm, at a position on a detector in half sides from its middle."""
     turn, scale = np.radians(detector.rotation), detector.pixel_scale
     u, v = x * detector.nx * scale / 2, y * detector.ny * scale / 2
     at = (detector.x + np.cos(turn) * u - np.sin(turn) * v, detector.y + np.sin(turn) * u + np.cos(turn) * v)
@@ -204,20 +271,20 @@ def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfigura
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Frequencies of a plane, cycles a radian: across [n / 2 + 1], along [n]."""
+    """Frequencies of a plane, cycles per radian: across [n / 2 + 1] and along [n]."""
 
     across: Float
     along: Float
 
     @classmethod
     def from_pixels(cls, side: int, samples: int, scale: float) -> _Grid:
-        """Of a plane of `side` pixels of `scale` arcsec, `samples` a pixel."""
+        """Grid of a plane of `side` pixels of `scale` arcsec, with `samples` per pixel."""
         step = scale * ARCSEC / samples
         n = side * samples
         return cls(np.asarray(np.fft.rfftfreq(n, step), float), np.asarray(np.fft.fftfreq(n, step), float))
 
     def transfer(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
-        """Of air and of perfect optics: wave : A;  fried : m."""
+        """Transfer function of the air and of perfect optics, for a wavelength in Angstrom and a Fried length in m."""
         farthest = FARTHEST * fried
         rho = np.linspace(0.0, farthest, _TABLE)
         table = atmosphere.transfer(rho, fried, telescope.outer) * ideal_transfer(
@@ -229,7 +296,7 @@ class _Grid:
         return np.interp(distance, rho, table, right=0.0)
 
     def interpolate_ratio(self, ratio: TransferRatio, wave: float) -> Complex:
-        """Between the lags of a ratio; beyond them it is not wanted.  wave : A."""
+        """Interpolate a ratio at a wavelength (Angstrom) between its lags; it is not needed beyond them."""
         count = (len(ratio.values) - 1) // 2
         lags = ratio.step * (np.arange(len(ratio.values)) - count)
         rows, columns = (_spline(np.asarray(lags, float), wave * 1e-10 * axis) for axis in (self.along, self.across))
@@ -239,11 +306,11 @@ class _Grid:
         return np.asarray(parts[0] + 1j * parts[1])
 
     def phase_shift(self, x: float, y: float) -> Complex:
-        """What moves an image by x, y radian."""
+        """Transfer function of a shift by x and y radian."""
         return np.asarray(np.exp(-2j * np.pi * x * self.across) * np.exp(-2j * np.pi * y * self.along[:, None]))
 
     def image(self, plane_transfer: Array) -> Float:
-        """[n + 1, n + 1] about the middle sample; what lies on the border belongs to both sides."""
+        """Image [n + 1, n + 1] about the middle sample; the light on the border is shared by both sides."""
         n = len(self.along)
         centred_image = np.fft.fftshift(scipy.fft.irfft2(plane_transfer, (n, n)))
         out = np.pad(centred_image, ((0, 1), (0, 1)), mode="wrap")
@@ -253,7 +320,7 @@ class _Grid:
 
 
 def _spline(lags: Float, at: Float) -> Float:
-    """[n, lags] what each lag brings to the places `at`: a cubic spline's, nothing beyond."""
+    """Weights [n, lags] of a cubic spline at the positions `at`; 0 beyond the lags."""
     inside = np.abs(at) <= lags[-1]
     out = np.zeros((len(at), len(lags)))
     out[inside] = make_interp_spline(lags, np.eye(len(lags)), k=3)(at[inside])
@@ -261,17 +328,17 @@ def _spline(lags: Float, at: Float) -> Float:
 
 
 def _degree(positions: int) -> int:
-    """Of the drift: more than two degrees change nothing (1e-5 of a size)."""
+    """Degree of the drift; degrees above 2 change sizes by less than 1e-5."""
     return min(euclid.DEGREES[positions][0], 2)
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
-    """Of the drift, which is of no colour."""
+    """Powers of the drift (`Planes.powers`), which does not depend on colour."""
     return tuple((k - j, j, 0) for k in range(1, _degree(positions) + 1) for j in range(k + 1))
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
-    """Where the optics are looked at across a detector, in half sides from its middle."""
+    """Positions at which the optics are evaluated across a detector, in half sides from its middle."""
     axis = np.linspace(-1.0, 1.0, _degree(positions) + 1).tolist() if _degree(positions) else []
     return tuple((x, y) for y in axis for x in axis)
 
@@ -280,7 +347,7 @@ def _drift(
     air: Air, detector: Detector, wave: float, positions: int, telescope: Telescope, samples: int,
     mission: MissionConfiguration,
 ) -> Float:  # fmt: skip
-    """Planes of Planes.drift, by least squares of the optics' ratio at the nodes, at the mean wavelength."""
+    """Planes of the drift (`Planes.drift`) at the mean wavelength, by least squares of the ratios at the nodes."""
     powers, nodes = _powers(positions), _nodes(positions)
     grid = _Grid.from_pixels(_DRIFT_SIDE, samples, detector.pixel_scale)
     if not powers:
@@ -305,9 +372,9 @@ def _drift(
 
 
 def _match_rings(edges_: Edges, image: Float, samples: int) -> Edges:
-    """With rings that are as bright where the plane ends as what is in it, the wings of the air.
+    """Scale the rings so that they are as bright at the border of the plane as the wings of the air in it.
 
-    Error : these fall as r^-11/3; twice as far out they are too bright by a half
+    The wings fall as r^-11/3; at twice the distance, the rings are too bright by a half.
     """
     axis = (np.arange(len(image)) - len(image) // 2) / samples
     r = np.hypot(axis, axis[:, None])
@@ -320,7 +387,7 @@ def _match_rings(edges_: Edges, image: Float, samples: int) -> Edges:
 def _outer_light(
     air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, samples: int
 ) -> tuple[Edges, Float32]:
-    """(edges, [n + 1, n + 1] their light inside a plane, but for the rings that its optics have)."""
+    """Edges, and their light [n + 1, n + 1] inside a plane without the rings, which are part of its optics."""
     pupil_edges = edges(air, detector, band, mission)
     step = 1.0 / samples
     axis = (np.arange(SIDE * samples + 1) - SIDE * samples // 2) * step

@@ -1,7 +1,4 @@
-"""A PSF as the renderer knows it: planes in Fourier space, or a table of its profile.
-
-spectrum_of           the Fourier transform of a PSF without planes
-"""
+"""Data model of a PSF: planes by wavelength and position, or a profile."""
 
 from __future__ import annotations
 
@@ -15,29 +12,43 @@ from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 from truesky.render.psf.spikes import Edges
 
-# Samples a pixel of VIS, of files and of profiles: the finest optical detail (lambda / D at 540 nm) is 2.8 samples
-# wide; cycles a sample that are more.
+# Samples per pixel for VIS, for files and for profiles: the finest optical detail (lambda / D at 540 nm) is 2.8
+# samples wide. The second value is an upper limit of its frequency in cycles per sample.
 SAMPLES, DETAIL = 3, 0.4
-# Largest side of a plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for
-# bright stars alone (drawing/far_light.py).
+# Largest side of a plane, and of the stamp of a point source, pixels. Light outside it (0.2 % for VIS) is drawn only
+# for bright stars (drawing/far_light.py).
 SIDE = 512
-# Side of the drawing that tells the width, and its samples a pixel: as many as let it hold what is broad.
+# Side of the image for measuring the width, samples, and its samples per pixel: the first that lets the core fit.
 _CORE, _FINE = 243, (9, 3, 1)
 _WITHIN = slice(_CORE // 6, -(_CORE // 6))
 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """A PSF by wavelength and place, centred on the middle sample.
+    """PSF by wavelength and position, centred on the middle sample.
 
-    PSF(source) = sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j, (a, b, c) = powers, redder the mean
-    wavelength of its photons above that of the planes, A.
+    Attributes
+    ----------
+    wavelength : float array, shape (w,)
+        Wavelengths, Angstrom.
+    images : float32 array, shape (w, s, s)
+        PSF at the detector's centre, of unit flux over the whole sky.
+    drift : float32 array, shape (d, t, t)
+        Changes with position and colour; d = 0 for one PSF per detector.
+    half : (float, float)
+        Half the columns and half the rows of the detector, the units of x and y.
+    powers : tuple of (int, int, int)
+        Powers of x, y and redder for each plane of the drift.
+    samples : int
+        Samples per pixel.
 
-    wavelength : float64[w] A;  images : float32[w, s, s] of unit flux over the whole sky, at the detector's centre
-    drift      : float32[d, t, t]; d = 0 for one PSF a detector
-    powers     : [d] of x, y and redder
-    half       : (columns, rows) half the detector: the unit of x and y
-    samples    : a pixel
+    Notes
+    -----
+    The PSF of a source is::
+
+        sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j,   (a, b, c) = powers
+
+    where redder is the mean wavelength of its photons minus that of the planes, Angstrom.
     """
 
     wavelength: Float
@@ -49,26 +60,37 @@ class Planes:
 
     @property
     def max_frequency(self) -> float:
-        """Beyond it nothing is looked at, radian / pixel: a quarter of a cycle a pixel before the samples' last."""
+        """Highest frequency used, radian / pixel: a quarter of a cycle per pixel below the Nyquist frequency."""
         return (self.samples - 0.5) * np.pi
 
 
 @dataclass(frozen=True, slots=True)
 class Psf:
-    """A point-spread function with what the choice of a stamp's size needs.
+    """A point-spread function, with the tables needed for the choice of stamp sizes.
 
-    profile     : galsim object, arcsec, detector axes, without the pixel, for flat f_nu at the detector's centre; its
-                  flux is what the model keeps of 1
-    pixel_scale : arcsec
-    surface     : float64[side / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
-    rim         : float64[side / 2] the largest fraction in a pixel at r pixels or more along columns or rows: spikes of
-                  the pupil's bars rise above the mean
-    outside     : float64[side / 2] fraction of the flux beyond r pixels
-    fwhm        : arcsec, pixel included
-    planes      : by wavelength and place; None where `profile` is all
-    intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing; None: the PSF
-                  has the pixel in it already
-    edges       : what shines beyond the planes; None: nothing does
+    Attributes
+    ----------
+    profile : galsim.GSObject
+        Profile in arcsec and detector axes, without the pixel, for flat f_nu at the detector's centre. Its flux is the
+        fraction that the model contains.
+    pixel_scale : float
+        Arcsec per pixel.
+    surface : float array, shape (side / 2,)
+        Azimuthal mean of the fraction of the flux in a pixel at a distance of r pixels.
+    rim : float array, shape (side / 2,)
+        Largest fraction in a pixel at r pixels or more along columns or rows; spikes of the pupil's bars exceed the
+        mean.
+    outside : float array, shape (side / 2,)
+        Fraction of the flux beyond r pixels.
+    fwhm : float
+        FWHM including the pixel, arcsec.
+    planes : Planes or None
+        Planes by wavelength and position; None if `profile` is the whole model.
+    intra_pixel : float or None
+        Loss of response at a pixel's edges relative to its centre (effects/light/intra_pixel.py), 0 for a uniform
+        response. None if the PSF already includes the pixel.
+    edges : Edges or None
+        Sources of light beyond the planes; None if there is no such light.
     """
 
     profile: galsim.GSObject
@@ -83,12 +105,18 @@ class Psf:
 
     @property
     def side(self) -> int:
-        """Of its planes, pixels."""
+        """Side of its planes, pixels."""
         return 2 * len(self.surface)
 
 
 def reduce_colours(psf: Psf, colours: int) -> Psf:
-    """The same PSF of so many wavelengths at most: each the mean of neighbours, which are of as many photons."""
+    """Return the PSF with at most `colours` wavelengths, each the mean of neighbours with equal numbers of photons.
+
+    Raises
+    ------
+    BadInput
+        If the number of wavelengths is not a multiple of `colours`.
+    """
     planes = psf.planes
     if planes is None or len(planes.wavelength) <= colours:
         return psf
@@ -100,14 +128,25 @@ def reduce_colours(psf: Psf, colours: int) -> Psf:
 
 
 def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim.GSObject:
-    """A plane as a galsim object, arcsec.
+    """Convert a plane to a galsim object in arcsec.
 
-    sampling : arcsec between its samples
-    exact : for the reference, between samples all but their Fourier series: what galsim's quintic makes of them is
-            1e-4 wrong in the middle of steep bulges
+    Parameters
+    ----------
+    image : float array
+        The plane.
+    sampling : float
+        Spacing of its samples, arcsec.
+    exact : bool
+        True, for the reference, to interpolate almost like the Fourier series. galsim's quintic interpolant has errors
+        of 1e-4 in the middle of steep bulges.
+
+    Returns
+    -------
+    galsim.GSObject
+        The profile.
     """
     sampled = galsim.Image(np.asarray(image, float), scale=sampling)
-    # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
+    # A plane that is empty at its border needs little padding, and its extent in real and Fourier space is known.
     return galsim.InterpolatedImage(
         sampled,
         x_interpolant=galsim.Lanczos(31) if exact else None,
@@ -119,10 +158,23 @@ def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim
 
 
 def from_planes(planes: Planes, pixel_scale: float, has_pixel: bool, side: int = SIDE) -> Psf:
-    """A PSF of planes.
+    """Build a PSF from planes.
 
-    pixel_scale : arcsec;  has_pixel : the detector's pixel is in them
-    side        : of a point's largest stamp through them, pixels
+    Parameters
+    ----------
+    planes : Planes
+        The planes.
+    pixel_scale : float
+        Arcsec per pixel.
+    has_pixel : bool
+        True if the planes include the detector's pixel.
+    side : int
+        Side of the largest stamp of a point source, pixels.
+
+    Returns
+    -------
+    Psf
+        The PSF.
     """
     mean = planes.images.mean(axis=0, dtype=float)
     return from_profile(galsim_profile(mean, pixel_scale / planes.samples), pixel_scale, planes, has_pixel, side)
@@ -135,11 +187,25 @@ def from_profile(
     has_pixel: bool = False,
     side: int = SIDE,
 ) -> Psf:
-    """With azimuthal means, and the largest values, of the profile sampled on pixels.
+    """Build a PSF from a profile, with azimuthal means and largest values on pixels.
 
-    profile     : of the PSF;  pixel_scale : arcsec;  planes : to draw through, None: the profile
-    has_pixel   : whether the profile is averaged over a pixel already
-    side        : pixels as far as which it is tabulated, twice
+    Parameters
+    ----------
+    profile : galsim.GSObject
+        Profile of the PSF.
+    pixel_scale : float
+        Arcsec per pixel.
+    planes : Planes, optional
+        Planes for drawing; None to draw the profile.
+    has_pixel : bool
+        True if the profile is already averaged over a pixel.
+    side : int
+        Twice the radius of the tables, pixels.
+
+    Returns
+    -------
+    Psf
+        The PSF.
     """
     image = profile.drawImage(nx=side + 1, ny=side + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(side + 1) - side // 2
@@ -156,29 +222,38 @@ def from_profile(
 
 
 def _width(profile: galsim.GSObject, pixel_scale: float, has_pixel: bool) -> float:
-    """FWHM with the pixel, arcsec.
-
-    profile, pixel_scale, has_pixel : as of `tabulated`
-    """
+    """FWHM including the pixel, arcsec."""
     for samples in _FINE:
         core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / samples, method="no_pixel", dtype=float)
         with_pixel = core.array if has_pixel else uniform_filter(core.array, samples)
         bright = with_pixel > 0.5 * with_pixel.max()
-        # What ends well within the drawing needs no coarser one.
+        # A core that fits into the image needs no coarser sampling.
         if bright[_WITHIN, _WITHIN].sum() == bright.sum():
             break
-    # About the middle of the core: a user's PSF may lie off the source's place.
+    # The width is measured about the middle of the core, since a user's PSF may not be centred.
     y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
     return float(galsim.Image(with_pixel, scale=pixel_scale / samples).calculateFWHM(center=galsim.PositionD(x, y)))
 
 
 def profile_spectrum(psf: Psf, size: int, reach: int) -> Array:
-    """Fourier transform of `profile` on the grid of a stamp of `size` pixels, without the pixel.
+    """Fourier transform of the profile on the grid of a stamp, without the pixel.
 
-    returns : complex[2 reach + 1, reach + 1], [iy, ix] at (ix, iy) times 2 pi / size radian / pixel
+    Parameters
+    ----------
+    psf : Psf
+        The PSF.
+    size : int
+        Side of the stamp, pixels.
+    reach : int
+        Largest index of the frequencies.
+
+    Returns
+    -------
+    complex array, shape (2 reach + 1, reach + 1)
+        Transform [iy, ix] at (ix, iy) times 2 pi / size radian / pixel.
     """
     profile = psf.profile.dilate(1.0 / psf.pixel_scale)
     image = galsim.ImageCD(galsim.BoundsI(0, reach, -reach, reach), scale=2 * np.pi / size)
-    # The half plane is all that a real image needs; galsim's public call draws both halves.
+    # A half plane is sufficient for a real image, but galsim's public method draws both halves.
     profile._drawKImage(image)
     return np.asarray(np.roll(image.array, -reach, axis=0))

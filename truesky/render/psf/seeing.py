@@ -1,8 +1,4 @@
-"""The PSF of a ground telescope: a Gaussian, a Moffat profile, or turbulent air and optics.
-
-of_exposure   that which the mission database chooses;  edges_of : what shines beyond it;  check : is there one?
-ground_psf    a Moffat profile
-"""
+"""PSF of a ground telescope: a Gaussian, a Moffat profile, or turbulent air and optics."""
 
 from __future__ import annotations
 
@@ -16,17 +12,32 @@ from truesky.render.psf import ground, model
 from truesky.render.psf.model import Psf
 from truesky.render.psf.spikes import Edges
 
-# Values of <section>.psf.profile.
+# Values of the mission parameter <section>.psf.profile.
 _GAUSSIAN, _MOFFAT = 0.0, 1.0
 
 
 def exposure_psf(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
 ) -> Psf:
-    """The PSF of a detector of a ground camera, as wide as the exposure's seeing.
+    """PSF of a detector of a ground camera, with the seeing of the exposure.
 
-    exposure  : its row;  detector : of its camera;  band : passband;  mission : the mission database
-    positions : where what changes across the detector is computed, one of euclid.DEGREES
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the table `exposures`.
+    detector : Detector
+        Detector of its camera.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database, which selects the profile.
+    positions : int
+        Number of positions at which the PSF is computed, one of `euclid.DEGREES`.
+
+    Returns
+    -------
+    Psf
+        The PSF.
     """
     section, scale = detector.section, detector.pixel_scale
     profile = mission.value(f"{section}.psf.profile")
@@ -38,18 +49,39 @@ def exposure_psf(
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
-    """Refuse a seeing, arcsec, or a pupil that there is no PSF of.
+    """Refuse a seeing, or a pupil, for which there is no PSF.
 
-    detector : of a ground camera;  band : passband;  mission : the mission database
+    Parameters
+    ----------
+    seeing : float
+        Seeing, arcsec.
+    detector : Detector
+        Detector of a ground camera.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
     """
     if mission.value(f"{detector.section}.psf.profile") not in (_GAUSSIAN, _MOFFAT):
         ground.check(seeing, detector, band, mission)
 
 
 def typical_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
-    """What shines beyond the planes, in the seeing that is usual; None of a profile without planes.
+    """Sources of light beyond the planes, for the typical seeing of the band.
 
-    detector : of a ground camera;  band : passband;  mission : the mission database
+    Parameters
+    ----------
+    detector : Detector
+        Detector of a ground camera.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Edges or None
+        Edges of the pupil, and the aureole; None for a profile without planes.
     """
     section = detector.section
     if mission.value(f"{section}.psf.profile") in (_GAUSSIAN, _MOFFAT):
@@ -60,10 +92,22 @@ def typical_edges(detector: Detector, band: Passband, mission: MissionConfigurat
 
 
 def moffat_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
-    """A round Moffat profile.
+    """PSF with a round Moffat profile.
 
-    seeing : FWHM, arcsec;  beta : exponent, > 1;  pixel_scale : arcsec
+    Parameters
+    ----------
+    seeing : float
+        FWHM, arcsec.
+    beta : float
+        Exponent, above 1.
+    pixel_scale : float
+        Arcsec per pixel.
+
+    Returns
+    -------
+    Psf
+        The PSF.
     """
-    # galsim ends it where 1e-5 of the light is left; of bright stars that is seen.
+    # By default galsim truncates the profile where 1e-5 of the light remains, which is visible for bright stars.
     accuracy_settings = galsim.GSParams(xvalue_accuracy=1e-12)
     return model.from_profile(galsim.Moffat(beta=beta, fwhm=seeing, gsparams=accuracy_settings), pixel_scale)

@@ -1,30 +1,30 @@
 """Diffraction spikes and rings of a pupil, far from a star.
 
-Edges     of a pupil;  of_pupil : the Euclid one's
-ring, spikes   light in a pixel;  wavelengths : that they are made of;  reach : how far out a star's spikes are noticed
+The light of a point source is spread over angles theta as |A(theta)|^2 / (lambda^2 S), where A is the integral of
+exp(-2 pi i x theta / lambda) over the clear pupil and S is the area of the pupil. Far out only edges matter. The
+interference of different parts of the pupil varies so fast that their light adds up.
 
-A point's light is spread over angles theta as |A(theta)|^2 / (lambda^2 S), where A is the integral of
-exp(-2 pi i x theta / lambda) over the clear pupil and S the pupil's area.  Far out only edges count, and those of
-different parts of the pupil beat so fast that their light adds up.
-
-Circles. Of an aperture of radius R, A = 2 pi R^2 J1(z) / z with z = 2 pi R theta / lambda.  Far out
-J1(z)^2 = 2 / (pi z) cos^2(z - 3 pi / 4), whose mean over rings is 1 / (pi z), so that
+Circles: for an aperture of radius R, A = 2 pi R^2 J1(z) / z with z = 2 pi R theta / lambda. Far out,
+J1(z)^2 = 2 / (pi z) cos^2(z - 3 pi / 4), with the mean 1 / (pi z) over rings, so that::
 
     |A|^2 / (lambda^2 S) = R lambda / (2 pi^2 S theta^3) = P lambda / (4 pi^3 S theta^3)
 
-with the perimeter P = 2 pi R: perimeters of all circles add up.  A pixel of side p at r pixels has p^2 of that, with
-theta = p r: P lambda / (4 pi^3 S p r^3), which is `ring` at r = 1.
+with the perimeter P = 2 pi R; the perimeters of all circles add up. A pixel of side p at r pixels receives p^2 times
+this, with theta = p r: P lambda / (4 pi^3 S p r^3). The value at r = 1 is `ring_light`.
 
-Bars. A straight bar of width w and length l takes A = w l sinc(w u / lambda) sinc(l v / lambda) away, where u runs
-across the bar and v along it, sinc(x) = sin(pi x) / (pi x).  Its light in a pixel,
+Bars: a straight bar of width w and length l removes A = w l sinc(w u / lambda) sinc(l v / lambda), where u runs across
+the bar, v along it, and sinc(x) = sin(pi x) / (pi x). Its light in a pixel is::
 
-    (w l p / lambda)^2 / S  sinc^2(w p r / lambda)  sinc^2(l p t / lambda),
+    (w l p / lambda)^2 / S  sinc^2(w p r / lambda)  sinc^2(l p t / lambda)
 
-is a pair of spikes across the bar (r pixels out) as narrow as l is long (t pixels beside their middle), with fringes
-along them.  The mean of the fringes is l^2 / (2 pi^2 S r^2), whatever the width: far out spikes outshine rings.
-Each sub-band is the sum of its wavelengths, smoothed across by jitter, diffusion and the pixel.
+This is a pair of spikes across the bar, with fringes along them; r is the distance along the spike and t that from its
+axis, in pixels. Longer bars have narrower spikes. The mean of the fringes is l^2 / (2 pi^2 S r^2) for any width: far
+out, spikes are brighter than rings. Each sub-band is the sum of several wavelengths, smoothed across the spike by
+jitter, diffusion and the pixel.
 
-Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle)
+References
+----------
+Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle).
 """
 
 from __future__ import annotations
@@ -38,29 +38,41 @@ from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes.passbands import Passband
 from truesky.numerics import matrices
 
-# Wavelengths in each sub-band: a bar's fringes run through each other.
+# Number of wavelengths per sub-band. The fringes of a bar differ between wavelengths.
 _WAVES = 8
-# Half the width of a spike, pixels, and the steps of its table across and along. Kernels contain these constants, and
+# Half the width of a spike, and the steps of its table across and along, pixels. Kernels contain these constants, and
 # naming truesky.numerics.compiling here makes this file part of the key of the machine code.
 WIDE, STEP, LONG = 40, 0.25, 8.0
-# Points along a bar that tell how much of it is seen.
+# Number of points along a bar for measuring its visible length.
 _POINTS = 7001
 ARCSEC = np.pi / 180.0 / 3600.0
-# Spikes are followed so far from a star, arcsec. There one of 7.4 mag still draws lines of a tenth of a pixel's noise
-# over a nominal exposure, one of 4.9 mag of as much as it.
+# Largest distance from a star at which spikes are drawn, arcsec. At this distance, the spikes of a star of 7.4 mag have
+# a tenth of the pixel noise of a nominal exposure, and the spikes of a star of 4.9 mag are equal to it.
 FARTHEST = 1200.0
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """What of a pupil counts far from a star.
+    """Edges of a pupil, and other sources of light far from a star.
 
-    wavelength : float64[w, n] A, by sub-band of the PSF
-    area       : mm2, clear;  round : mm, of all circles' perimeters
-    bars       : float64[b, 3] angle (radian), width and visible length (mm)
-    blur       : arcsec rms, of jitter and diffusion;  pixel_scale : arcsec
-    period     : pixels after which the plane's transform repeats itself; 0: what it folds is not noticed
-    halo       : aureole, A / (r^2 + c^2) of the light in an arcsec2 at r arcsec: (A, c)
+    Attributes
+    ----------
+    wavelength : float array, shape (w, n)
+        Wavelengths in each sub-band of the PSF, Angstrom.
+    area : float
+        Clear area, mm^2.
+    perimeter : float
+        Sum of the perimeters of all circles, mm.
+    bars : float array, shape (b, 3)
+        Angle (radian), width and visible length (mm) of each bar.
+    blur : float
+        Rms of jitter and diffusion, arcsec.
+    pixel_scale : float
+        Arcsec per pixel.
+    period : float
+        Period of the plane's transform, pixels; 0 if its aliasing is negligible.
+    halo : (float, float)
+        Values (A, c) of the aureole, A / (r^2 + c^2) of the light per arcsec^2 at r arcsec.
     """
 
     wavelength: Float
@@ -74,12 +86,12 @@ class Edges:
 
     @property
     def aureole(self) -> tuple[float, float]:
-        """The same in a pixel at r pixels: (A, c^2)."""
+        """Values (A, c^2) of the aureole per pixel, with distances in pixels."""
         return self.halo[0], (self.halo[1] / self.pixel_scale) ** 2
 
 
 def wavelengths(parts: tuple[Passband, ...]) -> Float:
-    """Edges.wavelength of sub-bands: the middles of parts of as many photons."""
+    """Wavelengths of sub-bands [w, n], Angstrom: the middles of parts with equal numbers of photons."""
     places = (np.arange(_WAVES) + 0.5) / _WAVES
     waves = []
     for part in parts:
@@ -91,10 +103,25 @@ def wavelengths(parts: tuple[Passband, ...]) -> Float:
 def from_euclid_pupil(
     parts: tuple[Passband, ...], blur: float, pixel_scale: float, period: float, mission: MissionConfiguration
 ) -> Edges:
-    """Of the Euclid pupil: the aperture stop, the central stop and three bars, as far as the stops let them be seen.
+    """Edges of the Euclid pupil: aperture stop, central stop, and three bars where they are not hidden by the stops.
 
-    parts : sub-bands of the PSF;  blur, pixel_scale, period : of Edges
-    mission : the mission database
+    Parameters
+    ----------
+    parts : tuple of Passband
+        Sub-bands of the PSF.
+    blur : float
+        Rms of jitter and diffusion, arcsec.
+    pixel_scale : float
+        Arcsec per pixel.
+    period : float
+        Period of the plane's transform, pixels.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Edges
+        The edges.
     """
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
@@ -114,24 +141,45 @@ def from_euclid_pupil(
 
 
 def ring_light(edges: Edges, photons: Float) -> float:
-    """Of a star's light in a pixel at a distance of one pixel, were the law r^-3 good there.
+    """Fraction of a star's light in a pixel at a distance of one pixel, extrapolated by the law r^-3.
 
-    photons : [w] share of each sub-band
-    Error   : 3 % beyond 5", 1 % of it where the bars hide the circles
+    Parameters
+    ----------
+    edges : Edges
+        Edges of the pupil.
+    photons : float array, shape (w,)
+        Fraction of the photons in each sub-band.
+
+    Returns
+    -------
+    float
+        The fraction. The error is 3 % beyond 5 arcsec, 1 % of which is caused by bars that hide the circles.
     """
     wavelength = float(matrices.matmul(photons, edges.wavelength.mean(axis=1))) * 1e-7
     return wavelength * edges.perimeter / (4.0 * np.pi**3 * edges.area) / (edges.pixel_scale * ARCSEC)
 
 
 def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
-    """float64[b, r, t] of a star's light in a pixel on each bar's spike: r times 8 pixels out, t times 1/4 across.
+    """Fraction of a star's light in the pixels of each bar's spike.
 
-    reach : pixels
+    Parameters
+    ----------
+    edges : Edges
+        Edges of the pupil.
+    photons : float array, shape (w,)
+        Fraction of the photons in each sub-band.
+    reach : float
+        Length of the spike, pixels.
+
+    Returns
+    -------
+    float array, shape (b, r, t)
+        The fraction at r LONG pixels along the spike and t STEP pixels from its axis.
     """
     share = np.repeat(photons / _WAVES, _WAVES)
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     out = LONG * np.arange(int(reach / LONG) + 2)
-    # Wider than it is kept: what the blur brings in.
+    # The table is wider than the result, to include the light that the blur moves into it.
     across = STEP * np.arange(2 * round(WIDE / STEP))
     lines = []
     for _, width, length in edges.bars:
@@ -144,19 +192,33 @@ def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
 
 
 def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
-    """float64[n] pixels as far as which a star's brightest spike, or its aureole, has a pixel of `least` electrons.
+    """Distance from a star up to which its spikes or its aureole are noticeable.
 
-    At most FARTHEST.
+    Parameters
+    ----------
+    edges : Edges
+        Edges of the pupil.
+    electrons : float array, shape (n,)
+        Expected electrons of the stars.
+    min_electrons : float
+        Smallest noticeable light in a pixel, electrons.
 
-    Error : 15 %, of fringes along the spike, and of colours: sub-bands are taken as equal
+    Returns
+    -------
+    float array, shape (n,)
+        Distance of the last such pixel, pixels, at most FARTHEST arcsec.
+
+    Notes
+    -----
+    The error is 15 %, because of fringes along the spike and because sub-bands are treated as equal.
     """
     share = 1.0 / edges.wavelength.size
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     across, blur = STEP * np.arange(2 * round(WIDE / STEP)), edges.blur / edges.pixel_scale
-    # What the blur takes of each place into the middle, of both sides.
+    # Light that the blur moves from each position, on both sides, to the middle.
     blur_kernel = np.fft.irfft(_blur_transfer(2 * len(across) - 1, blur), 2 * len(across) - 1)[: len(across)]
     blur_kernel[1:] *= 2.0
-    # Of fringes whose mean is half of r^-2.
+    # The mean of the fringes is half of their peak.
     middle = [
         share
         * float(np.maximum((np.sinc(length * cycles[:, None] * across) ** 2 * blur_kernel).sum(axis=1), 0.0).sum())
@@ -171,7 +233,7 @@ def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
 
 
 def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
-    """Sum of the lines [w, t], t >= 0, through jitter, diffusion and pixel: [r, t] up to _WIDE."""
+    """Sum of the lines [w, t], t >= 0, blurred by jitter, diffusion and pixel: [r, t] up to WIDE."""
     symmetric = np.concatenate([lines[:, :0:-1], lines], axis=1)
     passed = np.fft.rfft(symmetric, axis=1) * _blur_transfer(symmetric.shape[1], blur)
     smooth = np.fft.irfft(passed, symmetric.shape[1], axis=1)[:, lines.shape[1] - 1 :]
@@ -179,6 +241,6 @@ def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
 
 
 def _blur_transfer(count: int, blur: float) -> Float:
-    """Of each frequency of so many samples, what jitter, diffusion and pixel leave."""
+    """Transfer function of jitter, diffusion and pixel at the frequencies of `count` samples."""
     k = 2.0 * np.pi * np.fft.rfftfreq(count, STEP)
     return np.asarray(np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi)))

@@ -1,7 +1,4 @@
-"""The parts of a passband in which the PSF is taken as constant.
-
-sub_bands   a band cut into parts of equal photon number for flat f_nu
-"""
+"""Sub-bands of a passband in which the PSF is treated as constant."""
 
 from __future__ import annotations
 
@@ -9,12 +6,12 @@ import numpy as np
 
 from truesky.fluxes.passbands import Passband
 
-# Eight reproduce the second moments of a PSF of continuous colour to 2e-4 (benchmarks/render.py).
+# Eight sub-bands reproduce the second moments of a PSF of continuous colour to 2e-4 (benchmarks/render.py).
 N_SUB_BANDS = 8
 
 
 def sub_bands(band: Passband, count: int = N_SUB_BANDS) -> tuple[Passband, ...]:
-    """A band cut into parts of equal photon number for flat f_nu, blue to red."""
+    """Divide a band into sub-bands with equal numbers of photons for flat f_nu, from blue to red."""
     photons = band.response / band.wavelength
     rank = (np.cumsum(photons) - 0.5 * photons) / photons.sum()
     part = np.minimum((rank * count).astype(int), count - 1)

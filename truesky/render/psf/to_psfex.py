@@ -1,7 +1,4 @@
-"""The PSF that a detector was drawn with, as PSFEx would write it: pixels included, of flat f_nu.
-
-written   Psf -> file
-"""
+"""Write the PSF of a detector in the format of PSFEx, including pixels and for flat f_nu."""
 
 from __future__ import annotations
 
@@ -16,14 +13,25 @@ from lake_schema.fits import psfex
 from truesky.render.camera.detectors import Detector
 from truesky.render.psf.model import Planes, Psf
 
-# Half the side of a model, FWHM and at most samples; samples a pixel of a PSF without planes.
+# Half the side of a model, in FWHM, and its largest value, in samples; samples per pixel of a PSF without planes.
 _HALF, _MAX_HALF, _SAMPLES = 5.0, 63, 2
 
 
 def write(psf: Psf, detector: Detector, path: Path) -> None:
-    """Write the model of a detector; its flux is 1 within its side, 10 FWHM or as much as 127 samples hold.
+    """Write the model of a detector, with flux 1 within its side of 10 FWHM or at most 127 samples.
 
-    Error : what of the PSF goes with a source's colour is left out;  size 1e-3, ellipticity 1e-3
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    detector : Detector
+        The detector.
+    path : Path
+        File to write.
+
+    Notes
+    -----
+    The dependence on the source's colour is neglected. Errors of size and ellipticity are 1e-3.
     """
     planes, step = psfex_planes(psf)
     middle = ((detector.nx + 1) / 2, (detector.ny + 1) / 2)
@@ -31,7 +39,7 @@ def write(psf: Psf, detector: Detector, path: Path) -> None:
 
 
 def psfex_planes(psf: Psf) -> tuple[Float32, float]:
-    """(planes float32[n, s, s] in PSFEx's order, pixels between samples); x, y = -1 .. 1 across the detector."""
+    """Planes [n, s, s] in the order of PSFEx and their spacing in pixels, for x, y = -1 to 1 across the detector."""
     samples = psf.planes.samples if psf.planes else _SAMPLES
     half = min(int(np.ceil(_HALF * psf.fwhm / psf.pixel_scale * samples)), _MAX_HALF)
     if psf.planes is None:
@@ -55,8 +63,8 @@ def psfex_planes(psf: Psf) -> tuple[Float32, float]:
 
 
 def _central_plane(plane: Array, planes: Planes, half: int, has_pixel: bool) -> Float:
-    """The middle of a plane, 2 half + 1 samples, averaged over pixels; beyond the plane there is nothing."""
-    # Room for a pixel beyond the border.
+    """Middle of a plane, 2 half + 1 samples, averaged over pixels; 0 outside the plane."""
+    # The average over pixels needs one pixel beyond the border.
     margin = half + planes.samples - len(plane) // 2
     image = np.pad(plane.astype(float), max(margin, 0))
     if not has_pixel:

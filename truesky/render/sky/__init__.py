@@ -1,1 +1,1 @@
-"""Diffuse light of the sky."""
+"""Diffuse light of the sky, and visibility of fields."""

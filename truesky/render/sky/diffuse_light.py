@@ -1,13 +1,4 @@
-"""The diffuse sky: electrons per second in a pixel.
-
-starlit_sky, thermal_sky, ground_sky   of a band, as different cameras see it
-sky_rate              of a band, at a position and date;  photons : by wavelength;  warm : the thermal ones of them
-zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
-zodiacal_sky          zodiacal light through a passband, for `sky_rate`
-starlight             of a field's stars, of which the telescope scatters some
-solar                 the Sun's spectrum
-sun_longitude
-"""
+"""Diffuse light of the sky in electrons per second and pixel: zodiacal light, scattered starlight, thermal light."""
 
 from __future__ import annotations
 
@@ -29,28 +20,34 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.sky import thermal
 
 _MJD_J2000 = 51544.5
-# Mean longitude, mean anomaly (value at J2000, rate a day) and equation of the centre, deg: The Astronomical
-# Almanac, low-precision formula for the Sun (0.01 deg, 1950-2050); general precession a day turns "of date"
-# into J2000.
+# Mean longitude and mean anomaly (value at J2000 and rate per day) and equation of the centre, deg: The Astronomical
+# Almanac, low-precision formula for the Sun (0.01 deg, 1950-2050). The general precession per day converts from the
+# equinox of date to J2000.
 _SUN_LONGITUDE = (280.460, 0.9856474)
 _SUN_ANOMALY = (357.528, 0.9856003)
 _SUN_CENTRE = (1.915, 0.020)
 _PRECESSION = 1.39697 / 36525.0
 # Unit of the table of Leinert et al. 1998.
 _TABLE_UNIT = 1e-8
-# The band that the mission's scattered light is of.
+# Band of the scattered light in the mission database.
 _VIS = "euclid_vis"
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class SkyBand:
-    """What of a band's sky depends neither on the place nor on the date.
+    """Terms of a band's sky that depend neither on position nor on date, in electrons per second and pixel.
 
-    constant            : electrons per second in a pixel: thermal light, the ground's sky
-    zodi, red, blue     : electrons per second in a pixel for a unit of intensity at 500 nm: of the Sun's spectrum,
-                          and of it times the decades of wavelength on either side of 500 nm
-    stars               : electrons per second in a pixel: scattered light of the stars of |b| = 60 deg
+    Attributes
+    ----------
+    constant : float
+        Thermal light, or the sky of a ground camera.
+    zodi : float
+        Light with the Sun's spectrum, for a unit of intensity (W m-2 sr-1 um-1) at 500 nm.
+    red, blue : float
+        The same, with the spectrum multiplied by the decades of wavelength from 500 nm, above and below 500 nm.
+    stars : float
+        Scattered light of the stars at a Galactic latitude of 60 deg.
     """
 
     constant: float
@@ -63,20 +60,46 @@ class SkyBand:
 def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
     """Zodiacal light, and starlight that the telescope scatters.
 
-    detector, band : of the camera, and the band's name;  mission : the mission database
-    curve          : the passband, None = the embedded one
+    Parameters
+    ----------
+    detector : Detector
+        Detector of the camera.
+    band : str
+        Name of the band.
+    mission : MissionConfiguration
+        Mission database.
+    curve : Passband, optional
+        The passband; by default the embedded one.
+
+    Returns
+    -------
+    SkyBand
+        Terms of the sky.
     """
     rate = mission.value(f"{detector.section}.scattered_light", "electron / (s pix)")
-    # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
+    # The scattered light in a band is proportional to its width, for flat f_nu.
     part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
     return SkyBand(0.0, *_zodiacal_terms(detector, band, mission, curve), rate * part)
 
 
 def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, thermal light of telescope and instrument, and what starlight they scatter.
+    """Zodiacal light, thermal light of telescope and instrument, and starlight that they scatter.
 
-    detector, band : of the camera, and the band's name;  mission : the mission database
-    curve          : the passband, None = the embedded one
+    Parameters
+    ----------
+    detector : Detector
+        Detector of the camera.
+    band : str
+        Name of the band.
+    mission : MissionConfiguration
+        Mission database.
+    curve : Passband, optional
+        The passband; by default the embedded one.
+
+    Returns
+    -------
+    SkyBand
+        Terms of the sky.
     """
     section, key = detector.section, f"{detector.section}.{band}.scattered_light"
     warm = thermal.rate(section, band, curve or passbands.load(band), mission)
@@ -85,10 +108,23 @@ def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
 
 
 def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """The band's dark-sky rate of the mission database, or what follows from its surface brightness and zero point.
+    """Dark-sky rate of a band from the mission database, or from its surface brightness and zero point.
 
-    detector, band : of the camera, and the band's name;  mission : the mission database
-    curve          : is not asked for: the sky of a band is as published
+    Parameters
+    ----------
+    detector : Detector
+        Detector of the camera.
+    band : str
+        Name of the band.
+    mission : MissionConfiguration
+        Mission database.
+    curve : Passband, optional
+        Not used, since the sky of a band is a published value.
+
+    Returns
+    -------
+    SkyBand
+        A constant sky.
     """
     section = detector.section
     if f"{section}.{band}.sky" in mission:
@@ -99,21 +135,47 @@ def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, cur
 
 
 def sky_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons per second in a pixel of a band, at a place and date.
+    """Electrons per second and pixel of a band's sky, at a position and date.
 
-    own          : of a band;  mission : the mission database
-    ra, dec, mjd : deg, and date
+    Parameters
+    ----------
+    sky_band : SkyBand
+        Terms of the sky.
+    ra, dec : float
+        Position, deg.
+    mjd : float
+        Date.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Electrons per second and pixel.
     """
     scattered = sky_band.stars * starlight(ra, dec, mission) if sky_band.stars else 0.0
     return sky_band.constant + scattered + (_zodiacal_rate(sky_band, ra, dec, mjd, mission) if sky_band.zodi else 0.0)
 
 
 def photons(section: str, rate: float, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[n] electrons a second in a pixel at the wavelengths of a band, which are 1 A apart.
+    """Spectrum of the sky: electrons per second and pixel at the wavelengths of a band, which are 1 Angstrom apart.
 
-    section : of the camera in the mission database, with its temperatures
-    rate    : of all of the sky, e-/s;  band : passband;  mission : the mission database
-    Error   : what is not thermal is taken as zodiacal light 90 deg from the Sun
+    Parameters
+    ----------
+    section : str
+        Prefix of the camera in the mission database.
+    rate : float
+        Total rate of the sky, electrons per second and pixel.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database, with the temperatures of the camera.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Electrons per second and pixel. Light that is not thermal has the spectrum of zodiacal light 90 deg from the
+        Sun.
     """
     warm_light = thermal_photons(section, band, mission)
     red, blue = _reddening_slopes(90.0, mission)
@@ -124,16 +186,46 @@ def photons(section: str, rate: float, band: Passband, mission: MissionConfigura
 
 
 def thermal_photons(section: str, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[n] what of `photons` is thermal light: 0 where the mission has none in the band."""
+    """Thermal part of the spectrum of the sky.
+
+    Parameters
+    ----------
+    section : str
+        Prefix of the camera in the mission database.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Electrons per second and pixel; 0 if the mission database has no thermal light in the band.
+    """
     if f"{section}.{band.name}.thermal" not in mission:
         return np.zeros(len(band.wavelength))
     return thermal.photons(section, band.name, band, mission)
 
 
 def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:
-    """Light of a field's stars over its mean at a Galactic latitude of 60 deg, bilinear in the logarithm.
+    """Light of a field's stars, relative to the mean at a Galactic latitude of 60 deg.
 
-    Error : without dust: within 10 deg of the Galactic plane too bright, several times in the plane
+    Parameters
+    ----------
+    ra, dec : float
+        Position, deg.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Ratio, from bilinear interpolation of the logarithm.
+
+    Notes
+    -----
+    Dust is neglected. Within 10 deg of the Galactic plane the light is too bright, by several times in the plane
+    itself.
     """
     longitude, latitude = (float(angle) for angle in galactic(ra, dec))
     longitudes, latitudes, logarithms = _starlight_table(mission.numbers("env.straylight.map"))
@@ -143,14 +235,14 @@ def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:
 
 @lru_cache(maxsize=8)
 def _starlight_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float, Float]:
-    """Longitudes [l] folded at 180 deg, latitudes [b], deg, logarithms [l, b]."""
+    """Longitudes [l] (0 to 180 deg), latitudes [b] (deg) and logarithms of the light [l, b]."""
     table = np.array(sorted(rows))
     longitudes, latitudes = np.unique(table[:, 0]), np.unique(table[:, 1])
     return longitudes, latitudes, np.log(table[:, 2]).reshape(len(longitudes), len(latitudes))
 
 
 def sun_longitude(mjd: float) -> float:
-    """Ecliptic longitude of the Sun from the Earth, deg, mean equinox J2000.  Error: 0.02 deg, 1950-2050."""
+    """Ecliptic longitude of the Sun from the Earth, deg, mean equinox J2000, to 0.02 deg between 1950 and 2050."""
     days = mjd - _MJD_J2000
     longitude = _SUN_LONGITUDE[0] + (_SUN_LONGITUDE[1] - _PRECESSION) * days
     anomaly = np.radians(_SUN_ANOMALY[0] + _SUN_ANOMALY[1] * days)
@@ -158,11 +250,31 @@ def sun_longitude(mjd: float) -> float:
 
 
 def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfiguration) -> float:
-    """Zodiacal light at 500 nm seen from the Earth, W m-2 sr-1 um-1.
+    """Zodiacal light at 500 nm from the Earth.
 
-    from_sun : deg, ecliptic longitude minus the Sun's;  latitude : deg, ecliptic
-    Error    : 10 %; within 15 deg of the Sun, where the table is empty, its nearest value
-    Ref      : Leinert et al. 1998, Table 17, bilinear in the logarithm
+    Parameters
+    ----------
+    from_sun : float
+        Ecliptic longitude minus that of the Sun, deg.
+    latitude : float
+        Ecliptic latitude, deg.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Intensity, W m-2 sr-1 um-1, to 10 %. Within 15 deg of the Sun, where the table is empty, its nearest value is
+        used.
+
+    Raises
+    ------
+    OutOfRange
+        If the latitude is not between -90 and 90 deg.
+
+    References
+    ----------
+    Leinert et al. 1998, Table 17, bilinear in the logarithm.
     """
     if not abs(latitude) <= 90.0:
         raise OutOfRange("ecliptic latitude", latitude, -90.0, 90.0)
@@ -177,12 +289,12 @@ def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfigu
     return float(np.exp(mean)) * _TABLE_UNIT
 
 
-# Columns of the table.
+# Ecliptic latitudes of the table's columns, deg.
 _LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0, 90.0])
 
 
 def _zodiacal_table(mission: MissionConfiguration) -> tuple[Float, Float]:
-    """|longitude from the Sun| [19] deg, values [19, 11]; an empty entry takes the next away from the Sun."""
+    """Longitudes from the Sun [19], deg, and values [19, 11]; empty entries have the next value away from the Sun."""
     return _fill_table(mission.numbers("env.zodi.map"))
 
 
@@ -197,11 +309,27 @@ def _fill_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
 
 
 def zodiacal_sky(band: Passband, area: float, pixel_scale: float, mission: MissionConfiguration) -> SkyBand:
-    """Zodiacal light alone.
+    """Zodiacal light through a passband, without other light.
 
-    band : passband;  area : m2, collecting;  pixel_scale : arcsec;  mission : the mission database
-    Spectrum : the Sun's, reddened with the wavelength and the elongation
-    Ref      : Leinert et al. 1998, section 8
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+    area : float
+        Collecting area, m^2.
+    pixel_scale : float
+        Arcsec per pixel.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    SkyBand
+        Terms of the sky. The spectrum is that of the Sun, reddened depending on wavelength and elongation.
+
+    References
+    ----------
+    Leinert et al. 1998, section 8.
     """
     return SkyBand(0.0, *_zodiacal_integrals(band, area, pixel_scale, mission))
 
@@ -229,7 +357,7 @@ def _zodiacal_integrals(
     reference = mission.value("env.zodi.reference_wavelength", "nm")
     spectrum = solar_irradiance(wavelength, mission) / solar_irradiance(np.array([reference]), mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
-    # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
+    # The spectrum is in W m-2 sr-1 um-1, in steps of 1 A = 1e-4 um.
     photons = spectrum * band.response / energy * (1e-4 * area * (pixel_scale * _ARCSEC) ** 2)
     decades = np.log10(wavelength / reference)
     weights = (np.ones_like(decades), np.maximum(decades, 0.0), np.minimum(decades, 0.0))
@@ -238,15 +366,26 @@ def _zodiacal_integrals(
 
 
 def solar_irradiance(wavelength: Float, mission: MissionConfiguration) -> Float:
-    """Solar spectral irradiance, W m-2 nm-1, 25 nm means; wavelength in nm.  Ref: Gueymard 2004."""
+    """Solar spectral irradiance at wavelengths in nm, W m-2 nm-1, averaged over 25 nm.
+
+    Raises
+    ------
+    BadInput
+        If the wavelengths exceed the range of the spectrum.
+
+    References
+    ----------
+    Gueymard 2004.
+    """
     table = np.array(mission.numbers("env.sun.spectrum"))
     if wavelength.min() < table[0, 0] or wavelength.max() > table[-1, 0]:
-        raise BadInput(f"the solar spectrum covers {table[0, 0]:g}-{table[-1, 0]:g} nm, the band wants more")
+        band = f"the band extends from {wavelength.min():g} to {wavelength.max():g} nm"
+        raise BadInput(f"the solar spectrum covers {table[0, 0]:g}-{table[-1, 0]:g} nm, but {band}")
     return np.asarray(np.interp(wavelength, table[:, 0], table[:, 1]))
 
 
 def _reddening_slopes(elongation: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Slopes k of f_co = 1 + k log10(lambda / 500 nm), Leinert et al. 1998: red of 500 nm, blue of it."""
+    """Slopes k of f_co = 1 + k log10(lambda / 500 nm) of Leinert et al. 1998, above and below 500 nm."""
     ends = [mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far")]
     red, blue = (
         float(np.interp(elongation, ends, [mission.value(f"env.zodi.colour_{side}_{end}") for end in ("near", "far")]))

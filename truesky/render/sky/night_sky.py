@@ -1,11 +1,7 @@
-"""The sky of a site at night: airglow, zodiacal light and moonlight, and what the air takes of a source's light.
+"""Night sky of a ground site (airglow, zodiacal light and moonlight), and extinction of sources.
 
-Night        of a band of a ground camera
-sky_rate     electrons a second in a pixel;  fainter : magnitudes that the air takes more than it did of the zero point
-moonlight    nanolamberts in V
-
-Where the mission database says that a band's level is a survey's own mean (`sky_model` 0), it is taken as it is; else
-it is that of a dark zenith, and airmass, date and Moon change it.
+If the level of a band in the mission database is the mean of a survey (`sky_model` 0), it is used unchanged. Otherwise
+it is the level of a dark zenith, and depends on airmass, date and Moon.
 """
 
 from __future__ import annotations
@@ -26,24 +22,38 @@ from truesky.render.sky import diffuse_light, observatory
 from truesky.render.sky.diffuse_light import SkyBand
 from truesky.render.sky.observatory import Site
 
-# Where zodiacal light is least, deg; the airglow has at least this part of a dark sky.
+# Ecliptic latitude with the least zodiacal light, deg; smallest fraction of a dark sky that is airglow.
 _POLE, _MIN_AIRGLOW = 90.0, 0.2
-# V: nanolamberts of B = 34.08 exp(20.7233 - 0.92104 V), and the wavelength, A.
+# V band: nanolamberts are B = 34.08 exp(20.7233 - 0.92104 V); and its wavelength, Angstrom.
 _NANOLAMBERTS, _V_ZERO, _V = 34.08, 20.7233, 5510.0
-# The Moon nearer than this is taken as there, deg.
+# Smallest distance of the Moon at which the model is evaluated, deg. Smaller distances use this value.
 _NEAREST_MOON = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Night:
-    """What all exposures of a ground camera in a band have in common.
+    """Properties of the night sky that are the same for all exposures of a ground camera in a band.
 
-    level      : electrons a second in a pixel, as the mission database has it
-    modelled   : whether it is of a dark zenith
-    zodiacal   : of it, at the ecliptic pole;  moon : of a nanolambert of moonlight in V
-    sky, scale : zodiacal light of the passband and area, and the camera's electrons over theirs
-    extinction : mag an airmass;  reference : airmass that the zero point is of
-    site       : observatory
+    Attributes
+    ----------
+    level : float
+        Level in the mission database, electrons per second and pixel.
+    modelled : bool
+        True if the level is that of a dark zenith.
+    zodiacal : float
+        Part of the level that is zodiacal light at the ecliptic pole.
+    moon : float
+        Electrons per second and pixel for one nanolambert of moonlight in V.
+    sky : SkyBand
+        Zodiacal light for the passband and the collecting area.
+    scale : float
+        Electrons of the camera, divided by those expected from passband and area.
+    extinction : float
+        Extinction, mag per airmass.
+    reference_airmass : float
+        Airmass of the zero point.
+    site : Site
+        The observatory.
     """
 
     level: float
@@ -61,11 +71,26 @@ class Night:
         cls, detector: Detector, band: str, photometry: tuple[float, float], mission: MissionConfiguration,
         curve: Passband | None,
     ) -> Night:  # fmt: skip
-        """Of a detector's camera.
+        """Read the properties for a detector's camera.
 
-        band       : name of the passband;  curve : the passband, None = the embedded one
-        photometry : AB magnitude of 1 e-/s, and the sky's level in the mission database, e-/s in a pixel
-        mission    : the mission database
+        Parameters
+        ----------
+        detector : Detector
+            Detector of the camera.
+        band : str
+            Name of the passband.
+        photometry : (float, float)
+            AB magnitude of 1 electron per second, and level of the sky in the mission database, electrons per second
+            and pixel.
+        mission : MissionConfiguration
+            Mission database.
+        curve : Passband or None
+            The passband; None for the embedded one.
+
+        Returns
+        -------
+        Night
+            The properties.
         """
         (zero_point, level), section, curve = photometry, detector.section, curve or passbands.load(band)
         area, pixel = mission.value(f"{section}.collecting_area", "m2"), detector.pixel_scale
@@ -83,12 +108,32 @@ class Night:
 
 
 def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons a second in a pixel.
+    """Electrons per second and pixel of the night sky.
 
-    night : of the band;  ra, dec, mjd : deg, and date;  mission : the mission database
-    Error : 10 % of the dark sky, whose airglow changes by half with the Sun's activity; 20 % of moonlight, which is too
-            bright by a half where the air absorbs (y)
-    Ref   : Krisciunas & Schaefer 1991, PASP 103, 1033; zodiacal light, Leinert et al. 1998
+    Parameters
+    ----------
+    night : Night
+        Properties of the band.
+    ra, dec : float
+        Position, deg.
+    mjd : float
+        Date.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Electrons per second and pixel.
+
+    Notes
+    -----
+    The error is 10 % of the dark sky, whose airglow changes by half with the Sun's activity. It is 20 % of moonlight,
+    which is too bright by a half if the air absorbs light (y band).
+
+    References
+    ----------
+    Krisciunas & Schaefer 1991, PASP 103, 1033; zodiacal light, Leinert et al. 1998.
     """
     if not night.modelled:
         return night.level
@@ -100,15 +145,32 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
 
 
 def extra_extinction(night: Night, airmass: float) -> float:
-    """Magnitudes by which the air dims a source more than at the airmass that the zero point is of."""
+    """Additional extinction of a source, relative to the airmass of the zero point, mag."""
     return night.extinction * (airmass - night.reference_airmass)
 
 
 def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -> float:
-    """Nanolamberts of a V band in which the air takes as much as in this one: 0 while the Moon is down.
+    """Moonlight in a V band with the extinction of this band.
 
-    night : of the band;  ra, dec, mjd : deg, and date;  airmass : of the field
-    Ref   : Krisciunas & Schaefer 1991, eqs. 3, 15, 17 to 21
+    Parameters
+    ----------
+    night : Night
+        Properties of the band.
+    ra, dec : float
+        Position of the field, deg.
+    mjd : float
+        Date.
+    airmass : float
+        Airmass of the field.
+
+    Returns
+    -------
+    float
+        Nanolamberts; 0 if the Moon is below the horizon.
+
+    References
+    ----------
+    Krisciunas & Schaefer 1991, eqs. 3, 15, 17 to 21.
     """
     moon_ra, moon_dec, phase = (float(x) for x in observatory.moon_position(mjd))
     up = float(observatory.moon_altitude(mjd, night.site))
@@ -123,12 +185,17 @@ def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -
 
 
 def _path_length(altitude: float) -> float:
-    """Through a layer high above the ground, in its height; altitude : radian.  Ref: Krisciunas & Schaefer, eq. 3."""
+    """Path length through a layer high above the ground, relative to its thickness, at an altitude in radian.
+
+    References
+    ----------
+    Krisciunas & Schaefer 1991, eq. 3.
+    """
     return float((1.0 - 0.96 * np.cos(altitude) ** 2) ** -0.5)
 
 
 def _sun_colour(band: Passband, mission: MissionConfiguration) -> float:
-    """AB magnitude of sunlight in a band less that at V's wavelength."""
+    """AB magnitude of sunlight in a band minus that at the wavelength of V."""
     photons = band.response / band.wavelength
 
     def f_nu(wavelength: Float) -> Float:

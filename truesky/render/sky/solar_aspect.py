@@ -1,11 +1,8 @@
-"""Where the Sun lets Euclid look: the angle between a pointing and the Sun, and the dates at which it is allowed.
+"""Angle between pointings of Euclid and the Sun, and the dates at which a pointing is allowed.
 
-sun_vector, solar_aspect   the Sun's direction, and its distance from a pointing
-position_angle             of the focal plane, with the sunshield towards the Sun
-allowed, next_allowed      dates
-check_aspect               refuses a pointing, and says when it is allowed
-
-Ref : Scaramella et al. 2022, section 4.1
+References
+----------
+Scaramella et al. 2022, section 4.1.
 """
 
 from __future__ import annotations
@@ -24,31 +21,63 @@ from truesky.numerics import matrices
 from truesky.render.camera import pointing
 from truesky.render.sky.diffuse_light import sun_longitude
 
-# The low-precision Sun is good to 0.02 deg.
+# Tolerance of the limits, deg; the low-precision position of the Sun has an error of 0.02 deg.
 _TOLERANCE = 0.05
-# Days that are looked through for an allowed date, in steps and to an accuracy of so many days: a year sees every
-# season, the shortest of them lasts two weeks.
+# Length, step and accuracy of the search for allowed dates, days. A year contains all seasons, and the shortest lasts
+# two weeks.
 _SPAN, _STEP, _EXACT = 400.0, 1.0, 1e-3
-# 1858-11-17, from where MJD counts.
+# Calendar date of MJD 0.
 _FIRST_DAY = np.datetime64("1858-11-17")
 
 
 def sun_vector(mjd: float) -> Float:
-    """Unit vector [3], ICRS, from the Earth to the Sun.  Error: 0.02 deg"""
+    """Unit vector from the Earth to the Sun, ICRS, with an error of 0.02 deg."""
     return sky.unit_vectors(*equatorial(sun_longitude(mjd), 0.0))
 
 
 def solar_aspect(ra: float, dec: float, mjd: float) -> float:
-    """Angle between a pointing and the Sun, deg."""
+    """Angle between a pointing and the Sun.
+
+    Parameters
+    ----------
+    ra, dec : float
+        Pointing, deg.
+    mjd : float
+        Date.
+
+    Returns
+    -------
+    float
+        Angle, deg.
+    """
     return float(np.degrees(np.arccos(np.clip(matrices.matmul(sky.unit_vectors(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
 
 
 def position_angle(ra: float, dec: float, mjd: float) -> float:
-    """Of the focal plane's y axis, deg, north through east: across the direction of the Sun, z x p."""
+    """Position angle of the focal plane's y axis, with the sunshield towards the Sun.
+
+    Parameters
+    ----------
+    ra, dec : float
+        Pointing, deg.
+    mjd : float
+        Date.
+
+    Returns
+    -------
+    float
+        Angle, deg from north through east. The axis is perpendicular to the direction of the Sun, z x p.
+
+    Raises
+    ------
+    BadInput
+        If the pointing is parallel to the direction of the Sun.
+    """
     p, s = sky.unit_vectors(ra, dec), sun_vector(mjd)
     towards = s - matrices.matmul(s, p) * p
     if matrices.matmul(towards, towards) < 1e-12:
-        raise BadInput(f"a pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} looks along the Sun's direction")
+        problem = "is parallel to the direction of the Sun, where no position angle is defined"
+        raise BadInput(f"the pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} {problem}")
     y = np.cross(towards, p)
     east, north, _ = pointing.basis(ra, dec)
     return float(np.degrees(np.arctan2(matrices.matmul(y, east), matrices.matmul(y, north))))
@@ -60,9 +89,21 @@ def limits(mission: MissionConfiguration) -> tuple[float, float]:
 
 
 def is_allowed(ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> bool:
-    """Whether the sunshield lets the telescope look there.
+    """Return True if the sunshield allows a pointing.
 
-    ra, dec : deg;  mjd : date;  mission : the mission database
+    Parameters
+    ----------
+    ra, dec : float
+        Pointing, deg.
+    mjd : float
+        Date.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    bool
+        True if the angle from the Sun is within the limits.
     """
     lowest, highest = limits(mission)
     return lowest - _TOLERANCE <= solar_aspect(ra, dec, mjd) <= highest + _TOLERANCE
@@ -71,9 +112,21 @@ def is_allowed(ra: float, dec: float, mjd: float, mission: MissionConfiguration)
 def allowed_intervals(
     ra: float, dec: float, start: float, mission: MissionConfiguration
 ) -> Iterator[tuple[float, float]]:
-    """Stretches of dates (MJD from, to) within 400 days at which a place is seen.  Error: 0.001 d
+    """Yield the intervals within 400 days in which a position is visible.
 
-    ra, dec : deg;  start : MJD;  mission : the mission database
+    Parameters
+    ----------
+    ra, dec : float
+        Position, deg.
+    start : float
+        Earliest date, MJD.
+    mission : MissionConfiguration
+        Mission database.
+
+    Yields
+    ------
+    (float, float)
+        First and last MJD, to 0.001 d.
     """
     lowest, highest = limits(mission)
     days, suns = _sun_directions(start)
@@ -92,13 +145,13 @@ def allowed_intervals(
 
 @lru_cache(maxsize=8)
 def _sun_directions(start: float) -> tuple[Float, Float]:
-    """Dates [n] MJD from `start` on, and the Sun's directions [n, 3] at them."""
+    """Dates [n], MJD, from `start`, and directions of the Sun [n, 3] at these dates."""
     days = start + np.arange(0.0, _SPAN + _STEP, _STEP)
     return days, np.stack([sun_vector(float(day)) for day in days])
 
 
 def _edge(ra: float, dec: float, forbidden: float, free: float, mission: MissionConfiguration) -> float:
-    """An allowed date next to where the Sun begins to forbid it."""
+    """Allowed date next to the limit between an allowed and a forbidden date."""
     while abs(free - forbidden) > _EXACT:
         middle = 0.5 * (free + forbidden)
         forbidden, free = (forbidden, middle) if is_allowed(ra, dec, middle, mission) else (middle, free)
@@ -106,9 +159,26 @@ def _edge(ra: float, dec: float, forbidden: float, free: float, mission: Mission
 
 
 def next_allowed(ra: float, dec: float, start: float, mission: MissionConfiguration) -> float:
-    """The first date at which a place is seen, MJD; BadInput where there is none in 400 days.
+    """First date at which a position is visible.
 
-    ra, dec : deg;  start : MJD, the earliest;  mission : the mission database
+    Parameters
+    ----------
+    ra, dec : float
+        Position, deg.
+    start : float
+        Earliest date, MJD.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        MJD.
+
+    Raises
+    ------
+    BadInput
+        If the position is not visible within 400 days.
     """
     if is_allowed(ra, dec, start, mission):
         return start
@@ -119,9 +189,23 @@ def next_allowed(ra: float, dec: float, start: float, mission: MissionConfigurat
 
 
 def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguration, where: str) -> None:
-    """Refuse a pointing of the telescope that its sunshield forbids; the message names the next allowed dates.
+    """Refuse a pointing that the sunshield forbids.
 
-    ra, dec, mjd : deg, and date;  mission : the mission database;  where : named in the refusal
+    Parameters
+    ----------
+    ra, dec : float
+        Pointing, deg.
+    mjd : float
+        Date.
+    mission : MissionConfiguration
+        Mission database.
+    where : str
+        Place in the user's input, for the message.
+
+    Raises
+    ------
+    BadInput
+        If the pointing is not allowed; the message contains the next allowed dates.
     """
     if is_allowed(ra, dec, mjd, mission):
         return
@@ -132,12 +216,12 @@ def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguratio
     ]
     when = f"next allowed: MJD {', '.join(stretches[:2])}" if stretches else "no day of the next year is allowed"
     raise BadInput(
-        f"{where}: {angle:.1f} deg from the Sun on MJD {mjd:g}, the telescope looks {lowest:g} to {highest:g} deg from "
-        f"it; {when}"
+        f"{where}: the pointing is {angle:.1f} deg from the Sun on MJD {mjd:g}, but {lowest:g} to {highest:g} deg is "
+        f"allowed; {when}"
     )
 
 
 def _date(mjd: float, towards: str) -> str:
-    """A date that lies within the stretch: the first rounded up, the last rounded down."""
+    """Text of a date inside an interval: the first date is rounded up, the last one down."""
     tenth = (np.ceil if towards == "up" else np.floor)(mjd * 10.0) / 10.0
     return f"{tenth:.1f} ({_FIRST_DAY + int(tenth)})"

@@ -1,1 +1,1 @@
-"""Which catalogue rows shine, and how they look."""
+"""Sources of light from catalogue rows: selection, shapes, colours and pictures."""

@@ -1,4 +1,4 @@
-"""The catalogue rows that a task reads: in its circle, and the bright ones beyond it; stars where they are then."""
+"""Read the catalogue rows of a task: sources in its circle, bright sources beyond it, with proper motions of stars."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,34 +15,34 @@ from lake_schema.tables.stars import EPOCH
 from truesky.render.psf import spikes
 from truesky.render.sources import lensed_arcs, selection
 
-# Each with its fluxes.
+# Tables of sources, each with its table of fluxes.
 CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
-# Drawn where the lake has it.
+# Optional table of strong lenses.
 LENSES = "strong_lenses"
-# How far beyond a detector sources are looked for that shine so far, arcsec: spikes of stars, outskirts of galaxies.
+# Largest distance from a detector of sources that may shine on it, arcsec: spikes of stars, outskirts of galaxies.
 FARTHEST = max(spikes.FARTHEST, selection.FARTHEST)
-# How far a star has moved at most that is looked for, deg: 3"/yr over 12 years; Julian years and days, of J2000.
+# Largest displacement of a star by proper motion, deg: 3 arcsec/yr over 12 years. Julian year and MJD of J2000.
 FARTHEST_MOVED = 0.01
 _JULIAN_2000, _MJD_2000, _DAYS_A_YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
-# What the parts of catalogues say of themselves.
+# Key of the cells among the facts of a catalogue's parts.
 CELLS = "generation_cells"
 
 
 def drawn_cells(catalogue: read.Version) -> set[int]:
-    """Order-8 cells that a catalogue was drawn in."""
+    """Order-8 cells for which a catalogue was drawn."""
     return {cell for part in catalogue.manifest["parts"] for cell in part["facts"][CELLS]}
 
 
 def max_deflection(catalogue: read.Version) -> float:
-    """How far a source may be seen from where its cell says, deg: stars move, galaxies do not.
+    """Largest distance between a source's position and its cell, deg: stars move, galaxies do not.
 
-    Error: a star that has moved farther is missed where its cell is not read
+    Stars that have moved farther are missed if their cell is not read.
     """
     return FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
 
 
 def apply_proper_motion(stars: pa.Table, mjd: float) -> pa.Table:
-    """Rows of table `stars` where their proper motions have led at a time, MJD; parallaxes are left out."""
+    """Return rows of the table `stars` with positions at a date (MJD) from proper motions; parallaxes are neglected."""
     if not {"pm_ra", "pm_dec"} <= set(stars.column_names):
         return stars
     years = _JULIAN_2000 + (mjd - _MJD_2000) / _DAYS_A_YEAR - EPOCH
@@ -65,13 +65,31 @@ def read_sources(
     min_flux: float,
     min_bright_flux: float = float("inf"),
 ) -> tuple[pa.Table, pa.Table, float]:
-    """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
+    """Read the sources that a task may draw, and their fluxes.
 
-    farther : how far beyond the circle a source may be seen and reach the detector, arcsec
-    least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
-    bright  : microjansky, of sources still farther out, as far as spikes and outskirts go; infinite where none do
-    catalogue, fluxes : versions of the two tables;  task : its row
-    columns : that are wanted;  bands : whose fluxes are, those of the first are limited
+    Parameters
+    ----------
+    catalogue, fluxes : read.Version
+        Versions of the two tables.
+    task : mapping
+        Row of the task.
+    columns : sequence of str
+        Columns of the catalogue to read.
+    bands : sequence of str
+        Bands of the fluxes to read. The flux limits apply to the first band.
+    reach_arcsec : float
+        Distance beyond the task's circle up to which sources may reach the detector, arcsec.
+    min_flux : float
+        Smallest flux of sources outside the cells of the circle, microjansky; infinite if no source is visible at all.
+    min_bright_flux : float
+        Smallest flux of sources still farther out, up to the reach of spikes and outskirts, microjansky; infinite to
+        read none of these.
+
+    Returns
+    -------
+    (pyarrow.Table, pyarrow.Table, float)
+        Rows of the catalogue, their fluxes, and the distance beyond the task's circle up to which they are complete,
+        arcsec.
     """
     deflection, flux = max_deflection(catalogue), ["id", *(f"f_nu_{band}" for band in bands)]
     inner_cells: list[int] = []
@@ -100,10 +118,20 @@ def read_sources(
 
 @dataclass(frozen=True, slots=True)
 class BrightQuery:
-    """Of a catalogue the sources that are seen within a task's circle and shine brightly.
+    """Query for the bright sources in a task's circle.
 
-    task    : its row;  columns : that are wanted;  band : whose fluxes are
-    least   : microjansky; infinite where no source shows;  farther : how far beyond the circle they are seen, arcsec
+    Attributes
+    ----------
+    task : mapping
+        Row of the task.
+    columns : sequence of str
+        Columns of the catalogue to read.
+    band : str
+        Band of the fluxes.
+    min_flux : float
+        Smallest flux, microjansky; infinite if no source is visible.
+    reach_arcsec : float
+        Distance beyond the circle up to which sources are included, arcsec.
     """
 
     task: Mapping[str, Any]
@@ -116,9 +144,19 @@ class BrightQuery:
 def read_bright(
     catalogue: read.Version, fluxes: read.Version, queries: Sequence[BrightQuery]
 ) -> list[tuple[pa.Table, pa.Table]]:
-    """(rows of a catalogue, their fluxes) of each that is wanted; what several want is read once.
+    """Read the bright sources of several queries; rows that several queries need are read once.
 
-    catalogue, fluxes : versions of the two tables
+    Parameters
+    ----------
+    catalogue, fluxes : read.Version
+        Versions of the two tables.
+    queries : sequence of BrightQuery
+        The queries.
+
+    Returns
+    -------
+    list of (pyarrow.Table, pyarrow.Table)
+        Rows of the catalogue, and their fluxes, for each query.
     """
     if not queries:
         return []
@@ -136,7 +174,7 @@ def read_bright(
         for query, query_cells in zip(queries, cells, strict=True)
     ]
     bright_ids = light["id"].filter(pa.array(np.logical_or.reduce(shows)))
-    # Fluxes are small: only the parts of the catalogue that have some of these are read.
+    # Fluxes are small and read first, so that only the parts of the catalogue with bright sources are read.
     parts = [
         part["name"] for part in catalogue.manifest["parts"] if not set(all_cells).isdisjoint(part["facts"][CELLS])
     ]
@@ -153,18 +191,32 @@ def read_bright(
 def read_lenses(
     table: read.Version, task: Mapping[str, Any], deflection: float, reach_arcsec: float, min_flux: float
 ) -> pa.Table:
-    """Strong lenses that are seen within a task's circle, and beyond it as far as others are read.
+    """Read the strong lenses in a task's circle, and beyond it up to a given distance.
 
-    deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`
-    farther    : arcsec, as of `sources`
-    table      : version of `strong_lenses`;  task : its row
+    Parameters
+    ----------
+    table : read.Version
+        Version of the table `strong_lenses`.
+    task : mapping
+        Row of the task.
+    deflection : float
+        Largest deflection of the galaxies, deg.
+    reach_arcsec : float
+        Distance beyond the circle up to which lenses are read, arcsec.
+    min_flux : float
+        Infinite if no source is visible, see `read_sources`.
+
+    Returns
+    -------
+    pyarrow.Table
+        Rows with the columns of `lensed_arcs.ARC_COLUMNS`.
     """
     cells = selection.cells_within_reach(task, deflection, reach_arcsec) if np.isfinite(min_flux) else []
     positions = table.rows_in_cells(cells, GENERATION_ORDER, ["id", "ra", "dec"])
     ra, dec = (positions[name].to_numpy() for name in ("ra", "dec"))
     reach = task["radius"] + reach_arcsec / 3600.0
     lens_ids = positions["id"].filter(pa.array(selection.within_radius(ra, dec, (task["ra"], task["dec"]), reach)))
-    # Pictures are large: only those of lenses that are seen are read.
+    # Pictures are large, so only those of visible lenses are read.
     parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
     return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(lens_ids) else [], pc.field("id").isin(lens_ids))
 
@@ -177,17 +229,32 @@ def add_lensed_galaxies(
     task: Mapping[str, Any],
     reach_arcsec: float,
 ) -> tuple[pa.Table, pa.Table]:
-    """(galaxies, their fluxes) with those behind lenses, that alone would be too faint to be seen from so far away.
+    """Add galaxies behind lenses that would be too faint to be read without the lens.
 
-    found  : rows of the two tables, whose columns are read;  lenses : of `strong_lenses`
-    catalogue, fluxes : versions of the two tables;  task, farther : as of `lenses`
+    Parameters
+    ----------
+    galaxies : (pyarrow.Table, pyarrow.Table)
+        Rows of galaxies and their fluxes.
+    lenses : pyarrow.Table
+        Rows of the table `strong_lenses`.
+    catalogue, fluxes : read.Version
+        Versions of the two tables.
+    task : mapping
+        Row of the task.
+    reach_arcsec : float
+        Distance beyond the circle up to which lenses were read, arcsec.
+
+    Returns
+    -------
+    (pyarrow.Table, pyarrow.Table)
+        Rows and fluxes with the additional galaxies.
     """
     rows, light = galaxies
     missing = pc.unique(lenses["source_id"]).to_numpy()
     missing = missing[~np.isin(missing, rows["id"].to_numpy())]
     if not len(missing):
         return galaxies
-    # A lens and what lies behind it are of one cell.
+    # A lens and the galaxy behind it belong to the same cell.
     cells = set(selection.cells_within_reach(task, max_deflection(catalogue), reach_arcsec))
     parts = [part["name"] for part in catalogue.manifest["parts"] if not cells.isdisjoint(part["facts"][CELLS])]
     is_missing = pc.field("id").isin(pa.array(missing))

@@ -1,10 +1,6 @@
-"""The colour of each source inside a band: which photons its PSF is made of.
+"""Colours of sources within a band: fractions of their photons in the sub-bands of the PSF.
 
-galaxies    fractions of each galaxy's photons in each part, from its spectrum
-stars       the same of stars
-of_spectrum the same of one spectrum
-
-Whose spectrum the table does not hold has flat f_nu.
+Sources without a spectrum in the table have flat f_nu.
 """
 
 from __future__ import annotations
@@ -27,24 +23,35 @@ from truesky.fluxes.tables.build_tables import Setting
 from truesky.render.psf import sub_bands
 from truesky.render.psf.sub_bands import N_SUB_BANDS
 
-# Of the tables of f_nu by redshift and dust: 1e-3 of a part's share is 1e-5 of second moments.
+# Resolution of the tables of f_nu by redshift and dust: an error of 1e-3 of a fraction is 1e-5 of the second moments.
 _SETTING = Setting(0.01, 4, 3)
-# What is read of the catalogues.
+# Columns of the galaxy catalogue.
 GALAXY_COLUMNS = (
     *("z_obs", "abs_mag_r01", "mag_r01", "a_v", "kappa", "gamma1", "gamma2"),
     *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS),
     *sorted({line.column for line in line_list()}),
 )
-# What a star must have for a spectrum; a user's own catalogue has no second template.
+# Columns that a star needs for a spectrum. User catalogues do not have a second template.
 ONE_TEMPLATE_COLUMNS = ("sed", "mag_h", "a_v")
 STAR_COLUMNS = (*ONE_TEMPLATE_COLUMNS, *(f"{name}_{k}" for k in STAR_COMPONENTS for name in ("sed", "frac")))
 
 
 def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
-    """float64[n, PARTS] fractions of the detected photons of rows of the table `galaxies`.
+    """Fractions of the detected photons of galaxies by sub-band.
 
-    library : what sed_1 and sed_2 count, None = the embedded galaxies
-    Error : 1e-3 rms (the coarse tables); 1e-5 of second moments
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows of the table `galaxies`.
+    band : Passband
+        The passband.
+    library : Library, optional
+        Library to which sed_1 and sed_2 refer; by default the embedded galaxies.
+
+    Returns
+    -------
+    float array, shape (n, N_SUB_BANDS)
+        Fractions, with an rms error of 1e-3 from the coarse tables, which is 1e-5 of the second moments.
     """
     if not len(rows) or not set(GALAXY_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
@@ -60,7 +67,7 @@ def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> 
 
 
 def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
-    """f_nu of galaxies whose spectra are in the galaxy library."""
+    """Values of f_nu for galaxies whose spectra are in the galaxy library."""
     parameters = galaxies_from_table(rows, library)
     tabulated = flux_tables.covered_galaxies(parameters)
     f_nu = np.empty((len(parameters), len(parts)))
@@ -73,7 +80,22 @@ def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library)
 
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
-    """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`; library as in `galaxies`."""
+    """Fractions of the detected photons of stars by sub-band.
+
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows of the table `stars`.
+    band : Passband
+        The passband.
+    library : Library, optional
+        Library to which the templates refer; by default the embedded stars.
+
+    Returns
+    -------
+    float array, shape (n, N_SUB_BANDS)
+        Fractions.
+    """
     if not len(rows) or not set(ONE_TEMPLATE_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
     library, parts = library or templates.stellar_library(), sub_bands.sub_bands(band)
@@ -87,7 +109,7 @@ def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Flo
 
 
 def spectrum_fractions(band: Passband, f_lambda: Float) -> Float:
-    """float64[PARTS] fractions of the detected photons of a spectrum given on the band's wavelengths."""
+    """Fractions [N_SUB_BANDS] of the detected photons of a spectrum f_lambda at the band's wavelengths."""
     parts = sub_bands.sub_bands(band)
     f_nu = np.array([[passbands.ab_flux(part, band.wavelength, f_lambda) for part in parts]])
     return np.asarray(_shares(f_nu, parts)[0])

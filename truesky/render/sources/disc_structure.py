@@ -1,14 +1,13 @@
-"""Spiral arms and knots of discs: what they add to a smooth disc, and take from it.
+"""Spiral arms and knots of discs, as pictures of light added to and removed from a smooth disc.
 
-DiscStructure   what is asked for
-sides           how large a stamp it wants;  added : sources with it
-arms_and_knots  of one face-on disc: a picture whose sum is 0, to be drawn on top of the smooth profile
+On every circle about the middle of a disc, the structure adds and removes the same amount of light. Flux and half-light
+radius therefore remain those of the profile. The random numbers depend on the galaxy's identifier only, so that the
+structure is the same in every band and exposure.
 
-On every circle about a disc's middle its structure adds as much light as it takes away, so that flux and half-light
-radius stay those of the profile. Its random numbers are of the galaxy's identifier: it is the same in every band and
-exposure.
-Ref : Yu & Ho 2019, ApJ 871, 194 (pitch angles fall with the bulge's part); Kendall et al. 2011, MNRAS 414, 538
-      (contrast of arms); Kennicutt, Edgar & Hodge 1989, ApJ 337, 761 (H II regions: dN / dL goes with L^-2)
+References
+----------
+Yu & Ho 2019, ApJ 871, 194 (pitch angles decrease with the bulge fraction); Kendall et al. 2011, MNRAS 414, 538
+(contrast of arms); Kennicutt, Edgar & Hodge 1989, ApJ 337, 761 (H II regions: dN / dL is proportional to L^-2).
 """
 
 from __future__ import annotations
@@ -27,46 +26,54 @@ from truesky.render.sources.lensed_arcs import Picture
 from truesky.render.sources.source_list import Sources
 from truesky.request.structure import Arms
 
-# Half the side of a picture, in the disc's scale lengths; arcsec of a pixel that are wanted, and sides to be had.
+# Half the side of a picture, scale lengths of the disc; preferred pixel size, arcsec; and available sides, pixels.
 REACH = 5.0
 _FINE = 0.05
 _SIDES = np.array([128, 192, 256, 384, 512])
-# Scale lengths between which the structure sets in, and fades; arcsec that it is narrower than, so that the largest
-# stamp of the finest pixels holds it.
+# Ranges, in scale lengths, in which the structure begins and fades; and its largest width, arcsec, which is limited by
+# the largest stamp of the finest pixels.
 _INNER, _OUTER, _WIDEST = (0.3, 0.9), (3.6, 4.9), 180.0
-# Of the light in the bulge, from which on a disc is smooth.
+# Bulge fraction from which a disc is smooth.
 _SMOOTH = 0.5
-# Pitch angles, deg: of no bulge and of `_SMOOTH`, their scatter, and bounds.
+# Pitch angles, deg: without a bulge, and for the bulge fraction `_SMOOTH`; their scatter and limits.
 _OPEN, _TIGHT, _SCATTER, _PITCHES = 26.0, 13.0, 4.0, (10.0, 30.0)
-# Number of arms, and how many galaxies of a hundred have them.
+# Numbers of arms, and fractions of galaxies with these numbers.
 _ARMS, _ODDS = (2, 3, 4), (0.65, 0.15, 0.20)
-# How narrow arms are: ln of ridge over trough is twice this.
+# Range of the narrowness of arms: half the natural logarithm of the ratio of ridge and trough.
 _NARROW = (1.3, 2.4)
-# Spurs and patches between the arms: waves, and the scatter that they bring to the log of the light.
+# Spurs and patches between the arms: number of waves, and their scatter in the logarithm of the light.
 _WAVES, _PATCHY = 14, 0.28
-# Knots: the brightest over the faintest, widths in scale lengths, part that lies anywhere, scatter about an arm as a
-# part of the angle to the next.
+# Knots: flux ratio of the brightest and the faintest; widths in scale lengths; fraction at any angle; scatter about an
+# arm as a fraction of the angle to the next arm.
 _RANGE, _WIDTHS, _FIELD, _ASTRAY = 30.0, (0.030, 0.075), 0.2, 0.07
-# Scale lengths over which light on circles is balanced.
+# Width of the rings on which light is balanced, scale lengths.
 _RING = 0.12
 
 
 @dataclass(frozen=True, slots=True)
 class DiscStructure:
-    """What structure discs have; wanted : numbers of the request;  seed : of the request"""
+    """Options for the structure of discs.
+
+    Attributes
+    ----------
+    arms : Arms
+        Options of the request.
+    seed : int
+        Seed of the request.
+    """
 
     arms: Arms
     seed: int
 
 
 def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
-    """[n] arcsec that the structure of galaxies is wide, 0 of those that have none.
+    """Widths of the structures of galaxies [n], arcsec; 0 for galaxies without structure.
 
-    Of large discs that the bulge does not outshine, as far as the largest stamp holds them.
+    Large discs without a dominant bulge have a structure, if it fits on the largest stamp.
     """
     if discs is None:
         return np.zeros(len(shape))
-    # The half-light radius along the major axis, of the disc alone, as it is seen.
+    # Apparent half-light radius of the disc, without the bulge, along the major axis.
     half_light_radius = galaxy_shapes.half_light(replace(shape, bulge_fraction=np.zeros(len(shape))))
     wide = 2 * REACH / EXPONENTIAL_RADIUS * half_light_radius
     has_structure = (shape.disk_radius >= discs.arms.least_radius) & (shape.bulge_fraction < _SMOOTH) & (wide < _WIDEST)
@@ -74,7 +81,22 @@ def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
 
 
 def add_structure(sources: Sources, shape: Shapes, discs: DiscStructure | None) -> Sources:
-    """The sources, with pictures of the structure of those discs that have one; shape : of all galaxies."""
+    """Add pictures of the structure of discs to the sources.
+
+    Parameters
+    ----------
+    sources : Sources
+        The sources.
+    shape : Shapes
+        Shapes of all galaxies.
+    discs : DiscStructure or None
+        Options; None returns the sources unchanged.
+
+    Returns
+    -------
+    Sources
+        Sources with the additional pictures.
+    """
     if discs is None:
         return sources
     indices = np.flatnonzero(np.append(sides(shape, discs) > 0.0, False)[sources.shape])
@@ -97,9 +119,23 @@ def _pictures(ids: Int, shape: Shapes, discs: DiscStructure) -> tuple[Picture, .
 
 
 def arms_and_knots(side: int, bulge_fraction: float, arms: Arms, generator: np.random.Generator) -> Float32:
-    """float32[side, side] of sum 0: the structure of a face-on exponential disc of flux 1, 2 REACH scale lengths wide.
+    """Structure of a face-on exponential disc of flux 1.
 
-    bulge_fraction : of the galaxy's light;  wanted : numbers of the request;  numbers : random ones
+    Parameters
+    ----------
+    side : int
+        Side of the picture, pixels; it is 2 REACH scale lengths wide.
+    bulge_fraction : float
+        Fraction of the galaxy's light in the bulge.
+    arms : Arms
+        Options of the request.
+    generator : numpy.random.Generator
+        Source of random numbers.
+
+    Returns
+    -------
+    float32 array, shape (side, side)
+        Structure with the sum 0.
     """
     step = 2 * REACH / side
     at: Float = (np.arange(float(side)) - 0.5 * (side - 1)) * step
@@ -116,7 +152,19 @@ def arms_and_knots(side: int, bulge_fraction: float, arms: Arms, generator: np.r
 
 @dataclass(frozen=True, slots=True)
 class _Winding:
-    """Logarithmic spirals, which wander a little; slope : radian by the log of the radius, the first arm at `first`."""
+    """Logarithmic spirals with small random deviations.
+
+    Attributes
+    ----------
+    arms : int
+        Number of arms.
+    slope : float
+        Change of the angle with the logarithm of the radius, radian.
+    first : float
+        Angle of the first arm at radius 1, radian.
+    wander : float array, shape (2, 3)
+        Amplitudes of the deviations.
+    """
 
     arms: int
     slope: float
@@ -133,7 +181,7 @@ class _Winding:
         return cls(arms, slope, first, generator.uniform(-1.0, 1.0, (2, 3)))
 
     def angle(self, log_radius: Float) -> Float:
-        """Of the first arm, radian."""
+        """Angle of the first arm, radian."""
         arm_angle = self.first + self.slope * log_radius
         for wave, (cosine, sine) in enumerate(self.wander.T, start=2):
             arm_angle = arm_angle + (0.25 / wave) * (
@@ -145,13 +193,13 @@ class _Winding:
 def _pattern(
     log_radius: Float, angle: Float, winding: _Winding, contrast: float, generator: np.random.Generator
 ) -> Float:
-    """Light of arms with spurs and patches over the mean of its circle, about."""
+    """Light of arms with spurs and patches, relative to about the mean of its circle."""
     narrow = generator.uniform(*_NARROW)
     mean = i0e(narrow)
     strength = contrast * generator.uniform(0.7, 1.1) / (1.0 / mean - 1.0)
     phase = angle - winding.angle(log_radius)
     ridge = np.exp(narrow * (np.cos(winding.arms * phase) - 1.0)) / mean
-    # One arm is not as bright as the other, nor all along.
+    # The brightness differs between arms and along each arm.
     uneven = 1.0 + 0.35 * np.cos(phase + generator.uniform(0, 2 * np.pi) + 1.3 * log_radius)
     pattern = 1.0 + min(strength, 0.95) * (ridge * uneven - 1.0)
     patches = np.zeros_like(pattern)
@@ -163,14 +211,14 @@ def _pattern(
 
 
 def _knots(at: Float, winding: _Winding, arms: Arms, generator: np.random.Generator) -> Float:
-    """Light of knots along the arms; at : [side] scale lengths of the picture's columns and rows."""
+    """Light of knots along the arms; `at` [side] are the columns and rows of the picture in scale lengths."""
     light, count = np.zeros((len(at), len(at))), arms.number
     if not count or not arms.knots:
         return light
     step = at[1] - at[0]
     steps = np.linspace(0.0, REACH, 501)
     inside = np.cumsum(steps * np.exp(-steps))
-    # As many in each part of the disc as it has light.
+    # The number of knots at each radius is proportional to the light of the disc.
     radius = np.interp((np.arange(count) + generator.random(count)) / count, inside / inside[-1], steps)
     flux = 1.0 / (1.0 - generator.random(count) * (1.0 - 1.0 / _RANGE))
     width = generator.uniform(*_WIDTHS, count) * (flux / flux.mean()) ** 0.2
@@ -190,7 +238,7 @@ def _knots(at: Float, winding: _Winding, arms: Arms, generator: np.random.Genera
 
 
 def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, step: float) -> Float32:
-    """What is left of light [side, side] without the smooth disc, once circles have as much of both."""
+    """Light [side, side] minus the smooth disc, after scaling it to the same sum on all circles."""
     ring = (radius / step).astype(np.int64).ravel()
     ring_light, smooth_light = (
         gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth)
@@ -198,7 +246,7 @@ def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, st
     middles = (np.arange(len(ring_light)) + 0.5) * step
     light = light * np.interp(radius, middles, smooth_light / ring_light)
     structure = window * (light - smooth)
-    # What the width of a ring leaves over, within the half-light radius and beyond.
+    # Remaining imbalance, because rings have a finite width, is removed inside and outside the half-light radius.
     within = radius < EXPONENTIAL_RADIUS
     for weight in (window * smooth * within, window * smooth * ~within):
         structure -= weight * (structure.sum(where=weight > 0.0) / weight.sum())
@@ -206,6 +254,6 @@ def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, st
 
 
 def _rise(radius: Float, low: float, high: float) -> Float:
-    """From 0 at `low` to 1 at `high`, smoothly."""
+    """Rise smoothly from 0 at `low` to 1 at `high`."""
     part = np.clip((radius - low) / (high - low), 0.0, 1.0)
     return np.asarray(part**2 * (3.0 - 2.0 * part))

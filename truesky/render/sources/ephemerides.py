@@ -1,13 +1,15 @@
-"""Moving bodies of the user's own, in place of the embedded population.
+"""Moving bodies from a user's table, which replace the embedded population.
 
-Bodies, read   a table of where they are on which date, how they move, how bright they are
-check          that planned exposures are of its days
+A table is a Parquet, CSV or FITS file with the columns of KEYS and one row per body and day:
 
-A table : Parquet, CSV or FITS with the columns of KEYS, one row a body and day: mjd (UTC), ecliptic longitude and
-          latitude then (deg, mean equinox J2000), motion to the east and north along them (arcsec / h), I_E (AB).
-          An exposure sees the rows of the day that it begins on. Where there is a column `name` (texts or whole
-          numbers), each row has one, and none stands twice on a day: whoever has an ephemeris by the hour wants one
-          row of each day. Other columns are left alone.
+- mjd: date (UTC).
+- lon, lat: ecliptic longitude and latitude at this date (deg, mean equinox J2000).
+- east, north: motion in these directions (arcsec / h).
+- mag: I_E (AB).
+
+An exposure uses the rows of the day on which it begins. If there is a column `name` (texts or integers), each row must
+have a name, and no name may occur twice on a day. From an hourly ephemeris, select one row per day. Other columns are
+ignored.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from lake_schema.ids import GENERATION_ORDER, source_id
 from lake_schema.sky.ecliptic import equatorial
 from truesky.render.sources.solar_system import KIND, Population
 
-# Columns, and the smallest and largest value of each. A day has to fit into an identifier.
+# Smallest and largest value of each column. A day must fit into an identifier.
 KEYS = {
     "mjd": (0.0, 2.0**18 - 1.0),
     "lon": (-360.0, 720.0),
@@ -39,25 +41,36 @@ KEYS = {
     "mag": (-30.0, 60.0),
 }
 _NAME = "name"
-# Every worker holds the table, within the memory of its task (2 GB): 0.2 kB a row, 0.3 kB while it is read.
+# Every worker stores the table within the memory of its task (2 GB): 0.2 kB per row, 0.3 kB while reading.
 _MOST_ROWS = 1 << 21
 
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """Rows of a table by the day, int64[n], MJD, that they are of."""
+    """Moving bodies by day.
+
+    Attributes
+    ----------
+    day : int array, shape (n,)
+        MJD of each row.
+    rows : Population
+        Rows of the table.
+    """
 
     day: Int
     rows: Population
 
     def on_day(self, day: int) -> Population:
-        """Those of one day."""
+        """Bodies of one day (MJD)."""
         return self.rows.take(self.day == day)
 
 
 @lru_cache(maxsize=2)
 def read(file: Path, sha256: str) -> Bodies:
-    """A table of bodies; BadInput names the file, and the column and row that is wrong.  sha256 : of the file."""
+    """Read and check a table of bodies; `sha256` is the checksum of the file.
+
+    `external_rows` raises BadInput with the file, column and row of a wrong value.
+    """
     values, names = _table(file)
     for key, bounds in KEYS.items():
         external_rows.check_bounds(file, key, values[key], bounds)
@@ -72,15 +85,30 @@ def read(file: Path, sha256: str) -> Bodies:
 
 
 def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
-    """Refuse a table that has nothing of any exposure's day; mjd : of their starts."""
+    """Refuse a table without bodies on the day of any exposure.
+
+    Parameters
+    ----------
+    bodies : Bodies
+        The bodies.
+    file : Path
+        Their file, for the message.
+    mjd : iterable of float
+        Starts of the exposures.
+
+    Raises
+    ------
+    BadInput
+        If no exposure begins on a day of the table.
+    """
     days = sorted({int(np.floor(start)) for start in mjd})
     if days and not np.isin(days, bodies.day).any():
         has = f"MJD {bodies.day.min()} to {bodies.day.max()}" if len(bodies.day) else "no day"
-        raise BadInput(f"{file}: has bodies of {has}, the exposures begin on {days[0]} to {days[-1]}")
+        raise BadInput(f"{file}: has bodies of {has}, but the exposures begin on {days[0]} to {days[-1]}")
 
 
 def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
-    """Columns of KEYS, and names where it has some."""
+    """Columns of KEYS, and names if the table has a column for them."""
     parts: dict[str, list[Float]] = {key: [np.zeros(0)] for key in KEYS}
     names, rows = [], 0
     for piece in external_rows.read_batches(file, list(KEYS), text_columns=[_NAME], kind="table of bodies"):
@@ -95,16 +123,14 @@ def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
 
 
 def _refuse_duplicates(file: Path, names: pa.ChunkedArray, day: Int) -> None:
-    """One row a name and day."""
+    """Raise BadInput if a name is missing, or occurs twice on a day."""
     if (absent := pc.index(names, "").as_py()) >= 0:
         raise BadInput(f"{file}: {_NAME} of row {absent + 1} is missing")
     body = names.combine_chunks().dictionary_encode().indices.to_numpy()
     order = np.lexsort((body, day))
     same = np.flatnonzero((np.diff(body[order]) == 0) & (np.diff(day[order]) == 0))
     if len(same):
-        # Sorting keeps the order of equals.
+        # Sorting is stable, so the second of two equal rows is reported.
         row = int(order[same + 1].min())
-        problem = (
-            f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which has a row of MJD {day[row]} before it"
-        )
+        problem = f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which already has a row for MJD {day[row]}"
         raise BadInput(f"{file}: {problem} ({len(same)} of {len(day)} rows like it)")

@@ -1,13 +1,7 @@
-"""Catalogue rows -> light profiles, lensed, on the sky.
+"""Convert catalogue rows to lensed light profiles on the sky.
 
-World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through east)
-lies at 90 deg + PA from u.
-
-shapes        rows -> Shapes, checked arrays
-forms         what the kernel draws them from, in pixels
-profile       one galaxy by galsim, for the reference
-surface       its light at a radius, for the choice of a stamp's size;  line : along a line
-outside       its light beyond a radius;  on_the_sky : its light at any place, for what lies outside its stamp
+The world frame is that of galsim: u to the west, v to the north, in arcsec. An axis at the position angle PA (north
+through east) lies at 90 deg + PA from u.
 """
 
 from __future__ import annotations
@@ -28,19 +22,19 @@ from truesky.request.schema import MAX_SHEAR
 
 # Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
-# Inverse magnification near a critical line: beyond it, as beyond MOST_SHEAR, a single source is not a lensed ellipse.
+# Smallest inverse magnification near a critical line. Below it, or beyond MAX_SHEAR, the image is not an ellipse.
 _MIN_DETERMINANT = 1e-3
-# An ellipse has an area: thinner than this is a line.
+# Smallest axis ratio; a thinner ellipse would be a line without area.
 _SLIMMEST = 1e-4
-# From this index on Sersic's b_n is taken from its series.
+# Smallest index for which Sersic's b_n is computed from its series.
 _SERIES = 0.8
-# Places along a line at which light is summed: t, from the nearest on, of distances that rise as cosh t.
+# Step and number of the nodes t for integrals along a line; the distance of a node is proportional to cosh t.
 _LINE_STEP, _LINE_NODES = 0.35, 12
-# Square pixels of a component that has no light to speak of outside any stamp.
+# Area, in square pixels, below which a component has negligible light outside any stamp.
 _NO_AREA = 1e-8
 
 
-# What is read of the catalogue.
+# Columns of the galaxy catalogue.
 COLUMNS = (
     "bulge_half_light_radius",
     "disk_half_light_radius",
@@ -57,12 +51,26 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """Structure of n galaxies, arrays [n].
+    """Structure of n galaxies, as arrays [n].
 
-    bulge_radius, disk_radius : half-light semi-major axis, arcsec, before lensing
-    beta                      : radian, major axis from u towards v
-    g1, g2                    : reduced shear in the world frame
-    magnification             : > 0, used for sizes alone (catalogue fluxes hold it already)
+    Attributes
+    ----------
+    bulge_radius, disk_radius : float array
+        Half-light semi-major axes before lensing, arcsec.
+    bulge_fraction : float array
+        Fraction of the light in the bulge.
+    sersic_index : float array
+        Sersic index of the bulge.
+    bulge_axis_ratio : float array
+        Axis ratio of the bulge.
+    inclination : float array
+        Inclination of the disc, deg.
+    beta : float array
+        Angle of the major axis from u towards v, radian.
+    g1, g2 : float array
+        Reduced shear in the world frame.
+    magnification : float array
+        Magnification, positive. It affects sizes only, since catalogue fluxes already include it.
     """
 
     bulge_radius: Float
@@ -80,15 +88,17 @@ class Shapes:
         return len(self.beta)
 
     def take(self, chosen: Int) -> Shapes:
-        """Some of the galaxies."""
+        """Return the selected galaxies."""
         return Shapes(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def shapes(galaxies: pa.Table) -> Shapes:
-    """Rows of the table `galaxies` -> Shapes.
+    """Convert rows of the table `galaxies` to shapes.
 
-    Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant
-                  held above 1e-3
+    Notes
+    -----
+    The reduced shear is g = gamma / (1 - kappa), limited to MAX_SHEAR. The magnification is mu = 1 / |(1 - kappa)^2 -
+    gamma^2|, with a determinant of at least 1e-3.
     """
     columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in COLUMNS}
     stretch = 1.0 - columns["kappa"]
@@ -113,11 +123,15 @@ def shapes(galaxies: pa.Table) -> Shapes:
 
 @dataclass(frozen=True, slots=True)
 class Forms:
-    """Sizes and orientations of n galaxies in Fourier space, k in radian / pixel.
+    """Sizes and orientations of n galaxies in Fourier space, for k in radian / pixel.
 
-    bulge, disk : float64[n, 2, 2] k @ matrix is k along and across the major axis times the radius: half-light of
-                  the bulge, scale length of the disc, both foreshortened across
-    thick       : float64[n, 2] k @ vector is (pi / 2) (h / r) sin(inclination) times k r across, r the scale length
+    Attributes
+    ----------
+    bulge, disk : float array, shape (n, 2, 2)
+        k @ matrix is k along and across the major axis times the radius: the half-light radius of the bulge, or the
+        scale length of the disc. Both are foreshortened across the axis.
+    thick : float array, shape (n, 2)
+        k @ vector is (pi / 2) (h / r) sin(inclination) times k r across the axis, with the scale length r.
     """
 
     bulge: Float
@@ -126,10 +140,15 @@ class Forms:
 
 
 def forms(shape: Shapes, jacobian: Float) -> Forms:
-    """What the kernel needs of shapes [n] at places of a Jacobian [n, 2, 2] (arcsec by pixels).
+    """Compute the forms of shapes [n] at positions with the Jacobians [n, 2, 2], in arcsec per pixel.
 
-    An inclined disc of scale height h, sech^2 across, has (1 + k_p^2)^-3/2 q / sinh q for its transform.
-    Ref : van der Kruit & Searle 1981 (the disc); galsim.InclinedExponential
+    Notes
+    -----
+    An inclined disc with the vertical profile sech^2(z / h) has the transform (1 + k_p^2)^-3/2 q / sinh q.
+
+    References
+    ----------
+    van der Kruit & Searle 1981 (the disc); galsim.InclinedExponential.
     """
     cos_beta, sin_beta = np.cos(shape.beta), np.sin(shape.beta)
     turn = _matrices(cos_beta, -sin_beta, sin_beta, cos_beta)
@@ -150,9 +169,21 @@ def _matrices(a: Float, b: Float, c: Float, d: Float) -> Float:
 
 
 def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
-    """Galaxy i, flux 1, world frame, arcsec.
+    """Profile of one galaxy of flux 1 in the world frame, arcsec.
 
-    smallest : arcsec; a component of a smaller half-light radius is a point
+    Parameters
+    ----------
+    shape : Shapes
+        Shapes of galaxies.
+    i : int
+        Number of the galaxy.
+    smallest : float
+        Components with a smaller half-light radius are point sources, arcsec.
+
+    Returns
+    -------
+    galsim.GSObject
+        The profile.
     """
     fraction = float(shape.bulge_fraction[i])
     parts = []
@@ -167,8 +198,7 @@ def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 
 def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
-    # galsim's shear keeps the area, so the circle that it starts from has the geometric mean of the axes as
-    # its radius.
+    # galsim's shear preserves the area, so the radius of the initial circle is the geometric mean of the axes.
     q = float(shape.bulge_axis_ratio[i])
     radius = float(shape.bulge_radius[i]) * np.sqrt(q)
     if radius < smallest:
@@ -195,9 +225,19 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 
 def surface_brightness(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux per arcsec2 along the major axis, an upper bound for every other direction.
+    """Fraction of the flux per arcsec^2 along the major axis, which is an upper limit for all directions.
 
-    radius : [m] arcsec;  returns [n, m]
+    Parameters
+    ----------
+    shape : Shapes
+        Shapes of n galaxies.
+    radius : float array, shape (m,)
+        Radii, arcsec.
+
+    Returns
+    -------
+    float array, shape (n, m)
+        Fractions.
     """
     stretch = _lensed_stretch(shape)
     area = 1.0 / shape.magnification
@@ -210,13 +250,23 @@ def surface_brightness(shape: Shapes, radius: Float) -> Float:
 
 
 def line_brightness(shape: Shapes, distance: float) -> Float:
-    """Fraction of the flux per arcsec of a line at a distance from the middle: of the major axis, along the minor.
+    """Fraction of the flux per arcsec on a line parallel to the minor axis, an upper limit for all directions.
 
-    distance : arcsec, > 0;  returns [n], an upper bound for lines of every other direction. Error : 1 %
+    Parameters
+    ----------
+    shape : Shapes
+        Shapes of n galaxies.
+    distance : float
+        Distance of the line from the middle along the major axis, arcsec, positive.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Fractions, with an error of 1 %.
     """
     t = _LINE_STEP * np.arange(_LINE_NODES)
     radius, stretch = distance * np.cosh(t), _lensed_stretch(shape)
-    # Both sides of the nearest point, by the trapezoidal rule: x = distance sinh t, dx = radius dt.
+    # Trapezoidal rule on both sides of the nearest point, with x = distance sinh t and dx = radius dt.
     weights = 2.0 * _LINE_STEP * radius
     weights[0] *= 0.5
     ones, parts = np.ones(len(shape)), ((shape.bulge_radius, shape.sersic_index), (shape.disk_radius, None))
@@ -228,9 +278,19 @@ def line_brightness(shape: Shapes, distance: float) -> Float:
 
 
 def flux_outside(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux beyond a radius along the major axis, an upper bound for what is beyond that circle.
+    """Fraction of the flux outside an ellipse with a given semi-major axis, an upper limit for that outside the circle.
 
-    radius : [n] arcsec;  returns [n]
+    Parameters
+    ----------
+    shape : Shapes
+        Shapes of n galaxies.
+    radius : float array, shape (n,)
+        Radii along the major axis, arcsec.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Fractions.
     """
     stretch, n = _lensed_stretch(shape), shape.sersic_index
     bulge_radius, disk_radius = (np.maximum(r * stretch, 1e-6) for r in (shape.bulge_radius, shape.disk_radius))
@@ -241,15 +301,28 @@ def flux_outside(shape: Shapes, radius: Float) -> Float:
 
 
 def real_space_profile(shape: Shapes, form: Forms) -> Float:
-    """float64[n, 11]: what drawing/kernels/frame.py takes the light at a place from, of unit flux.
+    """Parameters of the light at any position, for flux 1, as used by drawing/kernels/frame.py.
 
-    Of the bulge and of the disc the light in the middle, by square pixel; of the bulge, of pixels (x, y) from the
-    middle, the rows of a matrix and an exponent p: light exp(-(u^2 + v^2)^p); of the disc a matrix:
-    light exp(-sqrt(u^2 + v^2)).
-    Error : the disc is thin, of the axis ratio that it is seen with
+    Parameters
+    ----------
+    shape : Shapes
+        Shapes of n galaxies.
+    form : Forms
+        Their forms.
+
+    Returns
+    -------
+    float array, shape (n, 11)
+        Columns: light in the middle of the bulge and of the disc, per square pixel; four elements (rows first) of the
+        bulge's matrix, and its exponent p; four elements of the disc's matrix.
+
+    Notes
+    -----
+    The matrices convert pixels (x, y) from the middle to (u, v). The light of the bulge is proportional to exp(-(u^2 +
+    v^2)^p) and that of the disc to exp(-sqrt(u^2 + v^2)). The disc is treated as thin, with its apparent axis ratio.
     """
     n, b = shape.sersic_index, _b(shape.sersic_index)
-    # A disc on edge is as thick as it is high.
+    # The width of an edge-on disc is given by its scale height.
     across = form.disk[:, :, 1], form.thick * (2 / np.pi)
     disk = np.stack([form.disk[:, :, 0], np.copysign(np.hypot(*across), across[0] + across[1])], -1)
     areas = [
@@ -276,7 +349,7 @@ def real_space_profile(shape: Shapes, form: Forms) -> Float:
 
 
 def half_light(shape: Shapes) -> Float:
-    """Half-light radius along the major axis, lensed, arcsec: the mean of the components'."""
+    """Half-light radius after lensing along the major axis, arcsec: the mean of bulge and disc, weighted by light."""
     fraction = shape.bulge_fraction
     return _lensed_stretch(shape) * (fraction * shape.bulge_radius + (1 - fraction) * shape.disk_radius)
 
@@ -293,7 +366,12 @@ def _apparent_axis_ratio(shape: Shapes) -> Float:
 
 
 def _b(index: Float) -> Float:
-    """Sersic's b_n.  Error: 3e-5.  Ref: Ciotti & Bertin 1999, eq. 18, which is wrong by 1 % at the lowest index."""
+    """Sersic's b_n, with an error of 3e-5.
+
+    References
+    ----------
+    Ciotti & Bertin 1999, eq. 18, which has an error of 1 % at the lowest index.
+    """
     out = np.asarray(2 * index - 1 / 3 + 4 / (405 * index) + 46 / (25515 * index**2))
     low = index < _SERIES
     out[low] = gammaincinv(2 * index[low], 0.5)
@@ -301,7 +379,7 @@ def _b(index: Float) -> Float:
 
 
 def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Float) -> Float:
-    """[n, m] per arcsec2 of the unlensed circle; axis ratio and magnification are the caller's."""
+    """Surface brightness [n, m] per arcsec^2 of the unlensed circle, without axis ratio and magnification."""
     r_e = np.maximum(half_light, 1e-6)[:, None]
     n, b = index[:, None], _b(index)[:, None]
     log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])

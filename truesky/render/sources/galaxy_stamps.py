@@ -1,13 +1,10 @@
-"""Galaxies of a library of the user's, drawn in place of profiles.
+"""Galaxies from a user's library of stamps, which are drawn instead of profiles.
 
-Library, read   stamps of a file, checked and measured
-GalaxyStamps    what is asked for;  of_rows : which galaxies have which picture
-
-A library : FITS, its first image of three axes: columns, rows, and stamps that the column `stamp` of table `galaxies`
-            counts from 0. A stamp is a galaxy about its middle, on nothing, with margins as wide as it is seen. Its
-            scale, flux and orientation are free: it is drawn with the flux of the row, its half-light semi-major axis
-            as large as the mean of the row's bulge and disc, its major axis at the row's position angle, and lensed.
-            Its axis ratio and hand stay. All bands have the same picture.
+A library is a FITS file whose first image has three axes: columns, rows and stamps. The column `stamp` of the table
+`galaxies` contains the number of a stamp, counted from 0. A stamp contains a galaxy at its middle, without background
+and with margins up to where it is visible. Its scale, flux and orientation are arbitrary. It is drawn with the flux of
+the row, and its half-light semi-major axis becomes the mean of the row's bulge and disc. Its major axis is turned to
+the row's position angle, and it is lensed. Axis ratio and handedness do not change. All bands have the same picture.
 """
 
 from __future__ import annotations
@@ -31,27 +28,37 @@ from truesky.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS, Shapes
 from truesky.render.sources.lensed_arcs import Picture
 from truesky.request.structure import Stamps
 
-# Of a pixel, so that no sum is without end.
+# Largest value of a pixel, so that sums are finite.
 _LARGEST = 1e30
-# A kind of lake_schema.user_files; the column that counts stamps.
+# Kind of file in lake_schema.user_files, and column with the number of the stamp.
 KIND, COLUMN = "library of galaxies", "stamp"
-# Sides of a stamp, pixels; part of its light that may be missing, as light below 0; least half-light radius, pixels.
+# Smallest and largest side of a stamp, pixels; largest fraction of negative light; smallest half-light radius, pixels.
 _SIDE_BOUNDS, _BELOW, _COARSEST = (16, 1024), 0.01, 1.5
-# Rounds in which a Gaussian weight takes the shape of the light under it, until it changes by less, on pixels that are
-# joined to so many a side; and the slimmest that it may have.
+# Adaptive moments: largest number of iterations, tolerance, side to which stamps are binned, and smallest axis ratio.
 _ROUNDS, _TOLERANCE, _MAX_REBINNED_SIDE, _SLIMMEST = 60, 1e-5, 128, 0.05
-# Of the nearest in shape one is drawn; arcsec that a stamp is narrower than, so that the largest of the finest pixels
-# holds it.
+# Number of stamps nearest in shape from which one is drawn; largest width, arcsec, which is limited by the largest
+# stamp of the finest pixels.
 _NEAREST, _WIDEST = 8, 180.0
 
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """n stamps.
+    """A library of n stamps.
 
-    images : float32[n, ny, nx] of sum 1 each
-    radius : float64[n] half-light semi-major axis, pixels;  ratio, angle : of the axes, and of the major one from the
-             columns towards the rows, radian;  inner : light within half of the radius
+    Attributes
+    ----------
+    file : Path
+        The file.
+    images : float32 array, shape (n, ny, nx)
+        Stamps with the sum 1.
+    radius : float array, shape (n,)
+        Half-light semi-major axis, pixels.
+    ratio : float array, shape (n,)
+        Axis ratio.
+    angle : float array, shape (n,)
+        Angle of the major axis from the columns towards the rows, radian.
+    inner : float array, shape (n,)
+        Fraction of the light within half of the radius.
     """
 
     file: Path
@@ -67,17 +74,27 @@ class Library:
 
 @lru_cache(maxsize=1)
 def read(file: Path, sha256: str) -> Library:
-    """A library of stamps; BadInput names the file and the stamp that is wrong.  sha256 : of the file
+    """Read, check and measure a library of stamps; `sha256` is the checksum of the file.
 
-    Error : of a stamp's half-light radius, 1 % where it is 3 pixels or more, besides what lies beyond its margins
+    Raises
+    ------
+    BadInput
+        If the file is not a valid library; the message contains the file and the stamp.
+
+    Notes
+    -----
+    The half-light radius of a stamp has an error of 1 % if it is 3 pixels or more; light beyond the margins is not
+    included.
     """
     data, _ = external.read_planes(file, "", KIND)
     try:
         if data.ndim != 3:
-            raise BadInput(f"is an image of {data.ndim} axes, wanted three: columns, rows, stamps")
+            raise BadInput(f"is an image of {data.ndim} axes, but must have three: columns, rows, stamps")
         if not all(_SIDE_BOUNDS[0] <= side <= _SIDE_BOUNDS[1] for side in data.shape[1:]):
             limits = f"{_SIDE_BOUNDS[0]} to {_SIDE_BOUNDS[1]}"
-            raise BadInput(f"its stamps are of {data.shape[2]} x {data.shape[1]} pixels, wanted {limits}")
+            raise BadInput(
+                f"its stamps have {data.shape[2]} x {data.shape[1]} pixels, but {limits} per side is allowed"
+            )
         measured = np.array([_measure_stamp(number, stamp) for number, stamp in enumerate(data)])
     except BadInput as error:
         raise BadInput(f"{file}: {error}") from None
@@ -88,14 +105,14 @@ def read(file: Path, sha256: str) -> Library:
 
 
 def _measure_stamp(number: int, stamp: Float) -> tuple[float, float, float, float]:
-    """(radius, ratio, angle, inner) of Library."""
+    """Radius, ratio, angle and inner fraction of a stamp, see `Library`."""
     if not (np.abs(stamp) < _LARGEST).all():
-        raise BadInput(f"stamp {number} holds values that are not numbers below {_LARGEST:g}")
+        raise BadInput(f"stamp {number} contains values that are not numbers below {_LARGEST:g}")
     total = float(stamp.sum())
     if not total > 1.0 / _LARGEST:
-        raise BadInput(f"stamp {number} sums to {total:.4g}, wanted some light")
+        raise BadInput(f"stamp {number} sums to {total:.4g}, but must have a positive sum")
     if -float(stamp[stamp < 0.0].sum()) > _BELOW * total:
-        raise BadInput(f"stamp {number} is below 0 by more than {_BELOW:g} of its light: wanted no noise")
+        raise BadInput(f"stamp {number}: negative pixels exceed {_BELOW:g} of its light, noise is not allowed")
     light = np.maximum(stamp, 0.0)
     ratio, angle = _ellipse(light)
     y, x = _places(light)
@@ -106,17 +123,17 @@ def _measure_stamp(number: int, stamp: Float) -> tuple[float, float, float, floa
     grown = (grown - 0.5 * light.ravel()[order]) / grown[-1]
     half = float(np.interp(0.5, grown, radius[order]))
     if half < _COARSEST:
-        raise BadInput(f"stamp {number}: half of its light is within {half:.3g} pixels, wanted at least {_COARSEST:g}")
+        raise BadInput(f"stamp {number}: half-light radius is {half:.3g} pixels, but must be at least {_COARSEST:g}")
     return half, ratio, angle, float(np.interp(0.5 * half, radius[order], grown))
 
 
 def _places(light: Float) -> Float:
-    """[2, ny, nx] rows and columns of pixels from the middle."""
+    """Rows and columns of pixels [2, ny, nx] from the middle."""
     return np.asarray(np.mgrid[: light.shape[0], : light.shape[1]] - 0.5 * (np.array(light.shape)[:, None, None] - 1))
 
 
 def _rebin(light: Float) -> Float:
-    """Pixels, some of them added up where there are many, about the same middle."""
+    """Bin the pixels of a large stamp about the same middle."""
     factor = max(min(light.shape) // _MAX_REBINNED_SIDE, 1)
     cut = [(side % factor) // 2 for side in light.shape]
     rows, columns = (side // factor for side in light.shape)
@@ -125,9 +142,11 @@ def _rebin(light: Float) -> Float:
 
 
 def _ellipse(light: Float) -> tuple[float, float]:
-    """(axis ratio, angle of the major axis) under a Gaussian of the same shape.
+    """Axis ratio and angle of the major axis, with a Gaussian weight of the same shape.
 
-    Ref : Bernstein & Jarvis 2002, AJ 123, 583 (adaptive moments)
+    References
+    ----------
+    Bernstein & Jarvis 2002, AJ 123, 583 (adaptive moments).
     """
     light = _rebin(light)
     y, x = _places(light)
@@ -139,7 +158,7 @@ def _ellipse(light: Float) -> tuple[float, float]:
         if not total > 0.0:
             return 1.0, 0.0
         xx, xy, yy = (2.0 * float((weight * part).sum() / total) for part in (x * x, x * y, y * y))
-        # A Gaussian that has shrunk to less than a pixel weighs nothing.
+        # A Gaussian narrower than a pixel would have no weight.
         xx, yy = max(xx, 0.5), max(yy, 0.5)
         xy = float(np.clip(xy, -0.99 * np.sqrt(xx * yy), 0.99 * np.sqrt(xx * yy)))
         if max(abs(now - then) for now, then in zip((xx, xy, yy), previous, strict=True)) < _TOLERANCE * (xx + yy):
@@ -151,7 +170,17 @@ def _ellipse(light: Float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class GalaxyStamps:
-    """What is drawn in place of profiles; wanted : of the request;  seed : of the request"""
+    """Stamps that are drawn instead of profiles.
+
+    Attributes
+    ----------
+    library : Library
+        The stamps.
+    options : Stamps
+        Options of the request.
+    seed : int
+        Seed of the request.
+    """
 
     library: Library
     options: Stamps
@@ -159,17 +188,52 @@ class GalaxyStamps:
 
 
 def from_file(options: Stamps, seed: int, sha256: str) -> GalaxyStamps:
-    """The same of a file that has to be as it was; wanted, seed : of the request;  sha256 : of the file then."""
+    """Read the stamps from a file that must not have changed.
+
+    Parameters
+    ----------
+    options : Stamps
+        Options of the request, with the file.
+    seed : int
+        Seed of the request.
+    sha256 : str
+        Original checksum of the file.
+
+    Returns
+    -------
+    GalaxyStamps
+        The stamps.
+
+    Raises
+    ------
+    BadInput
+        If the file has changed.
+    """
     if file_sha256(options.file) != sha256:
         raise BadInput(f"{options.file}: has changed since the rendering began")
     return GalaxyStamps(read(options.file, sha256), options, seed)
 
 
 def assign_pictures(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> tuple[Int, tuple[Picture, ...]]:
-    """(number of its picture of each galaxy, -1 = it has none; the pictures).
+    """Assign pictures of stamps to galaxies.
 
-    galaxies : rows of the table;  shape : theirs;  stamps : None: there are none
-    Errors   : BadInput for a stamp that the library does not have
+    Parameters
+    ----------
+    galaxies : pyarrow.Table
+        Rows of the table `galaxies`.
+    shape : Shapes
+        Their shapes.
+    stamps : GalaxyStamps or None
+        The stamps; None to draw profiles only.
+
+    Returns
+    -------
+    (int array, tuple of Picture)
+        Number of the picture of each galaxy, -1 for none; and the pictures.
+
+    Notes
+    -----
+    `_stamps_in_rows` raises BadInput if a galaxy has the number of a stamp that does not exist.
     """
     number = np.full(len(galaxies), -1)
     if stamps is None or not len(galaxies):
@@ -192,19 +256,19 @@ def assign_pictures(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | No
 
 
 def _stamps_in_rows(galaxies: pa.Table, library: Library) -> Int:
-    """int64[n] stamps that rows name, -1 = none."""
+    """Numbers of the stamps in the rows [n], -1 for none."""
     if COLUMN not in galaxies.column_names:
         return np.full(len(galaxies), -1)
     named: Array = galaxies[COLUMN].fill_null(-1).to_numpy().astype(np.int64)
     if (bad := named >= len(library)).any():
         row = int(bad.argmax())
         label = f"galaxy {galaxies['id'][row].as_py()}: stamp {named[row]}"
-        raise BadInput(f"{label} is not one of the {len(library)} of {library.file}, counted from 0")
+        raise BadInput(f"{label} does not exist, {library.file} has stamps 0 to {len(library) - 1}")
     return named
 
 
 def _draw_stamps(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
-    """int64[n] stamps drawn among those nearest in axis ratio and concentration."""
+    """Draw one of the stamps nearest in axis ratio and concentration for each galaxy."""
     fraction = shape.bulge_fraction
     disk = np.hypot(np.cos(np.radians(shape.inclination)), DISK_SCALE_HEIGHT)
     ratio = fraction * shape.bulge_axis_ratio + (1 - fraction) * np.minimum(disk, 1.0)
@@ -219,7 +283,7 @@ def _draw_stamps(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
 
 
 def _matrices(shape: Shapes, library: Library, stamp: Int) -> Float:
-    """float64[n, 2, 2] of Picture, of stamps [n] on galaxies [n]."""
+    """Matrices of `Picture` [n, 2, 2] for stamps [n] on galaxies [n]."""
     half_light_radius = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
     face_on = Shapes(
         np.zeros(len(half_light_radius)),

@@ -1,8 +1,4 @@
-"""Sources that are pictures; the lensed images of a galaxy behind a strong lens, as such.
-
-Picture         surface brightness on a grid of its own
-arcs            rows of strong lenses -> pictures, places and electrons
-"""
+"""Sources that are pictures, and the lensed images of galaxies behind strong lenses."""
 
 from __future__ import annotations
 
@@ -14,19 +10,24 @@ import pyarrow as pa
 from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.errors import BadInput
 
-# What is read of the table `strong_lenses`; arcsec of a pixel of its pictures, as the table declares.
+# Columns of the table `strong_lenses`, and the pixel size of its pictures according to the table, arcsec.
 ARC_COLUMNS = ("id", "source_id", "ra", "dec", "stamp_side", "stamp")
 ARC_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What is drawn as it is, or on top of a disc.
+    """Image that is drawn by itself or on top of a disc.
 
-    image  : float32[ny, nx] of sum 1, its place in the middle; of sum 0 where it is a disc's structure
-    matrix : float64[2, 2] arcsec to the west and to the north (rows) of a step to its next column and to its next row
-             (columns)
-    thick  : float64[2] of a disc's structure: galaxy_shapes.Forms' for arcsec, by which it is as thick as its disc
+    Attributes
+    ----------
+    image : float32 array, shape (ny, nx)
+        Pixels of sum 1, centred on the source; of sum 0 for the structure of a disc.
+    matrix : float array, shape (2, 2)
+        Arcsec to the west and north (rows) for a step of one column and one row (columns).
+    thick : float array, shape (2,), or None
+        For the structure of a disc, the vector of `galaxy_shapes.Forms` in arcsec, which gives it the thickness of the
+        disc.
     """
 
     image: Float32
@@ -35,19 +36,19 @@ class Picture:
 
     @classmethod
     def from_sky_image(cls, image: Float32, scale: float) -> Picture:
-        """An image of sum 1, south to north and west to east; scale : arcsec."""
+        """Picture from an image of sum 1, south to north and west to east, with `scale` arcsec per pixel."""
         return cls(image, np.array([[-scale, 0.0], [0.0, scale]]))
 
     @property
     def diagonal(self) -> float:
-        """Corner to corner, arcsec; no less of an image that is drawn on a slant."""
+        """Upper limit of the distance between opposite corners, arcsec."""
         west, north = np.abs(self.matrix)
         rows, columns = self.image.shape
         return float(np.hypot(west[0] * columns + west[1] * rows, north[0] * columns + north[1] * rows))
 
     @property
     def half_light(self) -> float:
-        """Radius about its middle that holds half of its light, arcsec, to half a pixel."""
+        """Radius about its middle that contains half of its light, arcsec, to half a pixel."""
         (a, b), (c, d) = self.matrix
         step = 0.5 * float(abs(a * d - b * c)) ** 0.5
         up, across = (np.arange(n) - (n - 1) / 2 for n in self.image.shape)
@@ -57,13 +58,27 @@ class Picture:
 
     @property
     def is_structure(self) -> bool:
-        """Light that is moved about on a disc, none by itself."""
+        """True if the picture only redistributes the light of a disc."""
         return self.thick is not None
 
 
 @dataclass(frozen=True, slots=True)
 class Arcs:
-    """n lensed galaxies: id, ra, dec in deg, electrons, the row of the galaxy that they are an image of, pictures."""
+    """Images of n lensed galaxies.
+
+    Attributes
+    ----------
+    ids : int array, shape (n,)
+        Identifiers of the lenses.
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+    electrons : float array, shape (n,)
+        Expected electrons.
+    source : int array, shape (n,)
+        Row of the lensed galaxy.
+    pictures : tuple of Picture
+        The images.
+    """
 
     ids: Int
     ra: Float
@@ -74,9 +89,26 @@ class Arcs:
 
 
 def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
-    """Rows of the table `strong_lenses` -> Arcs.
+    """Convert rows of the table `strong_lenses` to arcs.
 
-    ids, electrons : [m] of galaxies, without the magnification of their own that fluxes hold
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows of the table.
+    ids : int array, shape (m,)
+        Identifiers of galaxies.
+    electrons : float array, shape (m,)
+        Their expected electrons, without the magnification that catalogue fluxes include.
+
+    Returns
+    -------
+    Arcs
+        The arcs.
+
+    Raises
+    ------
+    BadInput
+        If the source of a lens is not among the galaxies.
     """
     source_ids, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
     at = np.searchsorted(ids, source_ids, sorter=order)
@@ -100,8 +132,9 @@ def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
 
 
 def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
-    """A strong lens' picture, and its sum."""
+    """Picture of a strong lens, and its sum."""
     total = float(pixels.sum(dtype=float))
     if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
-        raise BadInput(f"strong lens {lens}: its stamp of side {side} has {len(pixels)} pixels of sum {total:g}")
+        actual = f"got {len(pixels)} pixels of sum {total:g}"
+        raise BadInput(f"strong lens {lens}: its stamp must have {side} x {side} pixels and a positive sum, {actual}")
     return Picture.from_sky_image((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total

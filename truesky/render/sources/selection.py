@@ -1,13 +1,7 @@
-"""Which catalogue rows a detector needs.
+"""Select the catalogue cells and rows that a detector needs.
 
-needed     cells of which every source counts
-within     these and whatever cell may matter besides
-beyond     cells that lie farther out, of which the bright sources count
-near       rows within a circle, before any projection
-touching   sources whose stamp overlaps the frame
-
-Cells hold galaxies by where they are seen. Stars move: circles are widened by how far a star may be seen from where its
-cell says.
+Galaxies belong to the cells of their observed positions. Stars move: circles are enlarged by the largest distance
+between a star's position and its cell.
 """
 
 from __future__ import annotations
@@ -22,36 +16,63 @@ from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
 
-# Galaxies are followed so far, arcsec: as far as stars' spikes.
+# Largest distance up to which galaxies are drawn, arcsec: the same as for spikes of stars.
 FARTHEST = 1200.0
-# Added to circles: more than the rounding of the largest deflection, deg.
+# Margin of circles, deg: more than the rounding error of the largest deflection.
 _ROUNDING = 1e-9
-# Steps in which the completeness beyond a detector is told, arcsec.
+# Steps of the completeness beyond a detector, arcsec.
 _STEP = 1.0
 
 
 def cells_of_task(task: Mapping[str, Any], deflection: float) -> list[int]:
-    """Order-8 cells of every source that is seen within a task's circle.
+    """Order-8 cells of all sources in a task's circle.
 
-    task : ra, dec, radius of the table `tasks`;  deflection : largest of the catalogue, deg
+    The task is a row with `ra`, `dec` and `radius` (deg); `deflection` is the largest of the catalogue, deg.
     """
     return _cells(task, deflection)
 
 
 def cells_within_reach(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
-    """Order-8 cells of every source whose light may be on the detector; reach : stamps.reach, arcsec."""
+    """Order-8 cells of all sources whose light may fall on the detector.
+
+    Parameters
+    ----------
+    task : mapping
+        Row of the task.
+    deflection : float
+        Largest deflection of the catalogue, deg.
+    reach : float
+        Distance up to which sources shine, arcsec.
+
+    Returns
+    -------
+    list of int
+        The cells.
+    """
     return _cells(task, deflection + reach / 3600.0)
 
 
 def cells_beyond_task(
     task: Mapping[str, Any], deflection: float, reach_arcsec: float, catalogue_cells: Set[int]
 ) -> tuple[list[int], float]:
-    """(the catalogue's order-8 cells outside the needed ones, how far it is complete), as far as sources shine.
+    """Order-8 cells of a catalogue outside the cells of the circle, up to the distance at which sources shine.
 
-    farther : how far beyond the task's circle a source may be seen and reach the detector, arcsec
-    drawn   : order-8 cells that the catalogue has
-    task    : its row;  deflection : largest of the galaxies, deg
-    returns : the second in arcsec beyond the task's circle, at most `farther`, rounded down to 1"
+    Parameters
+    ----------
+    task : mapping
+        Row of the task.
+    deflection : float
+        Largest deflection of the catalogue, deg.
+    reach_arcsec : float
+        Distance beyond the task's circle up to which a source may reach the detector, arcsec.
+    catalogue_cells : set of int
+        Order-8 cells of the catalogue.
+
+    Returns
+    -------
+    (list of int, float)
+        The cells, and the distance beyond the circle up to which the catalogue is complete: at most `reach_arcsec`,
+        rounded down to 1 arcsec.
     """
     inner = set(_cells(task, deflection))
     cells = set(_cells(task, deflection + reach_arcsec / 3600.0))
@@ -72,20 +93,47 @@ def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
 
 @lru_cache(maxsize=256)
 def _in_circle(ra: float, dec: float, radius: float) -> tuple[int, ...]:
-    """Of each detector the same few circles are asked for by every table."""
+    """Cells in a circle, cached because every table needs the same few circles of a detector."""
     return tuple(sky.cells_in_cone(ra, dec, min(radius, 180.0), GENERATION_ORDER).tolist())
 
 
 def within_radius(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
-    """[n] True within `radius` deg of a centre; a gnomonic projection is then safe.
+    """Find positions within a radius of a centre, for which a gnomonic projection is safe.
 
-    ra, dec : float64[n] deg;  centre : ra, dec deg
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+    centre : (float, float)
+        Right ascension and declination of the centre, deg.
+    radius : float or float array
+        Radius, deg.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True for positions within the radius.
     """
     return np.asarray(sky.separation(ra, dec, centre[0], centre[1]) <= radius)
 
 
 def overlaps_frame(column: Float, row: Float, sizes: Int | Float, nx: int, ny: int) -> Bool:
-    """[n] True where a stamp of `sizes` pixels about (column, row) overlaps a frame of nx x ny pixels."""
+    """Find stamps that overlap a frame.
+
+    Parameters
+    ----------
+    column, row : float array, shape (n,)
+        Middles of the stamps, pixels.
+    sizes : int or float array, shape (n,)
+        Sides of the stamps, pixels.
+    nx, ny : int
+        Columns and rows of the frame.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True for stamps that overlap the frame.
+    """
     half = sizes / 2 + 1
     across = (column + half > 0) & (column - half < nx - 1)
     return np.asarray(across & (row + half > 0) & (row - half < ny - 1))

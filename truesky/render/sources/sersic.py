@@ -1,10 +1,7 @@
-"""The Fourier transform of Sersic profiles, tabulated once.
+"""Fourier transforms of Sersic profiles, in a cached table by index and k^2.
 
-table           transforms of unit flux and unit half-light radius, by index and k^2
-row_of, weights where an index lies in it
-
-The nodes in k^2 are the numbers whose single-precision form has the last 16 bits zero: 128 to the octave, so that a
-sample's segment is read off its bits.
+The transforms are for flux 1 and half-light radius 1. The nodes in k^2 are the numbers whose single-precision form ends
+with 16 zero bits: 128 per octave. The segment of a sample therefore follows from its bits.
 """
 
 from __future__ import annotations
@@ -18,33 +15,39 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
-# galsim.Sersic, the reference, accepts these.
+# Range of the index that galsim.Sersic, the reference, accepts.
 INDEX_LO, INDEX_HI = 0.3, 6.2
-# Rows, uniform in ln n: 4-point interpolation is then good to 1e-7 (tests/truesky/render/sources/test_sersic.py).
+# Number of rows, uniform in ln n: 4-point interpolation has an error of 1e-7
+# (tests/truesky/render/sources/test_sersic.py).
 ROWS = 96
-# k^2 from 2^-30, where 1 - S is below 1e-7 for every n, to 2^26.
+# k^2 ranges from 2^-30, where 1 - S is below 1e-7 for every n, to 2^26.
 OCTAVE_LO, OCTAVE_HI = -30, 26
-# The top bits of float32(2^OCTAVE_LO). Kernels contain this constant, and naming truesky.numerics.compiling here makes
+# Top bits of float32(2^OCTAVE_LO). Kernels contain this constant, and naming truesky.numerics.compiling here makes
 # this file part of the key of the machine code.
 FIRST_BITS = (127 + OCTAVE_LO) << 7
 _SEGMENTS = 128 * (OCTAVE_HI - OCTAVE_LO)
-# Grid of the Hankel transform: points, and reach in radius either side of 1.
+# Grid of the Hankel transform: number of points, and ratio of the largest radius to 1 and of 1 to the smallest.
 _POINTS, _REACH = 1 << 15, 1e12
 _LOG_LO, _LOG_STEP = float(np.log(INDEX_LO)), float(np.log(INDEX_HI / INDEX_LO) / (ROWS - 1))
 
 
 def table() -> Float32:
-    """float32[ROWS, segments + 1]: S(k) at the nodes; the first is set to 1, the flux.
+    """Transforms S(k) at the nodes, float32[ROWS, segments + 1]; the first column is 1, the flux.
 
-    Error : 1e-7 at the nodes, 6e-6 between them (tests/truesky/render/sources/test_sersic.py)
-    Ref   : Hamilton 2000 (logarithmic Hankel transform)
+    Notes
+    -----
+    The error is 1e-7 at the nodes and 6e-6 between them (tests/truesky/render/sources/test_sersic.py).
+
+    References
+    ----------
+    Hamilton 2000 (logarithmic Hankel transform).
     """
     key = cache.content_key(code_key(__name__))
     return cache.cached_arrays("sersic", key, lambda: {"transform": _make_table()})["transform"]
 
 
 def interpolation_weights(index: Float) -> tuple[Int, Float]:
-    """Where indices lie: the first of four rows [n], and the four weights [n, 4] of cubic interpolation in ln n."""
+    """First of four rows [n], and their weights [n, 4], for cubic interpolation in ln n at given indices."""
     position = (np.log(np.clip(index, INDEX_LO, INDEX_HI)) - _LOG_LO) / _LOG_STEP
     first = np.clip(np.floor(position).astype(np.int64) - 1, 0, ROWS - 4)
     t = position - first - 1.0
@@ -58,7 +61,7 @@ def interpolation_weights(index: Float) -> tuple[Int, Float]:
 
 
 def nodes() -> Float:
-    """k^2 of the columns of `table`."""
+    """Values of k^2 for the columns of `table`."""
     bits = (np.arange(_SEGMENTS + 1, dtype=np.int32) + FIRST_BITS) << 16
     return bits.astype(np.int32).view(np.float32).astype(float)
 
@@ -71,11 +74,11 @@ def _make_table() -> Float32:
 
 
 def transform(index: float, log_k: Float) -> Float:
-    """S(k) of unit flux and half-light radius 1 at ln k."""
+    """Transform S(k) for flux 1 and half-light radius 1 at ln k."""
     step = 2 * np.log(_REACH) / _POINTS
     offset = scipy.fft.fhtoffset(step, 0.0)
     log_r = (np.arange(_POINTS) - (_POINTS - 1) / 2) * step
-    # 2n of the incomplete gamma function is the fraction of light inside.
+    # The incomplete gamma function of order 2n is the fraction of light inside a radius.
     b = float(gammainccinv(2 * index, 0.5))
     log_flux = np.log(2 * np.pi * index) - 2 * index * np.log(b) + gammaln(2 * index)
     light = np.exp(log_r - b * np.exp(log_r / index) - log_flux)

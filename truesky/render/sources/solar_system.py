@@ -1,11 +1,8 @@
-"""Solar-system objects: an embedded population of small bodies, each a straight trail while an exposure lasts.
+"""Solar System objects: an embedded population of small bodies, each a straight trail during an exposure.
 
-Population   where they are on a date, how they move, how bright they are
-population   those near a place: drawn by day and order-5 cell, so that all exposures of a day see the same bodies
-sources      those of an exposure that a detector may see, as what is drawn
-
-Near the ecliptic they are dense, and most of them move along it, at the pace of the main belt; a few are fast and go
-anywhere. They shine like the Sun. At midnight UTC another population takes over.
+The density is highest near the ecliptic. Most bodies move along it at the pace of the main belt; a few are fast and
+move in any direction. They have the colour of the Sun. The population is drawn by day and order-5 cell, so that all
+exposures of a day contain the same bodies. At midnight UTC another population begins.
 """
 
 from __future__ import annotations
@@ -32,13 +29,13 @@ from truesky.render.sources import colours
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Kind of an identifier; its member is the day.
+# Kind in an identifier; the member in it is the day.
 KIND = 6
 _DAY_S, _HOUR_S = 86400.0, 3600.0
 _KEY = "env.solar_system"
-# Their magnitudes are of this band.
+# Band of the magnitudes.
 _BAND = "euclid_vis"
-# Motion along a circle of latitude is followed up to here.
+# Smallest cosine of the latitude for motion along a circle of latitude.
 _LEAST_COSINE = 1e-3
 
 
@@ -46,9 +43,18 @@ _LEAST_COSINE = 1e-3
 class Population:
     """n bodies on one day.
 
-    lon, lat   : deg, ecliptic, at noon UTC;  east, north : arcsec / h along them
-    mag        : I_E, AB
-    hour       : after noon, at which they are there
+    Attributes
+    ----------
+    ids : int array, shape (n,)
+        Identifiers.
+    lon, lat : float array, shape (n,)
+        Ecliptic positions, deg.
+    east, north : float array, shape (n,)
+        Motion in these directions, arcsec / h.
+    mag : float array, shape (n,)
+        I_E, AB.
+    hour : float or float array, shape (n,)
+        Time of the positions, hours after noon UTC.
     """
 
     ids: Int
@@ -60,7 +66,7 @@ class Population:
     hour: float | Float = 0.0
 
     def positions_after(self, hours: float | Float) -> tuple[Float, Float]:
-        """ra, dec [n] deg so many hours after noon."""
+        """Right ascensions and declinations [n], deg, at a number of hours after noon."""
         across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
         elapsed = (hours - self.hour) / 3600.0
         return equatorial(
@@ -68,14 +74,14 @@ class Population:
         )
 
     def take(self, selected: Bool | Int) -> Population:
-        """Some of the bodies."""
+        """Return the selected bodies."""
         return Population(
             *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[selected] for field in fields(Population))
         )
 
 
 def empty_population(day: int) -> Population:
-    """The bodies of a day on which there are none."""
+    """Population without bodies."""
     empty = np.zeros(0)
     return Population(np.zeros(0, np.int64), empty, empty, empty, empty, empty)
 
@@ -83,14 +89,32 @@ def empty_population(day: int) -> Population:
 def population(
     ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
 ) -> Population:
-    """Everything that is within `radius` deg of a place at some time of a day (MJD), so many hours around its noon.
+    """Bodies that are within a radius of a position at some time of a day.
 
-    ra, dec : of the place, deg;  mission : the mission database;  seed : of the request
+    Parameters
+    ----------
+    ra, dec : float
+        Position, deg.
+    radius : float
+        Radius, deg.
+    day : int
+        MJD.
+    mission : MissionConfiguration
+        Mission database.
+    seed : int
+        Seed of the request.
+    hours : float
+        Largest time before or after noon, h.
+
+    Returns
+    -------
+    Population
+        The bodies.
     """
     fastest = max(mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_max", "fast_rate_max"))
-    # Away from where it is at noon.
+    # Bodies may have moved by this distance from their positions at noon.
     reach = min(radius + hours * fastest / 3600.0, 180.0)
-    # A database without a faintest magnitude is of a sky without them.
+    # A mission database without a faintest magnitude has no Solar System objects.
     has_bodies = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
     cells = sky.cells_in_cone(ra, dec, reach, FILE_ORDER).tolist() if has_bodies else []
     parts = [_draw_cell(cell, day, mission, seed) for cell in cells]
@@ -101,7 +125,7 @@ def population(
 
 
 def density(latitude: npt.ArrayLike, mission: MissionConfiguration) -> Float:
-    """deg-2 down to the faintest magnitude, at an ecliptic latitude, deg."""
+    """Density of bodies down to the faintest magnitude at an ecliptic latitude in deg, deg-2."""
     value = {name: mission.value(f"{_KEY}.latitude_{name}", "deg") for name in ("zero", "scale", "cap")}
     fainter = mission.value(f"{_KEY}.faintest", "mag") - mission.value(f"{_KEY}.reference_magnitude", "mag")
     total = mission.value(f"{_KEY}.density", "deg-2") * 10.0 ** (_slope(mission) * fainter)
@@ -114,7 +138,7 @@ def _slope(mission: MissionConfiguration) -> float:
 
 
 def _draw_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> tuple[Any, ...]:
-    """ids and columns of Population of an order-5 cell."""
+    """Draw the columns of `Population`, without hours, for an order-5 cell."""
     generator = rng.stream(seed, "solar_system", day, cell)
     centre = ecliptic(*sky.cell_centre(FILE_ORDER, cell))[1]
     max_density = float(density(max(abs(float(centre)) - sky.cell_radius(FILE_ORDER), 0.0), mission))
@@ -128,7 +152,7 @@ def _draw_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) ->
         mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_min", "rate_max", "fast_rate_max")
     )
     is_fast = fast < mission.value(f"{_KEY}.fast_fraction", "")
-    # Fast ones: as many in every octave.
+    # The rates of fast bodies are uniform in the logarithm.
     rate = np.where(is_fast, usual * (fastest / usual) ** pace, slow + (usual - slow) * pace)
     turn = np.where(is_fast, 2.0 * np.pi * angle, 0.0)
     # 1 - u lies in (0, 1].
@@ -146,17 +170,37 @@ def trailed_sources(
     shapes: Shapes,
     day_population: Callable[[int], Population] | None = None,
 ) -> Sources:
-    """Bodies whose trail comes within `reach` deg of a detector's centre, ascending id.
+    """Bodies whose trails come close to a detector during an exposure, as sources in ascending order of identifiers.
 
-    Of a trail longer than twice `reach` it is as long a part about where it is nearest, with its share of the light.
-    shapes : of the sources that they are drawn with
-    own      : a day's (MJD) bodies in place of the embedded population
-    aim      : the exposure and detector;  mission : the mission database;  seed : of the request
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    mission : MissionConfiguration
+        Mission database.
+    seed : int
+        Seed of the request.
+    reach : float
+        Largest distance from the detector's centre, deg.
+    shapes : Shapes
+        Shapes of the other sources in the same list.
+    day_population : callable, optional
+        (MJD) -> bodies of a day, to replace the embedded population.
+
+    Returns
+    -------
+    Sources
+        The bodies.
+
+    Notes
+    -----
+    A trail longer than twice `reach` is cut to this length about its closest point, with the corresponding part of the
+    light.
     """
     exposure, system, band = aim.exposure, aim.wcs, aim.band
     start, seconds = exposure.mjd, exposure.exposure_time_s
     centre = astrometry.centre(aim.detector, system)
-    # An exposure belongs to the day that it begins on.
+    # An exposure belongs to the day on which it begins.
     day = int(np.floor(start))
     start_hours = 24.0 * (start - day - 0.5)
     end_hours = max(12.0, start_hours + seconds / _HOUR_S)
@@ -190,7 +234,7 @@ def trailed_sources(
 def _bodies_in_reach(
     begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
 ) -> tuple[Int, Float, Float]:
-    """(bodies that come within `reach` deg of a centre on their way, parts of it from which to which they are kept)."""
+    """Indices of bodies that come within `reach` deg of a centre, and the fractions between which trails are kept."""
     there, start, stop = (pointing.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
     way = stop - start
     length = np.sqrt(np.sum(way**2, axis=0))
@@ -205,7 +249,22 @@ def _bodies_in_reach(
 
 
 def flux(mag: Float, band: Passband, mission: MissionConfiguration) -> Float:
-    """f_nu [n] in a band, microjansky, of bodies of a magnitude in I_E."""
+    """Flux f_nu of bodies in a band.
+
+    Parameters
+    ----------
+    mag : float array, shape (n,)
+        Magnitudes in I_E, AB.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Flux, microjansky.
+    """
     band_flux, reference_flux = (_sun_flux(b, mission) for b in (band, passbands.load(_BAND)))
     return np.asarray(10.0 ** (0.4 * (units.AB_UJY - mag)) * band_flux / reference_flux)
 

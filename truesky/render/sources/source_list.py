@@ -1,7 +1,4 @@
-"""The sources to be drawn, column by column.
-
-Sources         what is drawn: galaxies (with a shape) and points
-"""
+"""List of sources to be drawn, column by column."""
 
 from __future__ import annotations
 
@@ -17,17 +14,31 @@ from truesky.render.sources.lensed_arcs import Picture
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """n sources in the order in which they are drawn (ascending id).
+    """n sources in the order in which they are drawn (ascending identifiers).
 
-    column, row : float64[n] 0-based pixel position
-    jacobian    : float64[n, 2, 2] d(u, v) / d(column, row), arcsec
-    electrons   : float64[n] expected
-    shape       : row of `shapes`, -1 = a point or a picture alone
-    photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
-    picture     : row of `pictures`, -1 = no picture; None: there is none. Of a source with a shape it is the structure
-                  of its disc, drawn on top of it
-    trail       : float64[n, 2] pixels that a point moves by in the exposure, in the middle of which it is at its
-                  position; None: nothing moves
+    Attributes
+    ----------
+    ids : int array, shape (n,)
+        Identifiers.
+    column, row : float array, shape (n,)
+        Positions, 0-based pixels.
+    jacobian : float array, shape (n, 2, 2)
+        d(u, v) / d(column, row), arcsec.
+    electrons : float array, shape (n,)
+        Expected electrons.
+    shape : int array, shape (n,)
+        Row of `shapes`, -1 for a point source or a picture without a profile.
+    shapes : Shapes
+        Shapes of galaxies.
+    photons : float array, shape (n, w), or None
+        Fraction of the photons in each sub-band of the PSF; None for flat f_nu.
+    picture : int array, shape (n,), or None
+        Number of the picture, -1 for none; None if no source has a picture. For a source with a shape, the picture is
+        the structure of its disc, which is drawn on top of the profile.
+    pictures : tuple of Picture
+        The pictures.
+    trail : float array, shape (n, 2), or None
+        Displacement of a point source during the exposure, centred on its position, pixels; None if no source moves.
     """
 
     ids: Int
@@ -46,7 +57,7 @@ class Sources:
         return len(self.ids)
 
     def take(self, chosen: Bool | Int) -> Sources:
-        """Some of the sources."""
+        """Return the selected sources."""
         return Sources(
             self.ids[chosen],
             self.column[chosen],
@@ -62,11 +73,11 @@ class Sources:
         )
 
     def picture_of(self, i: int) -> Picture | None:
-        """The picture of source i, if it has one."""
+        """Picture of source `i`, or None."""
         return None if self.picture is None or self.picture[i] < 0 else self.pictures[self.picture[i]]
 
     def with_moving(self, moving: Sources) -> Sources:
-        """These, at rest, and points that move, of later identifiers and the same shapes."""
+        """Append moving point sources, with later identifiers and the same shapes, to these sources at rest."""
         names = ("ids", "column", "row", "jacobian", "electrons", "shape")
         columns: dict[str, Any] = {n: np.concatenate([getattr(self, n), getattr(moving, n)]) for n in names}
         photons = None if self.photons is None else np.concatenate([self.photons, moving.photons])
@@ -78,10 +89,10 @@ class Sources:
 
     @property
     def has_structure(self) -> Bool:
-        """[n] True of galaxies whose disc has a structure of its own."""
+        """Mask [n] of the galaxies whose disc has a structure."""
         return np.zeros(len(self), bool) if self.picture is None else (self.shape >= 0) & (self.picture >= 0)
 
     @property
     def trail_length(self) -> Float:
-        """Of the trails, pixels."""
+        """Lengths of the trails [n], pixels."""
         return np.zeros(len(self)) if self.trail is None else np.hypot(*self.trail.T)

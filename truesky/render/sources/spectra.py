@@ -1,7 +1,4 @@
-"""Spectra of the sources of a detector over a passband: what is spread out by a grism.
-
-of_rows    a function of the sources' numbers
-"""
+"""Spectra of the sources of a detector over a passband, for dispersion by a grism."""
 
 from __future__ import annotations
 
@@ -26,13 +23,30 @@ def spectrum_function(
     spectrum_rows: Int, galaxies: pa.Table, stars: pa.Table, band: Passband, sun: Float,
     libraries: tuple[Library | None, Library | None] = (None, None),
 ) -> Spectra:  # fmt: skip
-    """(numbers of sources [k]) -> float32[k, w] f_lambda of each over the band, of which it detects one photon.
+    """Return a function that computes the spectra of sources over a band.
 
-    So it is as bright as the table of fluxes has it, whatever that says.  Whose spectrum the tables do not hold has
-    flat f_nu.
-    which     : int[n] row of each source's spectrum, counted from the galaxies on to the stars; -1 = the Sun's
-    galaxies, stars : rows of the catalogues;  band : passband;  sun : float64[w] the Sun's f_lambda, on any scale
-    libraries : what the galaxies' templates count, and the stars'; None = the embedded ones
+    Parameters
+    ----------
+    spectrum_rows : int array, shape (n,)
+        Row of each source's spectrum, counted from the galaxies on to the stars; -1 for the spectrum of the Sun.
+    galaxies, stars : pyarrow.Table
+        Rows of the catalogues.
+    band : Passband
+        The passband.
+    sun : float array, shape (w,)
+        f_lambda of the Sun on any scale.
+    libraries : (Library or None, Library or None)
+        Libraries to which the templates of galaxies and stars refer; None for the embedded ones.
+
+    Returns
+    -------
+    callable
+        (numbers of k sources) -> float32[k, w] f_lambda over the band, scaled to one detected photon.
+
+    Notes
+    -----
+    Because of the scaling, sources have the brightness of the table of fluxes. Sources without a spectrum in the tables
+    have flat f_nu.
     """
     count, weights = len(band.wavelength), band.response * band.wavelength
     of_galaxy, of_star = _galaxies(galaxies, band, libraries[0]), _stars(stars, band, libraries[1])

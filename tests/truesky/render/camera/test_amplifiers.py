@@ -64,7 +64,7 @@ def test_raw_files_have_their_published_size(camera):
     assert layout_of(first(camera)).raw_shape == RAW[camera]
 
 
-def test_sensors_of_two_makers_are_read_in_their_own_ways():
+def test_sensors_of_two_makers_have_different_gains():
     """Rubin Observatory: segments of 576 x 2048 (e2v) or 576 x 2048 with other scans (ITL); gains 1.47 and 1.57."""
     makers = {d.kind: d for d in detectors.detectors("lsstcam", MISSION)}
     e2v, itl = (layout_of(makers[kind]) for kind in ("e2v", "itl"))
@@ -112,11 +112,11 @@ def test_what_a_request_gives_is_taken_as_it_is():
 
 
 def test_a_detector_too_small_for_its_amplifiers_is_refused():
-    with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels for 2 amplifiers"):
+    with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels are too few for 2 amplifiers"):
         layout_of(replace(detectors.detector("decam", "S29", MISSION), nx=1, ny=8))
 
 
-def test_crosstalk_beyond_neighbours_is_as_little_as_measured():
+def test_crosstalk_beyond_neighbours_is_as_small_as_measured():
     """Rubin Observatory, LSSTCam: 1.5e-4 to 2.9e-4 between neighbours, less than 5e-5 between others."""
     for one in detectors.detectors("lsstcam", MISSION)[:60]:
         own = layout_of(one)

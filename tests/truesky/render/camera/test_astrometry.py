@@ -48,7 +48,7 @@ def test_vis_fills_the_published_field():
     assert height / 3600 == pytest.approx(0.7781, abs=5e-4)
 
 
-def test_between_the_halves_of_a_vis_detector_nothing_is_read():
+def test_rows_between_the_halves_of_a_vis_detector_are_not_read():
     """Four rows of charge injection between 2 x 2066: 4136 of them from edge to edge."""
 
     def half_rows(detector):

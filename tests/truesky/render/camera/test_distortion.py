@@ -176,7 +176,7 @@ def test_it_can_be_switched_off(camera, columns, pitch):
 
 
 @pytest.mark.parametrize("far", [1.3, 2.0, 6.0, 40.0])
-def test_what_lies_beyond_where_places_are_seen_twice_is_left(far):
+def test_positions_beyond_the_invertible_radius_are_unchanged(far):
     """HSC's distortion folds 1.7 deg from its axis, where there is no detector."""
     system = wcs(FARTHEST[-1], 150.0, 2.0, 0.0)
     place = [150.0], [2.0 + far]

@@ -67,7 +67,7 @@ def test_none_lies_on_rows_that_are_not_read():
         assert (np.abs(row - (whole.ny - 1) / 2) > 300).all()
 
 
-def test_what_bleeds_is_as_long_as_the_charge_that_does_not_fit():
+def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
     """In each column what fell on the full pixels is what they hold, and not an electron is lost."""
     one, _ = rendered("bleeding", 14.0)
     well, full = one.scene.value("full_well", "electron"), one.maps["saturation"] > 0

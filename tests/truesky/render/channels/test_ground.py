@@ -91,7 +91,7 @@ def test_photon_transfer_of_every_camera(camera, tmp_path):
     check_photon_transfer(camera, 4096 if camera in ("gpc1", "jpcam", "lsstcam") else 2048, tmp_path)
 
 
-def test_levels_of_amplifiers_differ_and_their_overscans_tell(tmp_path):
+def test_levels_of_amplifiers_differ_and_are_measured_in_overscans(tmp_path):
     one = exposure("hsc", 256, 2000.0)
     pixels, bias, header = sections(put(one, tmp_path)["science"])
     levels = [columns.mean() for columns in bias]

@@ -75,7 +75,7 @@ def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
     assert rows == pytest.approx(30.6 + y[len(y) // 2], abs=4.0)
 
 
-def test_sources_beside_the_detector_shine_onto_it_by_their_first_order():
+def test_first_orders_of_sources_outside_the_detector_fall_on_it():
     """250 px before its first column: farther than images are read."""
     beside = spectroscopic.rendered([18.0], [-250.0], [48.0])
     assert len(beside.sources) == 1
@@ -86,7 +86,7 @@ def test_sources_beside_the_detector_shine_onto_it_by_their_first_order():
     assert len(spectroscopic.rendered([16.0], [5000.0], [48.0]).sources) == 0
 
 
-def test_the_margin_holds_the_first_order_and_the_rest_is_looked_for_as_far_as_any_order_goes():
+def test_margin_contains_the_first_order_and_spectra_are_searched_up_to_any_order():
     whole = detectors.detector("nisp", "DET22", MISSION)
     exposure = fields.exposure(**spectroscopic.exposed(whole))
     assert CHANNEL.margin("nisp", MISSION) == pytest.approx(60.0 + 293 * 0.3, rel=0.02)
@@ -105,7 +105,7 @@ def wheel_errors(rows, seed):
     return np.array(found)
 
 
-def test_the_wheel_turns_each_exposure_a_little_and_its_realisations_alike():
+def test_wheel_error_differs_between_exposures_but_not_between_realisations():
     rows = [fields.exposure(**spectroscopic.exposed(strip(), mjd=infrared.MJD + i)) for i in range(200)]
     tilts = wheel_errors(rows, SEED)
     assert np.std(tilts) == pytest.approx(0.1, rel=0.2)
@@ -113,7 +113,7 @@ def test_the_wheel_turns_each_exposure_a_little_and_its_realisations_alike():
     np.testing.assert_array_equal(wheel_errors([again], SEED), tilts[:1])
 
 
-def test_the_wheel_s_errors_are_of_the_request_s_seed_and_of_the_setting():
+def test_wheel_errors_depend_on_the_seed_and_on_the_setting():
     """200 pairs of independent errors: the standard error of a correlation is 0.07."""
     rows = [fields.exposure(**spectroscopic.exposed(strip(), mjd=infrared.MJD + i)) for i in range(200)]
     turned = [replace(row, grism_angle=-4.0) for row in rows]
@@ -187,7 +187,7 @@ def test_a_pixel_is_sky_dark_and_noise():
     assert signal.std() == pytest.approx(np.hypot(found.scene.pixel_noise, 1.92 * 12**-0.5), rel=0.08)
 
 
-def test_neighbours_and_their_order_change_no_bit_of_another_s_light():
+def test_light_of_a_source_does_not_depend_on_neighbours_or_their_order():
     mags, x, y = [18.0, 19.0, 20.0], [250.0, 300.0, 350.0], [20.0, 48.0, 70.0]
     row, variant = spectroscopic.exposed(strip()), Variant(MISSION, DRAFT, {})
     aim = Aim.from_exposure(fields.exposure(**row), strip())
@@ -264,19 +264,19 @@ def test_spectra_before_an_image_leave_their_mean_sky():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"grism": None}, "a spectrum wants a grism and its angle"),
+        ({"grism": None}, "a spectrum requires a grism and its angle"),
         ({"grism": "RGS270"}, "'RGS270' is not one of"),
         ({"angle": 90.0}, "turns RGS000 by 90 deg, more than 45"),
         ({"psf": "psf.fits"}, "spectra do not support PSF files, got psf.fits"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(change, said):
+def test_impossible_spectra_are_refused(change, said):
     with pytest.raises(BadInput, match=said):
         spectroscopic.rendered([18.0], [300.0], [48.0], **change)
 
 
 def test_a_star_of_ab_2_in_order_0_fills_its_pixels():
-    """And no others: of the strip half is as dark as without it."""
+    """Other pixels are not saturated: half of the strip is as dark as without the star."""
     found = spectroscopic.rendered([2.0], [1400.0], [48.0], truth=("saturation", "order_0"))
     (row,) = (row for row in truth_table.spectra(found).to_pylist() if row["order"] == 0)
     column, line = (round(row[f"{axis}_first"] / 2 + row[f"{axis}_last"] / 2) for axis in "xy")

@@ -151,5 +151,5 @@ def test_a_line_is_seen_as_well_as_is_required():
 
 
 @pytest.mark.nightly
-def test_a_line_is_seen_as_well_as_is_required_all_over_a_detector():
+def test_signal_to_noise_of_a_line_is_as_required_across_a_detector():
     enough(*sequence(strip(nx=2040, ny=1000), SEED + 1, 2))

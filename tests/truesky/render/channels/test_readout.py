@@ -74,7 +74,7 @@ def test_every_array_has_its_own_type_unit_and_cards(monkeypatch, tmp_path, rice
 
 
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])
-def test_arrays_of_one_unit_have_it_each_and_in_the_header_of_all(channel, tmp_path):
+def test_common_unit_of_arrays_is_in_each_header_and_in_the_primary_header(channel, tmp_path):
     one = render(channel)
     assert one.readout.unit == "adu"
     with astropy_fits.open(put(one, tmp_path)["science"]) as units:
@@ -108,7 +108,7 @@ def test_a_file_of_no_channel_is_refused(monkeypatch, tmp_path):
             read(path)
 
 
-def test_what_an_effect_leaves_is_assembled_before_and_after_it_is_cut_into_quadrants():
+def test_result_of_an_effect_is_assembled_before_and_after_the_split_into_quadrants():
     one = render("VIS")
     mode = vis.CHANNEL.readout
     np.testing.assert_array_equal(mode.assemble(one.raw, one.scene), one.science)

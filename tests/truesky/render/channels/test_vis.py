@@ -54,7 +54,7 @@ def test_stars_saturate_at_the_published_magnitude():
 @pytest.mark.parametrize(
     ("ladder", "least", "most"), [(None, 18.4, 22.6), (("REQ", "DES", "BLT", "CBE", "SIM"), 10, 25)]
 )
-def test_a_galaxy_of_the_weak_lensing_sample_is_as_clear_as_required(ladder, least, most):
+def test_signal_to_noise_of_a_weak_lensing_galaxy_is_as_required(ladder, least, most):
     """Exponential, r_e = 0.3", I_E = 24.5, in an aperture of 1.3", four exposures."""
     mission = resolve(ladder=ladder) if ladder else MISSION
     one = rendered(mission, 24.5, {"disk_half_light_radius": 0.3})

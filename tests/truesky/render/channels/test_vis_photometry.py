@@ -73,8 +73,8 @@ def test_isolated_stars_are_as_bright_as_the_catalogue_says():
     assert change.std() <= 1.2 * np.sqrt(np.mean(noise**2)) + 0.005
 
 
-def test_what_the_effects_take_is_what_the_benchmark_says():
-    """Through old traps and brighter-fatter a star is dimmer by what benchmarks/effects.py finds of each, added up."""
+def test_losses_by_charge_effects_are_those_of_the_benchmark():
+    """Charge transfer with old traps and brighter-fatter dim a star by the sum of benchmarks/effects.py."""
     old = resolve(overrides={"vis.cti.age": (10.0, "")})
     detector = small("vis", "3-4", 256)
     quiet = nominal.off(*nominal.COSMIC_RAYS)
@@ -94,7 +94,7 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_galaxies_of_the_weak_lensing_sample_are_as_clear_as_stated():
+def test_signal_to_noise_of_weak_lensing_galaxies_is_as_stated():
     """Of I_E = 24.5 and r_e = 0.3", in a stack of four: the noise that their fluxes scatter by is the expected one.
 
     Sample of 240 galaxies or more; significance 6e-5 of the mean (4 standard errors), 0.03 of the scatter (10 %).

@@ -162,7 +162,7 @@ def test_sources_add_up_in_any_order_bit_by_bit():
     np.testing.assert_array_equal(sum(of(all_of_them.take(np.array([i]))) for i in range(8)), wanted)
 
 
-def test_nothing_is_drawn_of_orders_beside_the_detector_or_lost_in_the_noise():
+def test_orders_outside_the_detector_or_below_the_noise_are_not_drawn():
     source, through = placed(8, 1, 140.0, 60.0), psf()
     spectrum = continuum_and_line().astype(np.float32)[None]
     beside = [order(trace((5000.0, 100.0)))]

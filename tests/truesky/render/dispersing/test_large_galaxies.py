@@ -43,8 +43,8 @@ def steep():
 
 
 @pytest.mark.parametrize("electrons", [3e5, 1.2e5])
-def test_no_more_light_comes_in_at_the_edges_than_is_asked_for(electrons):
-    """As bright a column as of H = 17 and 18: pixels are right to what a survey promises, of their noise."""
+def test_aliased_light_of_large_galaxies_is_within_the_accuracy(electrons):
+    """Errors of pixels are within the accuracy "survey" for columns as bright as for H = 17 and 18."""
     source, spectrum, orders, wanted = steep()
     light = (electrons * spectrum).astype(np.float32)[None]
     found = drawn(source, lambda _: light, orders, psf(), wanted.shape, NOISE, SETTINGS)
@@ -54,8 +54,8 @@ def test_no_more_light_comes_in_at_the_edges_than_is_asked_for(electrons):
     assert error.max() < 0.02 * NOISE
 
 
-def test_faint_galaxies_take_no_more_than_their_light():
-    """The least stamp: no pixel is wrong by more than a survey allows, and what it lacks the PSF has outside."""
+def test_faint_galaxies_on_the_smallest_stamp_are_within_the_accuracy():
+    """Errors of pixels are within the accuracy "survey", and the missing light is that of the PSF outside the stamp."""
     spectrum, source = np.full((1, COUNT), 2e3 / COUNT, np.float32), galaxy(0.5, 1.0, 0.0, 60.0, 60.0)
     orders, through, frames = [order(trace((-32.0, 512.0)))], psf(), []
     for least in (SETTINGS.min_size, 128):
@@ -71,16 +71,16 @@ def test_faint_galaxies_take_no_more_than_their_light():
 
 
 @pytest.mark.parametrize("peak", [1e5, 1e7])
-def test_points_and_small_galaxies_end_where_the_planes_of_the_psf_do(peak):
-    """However bright a column: no stamp is larger than the PSF, and a giant is what is one by its own light."""
+def test_stamps_of_points_and_small_galaxies_are_at_most_as_large_as_the_psf(peak):
+    """The size of the PSF is sufficient for any brightness; only galaxies with extended light need more."""
     point = one(scenes.sources(scenes.NISP, 8, galaxies=0, stars=1), 0)
     for source in (fine.placed(point, 60.0, 60.0), galaxy(0.3, 1.0, 0.0, 60.0, 60.0)):
         sizes = Sizes.from_sources(source, psf(), SETTINGS.edge * NOISE, SETTINGS.min_size)
         assert sizes.size(np.array([0]), np.array([peak]), np.array([512.0 * peak])) == psf().side
 
 
-def test_a_giant_that_nobody_sees_takes_the_least_stamp():
-    """All of its light in a row at the stamp's edge is less than may be left out of a pixel."""
+def test_an_invisible_large_galaxy_has_the_smallest_stamp():
+    """Even its total light is below the negligible light of a pixel."""
     faint = Sizes.from_sources(galaxy(15.0, 1.0, 0.0, 60.0, 60.0), psf(), SETTINGS.edge * NOISE, SETTINGS.min_size)
     for electrons, wanted in ((1.0, SETTINGS.min_size), (1e8, LARGE_GALAXY_SIZES[1])):
         assert faint.size(np.array([0]), np.array([electrons / 512]), np.array([electrons])) == wanted
@@ -98,8 +98,8 @@ def test_a_coarse_frame_is_refined_as_its_spline():
 
 
 @pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
-def test_giants_are_what_is_drawn_of_them_undispersed(index, fraction):
-    """Of 15 arcsec, in two lines 100 pixels apart: each is the image that an exposure without a grism has."""
+def test_large_galaxies_agree_with_their_undispersed_images(index, fraction):
+    """Each of two lines, 100 pixels apart, is the image of a galaxy of 15 arcsec without a grism."""
     electrons, shape, source = 2e6, (260, 700), galaxy(15.0, index, fraction, 180.4, 130.2)
     at = np.rint(NODES[[0, 2]]).astype(int)
     spectrum = np.zeros((1, COUNT), np.float32)

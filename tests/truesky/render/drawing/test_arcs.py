@@ -169,7 +169,7 @@ def test_bad_lenses_are_refused():
     with pytest.raises(BadInput, match=r"strong lens \d+: its source 12345 is not among the galaxies"):
         render("EXT", body, points, lenses=row)
     row = lens(int(body["id"][0].as_py()), exposed["ra"], exposed["dec"], [(0.0, 0.0, 1.0)])
-    for stamp, said in (([1.0, 2.0], "has 2 pixels"), ([np.nan] * 6400, "sum nan"), ([0.0] * 6400, "sum 0")):
+    for stamp, said in (([1.0, 2.0], "got 2 pixels"), ([np.nan] * 6400, "sum nan"), ([0.0] * 6400, "sum 0")):
         bad = row.set_column(5, "stamp", pa.array([stamp], STRONG_LENSES.column("stamp").arrow_type))
         with pytest.raises(BadInput, match=said):
             render("EXT", body, points, lenses=bad)

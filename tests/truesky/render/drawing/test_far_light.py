@@ -297,8 +297,8 @@ def test_a_frame_is_the_sum_of_its_stars_in_any_order(vis):
     assert parts[2][:200].min() > 1.0
 
 
-def test_light_is_drawn_to_where_it_is_lost_in_the_noise(vis):
-    """Less accuracy, a smaller circle: what is left out is below what may be."""
+def test_light_is_drawn_down_to_the_noise(vis):
+    """With less accuracy the circle is smaller, and the missing light is below the limit."""
     least = 0.1 * NOISE
     whole, cut = (shone(vis, 2000, 300.0, 300.0, 1e9, part) for part in (0.0, least))
     assert np.count_nonzero(cut) < 0.5 * np.count_nonzero(whole)

@@ -187,8 +187,8 @@ def test_many_large_galaxies_are_drawn_to_their_outskirts(shape, mag, place, cam
 @example(4.0, 0.02, 10.0, None)
 @example(6.2, 0.02, 0.0, None)
 @example(1.0, 1.0, 57.0, 90.0)
-def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle, inclination):
-    """Of a bulge, or of a disc at an inclination; where 2 % of the light of slim ones was taken for even."""
+def test_aliased_light_of_a_stamp_is_the_sum_of_all_periodic_images(index, ratio, angle, inclination):
+    """For a bulge, or for an inclined disc; thin galaxies are the difficult ones."""
     side, electrons, disc = 512, 1e8, inclination is not None
     shape = shape_of(0.0 if disc else 1.0, 12.0 if disc else 24.0, index, ratio, inclination or 0.0, angle)
     detector = small("vis", "3-4", side)

@@ -51,8 +51,8 @@ def sample():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_what_is_left_out_is_within_what_is_promised(preset, sample):
-    """Of bright stars, whose spikes rise above the mean PSF at a stamp's edge, as of all others."""
+def test_neglected_light_is_within_the_promised_limit(preset, sample):
+    """This includes bright stars, whose spikes exceed the mean PSF at the edge of a stamp."""
     wanted, settings = PRESETS[preset], settings_for(PRESETS[preset])
     for one, own, image in sample:
         found = errors.errors(scenes.draw_sources(one, own, VIS, settings, SIDE), image, VIS, one)
@@ -113,7 +113,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
 
 
 @pytest.mark.parametrize(("scene", "file"), [(VIS, "psf_positions.csv"), (NISP, "psf_positions_nisp.csv")])
-def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says(scene, file):
+def test_psf_errors_between_positions_are_those_of_the_table(scene, file):
     """Against the optics computed at the place of a star."""
     table = {row["positions"]: row for row in rows(file) if row["nearest"] == 0}
     at = positions.make_optics(scene)

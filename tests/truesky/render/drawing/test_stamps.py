@@ -263,7 +263,7 @@ def test_the_jacobian_of_the_place_is_used():
     assert np.sqrt(body[1, 1] / body[0, 0]) == pytest.approx(2.0, rel=0.05)
 
 
-def test_focal_plane_jacobian_has_the_sign_that_stamps_want():
+def test_focal_plane_jacobian_has_the_sign_used_by_stamps():
     """On an upright detector with north up, u (west) grows with the column and v (north) with the row."""
     detector = small("lsstcam", "R22_S11")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))

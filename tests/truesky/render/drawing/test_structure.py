@@ -122,8 +122,8 @@ def test_a_knot_is_at_the_same_place_in_every_band_and_dither():
 
 
 @pytest.mark.parametrize("kind", ["arms", "stamps"])
-def test_a_bulge_that_is_brighter_in_a_band_is_another_bulge_in_the_same_picture(kind, monkeypatch, tmp_path):
-    """What a galaxy looks like goes by the catalogue; how much of its light is the disc's goes by the band."""
+def test_brighter_bulge_in_a_band_does_not_change_the_picture(kind, monkeypatch, tmp_path):
+    """The picture depends on the catalogue, but the fraction of light in the disc depends on the band."""
     asked = {"discs": DISCS}
     if kind == "stamps":
         fits.writeto(tmp_path / "two.fits", np.array([blob(q) for q in (1.0, 0.9, 0.5)], np.float32))

@@ -67,7 +67,7 @@ def test_planes_are_the_transform_of_the_psf_s_image():
         np.testing.assert_allclose(plane[1], 0.0, atol=2e-6)
 
 
-def test_a_psf_in_planes_and_the_same_as_a_profile_draw_alike():
+def test_psf_in_planes_and_as_a_profile_draw_the_same_image():
     """Colour and place by weights against one image made of them, many together against each alone."""
     psf, n = planes_psf(place=0.5), 20
     rng = np.random.default_rng(3)
@@ -103,7 +103,7 @@ def test_what_is_left_out_is_below_its_floor(index):
         assert np.abs(less - whole).max() < 0.5 * floor * 1e4
 
 
-def test_passing_is_an_upper_bound_of_the_seeing_disc_s_transform():
+def test_max_transfer_is_an_upper_limit_of_the_seeing_disc_s_transform():
     psf = psf_of("lsstcam")
     passing = transfer.max_transfer(psf)
     k = (np.arange(len(passing)) + 0.5) * transfer.STEP

@@ -49,7 +49,7 @@ def found(psf, galaxy=None, star=None):
     return some, sizes, image, drawn
 
 
-def test_a_galaxy_s_light_comes_from_beside_the_frame_as_far_as_it_goes():
+def test_light_of_a_galaxy_outside_the_frame_reaches_the_frame():
     """Where its stamp leaves the frame there is no step, and no end."""
     light, on_stamp = [], []
     for column in (-382.0, -383.0, -384.0, -385.0, -386.0, -387.0, -388.0):

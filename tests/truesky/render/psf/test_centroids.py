@@ -43,7 +43,7 @@ def test_of_a_shifted_gaussian_it_is_the_shift(samples):
     assert found[:, 0] == pytest.approx((0.1, -0.05), rel=0.03)
 
 
-def test_of_an_even_number_of_samples_it_is_the_shift():
+def test_centroid_with_an_even_number_of_samples_is_the_shift():
     waves, none = np.array([6000.0]), np.zeros((0, 49, 49), np.float32)
     planes = model.Planes(waves, shifted(0.1, -0.05, samples=2)[None], none, (50.0, 50.0), (), 2)
     x, y = offsets(model.from_planes(planes, 0.1, False, 24), np.ones((1, 1)))

@@ -46,13 +46,13 @@ def test_radii_of_one_gaussian_or_nearer_give_one():
 
 @pytest.mark.parametrize("radii", [(0.0, 1.0), (0.3, 0.3), (0.4, 0.3), (float("nan"), 1.0)])
 def test_radii_that_do_not_rise_are_refused(radii):
-    with pytest.raises(BadInput, match="do not rise"):
+    with pytest.raises(BadInput, match="must be positive and increase"):
         double_gaussian.widths(*radii, CORE)
 
 
 @pytest.mark.parametrize("core", [0.5, 0.8, float("nan")])
-def test_a_core_of_which_there_are_no_such_gaussians_is_refused(core):
-    with pytest.raises(BadInput, match=r"not between 0\.5 and 0\.8"):
+def test_core_without_a_solution_for_two_gaussians_is_refused(core):
+    with pytest.raises(BadInput, match=r"between 0\.5 and 0\.8 of the light, got"):
         double_gaussian.widths(0.2, 0.5, core)
 
 
@@ -88,8 +88,8 @@ def test_the_planes_have_the_radii_of_their_wavelengths():
             assert image[away < radius].sum() == pytest.approx(light, abs=0.03)
 
 
-def test_spectra_through_them_are_as_bright_and_as_far_across_as_their_light():
-    """By one value of a parameter; the rows that a star's light has are those of the Gaussians in a pixel."""
+def test_spectra_keep_flux_and_width_of_the_double_gaussian():
+    """One parameter selects the PSF; the profile across a star's spectrum is that of the Gaussians in a pixel."""
     missions = resolve(overrides=NO_BODIES), GAUSSIANS
     default, gaussian = (spectroscopic.rendered([18.0], [300.0], [48.0], mission=own) for own in missions)
     assert gaussian.noise_free.sum() == pytest.approx(default.noise_free.sum(), rel=0.01)

@@ -86,7 +86,7 @@ def test_colours_are_interpolated_between_planes(tmp_path, how):
         assert np.trace(second) / 2 * 0.01 == pytest.approx(sigma2 + 0.01 / 12, rel=2e-3)
 
 
-def test_a_detector_that_is_mounted_turned_sees_it_turned(tmp_path):
+def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
     path = cube(tmp_path / "a.fits", gaussian(0.15, x=0.3, y=0.1))
     upright, turned = (from_file.read(path, small("vis", name), BAND) for name in ("2-3", "2-4"))
     centre, _ = moments(star(upright, small("vis", "2-3")))
@@ -169,19 +169,19 @@ def test_galaxies_through_a_psfex_file(tmp_path):
 
 
 BAD = {
-    "sum": (lambda p: cube(p, 7 * gaussian(0.1, 0.1), **COLOURS), r"plane 1 sums to 7, wanted what it holds of 1"),
-    "nan": (lambda p: cube(p, gaussian(0.1) * np.nan), "holds values that are not numbers"),
+    "sum": (lambda p: cube(p, 7 * gaussian(0.1, 0.1), **COLOURS), r"plane 1 sums to 7, but 0.5 to 1.001 is allowed"),
+    "nan": (lambda p: cube(p, gaussian(0.1) * np.nan), "contains values that are not finite numbers"),
     "unit": (lambda p: cube(p, gaussian(0.1), CUNIT1="furlong"), "CUNIT1 = 'furlong' is not one of arcsec, mas, deg"),
-    "step": (lambda p: cube(p, gaussian(0.1), CDELT2=0.06), "CDELT1 and CDELT2 are not the same distance"),
+    "step": (lambda p: cube(p, gaussian(0.1), CDELT2=0.06), "CDELT1 and CDELT2 must be equal and positive"),
     "coarse": (lambda p: cube(p, gaussian(0.1), CUNIT1="deg"), "samples are 1800 pixels apart"),
     "text": (lambda p: cube(p, gaussian(0.1), CDELT1="x"), "CDELT1 = 'x' is not a number"),
-    "colour": (lambda p: cube(p, gaussian(0.1, 0.1), **{**COLOURS, "CDELT3": -1.0}), "wavelengths do not increase"),
-    "reach": (lambda p: cube(p, gaussian(0.1, 0.1), **COLOURS), "planes reach from 5000 to 6000 A, band euclid_vis"),
+    "colour": (lambda p: cube(p, gaussian(0.1, 0.1), **{**COLOURS, "CDELT3": -1.0}), "wavelengths must increase"),
+    "reach": (lambda p: cube(p, gaussian(0.1, 0.1), **COLOURS), "planes reach from 5000 to 6000 A, but band"),
     "no colour": (lambda p: cube(p, gaussian(0.1, 0.1)), "CUNIT3 = '' is not one of Angstrom"),
     "pixel": (lambda p: cube(p, gaussian(0.1), PIXEL="yes"), "PIXEL = 'yes' is not T or F"),
-    "degree": (lambda p: psfex(p, 2, POLDEG1=3), r"PSF_MASK has \[6, 33, 33\] samples, wanted 10 planes of degree 3"),
+    "degree": (lambda p: psfex(p, 2, POLDEG1=3), r"PSF_MASK has \[6, 33, 33\] samples, but degree 3 requires 10"),
     "places": (lambda p: psfex(p, 1, POLNAME1="MAG_AUTO"), "polynomials are of MAG_AUTO, Y_IMAGE"),
-    "scale": (lambda p: psfex(p, 1, POLSCAL1=0.0), "POLSCAL1 or POLSCAL2 is 0"),
+    "scale": (lambda p: psfex(p, 1, POLSCAL1=0.0), "POLSCAL1 and POLSCAL2 must not be 0"),
     "four axes": (lambda p: cube(p, gaussian(0.1)[None]), "no image of two or three axes and no table with a column"),
     "no file": (lambda p: None, "no such file"),
     "no FITS": (lambda p: p.write_text("hello"), "a.fits: "),

@@ -210,7 +210,7 @@ def test_a_seeing_finer_than_a_pixel_is_refused():
         psf_of(air=ground.Air(0.15))
 
 
-def test_a_seeing_that_turbulence_does_not_make_is_refused_before_it_is_rendered():
+def test_seeing_that_turbulence_cannot_cause_is_refused_before_rendering():
     """Waves of two metres at most have no air of half an arcsec."""
     calm = resolve(overrides={"ext.lsstcam.psf.outer_scale": (2.0, "m")})
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")

@@ -27,7 +27,7 @@ def by_astropy(ra, dec, mjd):
 @given(
     st.floats(0, 360, exclude_max=True), st.sampled_from([-90.0, -28.0, 0.0, 23.4, 66.0, 90.0]), st.floats(60200, 62000)
 )
-def test_the_stretches_are_those_in_which_the_sun_is_where_it_should(ra, dec, start):
+def test_intervals_are_dates_with_an_allowed_angle_from_the_sun(ra, dec, start):
     days = np.arange(start, start + 399.0, 0.5)
     aspect = by_astropy(ra, dec, days)
     inside = np.zeros(days.size, bool)

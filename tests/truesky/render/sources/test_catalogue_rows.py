@@ -103,8 +103,8 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
     assert one.complete_margin_arcsec == pytest.approx(stamp_sizes.reach(0.2), abs=0.5)
 
 
-def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
-    # Nobody shines so far.
+def test_sources_beyond_the_reach_or_too_faint_do_not_change_the_image():
+    # No source shines up to this distance.
     far = selection.FARTHEST + DETECTOR.half_diagonal + 1.0
     empty = rendered(far, found=False)
     assert len(empty.sources) == 0
@@ -177,7 +177,7 @@ def test_a_frame_that_no_source_shows_in_reads_none(dark):
     assert complete == FARTHER
 
 
-def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
+def test_bright_stars_are_read_up_to_the_visible_length_of_their_spikes():
     """Eighteen minutes of arc: one of them, and none where there are no spikes or no light."""
     detector, task = small("vis", "3-4"), place()
     exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
@@ -247,7 +247,7 @@ def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
     assert len(catalogue_rows.read_lenses(table, task, 0.0, farther, np.inf)) == 0
 
 
-def test_what_several_exposures_share_is_read_once_and_each_has_its_own():
+def test_rows_shared_by_several_exposures_are_read_once():
     """Of two bands, three circles, several limits and columns, the sources that a filter of the whole finds."""
     rng = np.random.default_rng(3)
     task = place()
@@ -309,7 +309,7 @@ class Files:
 
 
 @pytest.mark.parametrize(("channel", "camera", "name"), [("VIS", "vis", "3-4"), ("EXT", "lsstcam", "R22_S11")])
-def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel, camera, name):
+def test_large_galaxies_are_read_and_drawn_up_to_their_visible_radius(channel, camera, name):
     """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
     detector, task = small(camera, name), place()
     exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
@@ -337,8 +337,8 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     assert limits_of({**exposed, "image_type": "bias"}, detector, band).far_galaxy == np.inf
 
 
-def test_a_product_is_of_what_it_may_show_from_far_away():
-    """A file that changes a quarter of a degree away: of galaxies for all, of stars where there are spikes."""
+def test_a_product_depends_on_distant_sources_that_may_be_visible():
+    """A file 0.3 deg away matters to all products if it contains galaxies, and to some if it contains stars."""
     task = place()
     cells = {"near": selection.cells_of_task(task, 0.0)}
     cells["far"] = [int(sky.cell_at([task["ra"]], [task["dec"] - 0.3], 8)[0])]

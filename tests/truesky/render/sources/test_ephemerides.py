@@ -211,14 +211,14 @@ def test_a_body_has_one_row_a_day(tmp_path, kind):
         hourly = written(tmp_path / f"hourly-{names[0]}.{kind}", {**one, "name": names})
         with pytest.raises(BadInput) as caught:
             ephemerides.read(hourly, f"hourly of {names[0]}")
-        said = f"name of row 2 is {str(names[0])!r}, which has a row of MJD {DAY} before it (6 of 8 rows like it)"
+        said = f"name of row 2 is {str(names[0])!r}, which already has a row for MJD {DAY} (6 of 8 rows like it)"
         assert str(caught.value) == f"{hourly}: {said}"
         few = {key: np.asarray(column)[daily] for key, column in {**one, "name": names}.items()}
         file = written(tmp_path / f"daily-{names[0]}.{kind}", few)
         assert ephemerides.read(file, f"daily of {names[0]}").day.tolist() == [DAY, DAY + 1]
     # Others beside it, whose rows it stands between.
     three = {**{key: [1.0] * 3 for key in ephemerides.KEYS}, "name": ["Ceres", "Pallas", "Ceres "]}
-    with pytest.raises(BadInput, match=r"name of row 3 is 'Ceres', which has a row of MJD 1 before it \(1 of 3 rows"):
+    with pytest.raises(BadInput, match=r"name of row 3 is 'Ceres', which already has a row for MJD 1 \(1 of 3 rows"):
         ephemerides.read(written(tmp_path / f"between.{kind}", three), "between")
 
 
@@ -249,8 +249,8 @@ def test_names_without_end_are_refused(tmp_path):
             ephemerides.read(written(tmp_path / f"endless-{length}.{kind}", values), f"{kind} {length}")
 
 
-def test_what_no_table_of_ours_looks_like_is_refused(tmp_path):
-    """Parquet of users is read by a process of its own, with its bounds."""
+def test_parquet_with_too_many_columns_is_refused(tmp_path):
+    """Parquet files of users are read by a separate process with limits."""
     names = [*ephemerides.KEYS, *(f"c{i}" for i in range(6000))]
     file = tmp_path / "wide.parquet"
     pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), file)
@@ -286,7 +286,7 @@ def test_a_table_that_no_worker_can_hold_is_refused(tmp_path, monkeypatch, kind)
         ephemerides.read(file, "too long")
 
 
-def test_what_a_file_is_its_bytes_say_and_not_its_name(tmp_path):
+def test_file_format_is_recognised_by_content_not_by_name(tmp_path):
     """FITS under any name, packed as well."""
     values = columns(solar_system.population(*PLACE, 0.1, DAY, MISSION, 1))
     plain = written(tmp_path / "bodies.fits", values)
@@ -304,7 +304,7 @@ def test_a_table_of_other_days_is_refused(tmp_path):
     bodies = ephemerides.read(file, "old")
     ephemerides.check(bodies, file, [DAY + 0.2, DAY + 7.0])
     ephemerides.check(bodies, file, [])
-    with pytest.raises(BadInput, match=r"old.csv: has bodies of MJD 60905 to 60905, the exposures begin on 61000"):
+    with pytest.raises(BadInput, match=r"old.csv: has bodies of MJD 60905 to 60905, but the exposures begin on 61000"):
         ephemerides.check(bodies, file, [61000.5])
 
 

@@ -144,12 +144,12 @@ def test_bad_libraries_are_refused(tmp_path, cube):
     point[1, 32, 32] = 1.0
     path = tmp_path / "bad.fits"
     for data, said in (
-        (good[0], "is an image of 2 axes, wanted three: columns, rows, stamps"),
-        (good[:, :8], "its stamps are of 64 x 8 pixels, wanted 16 to 1024"),
-        (hole, "stamp 1 holds values that are not numbers"),
+        (good[0], "is an image of 2 axes, but must have three: columns, rows, stamps"),
+        (good[:, :8], "its stamps have 64 x 8 pixels, but 16 to 1024 per side is allowed"),
+        (hole, "stamp 1 contains values that are not numbers"),
         (dark, "stamp 0 sums to -"),
-        (noisy, "stamp 1 is below 0 by more than 0.01 of its light"),
-        (point, "stamp 1: half of its light is within "),
+        (noisy, "stamp 1: negative pixels exceed 0.01 of its light"),
+        (point, "stamp 1: half-light radius is "),
     ):
         fits.writeto(path, data, overwrite=True)
         with pytest.raises(BadInput, match=rf"bad.fits: {said}") as refused:
@@ -161,13 +161,13 @@ def test_bad_libraries_are_refused(tmp_path, cube):
     with pytest.raises(BadInput, match=r"structure.stamps.file: .*nowhere.fits: no such file"):
         keys.stamp_files(tmp_path / "nowhere.fits")
     table = rows([1, 4])
-    with pytest.raises(BadInput, match=r"galaxy \d+: stamp 4 is not one of the 4 of .*library.fits, counted from 0"):
+    with pytest.raises(BadInput, match=r"galaxy \d+: stamp 4 does not exist, .*library.fits has stamps 0 to 3"):
         galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), stamps(cube))
     with pytest.raises(BadInput, match=r"library.fits: has changed since the rendering began"):
         galaxy_stamps.from_file(Stamps(cube), 1, "another")
 
 
-def test_a_galaxy_that_no_stamp_of_the_drawing_holds_is_a_profile(cube):
+def test_galaxy_larger_than_the_largest_stamp_is_drawn_as_a_profile(cube):
     table = rows([0, 0], disk_half_light_radius=[1.0, 40.0])
     own = GalaxyStamps(library(cube), Stamps(cube), 1)
     number, found = galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), own)

@@ -51,8 +51,8 @@ def test_counts_and_motions_are_the_mission_s():
     assert stats.kstest(rate[usual], stats.uniform(10.0, 50.0).cdf).pvalue > 1e-4
 
 
-def test_a_body_is_where_its_motion_takes_it_whoever_looks():
-    """From another place on the same day it is the same body."""
+def test_bodies_are_the_same_for_every_field_of_a_day_and_move_at_their_rate():
+    """Fields at different positions on the same day contain the same bodies."""
     one, other = (
         solar_system.population(*place, 0.2, DAY, MISSION, 1) for place in (ECLIPTIC, (ECLIPTIC[0] + 0.3, ECLIPTIC[1]))
     )

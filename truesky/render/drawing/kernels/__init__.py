@@ -1,1 +1,1 @@
-"""The compiled loops of drawing."""
+"""Compiled inner loops of drawing."""

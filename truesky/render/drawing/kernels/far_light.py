@@ -1,4 +1,9 @@
-"""Compiled: light of stars far from them, wings and diffraction spikes, on a frame and on a stamp."""
+"""Compiled loops for the light of stars far from them: rings, aureole and diffraction spikes.
+
+In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole, for r in
+pixels. `bar_directions` [b, 2] are unit vectors of the pupil's bars. The light of a bar's spike is in the table `lines`
+[b, i, j], at the distance i LONG along the spike and j STEP across it.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +15,16 @@ from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
 from truesky.render.psf.spikes import LONG, STEP
 
-# Pixels over which the plane fades, and its outermost, which are not used: a stamp is periodic.
+# Pixels over which the plane fades, and outermost pixels that are not used because a stamp is periodic.
 _FADING, SPARED = 24.0, 2.0
-# Of the light at the plane's sides, at most what was folded into its corners; none to speak of so near to its middle,
-# of the period.
+# Largest aliased light in the corners, as a fraction of the light at the plane's sides; radius, as a fraction of the
+# period, within which aliased light is negligible.
 FOLDED, _MIN_FOLDED_RADIUS = 0.2, 0.15
 
 
 @jit
 def _spike_light(bar_directions: Any, lines: Any, b: int, dx: float, dy: float) -> Any:
-    """Bar b's spike at an offset; turned : [b, 2] along the bar."""
+    """Light of the spike of bar `b` at an offset (dx, dy)."""
     t = abs(dx * bar_directions[b, 0] + dy * bar_directions[b, 1]) / STEP
     r = abs(dy * bar_directions[b, 0] - dx * bar_directions[b, 1]) / LONG
     i, j = int(r), int(t)
@@ -32,7 +37,7 @@ def _spike_light(bar_directions: Any, lines: Any, b: int, dx: float, dy: float) 
 
 @jit
 def _ring_and_aureole_light(square: float, level: float, halo: float, core: float) -> Any:
-    """Rings of the pupil's circles and the aureole, at a squared distance."""
+    """Light of the rings of circular edges and of the aureole, at a squared distance."""
     return level / (square * np.sqrt(square)) + halo / (square + core)
 
 
@@ -51,11 +56,28 @@ def add_outside(
     spike_reach: float,
     spike_half_width: float,
 ) -> None:
-    """Adds what lies outside a square of half side `inner`: ring and aureole up to `radius`, spikes up to `far`.
+    """Add the light outside a square of half side `inner` to a frame.
 
-    level, halo, core, lines : in the frame's units, as below
-    frame : integers;  x, y : of the star, pixels
-    turned : [b, 2] directions of the bars;  wide : half width of a spike's table, pixels, 0 = no spikes
+    Parameters
+    ----------
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+    x, y : float
+        Position of the star, pixels.
+    inner : float
+        Half side of the square, pixels.
+    level, halo, core : float
+        Rings and aureole in units of the frame, see the module.
+    radius : float
+        Radius up to which rings and aureole are drawn, pixels.
+    bar_directions : float array, shape (b, 2)
+        Directions of the bars.
+    lines : float array, shape (b, i, j)
+        Light of the spikes in units of the frame.
+    spike_reach : float
+        Radius up to which spikes are drawn, pixels.
+    spike_half_width : float
+        Half width of the spikes, pixels; 0 without spikes.
     """
     ny, nx = frame.shape
     for r in range(ny):
@@ -94,9 +116,22 @@ def add_inside(
     bar_directions: Any,
     lines: Any,
 ) -> None:
-    """Adds what has faded of the plane, inside the square.
+    """Add the light that the faded plane lacks inside the square.
 
-    frame, x, y, inner, level, halo, core, turned, lines : as of `outside`
+    Parameters
+    ----------
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+    x, y : float
+        Position of the star, pixels.
+    inner : float
+        Half side of the square, pixels.
+    level, halo, core : float
+        Rings and aureole in units of the frame, see the module.
+    bar_directions : float array, shape (b, 2)
+        Directions of the bars.
+    lines : float array, shape (b, i, j)
+        Light of the spikes in units of the frame.
     """
     ny, nx = frame.shape
     for r in range(max(int(np.ceil(y - inner)), 0), min(int(np.ceil(y + inner)), ny)):
@@ -114,11 +149,24 @@ def add_inside(
 def remove_aliased_compiled(
     stamp: Any, x: Float, y: Float, inner: float, level: float, bar_directions: Any, lines: Any, period: float,
 ) -> None:  # fmt: skip
-    """Multiplies a stamp by what is not folded of the light that points at x, y send to each pixel.
+    """Multiply each pixel of a stamp by the direct fraction of its direct and aliased light.
 
-    inner        : half side of the square outside which the plane has faded, pixels
-    level, lines : ring and spikes of each point, electrons;  turned : [b, 2] directions of the bars
-    period       : of the plane's transform, pixels
+    Parameters
+    ----------
+    stamp : float array
+        Stamp, changed in place.
+    x, y : float array, shape (p,)
+        Positions of points along the trail, pixels.
+    inner : float
+        Half side of the square outside which the plane has faded, pixels.
+    level : float
+        Rings of each point, electrons.
+    bar_directions : float array, shape (b, 2)
+        Directions of the bars.
+    lines : float array, shape (b, i, j)
+        Spikes of each point, electrons.
+    period : float
+        Period of the plane's transform, pixels.
     """
     for r in range(stamp.shape[0]):
         for c in range(stamp.shape[1]):
@@ -139,14 +187,14 @@ def remove_aliased_compiled(
 
 @jit
 def fading_compiled(distance: float, inner: float) -> Any:
-    """Of the plane's light, pixels from its middle along one axis: a smooth step."""
+    """Smooth step by which the plane fades, at a distance from its middle along one axis, pixels."""
     z = min(max((inner - distance) / _FADING, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
 
 @jit
 def _light(dx: float, dy: float, level: float, halo: float, core: float, bar_directions: Any, lines: Any) -> Any:
-    """What a star shines in a pixel at an offset."""
+    """Light of a star in a pixel at an offset (dx, dy)."""
     light = _ring_and_aureole_light(dx * dx + dy * dy, level, halo, core)
     for b in range(len(bar_directions)):
         light += _spike_light(bar_directions, lines, b, dx, dy)
@@ -155,13 +203,13 @@ def _light(dx: float, dy: float, level: float, halo: float, core: float, bar_dir
 
 @jit
 def _folded_light(dx: float, dy: float, level: float, bar_directions: Any, lines: Any, period: float) -> Any:
-    """What of it the plane has that lies a period away; the pupil's soft edges had weakened that by sinc^2."""
+    """Light that is aliased from positions one period away, weakened by sinc^2 because the edges are softened."""
     total = 0.0
     for up in range(-1, 2):
         for right in range(-1, 2):
             ax, ay = dx + right * period, dy + up * period
             square = ax * ax + ay * ay
-            # From farther away than a period next to nothing has passed.
+            # Light from beyond one period is negligible.
             if (up != 0 or right != 0) and square < period * period:
                 softening = _edge_softening(np.sqrt(square) / period)
                 total += _light(ax, ay, level, 0.0, 1.0, bar_directions, lines) * softening

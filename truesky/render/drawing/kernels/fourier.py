@@ -1,14 +1,6 @@
-"""The inner loops of drawing, compiled: a source's Fourier transform on its stamp's grid, and the sum of stamps.
+"""Compiled inner loops of drawing in Fourier space: transforms of sources on the grids of their stamps.
 
-units_of      what an electron is in a frame's integers
-nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
-runs          which samples of a stamp's grid are taken, in what order
-take          the samples of a stamp's grid from a transform
-add_planes    planes of a PSF, weighted, summed
-between       a transform between its samples
-reaches       how far in Fourier space a source must be followed
-
-Precision is that of the planes: single, but double for sources so bright that it would show.
+The planes determine the precision: single, or double for sources that are bright enough to show rounding errors.
 """
 
 from __future__ import annotations
@@ -28,9 +20,12 @@ _FIRST = int(FIRST_BITS)
 
 
 def units_of(electrons: Float) -> float:
-    """Units of an electron in a frame of sources [n], a power of two: FIXED_POINT, or what they all fit in, in a pixel.
+    """Units per electron in a frame: FIXED_POINT, or a smaller power of two if the sum of `electrons` [n] requires it.
 
-    Error : of 5e13 electrons, the brightest star of the sky in 560 s, the frame is to 1e-5 of one; of 1e17 to 0.06
+    Notes
+    -----
+    With 5e13 electrons (the brightest star of the sky in 560 s) the frame is exact to 1e-5 electrons; with 1e17
+    electrons, to 0.06.
     """
     _, octave = math.frexp(math.fsum(electrons.tolist()))
     return min(FIXED_POINT, 2.0 ** (FULL - octave))
@@ -42,17 +37,42 @@ def nyquist_zones(
     weights: Array, x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
     fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, trail: Float,
 ) -> None:  # fmt: skip
-    """Fills zones, complex[m, N, N / 2 + 1]: what irfft2 turns into the stamps of m sources.
+    """Fill the half planes that irfft2 transforms to the stamps of m sources.
 
-    planes, kx .. inner : of transfer.Transfer and transfer.Grid; weights [m, b] sum the planes
-    body        : [m] False for a point
-    fraction    : [m] of the light in the bulge
-    bulge, disk, thick : [m, 2, 2], [m, 2, 2], [m, 2] of galaxy_shapes.Forms
-    sersic      : table of sersic.py; row, row_weights : [m], [m, 4] from sersic.row_of
-    cut         : [m] pieces from this |k| on, radian / pixel, are left out
-    x, y        : [m] position in the stamp, pixels, 0 = centre of the first;  electrons : [m]
-    trail       : [m, 2] pixels that it moves by, along columns and rows, about this position
-    ky, runs    : of transfer.Grid
+    Parameters
+    ----------
+    zones : complex array, shape (m, N, N / 2 + 1)
+        Result: profile x PSF x pixel x phase, aliased to the Nyquist zone of the pixels.
+    planes : float array, shape (b, 2, s)
+        Planes of `transfer.Transfer`.
+    kx, ky : float32 array, shape (s,)
+        Frequencies of `transfer.Grid`, radian / pixel.
+    runs, pieces, inner : array
+        Runs and pieces of `transfer.Grid`.
+    weights : array, shape (m, b)
+        Weights of the planes for each source.
+    x, y : float array, shape (m,)
+        Positions in the stamp, pixels; 0 is the centre of the first pixel.
+    electrons : float array, shape (m,)
+        Expected electrons.
+    cut : float array, shape (m,)
+        |k| from which pieces are omitted, radian / pixel.
+    sersic : float32 array
+        Table of `sersic.table`.
+    body : bool array, shape (m,)
+        False for point sources.
+    fraction : float array, shape (m,)
+        Fraction of the light in the bulge.
+    bulge, disk : float array, shape (m, 2, 2)
+        Matrices of `galaxy_shapes.Forms`.
+    thick : float array, shape (m, 2)
+        Vectors of `galaxy_shapes.Forms`.
+    row : int array, shape (m,)
+        First row of the table for the source's Sersic index.
+    row_weights : float array, shape (m, 4)
+        Interpolation weights of four rows of the table.
+    trail : float array, shape (m, 2)
+        Displacement along columns and rows during the exposure, centred on the position, pixels.
     """
     m, n, columns = zones.shape
     longest_piece, low, high, max_iy = 0, 0, 0, 0
@@ -61,7 +81,7 @@ def nyquist_zones(
     for j in range(len(runs) - 1):
         low, high = min(low, runs[j, 1]), max(high, runs[j, 1] + runs[j + 1, 0] - runs[j, 0])
         max_iy = max(max_iy, abs(runs[j, 2]))
-    # Phase by column and by row; the electrons enter with the rows.
+    # Phase factors by column and by row; the row factors include the electrons.
     of_column, of_row = np.empty((m, 2, high - low), planes.dtype), np.empty((m, 2, 2 * max_iy + 1), planes.dtype)
     tables = np.empty((m, sersic.shape[1]), np.float32)
     sums = np.zeros((m, 2, n, columns), planes.dtype)
@@ -73,7 +93,7 @@ def nyquist_zones(
             of_row[i, 0, r + max_iy] = electrons[i] * np.cos(step * r * y[i])
             of_row[i, 1, r + max_iy] = -electrons[i] * np.sin(step * r * y[i])
         if body[i] and fraction[i] > 0.0:
-            # Pieces are taken whole: to the inner edge of the first that is not.
+            # Pieces are used as a whole, so the outer limit is the inner edge of the first unused piece.
             outer = step * np.hypot(max_iy, max(-low, high))
             for p in range(len(inner) - 1, -1, -1):
                 outer = inner[p] if inner[p] >= cut[i] else outer
@@ -86,7 +106,7 @@ def nyquist_zones(
     bits = square.view(np.int32)
     for p in range(len(inner)):
         first, last = runs[pieces[p], 0], runs[pieces[p + 1], 0]
-        # From 0 over a slice: only so does the compiler use whole vectors.
+        # The compiler vectorises the loops only if they start at 0 on a slice.
         piece_re, piece_im, piece_profile = re[: last - first], im[: last - first], profile[: last - first]
         for i in range(m):
             if inner[p] >= cut[i]:
@@ -122,7 +142,7 @@ def nyquist_zones(
 
 @jit
 def _collapse(planes: Any, weights: Any, first: int, last: int, re: Any, im: Any) -> None:
-    """Fills re, im with the sum of the samples first .. last of the planes [b, 2, s]."""
+    """Fill `re` and `im` with the weighted sum of the samples first to last of the planes [b, 2, s]."""
     for part, out in ((0, re), (1, im)):
         triples = len(weights) // 3 * 3
         for c in range(len(out)):
@@ -153,9 +173,26 @@ def profile_at(
     fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, kx: Float32, ky: Float32,
     square: Float32, bits: Any, out: Float32,
 ) -> None:  # fmt: skip
-    """Fills `out` with the profile's transform at (kx, ky); square and its bits are scratch.
+    """Fill `out` with the transform of a galaxy's profile at the frequencies (kx, ky).
 
-    fraction, bulge, disk, thick : of one galaxy, as of `nyquist_zones`;  table : of its Sersic index (`interpolate`)
+    Parameters
+    ----------
+    fraction : float
+        Fraction of the light in the bulge.
+    bulge, disk : float array, shape (2, 2)
+        Matrices of `galaxy_shapes.Forms`.
+    thick : float array, shape (2,)
+        Vector of `galaxy_shapes.Forms`.
+    table : float32 array
+        Transform for the Sersic index, from `interpolate_sersic`.
+    kx, ky : float32 array, shape (s,)
+        Frequencies, radian / pixel.
+    square : float32 array
+        Scratch memory of at least s elements.
+    bits : int32 array
+        View of the bits of `square`.
+    out : float32 array, shape (s,)
+        Result.
     """
     unit, share = np.float32(1.0), np.float32(1.0 - fraction)
     if fraction < 1.0:
@@ -186,7 +223,7 @@ def profile_at(
 
 @jit
 def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: Any) -> None:
-    """Multiplies by the transform of an even straight line: sin(q) / q, q = k . line / 2."""
+    """Multiply by the transform of a uniform straight line: sin(q) / q with q = k . line / 2."""
     for c in range(len(re)):
         q = 0.5 * (across * kx[c] + along * ky[c])
         smeared = np.sin(q) / q if abs(q) > 1e-4 else 1.0
@@ -196,8 +233,8 @@ def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: A
 
 @jit
 def _sinh_over(square: Any) -> Any:
-    """sinh q / q from q^2: Taylor's series, 1e-7 for q < 4, and huge where 1e-7 matters no more."""
-    # Written out: a loop over a tuple would divide each time.
+    """Compute sinh q / q from q^2 by its Taylor series, exact to 1e-7 for q < 4; precision is irrelevant above."""
+    # The series is written out because a loop over a tuple of coefficients would divide each time.
     unit = np.float32(1.0)
     out = unit + square * np.float32(1.0 / 342.0)
     out = unit + square * np.float32(1.0 / 272.0) * out
@@ -215,11 +252,23 @@ def fourier_reach(
     max_transfer: Float, step: float, body: Bool, fraction: Float, bulge: Float, disk: Float, sersic: Float32, row: Int,
     floor: Float,
 ) -> Float:  # fmt: skip
-    """[m] the |k|, radian / pixel, beyond which profile times PSF is below `floor` [m] in every direction.
+    """Largest |k| at which the product of profile and PSF exceeds a limit in any direction.
 
-    passing : [i] the most that the PSF passes at |k| = i step
-    step    : radian / pixel;  floor : [m] part of the flux
-    body, fraction, bulge, disk, sersic, row : as of `nyquist_zones`
+    Parameters
+    ----------
+    max_transfer : float array, shape (i,)
+        Largest transfer function of the PSF at |k| = i step.
+    step : float
+        Spacing of `max_transfer`, radian / pixel.
+    body, fraction, bulge, disk, sersic, row : array
+        Profiles of m sources, see `nyquist_zones`.
+    floor : float array, shape (m,)
+        Limit, as a fraction of the flux.
+
+    Returns
+    -------
+    float array, shape (m,)
+        |k|, radian / pixel.
     """
     out = np.full(len(body), step * len(max_transfer))
     square = np.empty(1, np.float32)
@@ -245,10 +294,20 @@ def fourier_reach(
 def interpolate_sersic(
     sersic: Float32, row: int, row_weights: Float, min_square: float, max_square: float, table: Float32
 ) -> None:
-    """One index's transform, where the source needs it, into `table`.
+    """Interpolate the transform for one Sersic index, in the range that the source needs.
 
-    sersic      : of all indices;  row, row_weights : of the four about the one that is wanted
-    least, most : squared frequencies, times the square of the radius
+    Parameters
+    ----------
+    sersic : float32 array
+        Transforms for all tabulated indices.
+    row : int
+        First of the four neighbouring rows.
+    row_weights : float array, shape (4,)
+        Weights of these rows.
+    min_square, max_square : float
+        Range of the squared frequency times the squared radius.
+    table : float32 array
+        Result, filled within this range.
     """
     ends = np.array([min_square, max_square], np.float32)
     bits = ends.view(np.int32)
@@ -259,23 +318,32 @@ def interpolate_sersic(
     w2, w3 = np.float32(row_weights[2]), np.float32(row_weights[3])
     for i in range(low, high + 1):
         table[i] = w0 * sersic[row, i] + w1 * sersic[row + 1, i] + w2 * sersic[row + 2, i] + w3 * sersic[row + 3, i]
-    # k = 0: all of the light.
+    # At k = 0 the transform is 1.
     table[0] = np.float32(1.0)
     table[1] = table[1] if low <= 1 else np.float32(1.0)
 
 
 @jit
 def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
-    """Fills out [2, s] with the samples of transfer.Grid.runs: real and imaginary part of spectrum times pixel.
+    """Fill `out` with the samples of a stamp's grid from a transform, multiplied by that of the pixel.
 
-    spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [|iy|, |ix|] the pixel's own transform
+    Parameters
+    ----------
+    spectrum : complex array
+        Transform [iy, ix] of a real image, for ix >= 0.
+    runs : int array, shape (r + 1, 3)
+        Runs of `transfer.Grid`.
+    pixel : float array
+        Transform [|iy|, |ix|] of the pixel.
+    out : float array, shape (2, s)
+        Result: real and imaginary parts.
     """
     for j in range(len(runs) - 1):
         start, first_ix, iy = runs[j]
         for c in range(runs[j + 1, 0] - start):
             ix = first_ix + c
             pixel_transfer = pixel[abs(iy), abs(ix)]
-            # What lies to the left of kx = 0 is the mirror image's conjugate.
+            # For kx < 0, the sample is the conjugate of the opposite one.
             sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
             out[0, start + c] = pixel_transfer * sample.real
             out[1, start + c] = pixel_transfer * (sample.imag if ix >= 0 else -sample.imag)
@@ -283,12 +351,23 @@ def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
 
 @jit
 def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
-    """Runs of samples of a stamp's Fourier grid: see transfer.Grid.
+    """Find the runs of samples of a stamp's Fourier grid, see `transfer.Grid`.
 
-    reach   : largest |(ix, iy)|;  shells : rings of equal width that the runs are sorted by, then by iy
-    out     : filled with first sample, ix, iy, shell, as far as it has rows
-    size    : side of the stamp, pixels
-    returns : number of runs, number of samples
+    Parameters
+    ----------
+    size : int
+        Side of the stamp, pixels.
+    reach : float
+        Largest |(ix, iy)|.
+    shells : int
+        Number of rings of equal width. Runs are sorted by ring, then by iy.
+    out : int array, shape (r, 4)
+        Result: first sample, ix, iy and ring of each run, as far as there are rows.
+
+    Returns
+    -------
+    (int, int)
+        Number of runs, and number of samples.
     """
     count, samples = 0, 0
     for shell in range(shells):
@@ -296,11 +375,11 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
         for iy in range(-int(reach), int(reach) + 1):
             last = _half_chord(outside, iy)
             gap = _half_chord(inside, iy) if shell > 0 else -1
-            # Two arcs, left and right of the inner shells; or, on top of them, one.
+            # A row crosses two arcs to the left and right of the inner shells, or one arc above or below them.
             for arc in range(2 if gap >= 0 else 1):
                 low = gap + 1 if arc == 1 else -last
                 high = last if arc == 1 or gap < 0 else -gap - 1
-                # Half of a real image's plane is enough, with all that falls onto that half.
+                # Half of the plane is sufficient for a real image, with all aliases that fall on that half.
                 for alias in range(low // size, high // size + 1):
                     start, end = max(low, alias * size), min(high, alias * size + size // 2)
                     if start <= end:
@@ -313,16 +392,25 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
 
 @jit
 def _half_chord(radius: float, y: int) -> int:
-    """Largest x >= 0 with (x, y) inside a circle, else -1."""
+    """Largest integer x >= 0 with (x, y) inside a circle, or -1."""
     square = radius * radius - y * y
     return int(np.sqrt(square)) if square >= 0.0 else -1
 
 
 @jit
 def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> None:
-    """Adds the weighted sum of planes [b, s, s] to the image inside a margin.
+    """Add the weighted sum of planes to the part of an image inside a margin.
 
-    weights : [b] of the planes;  margin : pixels of the image before the first of the planes
+    Parameters
+    ----------
+    image : float32 array
+        Image, changed in place.
+    planes : float32 array, shape (b, s, s)
+        The planes.
+    weights : float array, shape (b,)
+        Weights of the planes.
+    margin : int
+        Pixels of the image before the first pixel of the planes.
     """
     for r in range(planes.shape[1]):
         out = image[margin + r, margin : margin + planes.shape[2]]
@@ -334,10 +422,20 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 @jit
 def interpolate_spectrum(spectrum: Array, across: Float, up: Float, width: int, slope: float, out: Array) -> None:
-    """Fills out [s] with the sums of a periodic spectrum [ny, nx] under a window about frequencies, radian / pixel.
+    """Fill `out` with a periodic spectrum, interpolated by a window at given frequencies.
 
-    window : exp(slope (sqrt(1 - z^2) - 1)), z = -1 .. 1 over `width` samples a direction
-    across, up : [s] frequencies along columns and rows, radian / pixel
+    Parameters
+    ----------
+    spectrum : complex array, shape (ny, nx)
+        The periodic spectrum.
+    across, up : float array, shape (s,)
+        Frequencies along columns and rows, radian / pixel.
+    width : int
+        Samples of the window per direction.
+    slope : float
+        Slope of the window exp(slope (sqrt(1 - z^2) - 1)), with z from -1 to 1 over `width` samples.
+    out : complex array, shape (s,)
+        Result.
     """
     ny, nx = spectrum.shape
     x_weights, y_weights = np.empty(width), np.empty(width)

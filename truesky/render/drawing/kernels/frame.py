@@ -1,10 +1,7 @@
-"""Compiled: stamps onto the frame, in fixed point; light that wraps around a stamp goes where it belongs.
+"""Compiled loops that add stamps to a frame in fixed point, and move aliased light to its correct position.
 
-accumulate        stamps onto the frame, in fixed point
-aliased_light     the light that comes in at the opposite edges of stamps
-subtract_aliased  takes it off them;  spill : and adds it where it belongs
-smooth            an image about points
-electrons_of      the frame with a smooth layer on top
+A stamp is periodic, so that light beyond its edges appears at the opposite edges. In all functions `profile` [m, 11]
+contains rows of `galaxy_shapes.real_space_profile`, in electrons.
 """
 
 from __future__ import annotations
@@ -16,19 +13,20 @@ import numpy as np
 from lake_schema.arrays import Array, Float, Int
 from truesky.numerics.compiling import jit
 
-# What an electron is in the frame's integers, to 1e-6; and their largest sum, which leaves room for what rings.
+# Units per electron in the frame's integers, a precision of 1e-6; and the binary logarithm of their largest sum, which
+# leaves room for ringing.
 FIXED_POINT, FULL = float(1 << 20), 61
-# Of a float's bits, those within a sixteenth of an octave; square of the scale lengths at which a disc ends.
+# Number of a float's bits below a sixteenth of an octave; square of the radius at which a disc ends, in scale lengths.
 _COARSE, _DARK = 19, 900.0
-# Columns of galaxy_shapes.on_the_sky: light in the middle of a bulge and of a disc, the first of the four of their
-# matrices, and the bulge's exponent.
+# Columns of `galaxy_shapes.real_space_profile`: light in the middle of the bulge and of the disc, first of four columns
+# of the bulge's matrix, exponent of the bulge, first of four columns of the disc's matrix.
 BULGE, DISK, BULGE_FORM, POWER, DISK_FORM = 0, 1, 2, 6, 7
-# Light that enters a stamp is taken off where it varies by less than the first about the middle, of itself; from the
-# second on nothing is. Measured on stamps too small by far (64 pixels, n = 3, half-light radius 10): without an end the
-# response to shear at axis ratio 0.1 is twice as wrong as with nothing taken off; if it ended at once it would be wrong
-# by 1.6, and fading is by 0.5.
+# Aliased light is removed if its relative variation about the middle is below `_EVEN`, not at all above `_STEEP`, and
+# gradually in between. The error of the response to shear was measured on stamps that are far too small (64 pixels,
+# n = 3, half-light radius 10) for axis ratio 0.1. Relative to no removal, it is 2 without an upper limit, 1.6 with a
+# sharp limit and 0.5 with the gradual one.
 _EVEN, _STEEP = 1.0, 3.0
-# It fades, too, where the terms cancel: they hold less light than this, of what the middle's level would be.
+# The removal also fades if the terms cancel: if their light is less than this fraction of that of the middle's level.
 _CANCELLED = 0.25
 
 
@@ -44,11 +42,25 @@ def min_singular_squared(form: Float) -> Any:
 def accumulate(
     frame: Int, stamps: Array, x0: Int, y0: Int, unread_rows: tuple[int, int], unit: float
 ) -> Int:  # fmt: skip
-    """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, `unit` to an electron.
+    """Add stamps to the frame, in integers, so that the sum does not depend on the order.
 
-    Whole numbers: the sum is the same, bit by bit, in any order.
-    unread  : first of the rows that count for nothing, and the one behind them
-    returns : int64[m] what of each stamp fell onto the others, in the same units
+    Parameters
+    ----------
+    frame : int array, shape (ny, nx)
+        Frame, changed in place.
+    stamps : float array, shape (m, N, N)
+        Stamps, electrons.
+    x0, y0 : int array, shape (m,)
+        Columns and rows of their lower left pixels.
+    unread_rows : (int, int)
+        First row that is not counted in the result, and the row after the last.
+    unit : float
+        Units per electron.
+
+    Returns
+    -------
+    int array, shape (m,)
+        Light of each stamp on the counted rows, in units.
     """
     ny, nx = frame.shape
     added = np.zeros(len(stamps), np.int64)
@@ -69,9 +81,18 @@ def accumulate(
 
 @jit
 def subtract_aliased(stamps: Array, x: Float, y: Float, curve: Float, removed: Float) -> None:
-    """Takes curve [m, 5] of `aliased_light` about (x, y) [m] off stamps [m, N, N]; no pixel becomes negative.
+    """Subtract aliased light from stamps; no pixel becomes negative.
 
-    taken : [m] filled with the electrons
+    Parameters
+    ----------
+    stamps : float array, shape (m, N, N)
+        Stamps, changed in place.
+    x, y : float array, shape (m,)
+        Positions of the sources in their stamps, pixels.
+    curve : float array, shape (m, 5)
+        Result of `aliased_light`.
+    removed : float array, shape (m,)
+        Result: subtracted electrons.
     """
     for i in range(len(stamps)):
         removed[i] = 0.0
@@ -93,19 +114,36 @@ def subtract_aliased(stamps: Array, x: Float, y: Float, curve: Float, removed: F
 
 @jit
 def aliased_light(size: Int, x: Float, y: Float, profile: Float, max_electrons: Float) -> Float:
-    """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; all of it.
+    """Light that is aliased into stamps, as a polynomial of second order about the source.
 
-    size, x, y : [m] side of the stamp, position in it, pixels;  profile : [m, 11] galaxy_shapes.on_the_sky, electrons
-    most  : [m] electrons that may enter
-    Error : of a round galaxy 2 % within an eighth of the stamp of the middle, of axis ratio 0.3 a third; too little
-            farther out. All 0 where the light varies too much for such terms: of steep, slim galaxies
+    Parameters
+    ----------
+    size : int array, shape (m,)
+        Sides of the stamps, pixels.
+    x, y : float array, shape (m,)
+        Positions of the sources in their stamps, pixels.
+    profile : float array, shape (m, 11)
+        Profiles of the galaxies.
+    max_electrons : float array, shape (m,)
+        Upper limit of the aliased light, electrons.
+
+    Returns
+    -------
+    float array, shape (m, 5)
+        Level in the middle, coefficients of x^2, x y and y^2, and sum over the stamp, electrons. All are 0 if the light
+        varies too much for such a polynomial, as for steep, thin galaxies.
+
+    Notes
+    -----
+    Within an eighth of the stamp from the middle, the error is 2 % for a round galaxy and a third for axis ratio 0.3.
+    Farther out the result is too small.
     """
     out = np.zeros((len(profile), 5))
     for i in range(len(profile)):
         n, h = size[i], size[i] / 8.0
         if profile[i, BULGE] == 0.0 and profile[i, DISK] == 0.0:
             continue
-        # The lattice of the stamp's images has no odd terms.
+        # The lattice of a stamp's images is symmetric, so there are no odd terms.
         middle, rising = _image_light(profile[i], n, 0.0, 0.0), _image_light(profile[i], n, h, h)
         right, up = _image_light(profile[i], n, h, 0.0), _image_light(profile[i], n, 0.0, h)
         falling = _image_light(profile[i], n, h, -h)
@@ -118,7 +156,7 @@ def aliased_light(size: Int, x: Float, y: Float, profile: Float, max_electrons: 
         second = across2 * (across**2 + spread) + cross_term * across * along + up2 * (along**2 + spread)
         light = n * n * (middle + second)
         if light > 0.0:
-            # By and by: if it ended at once, a galaxy and the same one sheared would differ by more than by the shear.
+            # With a sharp limit, a galaxy and its sheared version could be treated differently.
             z = min((_STEEP - uneven) / (_STEEP - _EVEN), light / (_CANCELLED * n * n * middle))
             z = min(max(z, 0.0), 1.0)
             part = z * z * (3.0 - 2.0 * z)
@@ -129,7 +167,7 @@ def aliased_light(size: Int, x: Float, y: Float, profile: Float, max_electrons: 
 
 @jit
 def _image_light(profile: Float, size: int, x: float, y: float) -> Any:
-    """Light of a source's images in the stamps about its own, three deep."""
+    """Light of a source's periodic images in the three rings of stamps around its stamp."""
     total = 0.0
     for r in range(-3, 4):
         for c in range(-3, 4):
@@ -140,7 +178,7 @@ def _image_light(profile: Float, size: int, x: float, y: float) -> Any:
 
 @jit
 def _light(profile: Float, x: float, y: float) -> Any:
-    """Of a galaxy, electrons a pixel at (x, y) pixels from its middle."""
+    """Light of a galaxy per pixel at (x, y) pixels from its middle, electrons."""
     out = 0.0
     if profile[BULGE] > 0.0:
         out += profile[BULGE] * np.exp(-np.exp(profile[POWER] * np.log(_square(profile, BULGE_FORM, x, y) + 1e-300)))
@@ -155,16 +193,27 @@ def _disk_light(profile: Float, x: float, y: float) -> Any:
 
 @jit
 def _square(profile: Float, form: int, x: float, y: float) -> Any:
-    """u^2 + v^2 of the matrix that begins at a column."""
+    """Compute u^2 + v^2 for the matrix that begins at column `form`."""
     u, v = profile[form] * x + profile[form + 1] * y, profile[form + 2] * x + profile[form + 3] * y
     return u * u + v * v
 
 
 @jit
 def add_smoothed(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
-    """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, `unit` to an electron.
+    """Add an image, in blocks, about each of several points, interpolated between the four nearest blocks.
 
-    image : electrons a pixel of one electron, on blocks, its middle one the point's, with a border of nothing
+    Parameters
+    ----------
+    blocks : int array
+        Blocks, changed in place.
+    image : float array
+        Electrons per pixel for one electron, on blocks, centred on the point and with a border of zeros.
+    x, y : float array, shape (m,)
+        Positions of the points, blocks.
+    electrons : float array, shape (m,)
+        Electrons of the points.
+    unit : float
+        Units per electron.
     """
     ny, nx = blocks.shape
     side = len(image) - 1
@@ -191,11 +240,28 @@ def add_spilled(
     blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, profile: Float,
     light: Float, unit: float,
 ) -> None:  # fmt: skip
-    """Adds what is taken off galaxies' stamps to blocks of `side` pixels outside, `unit` to an electron.
+    """Add the light that was removed from the stamps of galaxies to blocks outside the stamps.
 
-    margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it goes, pixels
-    column, row : [m] pixels;  profile : [m, 11] galaxy_shapes.on_the_sky
-    light  : [m] electrons to be shared among the blocks
+    Parameters
+    ----------
+    blocks : int array
+        Blocks, changed in place.
+    side : int
+        Side of a block, pixels.
+    margin : int
+        Number of blocks before the first pixel of the frame.
+    size : int array, shape (m,)
+        Sides of the stamps, pixels.
+    reach : float array, shape (m,)
+        Distance up to which the light is distributed, pixels.
+    column, row : float array, shape (m,)
+        Positions of the galaxies, pixels.
+    profile : float array, shape (m, 11)
+        Profiles of the galaxies.
+    light : float array, shape (m,)
+        Electrons to be distributed among the blocks.
+    unit : float
+        Units per electron.
     """
     middle = 0.5 * (side - 1)
     square = np.empty(1, np.float32)
@@ -232,7 +298,7 @@ def add_spilled(
 
 @jit
 def _add_image(blocks: Int, image: Float, x_first: int, y_first: int, scale: float) -> None:
-    """Adds an image times `scale`, rounded, to blocks from (left, low) on, as far as it lies on them."""
+    """Add an image times `scale`, rounded, to the blocks from (x_first, y_first)."""
     ny, nx = blocks.shape
     first, last = max(0, -x_first), min(image.shape[1], nx - x_first)
     for r in range(max(0, -y_first), min(len(image), ny - y_first)):
@@ -242,7 +308,7 @@ def _add_image(blocks: Int, image: Float, x_first: int, y_first: int, scale: flo
 
 @jit
 def _tabulate_bulge(profile: Float, min_square: float, max_square: float) -> tuple[Float, int]:
-    """(light of the bulge by u^2 + v^2, 16 places an octave, linear between; the top bits of the first)."""
+    """Light of the bulge by u^2 + v^2 with 16 nodes per octave, and the top bits of the first node."""
     ends = np.array([max(min_square, 1e-30), min(max(max_square, 1e-30), 1e30)], np.float32)
     bits = ends.view(np.int32)
     first, last = bits[0] >> _COARSE, (bits[1] >> _COARSE) + 2
@@ -256,10 +322,25 @@ def _tabulate_bulge(profile: Float, min_square: float, max_square: float) -> tup
 
 @jit
 def to_electrons(frame: Int, unit: float, blocks: Float, side: int, margin: int) -> Float:
-    """The electrons of a frame of `unit` to each, with those of blocks of `side` pixels, `margin` before its first.
+    """Convert a frame to electrons and add a smooth layer of blocks.
 
-    blocks : electrons a pixel, interpolated linearly between the blocks' centres
-    returns : float64[ny, nx] in the place of the frame, which is lost
+    Parameters
+    ----------
+    frame : int array, shape (ny, nx)
+        Frame; its memory is reused for the result.
+    unit : float
+        Units of the frame per electron.
+    blocks : float array
+        Electrons per pixel, interpolated linearly between the centres of blocks.
+    side : int
+        Side of a block, pixels.
+    margin : int
+        Number of blocks before the first pixel of the frame.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons.
     """
     ny, nx = frame.shape
     out, electrons_per_unit = frame.view(np.float64), 1.0 / unit
