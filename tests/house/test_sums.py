@@ -38,8 +38,9 @@ def faults(tree):
 
 @pytest.mark.parametrize(
     "text",
-    ["a @ b", "np.matmul(a, b)", "a @= b", "np.dot(a, b)", "a.dot(b)", "np.linalg.inv(a)", "from numpy.linalg import inv",
-     "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd", "numba.njit(parallel=True)"],
+    ["a @ b", "a @= b", "np.matmul(a, b)", "np.dot(a, b)", "a.dot(b)", "np.linalg.inv(a)",
+     "from numpy.linalg import inv", "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd",
+     "numba.njit(parallel=True)"],
 )  # fmt: skip
 def test_what_would_be_found(text):
     assert list(faults(ast.parse(text)))
