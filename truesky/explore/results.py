@@ -100,8 +100,10 @@ def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Pat
 
 
 def _refuse_same_names(rows: pa.Table) -> None:
-    if len(set(rows.column_names)) != rows.num_columns:
-        raise BadInput("two columns of the result have the same name; give one of them another with AS")
+    names = rows.column_names
+    if len(set(names)) != len(names):
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise BadInput(f"two columns of the result are called {repeated}: rename one with AS")
 
 
 def _csv(rows: pa.Table, path: Path) -> None:

@@ -321,7 +321,7 @@ def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
 
 def _load_passbands(bands: Sequence[str | Passband]) -> list[Passband]:
     if not bands:
-        raise BadInput("no passband is requested")
+        raise BadInput("passbands: at least one is required")
     return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
 
 

@@ -177,7 +177,7 @@ def _windows(bands: Sequence[Passband], reference: Passband | None) -> list[Wave
     """Return the windows that contain all bands and the reference band."""
     all_bands = [*bands, *([reference] if reference is not None else [])]
     if not bands:
-        raise BadInput("no passband is requested")
+        raise BadInput("passbands: at least one is required")
     ends = sorted((int(band.wavelength[0]), int(band.wavelength[-1])) for band in all_bands)
     merged = [ends[0]]
     for first, last in ends[1:]:
