@@ -29,7 +29,10 @@ _TYPES = {
 
 
 def footer_metadata(rows: pa.Table, table: Table) -> dict[str, str]:
-    """Return the VOTable entries for the footer of a Parquet file that contains these rows of a table."""
+    """Return the VOTable entries for the footer of a Parquet file that contains these rows of a table.
+
+    The header is that of the declared table. The rows are only needed for the longest text of each text column.
+    """
     texts = [column.name for column in table.columns if column.type == "string"]
     # astropy's VOTable reader takes a text of unknown length for an object, but its Parquet reader does not.
     text_lengths = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)

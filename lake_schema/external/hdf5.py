@@ -22,7 +22,8 @@ from lake_schema.external import files
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _TYPES = ("diffsky_fits", "synthetic_galaxies")
 _ROWS_PER_BATCH = 65_536
-# Largest number of groups of a file (including slices), of characters of a unit, and of bytes of an unpacked chunk.
+# Largest number of groups in a file (each slice of a light cone is a group), of characters in a unit, and of bytes in
+# an unpacked chunk.
 _MAX_GROUPS, _MAX_UNIT_LENGTH, _MAX_CHUNK_BYTES = 4096, 64, 64 << 20
 
 

@@ -32,7 +32,7 @@ def compare_configurations(first: str, second: str) -> list[str]:
 
 
 def load_configuration(name: str) -> MissionConfiguration:
-    """Return the configuration that a ladder, a request file or a lake names."""
+    """Return the configuration that a ladder (list of statuses such as REQ,DES), a request file or a lake names."""
     statuses = tuple(name.split(","))
     if all(status in STATUSES for status in statuses):
         return resolve(ladder=statuses)

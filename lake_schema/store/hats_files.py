@@ -37,7 +37,10 @@ Cell = tuple[int, int]  # order, nested cell
 
 
 def border_rows(rows: pa.Table, partition: str) -> pa.Table:
-    """Return the rows of a cell that margins of other cells may need; they are stored with the receipts until then."""
+    """Return the rows of a cell that the margins of other cells may need.
+
+    They are stored with the receipts of the tasks until the margins are written.
+    """
     order, cell = layout.cell_of_file(partition)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))

@@ -48,8 +48,9 @@ def write(path: Path, rows: pa.Table, table: Table) -> None:
 def file_checksums(path: Path) -> dict[str, Any]:
     """Return size, sha256 and blocks of a Parquet file that was just written.
 
-    A block contains the pages of one column of a row group with their headers, or several small such pieces. The last
-    block contains the page index and the footer.
+    A block contains the pages of one column of a row group with their headers. Small pieces share a block with the
+    next piece, and large pieces are divided into several blocks. The page index and the footer come last. The entry
+    `blocks` contains sizes and CRC-32 of the blocks as base64 text, see `blocks.file_checksums`.
     """
     metadata = pq.read_metadata(path)
     starts, end = [], 4  # the magic number

@@ -71,7 +71,10 @@ def libraries() -> Mapping[str, str]:
 
 
 def machine() -> str:
-    """Return the kind of this machine, as recorded in receipts and manifests; it is never part of a version's key."""
+    """Return the kind of this machine: instruction set and C library, such as "x86-64-v3 glibc 2.36".
+
+    Receipts of tasks and manifests of versions record it. It is not part of the key of a version.
+    """
     return instruction_set.kind()
 
 

@@ -71,7 +71,7 @@ def make_version(
     base: str | None = "",
     name: str | None = None,
 ) -> Path:
-    """Make the missing partitions of a plan's version and publish it.
+    """Make the missing partitions of a plan's version and publish it as the current version of its table.
 
     Parameters
     ----------
@@ -88,7 +88,8 @@ def make_version(
         Key of the version that this one replaces. By default ("") it is the version that exists at the call: the
         version of the request if `name` is given, else the current one.
     name : str, optional
-        Name of the request for which the version is made. The request is then also linked to the inputs of the plan.
+        Name of the request for which the version is made. The request is then linked to the version, and to the inputs
+        of the plan for which it has no link yet.
 
     Returns
     -------

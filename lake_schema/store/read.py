@@ -353,7 +353,7 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
     name : str
         Name of the table.
     key : str, optional
-        Key of the version.
+        Key of the version. It takes precedence over `request`.
     request : str, optional
         Name of the request whose version is returned.
 

@@ -87,7 +87,7 @@ def _refuse_shared_ids(
 
 
 def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
-    """Yield groups of two or more receipts whose spans of keys overlap."""
+    """Yield groups of two or more receipts whose rows have overlapping ranges of identifiers."""
     group: list[Json] = []
     highest: list[Any] = []
     for receipt in sorted(

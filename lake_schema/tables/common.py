@@ -1,4 +1,4 @@
-"""Columns and types that several tables share: identifiers, positions, origins of files."""
+"""Columns and types that several tables share: identifiers, positions, sources of files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def id_of_kinds(first: int, last: int) -> Column:
 def density_boost_column(sources: str) -> Column:
     """Return the column `density_boost`.
 
-    `sources` is the subject and verb of its description, such as "this kind was".
+    The column contains the factor by which a kind of source was drawn denser than in nature. `sources` is the subject
+    and verb in the description of the column, such as "this kind was".
     """
     doc = f"factor by which {sources} drawn denser than in nature; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

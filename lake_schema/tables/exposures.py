@@ -39,7 +39,7 @@ EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
 }
 # Passband whose fluxes select the sources that a slitless channel draws.
 SELECTION_BANDS: Mapping[str, str] = {"NISP-S": "euclid_h"}
-# Image types that can be rendered, by channel; all others can be planned and forecast. This copies the registry of
+# Image types that can be rendered, by channel; all others can only be planned. This copies the registry of
 # channels, because requests are checked without importing the renderer. test_checks.py compares the two.
 RENDERED_TYPES: Mapping[str, tuple[str, ...]] = {
     "VIS": (

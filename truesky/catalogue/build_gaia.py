@@ -1,4 +1,6 @@
-"""Build the table `gaia` of a lake's stars: spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST.
+"""Build the table `gaia`, the simulated Gaia catalogue of the stars.
+
+Command: spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST.
 
 The key `fluxes.bands` of the request must contain gaia_g, gaia_bp and gaia_rp.
 """

@@ -100,7 +100,7 @@ def job_totals(root: Folder) -> list[JobTotals]:
         If a line of a log is invalid. The message names the line.
     """
     totals_by_job: dict[str, JobTotals] = {}
-    # A job writes one log per table. A log of a table that the process has made already starts a new run.
+    # A job writes one log per table. If the log names a table that the process has already made, a new run begins.
     tables_by_process: dict[tuple[str, str], set[str]] = {}
     for path in run_log.logs_of_lake(root):
         if lines := run_log.lines(path):

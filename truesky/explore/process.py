@@ -141,7 +141,8 @@ class Process:
         max_rows : int, optional
             Largest number of rows; by default all.
         max_bytes : int, optional
-            Size above which a result is refused; by default any size is allowed.
+            Size above which a result is refused. By default any size is allowed, but a single row must not exceed
+            64 MiB.
         expressions : sequence of str
             Parts of the text that a user wrote; each must be exactly one expression.
 

@@ -200,7 +200,7 @@ def _band_table(band: Passband, library: Library) -> Float:
 
 @lru_cache(maxsize=64)
 def _compute_table(response: bytes, wavelength: bytes, library: Library) -> Float:
-    """Return ln(light in the band / light in the reference band at rest), float64[z, m] of the colour sequence."""
+    """Return ln(flux in a band / rest-frame flux in the reference band) by redshift and template, float64[z, m]."""
     band = Passband("", np.frombuffer(wavelength), np.frombuffer(response), "")
     sequence, nodes = colour_sequence(library), np.exp(np.arange(_FIRST, _LAST + 2 * _STEP, _STEP))
     samples = slice(None, None, max(len(band.wavelength) // _SAMPLES, 1))

@@ -126,7 +126,7 @@ def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
     Parameters
     ----------
     table : pa.Table
-        Rows of kinds in the galaxy library.
+        Rows of galaxies whose `kind` has templates in the library (not quasars, not high-redshift galaxies).
     library : Library
         Templates to which sed_1 and sed_2 refer.
 

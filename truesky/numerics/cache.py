@@ -168,7 +168,7 @@ def stored_checksums(folder: Path) -> dict[str, int] | None:
     A folder with a missing or damaged list is removed.
     """
     if not folder.exists():
-        # This is checked before the list is read, because another process may publish the whole folder at any time.
+        # Check the folder before its list of checksums is read, because another process may publish it at any time.
         return None
     try:
         stored = json.loads((folder / _CHECKSUM_FILE).read_bytes())

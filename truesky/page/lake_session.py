@@ -231,7 +231,7 @@ class RequestTables:
         return [] if version is None else version.rows(columns, where=where).to_pylist()
 
     def iterate_rows(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Yield the rows of a table partition by partition, because a plan may be larger than the memory."""
+        """Yield the rows of a table partition by partition, because a table may be larger than the memory."""
         version = self.versions.get(table)
         return iter(()) if version is None else (version.rows(columns, [part]) for part in version.partitions)
 

@@ -71,7 +71,7 @@ def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -
 
 
 def _overridden_parameters(version: read.Version) -> list[Json]:
-    """Mission parameters that a request has changed, with their values in the mission database of this version."""
+    """Mission parameters that a request has changed, with their default values when the version was made."""
     rows = version.rows(["name", "value", "unit", "overridden"]).to_pylist()
     defaults = resolve()
     return [

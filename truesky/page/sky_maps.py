@@ -293,9 +293,10 @@ def regions(lake: LakeSession) -> list[Json]:
     Returns
     -------
     list of dict
-        One entry per detector and exposure: `request` (None if the lake has only one), `exposure_id`, `detector`,
-        `channel`, `band`, `polygon` (corners in degrees), `state` ("planned", "observed" or "failed"), `images`
-        (numbers) and `contents` (content of each image). A large plan is listed only for exposures with images.
+        One entry per detector and exposure: `request` (None unless requests have different plans or images),
+        `exposure_id`, `detector`, `channel`, `band`, `polygon` (corners in degrees), `state` ("planned", "observed" or
+        "failed"), `error` (only if failed), `images` (numbers) and `contents` (content of each image). Images without
+        a plan are listed, too. A large plan is listed only for exposures with images.
     """
     failures = _failure_messages(lake)
     return [_current_region(place, region, failures) for place, region in _known_regions(lake).items()]

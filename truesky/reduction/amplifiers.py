@@ -74,7 +74,10 @@ def pixels_at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
 
 
 def unread_pixels(scene: Scene) -> Bool:
-    """Return True for pixels that no amplifier reads: rows between the halves, streets between cells; bool[ny, nx]."""
+    """Return the mask of pixels that no amplifier reads, bool[ny, nx].
+
+    These are the rows between the two halves of a detector and the gaps between its cells.
+    """
     if scene.layout is not None:
         return scene.layout.unread_pixels
     out = np.zeros((scene.ny, scene.nx), bool)

@@ -42,7 +42,7 @@ def to_rate(image: ImageFile) -> ReducedImage:
     """Return an image in electrons per second."""
     if image.card("BUNIT") == "electron/s":
         return image.reduced
-    # Exposure time in which 1 e-/s gives one unit.
+    # Signal that 1 e-/s gives in the exposure, in units of the image (BUNIT).
     time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
     counts = image.reduced
     return ReducedImage(

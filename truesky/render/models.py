@@ -89,7 +89,7 @@ def _extension(number: int, order: int | None, light: Float) -> Image:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the sources and print the electrons of each source on the detector."""
+    """Write the noise-free light of the given sources to a FITS file, and print the electrons of each."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
     )

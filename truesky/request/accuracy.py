@@ -126,7 +126,7 @@ def _error(row: dict[str, float], name: str) -> float:
 
 
 def _round_up(value: float) -> str:
-    """Return a number with two digits, rounded up, so that a request with this number is accepted."""
+    """Return a number with two significant digits, rounded up, so that a request with this number is accepted."""
     low = f"{value:.1e}"
     if float(low) >= value:
         return f"{float(low):g}"

@@ -25,8 +25,9 @@ _MAX_THRESHOLD = 2**31 - 1
 def retain_freed_memory() -> Iterator[None]:
     """Keep freed memory for new arrays in this context, and return it to the operating system afterwards.
 
-    Afterwards the C library no longer adapts the size from which it requests memory from the operating system: the size
-    is 128 kB. The context has no effect with other C libraries than GNU's.
+    The C library normally adapts the size above which it requests an array from the operating system. After the context
+    this size is fixed: 128 kB, unless the library had adapted it before. The context has no
+    effect with other C libraries than GNU's.
     """
     library = _library()
     if library is None:

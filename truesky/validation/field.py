@@ -92,9 +92,9 @@ def from_version(catalogue: read.Version, index: Int) -> Field:
 
 
 def from_cells(order: int, cells: Int) -> Field:
-    """Divide cells (ascending numbers of one order) into at most PATCHES patches of neighbouring cells.
+    """Divide cells (ascending numbers of one order) into at most PATCHES runs of consecutive cells.
 
-    No patch is smaller than a generation cell.
+    No patch is smaller than a generation cell, unless the whole field is. `order` must be at least GENERATION_ORDER.
     """
     n_patches = max(min(PATCHES, len(cells) >> 2 * (order - GENERATION_ORDER)), 1)
     return Field(order, cells, np.arange(len(cells)) * n_patches // max(len(cells), 1))

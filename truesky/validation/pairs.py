@@ -25,14 +25,14 @@ _OFFSETS = [(0, 0, 0)] + [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
-    """Sums over pairs, in total and without each patch.
+    """Sums of several quantities over pairs of points, for a jackknife over patches of the sky.
 
     Attributes
     ----------
-    total : float array, shape (c, bins)
+    total : float array, shape (quantities, bins)
         Sums over all pairs.
-    jackknife : float array, shape (patches, c, bins)
-        Sums over pairs with no end in the given patch.
+    jackknife : float array, shape (patches, quantities, bins)
+        Sums over the pairs without a point in the given patch.
     """
 
     total: Float

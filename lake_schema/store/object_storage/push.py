@@ -139,7 +139,10 @@ class Bucket:
                 return None
 
     def has_object(self, item: _Object) -> bool:
-        """Return True if an object exists with the contents of its file, by its checksum or else by reading it."""
+        """Return True if an object exists with the contents of its file, by its checksum or else by reading it.
+
+        An object that was sent in parts of another size counts as missing. Errors of the service raise BadInput.
+        """
         from botocore.exceptions import ClientError
 
         object_key = self.address.key(item.name)

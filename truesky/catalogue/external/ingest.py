@@ -156,12 +156,13 @@ def rows_of_cell(split: Split, cell: int) -> dict[str, Array]:
     Returns
     -------
     dict of str to array, shape (n,)
-        Values by key, with `index` (the order-29 cell), sorted by index, then by origin_id.
+        Values by name of the column, with `index` (the order-29 cell), sorted by index, then by origin_id.
 
     Raises
     ------
     Damaged
-        If a piece has changed on disk. The cached copy is deleted, and the next call of `split_by_cell` makes it again.
+        If the stored file of this cell has changed on disk. The cached copy is deleted, and the next call of
+        `split_by_cell` makes it again.
     """
     prefix = f"{cell >> 2 * (GENERATION_ORDER - FILE_ORDER)}/"
     pieces = [split.folder / name for name in sorted(split.checksums) if name.startswith(prefix)]

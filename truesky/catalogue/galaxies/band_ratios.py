@@ -344,7 +344,7 @@ def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
 
 
 def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
-    """Return spectra as columns of table `galaxies`; both components have the same dust."""
+    """Return spectra as columns of the table `galaxies`; both templates of a galaxy have the same dust."""
     return {
         "sed_1": sed.template_1,
         "frac_1": sed.frac_1,

@@ -80,7 +80,7 @@ def chebyshev_products(
             in_av[q] = current
             previous, current = current, 2.0 * x * current - previous
         for k in range(2):
-            # A component without flux may have any E(B-V).
+            # E(B-V) is limited to the table, because a template without flux may have any value.
             x = 2.0 * (min(ebv[k, i], ebv_last) if law[k, i] > 0 else 0.0) / ebv_last - 1.0
             previous, current = x, 1.0
             at = np.uint64((k * n + i) * n_ebv * n_av)

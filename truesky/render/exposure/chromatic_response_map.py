@@ -128,7 +128,7 @@ def with_dispersed_light(
 
 
 def _is_inactive(scene: Scene, aim: Aim) -> bool:
-    """Return True if this channel or image has no chromatic response, or if it is switched off."""
+    """Return True if the channel or the image type has no chromatic response map, or if the request switches it off."""
     effect = aim.channel.chromatic_effect
     return effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
 

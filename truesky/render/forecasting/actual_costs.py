@@ -68,7 +68,7 @@ class Line:
 
 
 def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> list[Line]:
-    """Summarise the costs of a request's images.
+    """Compare CPU time, memory and size of a request's images with their forecast.
 
     Parameters
     ----------

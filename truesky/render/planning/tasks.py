@@ -110,7 +110,10 @@ def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
 
 
 def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> float:
-    """Return the number of days for which persistence of an exposure is simulated, or 0 without persistence."""
+    """Return the longest time, in days, for which the persistence of an exposure is simulated.
+
+    It is the maximum over the cameras of the exposures, and 0 if none of their channels has persistence.
+    """
     return max(
         (persistence.window_days(camera, mission) for camera in _cameras_with_persistence(exposures)), default=0.0
     )

@@ -132,7 +132,7 @@ def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
 
 
 def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
-    """Picture of a strong lens, and its sum."""
+    """Return the image of the arcs of a strong lens, and the sum of its pixels."""
     total = float(pixels.sum(dtype=float))
     if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
         actual = f"got {len(pixels)} pixels of sum {total:g}"
