@@ -56,7 +56,7 @@ def star(electrons):
 CASES = {
     "background": lambda x: scene(sky=0.01 * x),
     "pixel_area": lambda x: scene(sky=0.01 * x),
-    "dispersed_sky": lambda x: replace(scene(), spread_sky=np.full((3, 3), 0.01 * x)),
+    "dispersed_sky": lambda x: replace(scene(), sky_change=np.full((3, 3), 0.01 * x)),
     "fringes": lambda x: replace(ground(des_z__fringes=min(1e-5 * x, 0.5)), band=passbands.load("des_z")),
     "satellite_trails": lambda x: replace(crossed(), zero_point=10.0 + 2.5 * np.log10(x)),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
