@@ -63,7 +63,7 @@ def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
 
 @pytest.mark.parametrize("flips", FLIPS)
 def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
-    path = images.file("images/0.fits")
+    path = images.sidecar_path("images/0.fits")
     whole = path.read_bytes()
     (good,) = read_images(path)
     rng = np.random.default_rng(4)
@@ -72,7 +72,7 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
         flipped(path, bit)
         assert len(read.find_faults(images, deep=True)) == 1
         with pytest.raises(Damaged, match=r"0\.fits has other contents"):
-            images.file("images/0.fits")
+            images.sidecar_path("images/0.fits")
         try:
             # Outside a lake the blanks after a header's end may change.
             (found,) = read_images(path)

@@ -318,7 +318,7 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
     monkeypatch.setattr(
         stamps, "_draw_batch", watched(add, "stamps", lambda _, one, chosen, p, *a: chosen.size * p.grid.size**2)
     )
-    for name in ("transfer", "collapsed"):
+    for name in ("transfer", "source_transfer"):
         made = watched(getattr(transfer, name), "planes", lambda t, *a: len(t.planes) * t.grid.size**2)
         monkeypatch.setattr(transfer, name, made)
     stamps.draw(sources, sizes, psf, 160, 160)
