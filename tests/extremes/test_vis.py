@@ -29,7 +29,7 @@ END = {"vis.cti.age": (1.0, "")}
 
 def scene_of(shape, seconds=nominal.TIME, peak=1e11, light=0.0, middle=0, **overrides):
     ny, nx = shape
-    detector = replace(small("vis", "3-4", 2), nx=nx, ny=ny, middle=middle)
+    detector = replace(small("vis", "3-4", 2), nx=nx, ny=ny, injection_rows=middle)
     lights = Lights(np.array([nx / 2]), np.array([ny / 3]), np.array([light]))
     return Scene(resolve(overrides=overrides), "vis", seconds, 0.25, peak, detector, lights, accuracy=SURVEY)
 

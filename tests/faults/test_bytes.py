@@ -184,7 +184,7 @@ def large(tmp_path_factory):
 
 def spans(version, part):
     """(column or "", row group, first byte, last byte + 1) of all that the file holds, the footer last."""
-    path = version.path(part)
+    path = version.partition_path(part)
     about = pq.read_metadata(path)
     found = []
     for group in range(about.num_row_groups):
@@ -198,7 +198,7 @@ def spans(version, part):
 @pytest.mark.parametrize("flips", [1, pytest.param(300, marks=pytest.mark.nightly)])
 def test_of_a_large_file_what_is_read_is_compared(large, flips):
     """A flip in what is asked for is refused, also where a page's own checksum does not reach; others are not seen."""
-    part = large.parts[0]
+    part = large.partitions[0]
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
     ra, dec = (large.rows([name])[name].to_numpy()[parquet.ROWS_PER_GROUP + 1000] for name in ("ra", "dec"))
     where = pc.field("_healpix_29") == int(index[parquet.ROWS_PER_GROUP + 1000])
@@ -209,7 +209,7 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
         "cone": (lambda: large.cone(ra, dec, 0.003, ["flux"]), {"flux", "_healpix_29", "ra", "dec"}, second),
         "explorer": (asking(large, "SELECT max(flux), min(flux) FROM toy"), {"flux"}, every),
     }
-    path = large.path(part)
+    path = large.partition_path(part)
     rng = np.random.default_rng(2)
     for reader, columns, groups in wanted.values():
         good = reader()
@@ -241,7 +241,7 @@ def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
     read_bytes.clear()
     large.rows(["flux"], where=pc.field("_healpix_29") == int(index[5]))
-    chunk = {(column, group): end - start for column, group, start, end in spans(large, large.parts[0])}
+    chunk = {(column, group): end - start for column, group, start, end in spans(large, large.partitions[0])}
     asked_for, beside = chunk["flux", 0] + chunk["_healpix_29", 0], chunk["flux", 2] + 2 * (64 << 10)
     assert asked_for <= sum(read_bytes) < asked_for + beside
 

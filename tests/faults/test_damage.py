@@ -49,21 +49,21 @@ def flipped(path, bit):
 
 @pytest.mark.parametrize("flips", FLIPS)
 def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
-    part = toy.parts[0]
-    path = toy.path(part)
+    part = toy.partitions[0]
+    path = toy.partition_path(part)
     whole = path.read_bytes()
     rng = np.random.default_rng(3)
     for bit in rng.choice(8 * len(whole), flips, replace=False):
         flipped(path, bit)
         assert read.find_faults(toy, deep=True) == [f"{path} has other contents than the manifest says"]
         with pytest.raises(Damaged, match=path.name):
-            toy.rows(parts=[part])
+            toy.rows(partitions=[part])
         path.write_bytes(whole)
 
 
 @pytest.mark.parametrize("flips", FLIPS)
 def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
-    path = images.file("images/0.fits")
+    path = images.sidecar_path("images/0.fits")
     whole = path.read_bytes()
     (good,) = read_images(path)
     rng = np.random.default_rng(4)
@@ -72,7 +72,7 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
         flipped(path, bit)
         assert len(read.find_faults(images, deep=True)) == 1
         with pytest.raises(Damaged, match=r"0\.fits has other contents"):
-            images.file("images/0.fits")
+            images.sidecar_path("images/0.fits")
         try:
             # Outside a lake the blanks after a header's end may change.
             (found,) = read_images(path)
@@ -87,12 +87,12 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
 @pytest.mark.parametrize("kind", ["rows", "image"])
 def test_a_truncated_file_is_refused_before_use(toy, images, kind):
     version = toy if kind == "rows" else images
-    path = version.path(version.parts[0]) if kind == "rows" else version.file("images/0.fits")
+    path = version.partition_path(version.partitions[0]) if kind == "rows" else version.sidecar_path("images/0.fits")
     whole = path.read_bytes()
     for size in {*range(0, len(whole), 4096), *range(len(whole) - 16, len(whole))}:
         os.truncate(path, size)
         with pytest.raises(Damaged, match="bytes"):
-            version.rows() if kind == "rows" else version.file("images/0.fits")
+            version.rows() if kind == "rows" else version.sidecar_path("images/0.fits")
         assert path.name in read.find_faults(version)[0]
         path.write_bytes(whole)
 
@@ -102,9 +102,9 @@ def test_a_truncated_file_is_refused_before_use(toy, images, kind):
 def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
     version = toy if kind == "rows" else images
     first, second = (
-        (version.path(p) for p in version.parts[:2])
+        (version.partition_path(p) for p in version.partitions[:2])
         if kind == "rows"
-        else (version.file(f"images/{i}.fits") for i in (0, 1))
+        else (version.sidecar_path(f"images/{i}.fits") for i in (0, 1))
     )
     other = first.with_name(f"x{first.name}")
     if harm == "delete":
@@ -137,7 +137,7 @@ def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
 
 def test_a_damaged_version_is_not_published_again(toy, lake):
     publish.make_version(lake, toy_plan(2), toy_work)
-    toy.path(toy.parts[0]).unlink()
+    toy.partition_path(toy.partitions[0]).unlink()
     with pytest.raises(Damaged, match="made again"):
         publish.make_version(lake, toy_plan(1), toy_work)
     shutil.rmtree(toy.folder)

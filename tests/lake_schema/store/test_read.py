@@ -54,7 +54,7 @@ def test_a_missing_table(lake):
 
 @pytest.mark.parametrize("harm", ["delete", "shorten", "add", "flip"])
 def test_damage_is_named(toy, harm):
-    path = toy.path(toy.parts[0])
+    path = toy.partition_path(toy.partitions[0])
     if harm == "delete":
         path.unlink()
     if harm == "shorten":

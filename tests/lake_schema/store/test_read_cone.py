@@ -73,7 +73,7 @@ def catalogues(request, tmp_path_factory):
 
 def test_corners_are_corners(catalogues):
     for _, _, version in catalogues:
-        assert len(version.parts) >= 3
+        assert len(version.partitions) >= 3
 
 
 @given(data=st.data(), on=st.sampled_from(["observed", "true"]))
@@ -161,7 +161,7 @@ def test_other_readers_open_mixed_orders(catalogues):
 def test_the_margin_of_each_cell_surrounds_it(catalogues):
     for _, rows, version in catalogues:
         fine = rows["_healpix_29"].to_numpy() >> 32
-        for part in version.parts:
+        for part in version.partitions:
             order, cell = layout.cell_of_file(part)
             margin = pq.read_table(version.folder / "lensed_margin" / "dataset" / part, partitioning=None)
             wanted = rows.filter(np.isin(fine, sky.margin_cells(order, cell, 13)))

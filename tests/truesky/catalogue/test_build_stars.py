@@ -37,7 +37,7 @@ def versions(tmp_path_factory):
 
 def test_the_rows_do_not_depend_on_the_files(versions):
     whole, mixed, fine = versions
-    orders = [{layout.cell_of_file(part)[0] for part in one.parts} for one in versions]
+    orders = [{layout.cell_of_file(part)[0] for part in one.partitions} for one in versions]
     assert [len(found) for found in orders] == [1, 3, 1]
     assert orders[2] == {ids.GENERATION_ORDER}
     rows = whole.rows()
@@ -51,7 +51,7 @@ def test_the_rows_do_not_depend_on_the_files(versions):
 def test_files_hold_about_what_was_planned(versions):
     """Sample of all files; significance 3e-7 for each (5 standard errors)."""
     _, mixed, _ = versions
-    coarse = [part for part in mixed.parts if layout.cell_of_file(part)[0] < ids.GENERATION_ORDER]
+    coarse = [part for part in mixed.partitions if layout.cell_of_file(part)[0] < ids.GENERATION_ORDER]
     rows = [mixed.rows(["id"], [part]).num_rows for part in coarse]
     assert max(rows) < 6200 + 5 * np.sqrt(6200)
 
@@ -80,7 +80,7 @@ def test_fluxes_lie_beside_their_stars(versions):
     step = compute_fluxes.flux_step("star", lake, wanted())
     publish.make_version(lake, step.plan, step.run_task)
     fluxes = read.version(lake, "star_fluxes")
-    assert fluxes.partitions == mixed.parts
+    assert fluxes.partitions == mixed.partitions
     assert hats_readers.is_valid(fluxes.folder)
     cells = sky.cells_in_cone(AREA["cone"]["ra"], AREA["cone"]["dec"], 0.3, 8).tolist()
     stars, beside = (one.rows_in_cells(cells, 8, ["id"]) for one in (mixed, fluxes))

@@ -84,7 +84,7 @@ def test_blue_galaxies_do_not_follow_and_amplitudes_multiply(universe, own, rng)
     _, ra, dec = sky.random_in_cell(0, 5, 100, rng)
     chi, m_r, red = np.full(100, 1500.0), np.full(100, -22.0), np.ones(100, bool)
     once = alignments.central_ellipticity(own, ra, dec, chi, m_r, red)
-    twice = alignments.central_ellipticity(replace(own, times=2.0), ra, dec, chi, m_r, red)
+    twice = alignments.central_ellipticity(replace(own, strength=2.0), ra, dec, chi, m_r, red)
     assert twice == pytest.approx(2 * once, abs=1e-15)
     assert alignments.central_ellipticity(own, ra, dec, chi, m_r - 2.5 / 1.2, red) == pytest.approx(
         10 * once, abs=1e-12
@@ -106,7 +106,7 @@ def test_satellites_point_to_their_central(own):
 
 def drawn_and_wanted(universe, cells, dust, monkeypatch, places):
     """Return (drawn / requested alignment, its error) of red galaxies in cells, with alignments twice as strong."""
-    strong, wanted, inner = replace(universe.alignments, times=2.0), [], galaxies._mean_ellipticities
+    strong, wanted, inner = replace(universe.alignments, strength=2.0), [], galaxies._mean_ellipticities
 
     def recorded(own, members, drawn):
         mean = inner(own, members, drawn)

@@ -76,7 +76,7 @@ def test_convergence_and_shear_are_those_at_the_image(universe, rng):
     beta = lensing.displace(np.full(300, 40.0), np.full(300, 20.0), radius * np.sin(angle), radius * np.cos(angle))
     found = halo_lensing.columns(halo, *beta, np.full(300, CHI))
     theta = found["ra"], found["dec"]
-    once = replace(halo, settings=replace(halo.settings, again=np.inf))
+    once = replace(halo, settings=replace(halo.settings, repeat_threshold=np.inf))
     there = halo_lensing.lensing_at_images(once, *theta, np.full(300, CHI))
     again = lensing.displace(*theta, *-there[3:])
     wrong = 3600 * sky.separation(*again, *beta)
@@ -104,7 +104,7 @@ def test_the_lens_equation_holds(near, behind):
     """theta - alpha(theta) = beta within 0.5" for 99 % of the sources of a cell, which move by up to 30"."""
     ra, dec, chi = behind
     found = halo_lensing.lensing_at_images(near, ra, dec, chi)
-    once = replace(near, settings=replace(near.settings, again=np.inf))
+    once = replace(near, settings=replace(near.settings, repeat_threshold=np.inf))
     theta = lensing.displace(ra, dec, *found[3:])
     back = lensing.displace(*theta, *-halo_lensing.lensing_at_images(once, *theta, chi)[3:])
     assert np.percentile(3600 * sky.separation(*back, ra, dec), 99) < 0.5
@@ -163,7 +163,7 @@ def test_the_smooth_part_of_halos_is_that_of_a_direct_sum(universe, cells, near,
     chosen = lens_halos.settings()
     monkeypatch.setattr(lens_halos, "settings", lambda: replace(chosen, close=90.0))
     direct = halo_lensing.lens_of_cell(universe.lens, CellCache(universe.population), CELL)
-    once = [replace(one, settings=replace(one.settings, again=np.inf)) for one in (near, direct)]
+    once = [replace(one, settings=replace(one.settings, repeat_threshold=np.inf)) for one in (near, direct)]
     split, whole = (halo_lensing.lensing_at_images(one, *behind) for one in once)
     assert not direct.smooth.any()
     assert np.all(np.std(split - whole, axis=1)[:3] < 0.01 * np.std(whole, axis=1)[:3])

@@ -34,7 +34,7 @@ def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
 
 def test_every_halo_has_one_level(model):
     """Each mass bin above the limit is drawn by one order; less than one halo of the sky is larger than any level."""
-    wanted = model.log_mass[None, 1:] >= (model.lowest - model.matching.occupation.depth)[:, None]
+    wanted = model.log_mass[None, 1:] >= (model.min_mass_limit - model.matching.occupation.depth)[:, None]
     left_out = wanted & (model.level == -1)
     expected = np.sum(np.where(left_out, model.number, 0.0) * model.steps.volume[:, None]) * 4 * np.pi
     assert expected < 1.0
@@ -61,7 +61,7 @@ def test_halos_above_a_mass_are_the_same_to_any_limit(model, order):
     """Halos for lensing do not depend on the request's limit for galaxies."""
     least = np.where(model.steps.z < 1.5, 12.0, np.inf)
     every, few = halos.draw(model, SEED, order, 70, least), halos.draw(model, SEED, order, 70)
-    shallow = dataclasses.replace(model, limit=model.limit + 1.0, far=2000.0)
+    shallow = dataclasses.replace(model, limit=model.limit + 1.0, max_distance=2000.0)
     again = halos.draw(shallow, SEED, order, 70, least)
     both = few.select((few.log_mass >= 12.0) & (few.chi < 2000.0))
     kept = every.select(

@@ -83,7 +83,9 @@ def test_the_truth_table_tells_where_sources_are(name, ra, dec):
         Rows(none, None, points, None), (np.zeros(0), np.full(300, 1e3)), aimed(detector, system, BAND),
         psf_of("vis"), 13.0, settings.settings_for(SURVEY),
     )  # fmt: skip
-    found = replace(alone(), detector=detector, wcs=system, sources=drawn, sizes=sizes, drawn=np.zeros(len(sizes)))
+    found = replace(
+        alone(), detector=detector, wcs=system, sources=drawn, sizes=sizes, drawn_electrons=np.zeros(len(sizes))
+    )
     rows = truth_table.truth(found)
     assert rows["id"].to_pylist() == sorted(points["id"].to_pylist())
     order = np.argsort(points["id"].to_numpy())

@@ -56,7 +56,7 @@ def star(electrons):
 CASES = {
     "background": lambda x: scene(sky=0.01 * x),
     "pixel_area": lambda x: scene(sky=0.01 * x),
-    "dispersed_sky": lambda x: replace(scene(), spread_sky=np.full((3, 3), 0.01 * x)),
+    "dispersed_sky": lambda x: replace(scene(), sky_change=np.full((3, 3), 0.01 * x)),
     "fringes": lambda x: replace(ground(des_z__fringes=min(1e-5 * x, 0.5)), band=passbands.load("des_z")),
     "satellite_trails": lambda x: replace(crossed(), zero_point=10.0 + 2.5 * np.log10(x)),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
@@ -83,7 +83,7 @@ CASES = {
     "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
     "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
     "detector_crosstalk": lambda x: replace(
-        scene(crosstalk_detectors=1e-4), elsewhere=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
+        scene(crosstalk_detectors=1e-4), neighbour_charge=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
     ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),

@@ -351,7 +351,7 @@ def test_a_source_just_outside_still_shines_in():
 
 def test_rows_that_are_not_read_count_for_nothing():
     """Light on the rows between a detector's halves is not drawn for anybody, nor does it decide on an effect."""
-    detector = replace(small("vis", "3-4", SIDE), ny=SIDE + 4, middle=4)
+    detector = replace(small("vis", "3-4", SIDE), ny=SIDE + 4, injection_rows=4)
     _, exposed, body, _ = field("VIS")
     system = astrometry.wcs(detector, exposed["ra"], exposed["dec"], exposed["position_angle"])
     lon, lat = astrometry.sky_of_pixel(system, np.array([100.0]), np.array([SIDE / 2 + 1.5]))

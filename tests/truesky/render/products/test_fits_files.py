@@ -204,7 +204,7 @@ def test_quadrants_are_extensions_with_separate_wcs(rendered, written):
 
 def test_gap_between_the_halves_of_a_detector(tmp_path):
     """A star in each half is in its quadrant at the position of the header; a star in the gap is nowhere."""
-    detector = replace(small("vis", "3-4", 260), middle=4)
+    detector = replace(small("vis", "3-4", 260), injection_rows=4)
     quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
     one = nominal.rendered(
         detector, [19.0, 19.0, 19.0], [60.0, 190.0, 190.0], [40.0, 215.0, 129.5], forced=quiet,

@@ -28,7 +28,7 @@ STARS = ((0.0, 0.0, 4e4), (30.0, 0.0, 3e4), (0.0, 40.0, 2e4))
 def _middle(detector):
     """Return the part of a detector that contains the patch, wherever the position lies in the patch."""
     side = round((same_sky.SIDE + 60.0) / detector.pixel_scale)
-    return replace(detector, nx=side, ny=side, middle=0)
+    return replace(detector, nx=side, ny=side, injection_rows=0)
 
 
 @pytest.fixture(scope="module")

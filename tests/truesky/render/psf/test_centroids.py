@@ -74,7 +74,7 @@ def test_stars_are_found_where_truth_has_them():
     """
     x, y = nominal.lattice(300, 100)
     quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
-    detector = replace(small("vis", "1-1", 300), middle=0)
+    detector = replace(small("vis", "1-1", 300), injection_rows=0)
     one = nominal.rendered(detector, np.full(len(x), 19.0), x, y, forced=quiet)
     rows = truth_table.truth(one)
     data = np.array(one.noise_free, float)

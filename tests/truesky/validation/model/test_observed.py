@@ -182,7 +182,7 @@ def idle_halos(flat):
 
 def hole(flat):
     """No galaxies from z = 2.3."""
-    return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, far=3844.0)))
+    return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, max_distance=3844.0)))
 
 
 def far_quasars(flat):

@@ -82,7 +82,7 @@ def test_charge_above_full_well_does_not_repel():
 
 def through(light, between):
     """As a detector with rows of charge injection does it, all borders followed."""
-    detector = replace(small("vis", "3-4", 2), nx=light.shape[1], ny=len(light), middle=between)
+    detector = replace(small("vis", "3-4", 2), nx=light.shape[1], ny=len(light), injection_rows=between)
     one = Scene(resolve(), "vis", 560.53, 0.25, 1e5, detector)
     *parameters, _, rows = brighter_fatter.EFFECT.parameters(one)
     return brighter_fatter.EFFECT.apply(light, *parameters, 0.0, rows, rng=np.random.default_rng(5))

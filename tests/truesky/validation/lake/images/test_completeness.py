@@ -23,22 +23,22 @@ def test_half_are_found_at_the_expected_limit(faint):
 
 def test_sources_that_were_not_drawn(faint):
     """Every third source is drawn at another position."""
-    known = faint.known
+    known = faint.sources
     off = np.where(np.arange(len(known)) % 3 == 0, 14.0, 0.0)
-    wrong = replace(faint, known=replace(known, x=known.x + off), series={})
+    wrong = replace(faint, sources=replace(known, x=known.x + off), series={})
     assert made.verdicts(COMPLETENESS, wrong)["bright"] == FAIL
 
 
 def test_an_image_of_another_sky(faint):
     """No source is at its position, so there is no 50 % limit; the check must fail nevertheless."""
-    known = faint.known
-    wrong = replace(faint, known=replace(known, x=known.x + 14.0), series={})
+    known = faint.sources
+    wrong = replace(faint, sources=replace(known, x=known.x + 14.0), series={})
     assert made.verdicts(COMPLETENESS, wrong) == {"bright": FAIL}
 
 
 def test_sources_that_are_fainter_than_they_should_be(faint):
-    known = faint.known
-    wrong = replace(faint, known=replace(known, expected=6.0 * known.expected), series={})
+    known = faint.sources
+    wrong = replace(faint, sources=replace(known, expected=6.0 * known.expected), series={})
     assert made.verdicts(COMPLETENESS, wrong)["half"] == FAIL
 
 

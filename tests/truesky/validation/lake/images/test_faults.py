@@ -46,9 +46,9 @@ def test_measurements_agree_with_input(good):
     """The frame's arithmetic is known: half-light radius and width of points, level and noise of the sky."""
     of, _ = good
     # A Gaussian averaged over pixels is not exactly a Gaussian.
-    assert of.measured.fwhm == pytest.approx(made.FWHM / made.SCALE, rel=0.05)
+    assert of.measurements.fwhm == pytest.approx(made.FWHM / made.SCALE, rel=0.05)
     assert of.tiles.level.mean() == pytest.approx(made.SKY * made.SECONDS, rel=2e-3)
-    assert np.abs(np.median(of.measured.stars.dx)) < 0.01
+    assert np.abs(np.median(of.measurements.stars.dx)) < 0.01
     rows = {row.quantity: row for row in ASTROMETRY.run(of)}
     assert abs(rows["offset_x"].value) < 5.0 * rows["offset_x"].error
 
@@ -67,7 +67,7 @@ def test_a_scale_that_is_wrong(good):
     """The scale is off by 0.2 pixels at the edge."""
     of, stars = good
     frame = replace(of.frame, wcs=made.system(stretch=1.0 + 4e-4))
-    wrong = replace(of, frame=frame, measured=frame_context.stars.measure_stars(frame, stars, of.noise), series={})
+    wrong = replace(of, frame=frame, measurements=frame_context.stars.measure_stars(frame, stars, of.noise), series={})
     assert turned(ASTROMETRY, wrong, "stretch_x")
 
 
@@ -91,7 +91,7 @@ def test_a_band_whose_flux_is_shifted(good):
     of, stars = good
     measured = frame_context.stars.measure_stars(of.frame, replace(stars, mag=stars.mag + 0.05), of.noise)
     for quantity in ("offset", "psf_offset"):
-        assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
+        assert turned(PHOTOMETRY, replace(of, measurements=measured, series={}), quantity)
 
 
 def test_vignetting(folder, good):
@@ -102,7 +102,7 @@ def test_vignetting(folder, good):
     assert made.verdicts(PHOTOMETRY, of)["offset"] != PASS
     header = {**of.frame.header, "DETSIZE": f"[1:{2 * made.SIDE},1:{2 * made.SIDE}]"}
     told = replace(of.frame, instrument=Instrument(vignetting=0.1), header=header)
-    known = replace(of, frame=told, measured=frame_context.stars.measure_stars(told, stars, of.noise), series={})
+    known = replace(of, frame=told, measurements=frame_context.stars.measure_stars(told, stars, of.noise), series={})
     assert made.verdicts(PHOTOMETRY, known)["offset"] == PASS
 
 
@@ -112,7 +112,7 @@ def test_magnitudes_that_are_not_linear(good):
         of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise
     )
     for quantity in ("slope", "psf_slope"):
-        assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
+        assert turned(PHOTOMETRY, replace(of, measurements=measured, series={}), quantity)
 
 
 def test_a_sky_that_is_too_bright(folder, good):

@@ -71,7 +71,7 @@ def test_frames_of_too_different_levels(tmp_path):
     of = pair(tmp_path, levels=(350.0, 300.0))
     lit = replace(of, frame=replace(of.frame, header={**of.frame.header, "IMAGETYP": "flat"}))
     assert {row.verdict for row in GAIN.run(lit)} == {NOT_APPLICABLE}
-    assert {row.verdict for row in GAIN.run(replace(of, before=None))} == {NOT_APPLICABLE}
+    assert {row.verdict for row in GAIN.run(replace(of, partner=None))} == {NOT_APPLICABLE}
 
 
 def shot(number, band, image_type="science", channel="EXT", sky=10.0, lamp=None):

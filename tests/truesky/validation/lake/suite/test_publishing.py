@@ -38,7 +38,7 @@ def test_not_applicable_rows_have_reasons(version):
 
 
 def test_report_requires_no_network(version):
-    page = version.file(publishing.REPORT).read_text()
+    page = version.sidecar_path(publishing.REPORT).read_text()
     assert len(re.findall(r"src='data:image/png;base64,[A-Za-z0-9+/=]+'", page)) >= 4
     assert not re.search(r"https?://|<script|<link|@import|url\(", page)
     assert "offset_x" in page
@@ -47,7 +47,7 @@ def test_report_requires_no_network(version):
 def test_second_run_reuses_the_table(lake, version, capsys, tmp_path):
     report = tmp_path / "r.html"
     assert __main__.main(["--lake", str(lake), "--report", str(report)]) == 1
-    assert report.read_bytes() == version.file(publishing.REPORT).read_bytes()
+    assert report.read_bytes() == version.sidecar_path(publishing.REPORT).read_bytes()
     said = capsys.readouterr().out
     assert re.search(r"^fail +VIS/euclid_vis/000002/1-1 +astrometry offset_x: -(9|10)\.", said, re.M)
 
