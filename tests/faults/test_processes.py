@@ -172,7 +172,7 @@ def _reads(root, n):
         return call
 
     with pytest.MonkeyPatch.context() as patch:
-        for module, name in ((os, "stat"), (io, "open"), (pq, "read_schema"), (parquet, "dataset")):
+        for module, name in ((os, "stat"), (io, "open"), (pq, "read_schema"), (parquet, "open_dataset")):
             patch.setattr(module, name, looked(getattr(module, name)))
         read.version(root, "plain").rows()
     return len(seen)

@@ -135,7 +135,7 @@ def test_dust_leaves_room_for_the_bluest_colours(ends, rng):
         found = sequences.Colour(np.full(n, BLUE), np.full(n, colour), np.zeros(n))
         law, ebv = sequences.draw_dust(MODEL, ends, np.full(n, -19.5), np.full(n, 2.0), found, rng)
         for code in set(law.tolist()) - {0}:
-            most = np.interp(colour, ends.behind[code - 1], ends.ebv)
+            most = np.interp(colour, ends.bluest_dusty[code - 1], ends.ebv)
             assert ebv[law == code].max() <= most + 1e-9
 
 
