@@ -13,7 +13,7 @@ from lake_schema.fits import external
 
 READERS = {
     "read_numbers": lambda path: external.read_numbers(path, "catalogue of stars"),
-    "number_batches": lambda path: list(external.read_batches(path, ["a", "b"], ["name"])),
+    "read_batches": lambda path: list(external.read_batches(path, ["a", "b"], ["name"])),
     "read_table": lambda path: external.read_table(path, "curve"),
     "read_map": lambda path: external.read_map(path, "a"),
     "read_planes": lambda path: external.read_planes(path, "a"),
@@ -104,7 +104,7 @@ def test_broken_files_are_refused_in_one_line(good, name, change):
     assert len(said.splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["number_batches", "read_map", "read_table"])
+@pytest.mark.parametrize("name", ["read_batches", "read_map", "read_table"])
 def test_lists_are_refused_before_they_are_read(tmp_path, name):
     rows = np.empty(3, object)
     rows[:] = [np.arange(2.0)] * 3

@@ -166,8 +166,8 @@ def test_the_margin_of_each_cell_surrounds_it(catalogues):
             margin = pq.read_table(version.folder / "lensed_margin" / "dataset" / part, partitioning=None)
             wanted = rows.filter(np.isin(fine, sky.margin_cells(order, cell, 13)))
             assert margin["id"].to_pylist() == wanted["id"].to_pylist()
-            assert version.margin(part).equals(wanted)
-            assert version.margin(part, ["id"]).column_names == ["id"]
+            assert version.read_margin(part).equals(wanted)
+            assert version.read_margin(part, ["id"]).column_names == ["id"]
             assert margin.num_rows > 10
 
 

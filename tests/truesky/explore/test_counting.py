@@ -24,7 +24,7 @@ def rows(seed, number=20_000):
 def by_duckdb(columns, chart, limits):
     """The slow reference: one query per chart."""
     table = pa.table({f"c{k}": pa.array(column, from_pandas=True) for k, column in enumerate(columns)})
-    own = set(chart.columns) if chart.ignored_limits is None else chart.own
+    own = set(chart.columns) if chart.ignored_limits is None else chart.ignored_limits
     where = [f"c{k} BETWEEN {lo!r}::DOUBLE AND {hi!r}::DOUBLE" for k, (lo, hi) in limits.items() if k not in own]
     where += [
         f"c{k} BETWEEN {lo!r}::DOUBLE AND {hi!r}::DOUBLE"

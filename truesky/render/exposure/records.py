@@ -32,7 +32,7 @@ class Rows:
     lenses : Table, optional
         Rows of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies. None without lenses.
     bodies : callable, optional
-        Function that returns the moving bodies of a day (ephemerides.Bodies.of_day). By default the embedded
+        Function that returns the moving bodies of a day (ephemerides.Bodies.on_day). By default the embedded
         population.
     galaxy_library, stellar_library : Library, optional
         Libraries with the spectra to which `sed_1` and `sed_2` of galaxies, and `sed` of stars, refer. By default the

@@ -64,7 +64,7 @@ def in_order(camera, frame, detector):
     """A detector's pixels as they are read."""
     if camera == "vis":
         pixels = (MISSION.value(f"vis.fpa.{key}", "pix") for key in ("prescan", "overscan", "parallel_overscan"))
-        return quadrants.apply(frame, *(int(n) for n in pixels), detector.middle)
+        return quadrants.apply(frame, *(int(n) for n in pixels), detector.injection_rows)
     return amplifiers.layout(detector, MISSION).split(frame)
 
 
