@@ -15,7 +15,7 @@ from lake_schema.fits.images import STRUCTURE, Card, Image
 # Names that astropy gives to images without a name.
 _DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 
-_INHERIT: tuple[Card, ...] = (("INHERIT", True, "the first header of the file holds, too"),)
+_INHERIT: tuple[Card, ...] = (("INHERIT", True, "primary header also applies"),)
 
 
 def join(

@@ -45,15 +45,15 @@ def write(
     table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
     table.header.update({"LOADED": 0, "ACCEPTED": 0, "CHI2": 0.0, "POLNAXIS": 2})
     for number, axis in enumerate("XY", start=1):
-        table.header[f"POLGRP{number}"] = (1, "polynomial group of this coordinate")
-        table.header[f"POLNAME{number}"] = (f"{axis}_IMAGE", "coordinate")
-        table.header[f"POLZERO{number}"] = (centre[number - 1], "[pix] its zero")
-        table.header[f"POLSCAL{number}"] = (scale[number - 1], "[pix] its unit")
-    table.header["POLNGRP"] = (1, "groups of coordinates")
+        table.header[f"POLGRP{number}"] = (1, "polynomial group of the coordinate")
+        table.header[f"POLNAME{number}"] = (f"{axis}_IMAGE", "name of the coordinate")
+        table.header[f"POLZERO{number}"] = (centre[number - 1], "[pix] zero of the scaled coordinate")
+        table.header[f"POLSCAL{number}"] = (scale[number - 1], "[pix] unit of the scaled coordinate")
+    table.header["POLNGRP"] = (1, "number of coordinate groups")
     table.header["POLDEG1"] = (degree, "degree of the polynomials")
-    table.header["PSF_FWHM"] = (fwhm, "[pix] of a star")
-    table.header["PSF_SAMP"] = (step, "[pix] between samples")
-    table.header["PSFNAXIS"] = (3, "axes of PSF_MASK")
+    table.header["PSF_FWHM"] = (fwhm, "[pix] FWHM of a star")
+    table.header["PSF_SAMP"] = (step, "[pix] sampling step of the PSF")
+    table.header["PSFNAXIS"] = (3, "number of axes of PSF_MASK")
     for number, length in enumerate((side, side, len(planes)), start=1):
         table.header[f"PSFAXIS{number}"] = length
     fits_file.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), table]))

@@ -138,7 +138,7 @@ def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
 def test_a_damaged_version_is_not_published_again(toy, lake):
     publish.make_version(lake, toy_plan(2), toy_work)
     toy.partition_path(toy.partitions[0]).unlink()
-    with pytest.raises(Damaged, match="made again"):
+    with pytest.raises(Damaged, match="to make it again"):
         publish.make_version(lake, toy_plan(1), toy_work)
     shutil.rmtree(toy.folder)
     publish.make_version(lake, toy_plan(1), toy_work)

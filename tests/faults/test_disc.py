@@ -171,7 +171,7 @@ def test_a_full_disc_is_a_clear_error(lake, work, most_bytes, file):
     answers = victims.CONTEXT.SimpleQueue()
     victims.run(victims.on_a_small_disc, lake, work, most_bytes, answers)
     text = answers.get()
-    assert text.startswith("TasksFailed: table plain: 3 of 3 parts failed")
+    assert text.startswith("TasksFailed: table plain: 3 of 3 tasks failed")
     assert "OSError" in text
     assert "File too large" in text or " requested and " in text, text
     assert promise.current(lake, "plain") == promise.key("plain", 1)

@@ -142,12 +142,16 @@ def write_master(
     cards: tuple[Card, ...] = (
         *(card for card in first.cards if card[0] in (*SHARED_CARDS, "CHANNEL", "MISSION", "TRUESKY")),
         ("IMAGETYP", f"master {kind}", "image type"),
-        ("BUNIT", _UNITS[kind], "unit of the pixels"),
-        *((("VIGNETTE", _through_optics(first), "contains vignetting?"),) if kind == "flat" else ()),
-        ("NCOMBINE", len(frames), "frames"),
-        ("EXPTIME", float(np.mean([frame.exposure.exposure_time_s for frame in frames])), "[s] mean of the frames"),
+        ("BUNIT", _UNITS[kind], "pixel unit"),
+        *((("VIGNETTE", _through_optics(first), "T if the flat includes vignetting"),) if kind == "flat" else ()),
+        ("NCOMBINE", len(frames), "number of combined frames"),
+        (
+            "EXPTIME",
+            float(np.mean([frame.exposure.exposure_time_s for frame in frames])),
+            "[s] mean exposure time of the frames",
+        ),
         *extra_cards,
-        *((f"FRAME{i}", frame.exposure.exposure_id, "exposure") for i, frame in enumerate(frames, start=1)),
+        *((f"FRAME{i}", frame.exposure.exposure_id, "exposure of a frame") for i, frame in enumerate(frames, start=1)),
     )
     units = [Image(None, cards), Image(combined.mean, (), "VALUE"), Image(combined.uncertainty, (), "UNCERTAINTY")]
     write_images(path, [*units, Image(combined.count, (), "COUNT")])
@@ -279,22 +283,29 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
     done = frame.applied - (set(without) | (_NONLINEARITY_EFFECTS if "nonlinearity" in without else set()))
     return (
         *raw_cards,
-        ("BUNIT", unit, "unit of SCI; WHT has its inverse square"),
-        ("GAIN", electrons, "[electron/BUNIT] of the pixels"),
+        ("BUNIT", unit, "unit of SCI; unit of WHT is its inverse square"),
+        ("GAIN", electrons, "[electron/BUNIT] gain"),
         ("MAGZERO", float(frame.card("ZEROPNT")) + 2.5 * math.log10(time / electrons), "[mag] AB magnitude of 1 BUNIT"),
-        *((f"CAL{kind.upper()[:5]}", kind not in without, f"master {kind} applied?") for kind in master_kinds(frame)),
-        *((("CALPERS", "persistence" not in without, "predicted persistence removed?"),) if frame.scene.ramp else ()),
-        ("CALXTALK", "crosstalk" in done, "crosstalk corrected?"),
-        ("CALLIN", bool(_NONLINEARITY_EFFECTS & done), "response corrected?"),
-        ("CALFRING", "fringes" in done, "fringes of the sky subtracted?"),
-        ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter corrected?"),
+        *(
+            (f"CAL{kind.upper()[:5]}", kind not in without, f"T if the master {kind} was applied")
+            for kind in master_kinds(frame)
+        ),
+        *(
+            (("CALPERS", "persistence" not in without, "T if predicted persistence was subtracted"),)
+            if frame.scene.ramp
+            else ()
+        ),
+        ("CALXTALK", "crosstalk" in done, "T if crosstalk was corrected"),
+        ("CALLIN", bool(_NONLINEARITY_EFFECTS & done), "T if nonlinearity was corrected"),
+        ("CALFRING", "fringes" in done, "T if sky fringes were subtracted"),
+        ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "T if vignetting and shutter were corrected"),
         *flag_cards(),
     )
 
 
 def flag_cards() -> tuple[Card, ...]:
     """Return cards with the meaning of the bits of FLG."""
-    return tuple((f"FLAG{bit}", text, "bit of FLG") for bit, text in FLAGS)
+    return tuple((f"FLAG{bit}", text, "meaning of bit in FLG") for bit, text in FLAGS)
 
 
 def write_image(path: Path, reduced: ReducedImage, cards: tuple[Card, ...], extensions: Sequence[Image] = ()) -> None:

@@ -97,11 +97,15 @@ def write(path: Path, frame: Frame, image: ReducedImage, cards: Sequence[Card], 
     sources = catalogue.detect_sources(image, float(header_values["GAIN"]), 0.5 * diameter / scale, settings.limits)
     header = (
         *cards,
-        ("APERDIAM", round(diameter / scale, 6), "[pix] diameter of the aperture of MAG_APER"),
-        ("APERCOR", round(2.5 * float(np.log10(aperture_fraction)), 6), "[mag] MAG_APER + this: total light of a star"),
-        ("DETTHR", settings.limits.threshold, "detection threshold, rms of the sky"),
-        ("DETPIX", settings.limits.pixels, "[pix] smallest number of pixels of a source"),
-        ("NDETECT", len(sources["x"]), "sources in the catalogue"),
+        ("APERDIAM", round(diameter / scale, 6), "[pix] aperture diameter of MAG_APER"),
+        (
+            "APERCOR",
+            round(2.5 * float(np.log10(aperture_fraction)), 6),
+            "[mag] add to MAG_APER for total flux of a star",
+        ),
+        ("DETTHR", settings.limits.threshold, "detection threshold in units of the sky rms"),
+        ("DETPIX", settings.limits.pixels, "[pix] minimum area of a source"),
+        ("NDETECT", len(sources["x"]), "number of sources in the catalogue"),
     )
     catalogue_cards = [card for card in header if not card[0].startswith(_OMITTED_CARDS)]
     rows = catalogue.columns(sources, system, float(header_values["MAGZERO"]))

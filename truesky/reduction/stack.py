@@ -169,9 +169,9 @@ def _central_psf(contributions: Sequence[Contribution], grid: Grid, stack: Stack
     x, y = _deepest_place(stack.reduced.weight)
     ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
     cards: tuple[Card, ...] = (
-        ("PSFSAMP", stacking.PSF_SAMPLES, "samples per pixel"),
-        ("PSFRA", float(ra[0]), "[deg] position of the PSF"),
-        ("PSFDEC", float(dec[0]), "[deg] position of the PSF"),
+        ("PSFSAMP", stacking.PSF_SAMPLES, "PSF samples per pixel along each axis"),
+        ("PSFRA", float(ra[0]), "[deg] right ascension of the PSF"),
+        ("PSFDEC", float(dec[0]), "[deg] declination of the PSF"),
     )
     return Image(stacking.effective_psf(contributions, grid, x, y).astype(np.float32), cards, "PSF")
 
@@ -196,17 +196,17 @@ def _stack_cards(images: Sequence[ImageFile], grid: Grid, scale: float, correlat
     return (
         *shared_cards.values(),
         ("IMAGETYP", "stack", "image type"),
-        ("BUNIT", "electron/s", "unit of SCI; WHT has its inverse square"),
-        ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] at the deepest pixels"),
-        ("NCOMBINE", len(images), "images"),
-        ("TEXPTIME", sum(time for _, time in exposures), "[s] of all exposures"),
+        ("BUNIT", "electron/s", "unit of SCI; unit of WHT is its inverse square"),
+        ("GAIN", sum(time for _, time in exposures), "[electron/BUNIT] gain of the deepest pixels"),
+        ("NCOMBINE", len(images), "number of combined images"),
+        ("TEXPTIME", sum(time for _, time in exposures), "[s] total exposure time"),
         ("PIXSCALE", scale, "[arcsec/pix] pixel scale"),
         *(
             ()
             if np.isnan(correlation)
-            else (("CORRVAR", round(correlation, 4), "variance of 8x8 sums / 64 x pixel's"),)
+            else (("CORRVAR", round(correlation, 4), "variance of 8x8 sums / (64 x pixel variance)"),)
         ),
-        *((f"EXPOS{i}", number, "exposure") for i, (number, _) in enumerate(exposures, start=1)),
+        *((f"EXPOS{i}", number, "exposure identifier") for i, (number, _) in enumerate(exposures, start=1)),
         *astrometry.cards(grid.wcs),
         *files.flag_cards(),
         ("TRUESKY", __version__, "version of the simulator"),

@@ -78,11 +78,11 @@ def _extension(number: int, order: int | None, light: Float) -> Image:
     first_row, end_row = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
     first_column, end_column = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
     cards = (
-        ("SRC_ID", number, "source"),
-        *((("ORDER", order, "of the grism"),) if order is not None else ()),
+        ("SRC_ID", number, "source identifier"),
+        *((("ORDER", order, "spectral order"),) if order is not None else ()),
         ("X0", int(first_column), "column of the first pixel, 0-based"),
         ("Y0", int(first_row), "row of the first pixel, 0-based"),
-        ("BUNIT", "electron", "unit of the pixels: expected, of this source"),
+        ("BUNIT", "electron", "pixel unit; expected signal of the source"),
     )
     name = f"{number}" if order is None else f"{number}.{order}"
     return Image(light[first_row:end_row, first_column:end_column].astype(np.float32), cards, name)
@@ -107,7 +107,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _write_models(options: argparse.Namespace) -> int:
     out = user_files.check_target(options.out, (".fits",))
     ids = list(dict.fromkeys(options.sources))
-    images = [Image(None, (("EXPOSURE", options.exposure, "exposure"), ("DETECTOR", options.detector, "detector")))]
+    images = [
+        Image(
+            None,
+            (("EXPOSURE", options.exposure, "exposure identifier"), ("DETECTOR", options.detector, "detector name")),
+        )
+    ]
     root = layout.open_lake(options.lake)
     version = read.version(root, "products", request=options.name)
     for model in models(root, version, options.exposure, options.detector, ids):

@@ -127,10 +127,10 @@ def test_rows_outside_all_bins_are_counted_for_every_axis(tab, shown):
     text = plain(until(tab, f"{RANGES}.length === 2 && {RANGES}.every((text) => text.includes('rows')) && {RANGES}[0]"))
     lost = int((~(z > bound)).sum())
     assert f"{lost} of all rows without m" in text
-    rows, beyond = (int(text.split(f" {word}")[0].split()[-1]) for word in ("rows", "beyond"))
-    assert rows + beyond + lost == GALAXIES_N
+    rows, outside = (int(text.split(f" {word}")[0].split()[-1]) for word in ("rows", "outside"))
+    assert rows + outside + lost == GALAXIES_N
     text = plain(tab.evaluate(RANGES)[1])
-    assert int(text.split(" rows")[0]) + int(text.split(" beyond")[0].split()[-1]) == GALAXIES_N
+    assert int(text.split(" rows")[0]) + int(text.split(" outside")[0].split()[-1]) == GALAXIES_N
     assert "without" not in text
 
 

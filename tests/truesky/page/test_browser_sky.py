@@ -22,7 +22,7 @@ CLIPBOARD = {"permissions": ["clipboard-read", "clipboard-write"]}
 def gone_to(tab, place=CENTRE):
     tab.fill("#sky-go", f"{place[0]} {place[1]}")
     tab.press("#sky-go", "Enter")
-    until(tab, f"{LEGEND}.includes('one by one')")
+    until(tab, f"{LEGEND}.includes('individual')")
 
 
 def test_footprints_by_state(browser, sky):
@@ -103,7 +103,7 @@ def test_captions_count_omitted_sources_and_cells(browser, sky, monkeypatch):
         tab.select_option("#sky-table", "stars")
         gone_to(tab)
         caption = "document.querySelector('#sky-legend > div:last-child').textContent"
-        whole = plain(until(tab, f"{caption}.includes('one by one') && {caption}")).split()[0]
+        whole = plain(until(tab, f"{caption}.includes('individual') && {caption}")).split()[0]
         monkeypatch.setattr(sky_maps, "MAX_SOURCES", 100)
         tab.fill("#sky-where", "dec > -90")
         tab.press("#sky-where", "Enter")

@@ -50,7 +50,7 @@ function held() {
 
 async function restore() {
   const was = held();
-  if (was.lake && was.lake !== api.lake.key) api.say("The address belongs to another version of this lake. The page shows the present version.");
+  if (was.lake && was.lake !== api.lake.key) api.say("The address belongs to another version of this lake. The page shows the current version.");
   theme(was.theme === "light" ? "light" : "dark");
   for (const [name, view] of Object.entries(VIEWS)) if (was[name] && view.restore) view.restore(was[name]);
   await show(was.view ?? "sky", was[was.view]);
@@ -73,7 +73,7 @@ function keys(event) {
 async function start() {
   await api.open();
   $("lake-name").textContent = api.lake.lake;
-  $("version").textContent = `truesky ${api.lake.version}, lake ${api.lake.key}. The page shows at most ${api.lake.limits.rows_shown} rows of a query; a query may take ${api.lake.limits.seconds} s.`;
+  $("version").textContent = `truesky ${api.lake.version}, lake ${api.lake.key}. Limits of a query: ${api.lake.limits.rows_shown} rows shown, ${api.lake.limits.seconds} s.`;
   $("tap-address").textContent = "";
   $("tap-address").append(api.h("button", { onclick: () => api.copy(api.lake.tap, "Address of the TAP service") }, "Copy TAP address"));
   for (const [name, why] of Object.entries(api.lake.damaged)) api.say(`${name}: ${why}`, true);

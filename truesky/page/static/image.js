@@ -120,7 +120,7 @@ export async function show() {
 
 async function open(number) {
   if (!opened.has(number)) {
-    $("image-place").textContent = "Making the tiles of this image, which is done once.";
+    $("image-place").textContent = "Making the tiles of this image (only once).";
     const about = await api.get(`image/${number}`).finally(() => ($("image-place").textContent = ""));
     opened.set(number, { ...about, plate: new Plate(about.grid) });
   }

@@ -31,14 +31,14 @@ export async function pin(id) {
     api.h("button", { onclick: () => api.copy(source.id, "Identifier") }, "Copy id"),
     api.h("button", { onclick: () => api.copy(`SELECT * FROM ${from} WHERE id = ${source.id}`, "SQL") }, "Copy as SQL")));
   const spectrum = api.h("div", {}), pictures = api.h("div", { class: "cutouts" }), grism = api.h("div", {});
-  panel.append(spectrum, api.h("h3", {}, "Pictures, north up"), pictures);
+  panel.append(spectrum, api.h("h3", {}, "Image cutouts, north up"), pictures);
   if (api.lake.tables.some((table) => table.name.endsWith("rendered_spectra"))) panel.append(api.h("h3", {}, "Through the grism"), grism);
   for (const [name, rows] of Object.entries(source.tables)) {
     const first = rows.filter((row) => SHOWN.includes(row.name) || row.name.startsWith("f_nu_"));
     panel.append(api.h("h3", {}, name), facts(first.length ? first : rows.slice(0, 12)));
     panel.append(api.h("details", {}, api.h("summary", {}, `all ${rows.length} columns`), facts(rows, true)));
   }
-  panel.append(api.h("h3", {}, "Drawn in"), source.drawn.length ? api.requested(source.drawn,
+  panel.append(api.h("h3", {}, "Images with this source"), source.drawn.length ? api.requested(source.drawn,
     [{ name: "exposure" }, { name: "detector", text: 1 }, { name: "x", unit: "pix" }, { name: "y", unit: "pix" }, { name: "expected", unit: "electron" }, { name: "drawn", unit: "electron" }],
     (d) => [d.exposure_id, d.detector, +d.x.toFixed(2), +d.y.toFixed(2), +d.expected.toPrecision(5), +d.drawn.toPrecision(5)])
     : api.h("p", { class: "quiet" }, "No image."));
@@ -88,7 +88,7 @@ function named(name) {
 function drawSpectrum(panel, found) {
   const canvas = api.h("canvas", { class: "spectrum", role: "img", tabindex: 0 });
   const data = api.h("div", { class: "data", hidden: true });
-  panel.replaceChildren(api.h("h3", {}, "Observed spectrum"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
+  panel.replaceChildren(api.h("h3", {}, "Observed spectrum"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Show bands and lines as a table"), data);
   data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "µJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
     [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
   if (found.lines.length) data.append(api.table([{ name: "line", text: 1 }, { name: "wavelength", unit: "nm" }], found.lines.map((l) => [named(l.name), (l.wavelength / 10).toFixed(1)])));

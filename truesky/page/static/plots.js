@@ -153,8 +153,8 @@ function sampled() {
 }
 
 function tell(ms) {
-  const sample = head.part > 1 ? ` a sample, 1 row in ${head.part}: counts are scaled, with the Poisson error of the sample;` : "";
-  const brushed = charts.some((chart) => chart.brush) ? "drag to brush, Escape clears a brush" : "drag in a chart to brush: the others follow";
+  const sample = head.part > 1 ? ` sample of 1 row in ${head.part}, counts scaled, with Poisson errors;` : "";
+  const brushed = charts.some((chart) => chart.brush) ? "drag to brush, Escape clears a brush" : "drag in a chart to brush; the other charts show the selected rows";
   $("plot-state").textContent = `${api.number(head.rows)} rows;${sample} counted and drawn in ${ms.toFixed(0)} ms; ${brushed}.`;
 }
 
@@ -224,7 +224,7 @@ function figure(chart) {
     built = false;
     show();
   } }, chart.axes.length > 1 ? `log ${"xy"[k]}` : "log"));
-  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "Rows as points", onclick: (event) => {
+  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "Show rows as points", onclick: (event) => {
     chart.points = !chart.points;
     event.target.setAttribute("aria-pressed", String(chart.points));
     ask();
@@ -250,7 +250,7 @@ function figure(chart) {
 
 /** Rows in no bin: beyond the ends of the axes, which omit the tails of a distribution, or without a value. */
 function leftOut(chart) {
-  const ends = chart.outside ? `${api.number(chart.outside * chart.part)} beyond the ends of the ${chart.axes.length > 1 ? "axes" : "axis"}` : "";
+  const ends = chart.outside ? `${api.number(chart.outside * chart.part)} outside the range of the ${chart.axes.length > 1 ? "axes" : "axis"}` : "";
   return [ends, ...chart.axes.map((axis, k) => (chart.missing[k] ? `${api.number(chart.missing[k] * head.part)} of all rows without ${facts(axis.expression).name}` : ""))];
 }
 
@@ -272,7 +272,7 @@ function asTable(chart) {
   const rows = [];
   chart.counts.forEach((count, k) => count && rows.push([at(x, Math.floor(k / size)), at(y, k % size), count * scale]));
   return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS),
-    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins with rows, the fullest first"));
+    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "non-empty bins, the fullest first"));
 }
 
 function drawAll() {
@@ -284,7 +284,7 @@ function draw(chart) {
   const shown = chart.brush ? chart.brush.map(([lo, hi], k) => `${label(chart.axes[k])} ${api.number(lo, 4)} to ${api.number(hi, 4)}`).join(", ") : "";
   const sum = chart.counts.reduce((a, b) => a + b, 0), scale = chart.part;
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
-  const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
+  const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, sample of 1 row in ${chart.placesPart * scale}` : ""}` : "";
   const most = chart.axes.length > 1 && !points ? `colours from 0 to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} per bin, logarithmic` : "";
   chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, ...leftOut(chart), most, points, shown].filter(Boolean).join("; ");
   tabulate(chart);

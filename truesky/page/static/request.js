@@ -21,7 +21,7 @@ async function requestOf(place, radius, regions) {
     'name = "field"', "seed = 1   # seed of the universe; the seed of the lake's request gives the same sources", "",
     "[area]", `cone = { ra = ${place[0].toFixed(7)}, dec = ${place[1].toFixed(7)}, radius = ${decimal(Math.min(180, Math.max(1e-3, radius)))} }`];
   if (asked.length > MOST) lines.push("", `# The first ${MOST} of ${asked.length} exposures that cover the field.`);
-  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are calibrations, which require an [[observation]].`);
+  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} exposures are calibrations, which require an [[observation]].`);
   // If several requests have planned the same exposure, include it once.
   const pointings = science.map((row) => pointing(row, detectors.get(name(row)).map((one) => one.detector).sort()).join("\n"));
   for (const text of new Set(pointings)) lines.push("", text);

@@ -12,14 +12,14 @@ export async function show() {
       ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of CPU time remaining` : ""));
   }
   const lost = Object.entries(api.lake.damaged);
-  if (lost.length) parts.push(api.h("h2", {}, "Tables that cannot be read"), api.table([{ name: "table", text: 1 }, { name: "why", text: 1 }], lost));
+  if (lost.length) parts.push(api.h("h2", {}, "Tables that cannot be read"), api.table([{ name: "table", text: 1 }, { name: "reason", text: 1 }], lost));
   parts.push(api.h("h2", {}, "Failures"), found.failures.length ? api.requested(found.failures,
     [{ name: "part", text: 1 }, { name: "error", text: 1 }, { name: "attempt" }, { name: "run", text: 1 }],
     (f) => [f.part, f.error, f.attempt, f.run]) : api.h("p", { class: "quiet" }, "None."));
   parts.push(api.h("h2", {}, "Mission values that differ from the default"), found.mission.length ? api.requested(found.mission,
     [{ name: "name", text: 1 }, { name: "value" }, { name: "default" }, { name: "unit", text: 1 }],
-    (m) => [m.name, m.value, m.usual, m.unit]) : api.h("p", { class: "quiet" }, "None: all have their default values."));
-  parts.push(api.h("h2", {}, "Where images are from"));
+    (m) => [m.name, m.value, m.usual, m.unit]) : api.h("p", { class: "quiet" }, "None."));
+  parts.push(api.h("h2", {}, "Provenance of images"));
   for (const image of images) {
     const details = api.h("details", { class: "tree" }, api.h("summary", {}, `${api.of(image)}${image.path.split("/").pop()}`));
     details.addEventListener("toggle", () => details.open && details.childElementCount === 1 && api.get(`provenance/${image.number}`).then(

@@ -215,11 +215,11 @@ function legend() {
 function caption() {
   if (dots) {
     const here = dots.ra.length, most = dots.most ?? 20000, all = dots.total ?? (here < most ? here : null);
-    if (all === here) return `${api.number(here)} sources one by one`;
+    if (all === here) return `${api.number(here)} individual sources`;
     return `${dots.by ? `the ${firstOf(dots)} ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
   }
   const outside = isCoverage() ? 0 : cells.beyond;
-  return outside ? `beyond the colour scale: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
+  return outside ? `outside the colour scale: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
 }
 
 function drawOver(turn) {
@@ -303,7 +303,7 @@ async function pinAt(place) {
     if (!id) return isByKeys && api.say("No source is near the centre.");
     await pin(id);
     redraw();
-    if (pinned().id === id) api.say(`Source ${id} is pinned: Images shows it.`);
+    if (pinned().id === id) api.say(`Source ${id} is pinned. The view Images shows it.`);
   } catch (error) {
     api.say(error.message, true);
   }
@@ -339,7 +339,7 @@ function query() {
 
 function go() {
   const place = placeOf($("sky-go").value);
-  if (!place) return api.say("Go to: enter RA and Dec in degrees or as 03:32:28.1 -27:48:29", true);
+  if (!place) return api.say("Enter RA and Dec in degrees or as 03:32:28.1 -27:48:29", true);
   Object.assign(view, { ra: place[0], dec: place[1], height: Math.min(view.height, 0.3) });
   went();
 }
@@ -368,7 +368,7 @@ export function key(event) {
   else if (event.key === "-") zoom(1 / 0.7);
   else if (event.key === "0") whole(true);
   else if (event.key === "o" || event.key === "O") openAt([view.ra, view.dec], true);
-  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned if the height of the view is below ${SINGLE} deg.`);
+  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Zoom in to less than ${SINGLE} deg to pin a source.`);
   else return;
   event.preventDefault();
   $("sky-place").textContent = api.place(view.ra, view.dec);

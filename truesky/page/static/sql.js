@@ -61,7 +61,7 @@ async function run() {
     return;
   }
   $("sql-state").className = "quiet";
-  const more = ran.more ? `the first ${ran.rows.length} rows; a download contains all` : `${ran.rows.length} rows`;
+  const more = ran.more ? `first ${ran.rows.length} rows; downloads contain all rows` : `${ran.rows.length} rows`;
   $("sql-state").textContent = `${more}, ${(ran.seconds * 1000).toFixed(0)} ms`;
   const columns = ran.columns.map((c) => ({ ...c, text: c.type === "string" }));
   $("sql-result").replaceChildren(api.table(columns, ran.rows.map((row) => row.map((value) => Array.isArray(value) ? `[${value.length} values]` : value))));
@@ -72,7 +72,7 @@ async function run() {
 async function plot() {
   if (!ran) await run();
   const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => `"${c.name}"`);
-  if (!numbers.length) return api.say("The result has no column of numbers.", true);
+  if (!numbers.length) return api.say("The result has no numeric column.", true);
   const text = $("sql-text").value.trim().replace(/;$/, "");
   usePlot(`(${text}\n) AS result`, numbers.length > 1 ? [[numbers[0]], [numbers[1]], [numbers[0], numbers[1]]] : [[numbers[0]]]);
   page.show("plots");
@@ -86,7 +86,7 @@ async function download(format) {
   try {
     const pieces = await api.begun(address, MOST_HELD, stop.signal);
     save(pieces ? URL.createObjectURL(new Blob(pieces)) : address, format);
-    $("sql-state").textContent = `${format}: the download has begun`;
+    $("sql-state").textContent = `${format}: download started`;
   } catch (error) {
     $("sql-state").className = "bad-text";
     $("sql-state").textContent = error.message;

@@ -47,12 +47,12 @@ export function drawTraces(c, source, image, place) {
 
 /** Fill the panel of a source: pixels of each first order, and a table of all orders and their lines. */
 export async function dispersed(panel, source, isStill, drawings) {
-  if (!source.spectra.length) return panel.append(api.h("p", { class: "quiet" }, "No grism image contains it."));
+  if (!source.spectra.length) return panel.append(api.h("p", { class: "quiet" }, "No grism image contains this source."));
   for (const trace of source.spectra.filter((one) => one.order === 1 && one.images.science !== undefined)) {
     const number = trace.images.science, middle = [poly(trace.trace_x, 0.5), poly(trace.trace_y, 0.5)];
     const canvas = api.h("canvas", { class: "strip", role: "img" }), scale = api.h("canvas", { class: "scale", "aria-hidden": "true" });
     const name = `${api.of(trace)}${trace.channel} ${trace.band}, exposure ${trace.exposure_id}, ${trace.detector}`;
-    const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % of it overlaps ${trace.contaminants.length} other sources` : ", no overlap with other sources";
+    const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % overlaps with ${trace.contaminants.length} other sources` : ", no overlap with other sources";
     panel.append(api.h("figure", {}, api.h("figcaption", {}, api.h("span", { class: "grow" }, name),
       api.h("button", { onclick: () => said.show?.(number, ...middle) }, "Show in the image")), canvas, scale,
       api.h("div", { class: "range" }, `${api.number(trace.expected, 4)} electrons expected, ${api.number(trace.drawn, 4)} on the detector${overlap}`)));

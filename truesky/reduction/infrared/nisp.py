@@ -203,7 +203,10 @@ def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path)
     )
     cards: list[Card] = []
     for i, (number, weight) in enumerate(zip(numbers, weights, strict=True), start=1):
-        cards += [(f"LAMP{i}", number, "LED of the calibration unit"), (f"WEIGHT{i}", weight, "weight in the mixture")]
+        cards += [
+            (f"LAMP{i}", number, "LED of the calibration unit"),
+            (f"WEIGHT{i}", weight, "weight of this LED in the mixed flat"),
+        ]
     return Master("flat", mixed, bright_frames, tuple(cards))
 
 

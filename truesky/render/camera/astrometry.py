@@ -183,14 +183,14 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
         ("CTYPE2", f"DEC--{_PROJECTIONS[has_distortion]}", projection),
         ("CUNIT1", "deg", "unit of CRVAL1, CD1_1, CD1_2"),
         ("CUNIT2", "deg", "unit of CRVAL2, CD2_1, CD2_2"),
-        ("CRVAL1", float(header.crval[0]), "[deg] boresight right ascension"),
-        ("CRVAL2", float(header.crval[1]), "[deg] boresight declination"),
-        ("CRPIX1", float(header.crpix[0]), "[pix] boresight, first pixel = 1"),
-        ("CRPIX2", float(header.crpix[1]), "[pix] boresight, first pixel = 1"),
-        ("CD1_1", float(header.cd[0, 0]), "[deg/pix]"),
-        ("CD1_2", float(header.cd[0, 1]), "[deg/pix]"),
-        ("CD2_1", float(header.cd[1, 0]), "[deg/pix]"),
-        ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
+        ("CRVAL1", float(header.crval[0]), "[deg] right ascension of the reference point"),
+        ("CRVAL2", float(header.crval[1]), "[deg] declination of the reference point"),
+        ("CRPIX1", float(header.crpix[0]), "[pix] column of the reference point, from 1"),
+        ("CRPIX2", float(header.crpix[1]), "[pix] row of the reference point, from 1"),
+        ("CD1_1", float(header.cd[0, 0]), "[deg/pix] linear transformation"),
+        ("CD1_2", float(header.cd[0, 1]), "[deg/pix] linear transformation"),
+        ("CD2_1", float(header.cd[1, 0]), "[deg/pix] linear transformation"),
+        ("CD2_2", float(header.cd[1, 1]), "[deg/pix] linear transformation"),
         ("LONPOLE", 180.0, "[deg] native longitude of the celestial pole"),
         ("RADESYS", "ICRS", "celestial reference system"),
         *(_sip_cards(system.sip) if has_distortion else ()),
@@ -200,9 +200,9 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
 def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
     """Yield the cards of the SIP polynomials, without terms that are 0."""
     for name, coefficients in (("A", sip.a), ("B", sip.b)):
-        yield f"{name}_ORDER", len(coefficients) - 1, f"distortion of {'columns' if name == 'A' else 'rows'}"
+        yield f"{name}_ORDER", len(coefficients) - 1, f"degree of distortion in {'columns' if name == 'A' else 'rows'}"
         for p, q in np.argwhere(coefficients).tolist():
-            yield f"{name}_{p}_{q}", float(coefficients[p, q]), f"[pix] times u^{p} v^{q}"
+            yield f"{name}_{p}_{q}", float(coefficients[p, q]), f"[pix] coefficient of u^{p} v^{q}"
 
 
 def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:

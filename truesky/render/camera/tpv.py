@@ -96,7 +96,7 @@ def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
     full[1, 0] += 1.0
     first, second = ("xi", "eta") if axis == 1 else ("eta", "xi")
     return [
-        (f"PV{axis}_{_FIRST[p + q] + q}", float(full[p, q]), f"times {first}^{p} {second}^{q}")
+        (f"PV{axis}_{_FIRST[p + q] + q}", float(full[p, q]), f"coefficient of {first}^{p} {second}^{q}")
         for p, q in sorted(np.argwhere(full).tolist(), key=lambda power: _FIRST[sum(power)] + power[1])
     ]
 

@@ -155,12 +155,12 @@ def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bo
     level = np.uint16(scene.value("reference_level", "adu"))
     cards: tuple[Card, ...] = (
         ("READMODE", "MACC", "multiple accumulated groups"),
-        ("NG", mode.groups, "groups"),
-        ("NR", mode.reads, "reads in a group"),
-        ("ND", mode.drops, "frames dropped between two groups"),
-        ("FRTIME", ramp.frame_time(scene), "[s] from frame to frame"),
-        ("ELAPTIME", mode.frames * ramp.frame_time(scene), "[s] from the reset to the last read"),
-        ("REFPIX", border, "[pix] width of the border of reference pixels"),
+        ("NG", mode.groups, "number of groups"),
+        ("NR", mode.reads, "number of reads per group"),
+        ("ND", mode.drops, "number of frames dropped between groups"),
+        ("FRTIME", ramp.frame_time(scene), "[s] time per frame"),
+        ("ELAPTIME", mode.frames * ramp.frame_time(scene), "[s] time from reset to last read"),
+        ("REFPIX", border, "[pix] width of the reference-pixel border"),
     )
     place = astrometry.cards(astrometry.shift_pixels(system, border, border))
     ny, nx = signal.shape
@@ -169,13 +169,13 @@ def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bo
     planes = [Extension(f"{detector}.SCI", padded, "adu", place, sections=sections)]
     if mode.groups > 2:
         flag = np.rint(np.minimum(frame[1], _MAX_CHI2)) if store_chi2 else frame[1] > limit
-        meaning = () if store_chi2 else (("QUALFLAG", 1, "value where chi^2 exceeds QUALLIM, else 0"),)
+        meaning = () if store_chi2 else (("QUALFLAG", 1, "value if chi^2 > QUALLIM, else 0"),)
         quality = np.pad(flag.astype(np.uint8), border)
         planes.append(Extension(f"{detector}.CHI2", quality, "", (*meaning, *place), sections=sections))
-        text = "chi^2 above which a ramp does not fit" if store_chi2 else "chi^2 above which a pixel's quality is 1"
+        text = "largest chi^2 of a good fit to the ramp" if store_chi2 else "largest chi^2 of a pixel with quality 0"
         cards += (("QUALLIM", limit, text),)
     else:
-        cards += (("QUALLIM", 0.0, "two groups have no chi^2: there is no quality"),)
+        cards += (("QUALLIM", 0.0, "no quality: two groups have no chi^2"),)
     return Readout(tuple(planes), signal, signal, cards)
 
 
@@ -207,17 +207,17 @@ def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
     raw = adc.to_file_type(frame, scene)
     prescan, overscan, rows, middle = sizes = layout.overscan_sizes(scene)
     scans = (
-        ("PRESCAN", prescan, "[pix] columns before the pixels"),
-        ("OVERSCAN", overscan, "[pix] columns after the pixels"),
-        ("OVERROWS", rows, "[pix] rows after the pixels"),
-        ("INJROWS", middle, "[pix] rows between the halves, without pixels"),
+        ("PRESCAN", prescan, "[pix] number of prescan columns"),
+        ("OVERSCAN", overscan, "[pix] number of overscan columns"),
+        ("OVERROWS", rows, "[pix] number of overscan rows"),
+        ("INJROWS", middle, "[pix] charge-injection rows between the halves"),
     )  # fmt: skip
     extensions = []
     for number, name in enumerate(layout.NAMES):
         # Position of the detector's first pixel in the extension, counted from 0.
         across, up = layout.pixel_offset(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shift_pixels(system, across, up))
-        cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant"), *scans, *place)
+        cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant name"), *scans, *place)
         sections, plane = (
             layout.sections(number, raw[number].shape, *sizes),
             layout.to_detector_axes(raw[number], number),
@@ -283,7 +283,7 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
         *astrometry.cards(
             astrometry.shift_pixels(system, amplifier_layout.data_section.x, amplifier_layout.data_section.y)
         ),
-        ("NAMPS", len(amplifier_layout.amplifiers), "amplifiers"),
+        ("NAMPS", len(amplifier_layout.amplifiers), "number of amplifiers"),
     ]
     numbers = (
         ("GAIN", scene.amplifier_values("gain", "electron / adu"), "[electron/adu] conversion gain"),
@@ -292,10 +292,10 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
     for number, amplifier in enumerate(amplifier_layout.amplifiers):
         n = number + 1
         cards += [
-            (f"AMP{n}", amplifier.name, "amplifier"),
-            (f"DSEC{n}", amplifier_layout.amplifier_data_section(number).text, "its pixels"),
-            (f"CSEC{n}", amplifier.pixels.text, "the same, on the detector"),
-            (f"BSEC{n}", amplifier_layout.amplifier_bias_section(number).text, "columns of bias beside them"),
+            (f"AMP{n}", amplifier.name, "amplifier name"),
+            (f"DSEC{n}", amplifier_layout.amplifier_data_section(number).text, "pixels of the amplifier"),
+            (f"CSEC{n}", amplifier.pixels.text, "pixels in detector coordinates"),
+            (f"BSEC{n}", amplifier_layout.amplifier_bias_section(number).text, "bias section of the amplifier"),
             *((f"{key}{n}", float(np.broadcast_to(value, len(raw))[number]), text) for key, value, text in numbers),
         ]
         # Amplifiers named by letters have the keywords of DECam and MegaCam in addition.
@@ -309,9 +309,9 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
                 (
                     f"BIASSEC{amplifier.name}",
                     amplifier_layout.amplifier_bias_section(number).text,
-                    "columns of bias beside them",
+                    f"bias section of amplifier {amplifier.name}",
                 ),
-                (f"CCDSEC{amplifier.name}", amplifier.pixels.text, "its pixels, on the detector"),
+                (f"CCDSEC{amplifier.name}", amplifier.pixels.text, "pixels in detector coordinates"),
             ]
     parts = Sections(amplifier_layout.data_section, Section(0, 0, amplifier_layout.nx, amplifier_layout.ny))
     return Readout(
@@ -334,7 +334,7 @@ def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Rea
         parts = amplifier_layout.amplifier_sections(number)
         across, up = (getattr(parts.data, axis) - getattr(parts.ccd, axis) for axis in "xy")
         cards: tuple[Card, ...] = (
-            ("AMPNAME", amplifier.name, "amplifier"),
+            ("AMPNAME", amplifier.name, "amplifier name"),
             *astrometry.cards(astrometry.shift_pixels(system, across, up)),
         )
         name = _SEGMENT.sub("Segment", amplifier.name)

@@ -20,10 +20,12 @@ SENSITIVITY = Table(
     1,
     (
         Column("WAVELENGTH", "float64", "Angstrom", "em.wl", "vacuum wavelength"),
-        Column("SENSITIVITY", "float64", "electron cm2 erg-1", "instr.sensitivity", "in a bin of 1 A"),
-        Column("ERROR", "float64", "electron cm2 erg-1", "stat.error", "of the sensitivity: there is none"),
+        Column(
+            "SENSITIVITY", "float64", "electron cm2 erg-1", "instr.sensitivity", "sensitivity in a bin of 1 Angstrom"
+        ),
+        Column("ERROR", "float64", "electron cm2 erg-1", "stat.error", "error of the sensitivity, always 0"),
     ),
-    "Electrons a second for each erg s-1 cm-2 A-1, of an order of a grism.",
+    "Sensitivity of an order of a grism, in electrons/s per erg s-1 cm-2 A-1.",
     key=("WAVELENGTH",),
 )
 # Number of terms 1, x, y, x^2, x y, y^2. grismconf requires the squares in polynomials of four powers of t.

@@ -16,24 +16,24 @@ def cards(exposure: ExposureRow, scene: Scene) -> tuple[Card, ...]:
     type_cards: tuple[Card, ...] = ()
     if kind in _INJECTED:
         type_cards += (
-            ("INJLEVEL", scene.value("injection.level", "electron"), "[electron] injected into a pixel"),
-            ("INJON", int(scene.value("injection.on", "pix")), "[pix] rows of a block that is injected"),
-            ("INJOFF", int(scene.value("injection.off", "pix")), "[pix] rows before each block"),
+            ("INJLEVEL", scene.value("injection.level", "electron"), "[electron] injected charge per pixel"),
+            ("INJON", int(scene.value("injection.on", "pix")), "[pix] injected rows per block"),
+            ("INJOFF", int(scene.value("injection.off", "pix")), "[pix] rows not injected before each block"),
         )
     if kind == "trap_pumping":
         type_cards += (
-            ("NSHUFFLE", int(scene.value("pumping.shuffles", "")), "cycles of trap pumping"),
-            ("PHASETIM", scene.value("pumping.phase_time", "s"), "[s] under an electrode in a cycle"),
+            ("NSHUFFLE", int(scene.value("pumping.shuffles", "")), "number of trap-pumping cycles"),
+            ("PHASETIM", scene.value("pumping.phase_time", "s"), "[s] time under an electrode in each cycle"),
         )
     if kind == "defocus":
-        type_cards += (("DEFOCUS", scene.value("psf.defocus", "nm"), "[nm] rms of the defocus, Noll's fourth term"),)
+        type_cards += (("DEFOCUS", scene.value("psf.defocus", "nm"), "[nm] rms defocus, Noll's fourth Zernike term"),)
     if exposure.target:
         magnitude, band = standard_stars.brightness(exposure, scene.mission)
         type_cards += (
-            ("TARGMAG", magnitude, "[mag] AB, of the calibration source"),
+            ("TARGMAG", magnitude, "[mag] AB magnitude of the calibration source"),
             ("TARGBAND", band, "band of TARGMAG"),
         )
     if kind == "stray_light":
         angle = scene.mission.value("survey.stray_light.distance", "deg")
-        type_cards += (("TARGDIST", angle, "[deg] of the source from the boresight, along y"),)
+        type_cards += (("TARGDIST", angle, "[deg] offset of the source from boresight in y"),)
     return type_cards

@@ -47,22 +47,26 @@ def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
     exposure, (raft, sensor) = rendered.exposure, rendered.detector.name.split("_")
     seconds = exposure.exposure_time_s
     return (
-        ("OBSID", f"MC_S_{exposure.exposure_id:08d}", "of the exposure"),
-        ("SEQNUM", exposure.exposure_id, "of the exposure"),
+        ("OBSID", f"MC_S_{exposure.exposure_id:08d}", "observation identifier"),
+        ("SEQNUM", exposure.exposure_id, "exposure identifier"),
         ("IMGTYPE", _IMAGE_TYPES[exposure.image_type], "type of observation"),
-        ("CONTRLLR", "S", "simulated"),
-        ("RAFTBAY", raft, "raft"),
-        ("CCDSLOT", sensor, "sensor in the raft"),
-        ("CHIPID", rendered.detector.name, "raft and sensor"),
-        ("DETNUM", _detector_number(rendered), "sensor, from 0"),
-        ("LSST_NUM", f"{rendered.detector.kind.upper()}-{_detector_number(rendered):03d}", "sensor by maker"),
-        ("ROTPA", exposure.position_angle % 360.0, "[deg] of the y axis, north through east"),
-        ("ROTCOORD", "sky", "ROTPA is against the sky"),
-        ("RASTART", exposure.ra, "[deg] boresight as the exposure begins"),
-        ("DECSTART", exposure.dec, "[deg] boresight as the exposure begins"),
-        *((("AMSTART", exposure.airmass, "airmass as the exposure begins"),) if exposure.airmass is not None else ()),
-        ("SHUTTIME", seconds, "[s] shutter open"),
-        ("DARKTIME", seconds, "[s] from clearing to reading"),
+        ("CONTRLLR", "S", "controller (S: simulation)"),
+        ("RAFTBAY", raft, "raft name"),
+        ("CCDSLOT", sensor, "sensor position in the raft"),
+        ("CHIPID", rendered.detector.name, "names of raft and sensor"),
+        ("DETNUM", _detector_number(rendered), "sensor number, from 0"),
+        (
+            "LSST_NUM",
+            f"{rendered.detector.kind.upper()}-{_detector_number(rendered):03d}",
+            "manufacturer and number of the sensor",
+        ),
+        ("ROTPA", exposure.position_angle % 360.0, "[deg] position angle of y, north through east"),
+        ("ROTCOORD", "sky", "reference of ROTPA"),
+        ("RASTART", exposure.ra, "[deg] boresight RA at exposure start"),
+        ("DECSTART", exposure.dec, "[deg] boresight Dec at exposure start"),
+        *((("AMSTART", exposure.airmass, "airmass at exposure start"),) if exposure.airmass is not None else ()),
+        ("SHUTTIME", seconds, "[s] shutter open time"),
+        ("DARKTIME", seconds, "[s] time from clearing to readout"),
         *_file_name(rendered),
     )
 
@@ -77,7 +81,7 @@ def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:
     name = (
         f"{kind}_{exposure.exposure_id:08d}-0-{band}-{rendered.detector.name}-det{_detector_number(rendered):03d}.fits"
     )
-    return (("FILENAME", name, "as the survey calls it"),)
+    return (("FILENAME", name, "imSim file name"),)
 
 
 _IMAGE_TYPES = {"science": "SKYEXP", "deep": "SKYEXP", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"}
@@ -102,11 +106,15 @@ def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         letter, pixels = amplifier.name, layout.amplifier_data_section(number)
         place = sections.to_mosaic_section(rendered.detector, amplifier.pixels, all_detectors)
         letter_cards += [
-            (f"AMPSEC{letter}", _readout_section(amplifier), "CCDSEC in the order in which it is read"),
-            (f"TRIMSEC{letter}", pixels.text, "its pixels"),
-            (f"PRESEC{letter}", layout.amplifier_prescan_section(number).text, "columns before them"),
-            (f"POSTSEC{letter}", layout.amplifier_overscan_section(number).text, "rows after them"),
-            *(((f"DETSEC{letter}", place, "its pixels in the mosaic"),) if place else ()),
+            (f"AMPSEC{letter}", _readout_section(amplifier), "CCDSEC in readout order"),
+            (f"TRIMSEC{letter}", pixels.text, f"pixels of amplifier {letter}"),
+            (f"PRESEC{letter}", layout.amplifier_prescan_section(number).text, f"prescan of amplifier {letter}"),
+            (
+                f"POSTSEC{letter}",
+                layout.amplifier_overscan_section(number).text,
+                f"overscan rows of amplifier {letter}",
+            ),
+            *(((f"DETSEC{letter}", place, f"amplifier {letter} in the mosaic"),) if place else ()),
             *(
                 (f"{key}{letter}", float(np.broadcast_to(numbers[name], len(layout.amplifiers))[number]), text)
                 for key, name, text in _NUMBERS

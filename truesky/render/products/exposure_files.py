@@ -105,9 +105,9 @@ def _sort_detectors(lake: Path, products: read.Version, camera: str, names: Sequ
 
 def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
     return (
-        ("POSANGLE", exposure["position_angle"], "[deg] of the focal plane, north through east"),
-        ("NDETECT", len(facts["detectors"]), "detectors in this file"),
-        ("NPLANNED", facts["planned"], "detectors of the exposure that are planned"),
+        ("POSANGLE", exposure["position_angle"], "[deg] position angle, north through east"),
+        ("NDETECT", len(facts["detectors"]), "number of detectors in this file"),
+        ("NPLANNED", facts["planned"], "number of planned detectors of the exposure"),
     )
 
 

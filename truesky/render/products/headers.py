@@ -35,26 +35,26 @@ _READOUT_KEYWORDS = ("GAIN", "RDNOISE", "RDNDRAWN", "SATURATE")
 PER_ARRAY_KEYWORDS = (*_REPEATED_KEYWORDS, *_READOUT_KEYWORDS, "BUNIT")
 # Cards of images in electrons, which are not read out.
 _UNREAD_CARDS: tuple[Card, ...] = (
-    ("GAIN", 1.0, "[electron/electron] of the pixels"),
+    ("GAIN", 1.0, "[electron/electron] gain; pixels in electrons"),
     ("RDNOISE", 0.0, "[electron] rms read noise"),
-    ("RDNDRAWN", 0.0, "[electron] the same, as it was drawn"),
+    ("RDNDRAWN", 0.0, "[electron] rms read noise added to the image"),
     ("BIAS", 0.0, "[electron] bias level"),
 )
-# For each component of an accuracy: end of its keywords, and its description.
+# For each component of an accuracy: end of its keywords, and template of their comments.
 _ERRORS = {
-    "flux": ("FLUX", "fraction of a source's flux"),
-    "shape": ("SHAPE", "reduced-shear component"),
-    "position": ("POS", "[pix]"),
-    "background": ("BACK", "fraction of a sky pixel's noise"),
+    "flux": ("FLUX", "{} relative error of flux"),
+    "shape": ("SHAPE", "{} error of a reduced-shear component"),
+    "position": ("POS", "[pix] {} error of position"),
+    "background": ("BACK", "{} error of sky / noise of a pixel"),
 }
 # Keywords of the readout and of amplifiers that apply to groups, which have no border of reference pixels.
 _RAMP_KEYWORDS = {"READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"}
 _GROUP_KEYWORDS = {"GAIN", "FRNOISE", "BIAS"}
 _GROUP_AXIS: tuple[Card, ...] = (
     ("WCSAXES", 3, "number of world coordinate axes"),
-    ("CTYPE3", "GROUP", "number of the group"),
-    ("CRVAL3", 1.0, "first group"),
-    ("CRPIX3", 1.0, "first plane = 1"),
+    ("CTYPE3", "GROUP", "group number"),
+    ("CRVAL3", 1.0, "number of the first group"),
+    ("CRPIX3", 1.0, "plane of the first group, counted from 1"),
     ("CD3_3", 1.0, ""),
 )
 _MJD_ZERO = datetime(1858, 11, 17)
@@ -66,14 +66,14 @@ def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common_cards(rendered),
-        ("DETSIZE", _mosaic_size(rendered), "of the mosaic of all detectors"),
+        ("DETSIZE", _mosaic_size(rendered), "section of the mosaic of all detectors"),
         *unit_cards(rendered.readout.unit),
         *_shared_amplifier_cards(rendered),
-        ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
+        ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky background"),
         (
             "DARKRATE",
             bool(_DARK_EFFECTS & applied) * scene.dark_rate,
-            "[electron/s/pix] dark current of usual pixels",
+            "[electron/s/pix] dark current, typical pixel",
         ),
         *_effect_cards(rendered),
     )
@@ -87,7 +87,7 @@ def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     if rendered.readout.unit == "electron":
         return (
             *_UNREAD_CARDS,
-            ("SATURATE", rendered.scene.value("full_well", "electron"), "[electron] of a full pixel"),
+            ("SATURATE", rendered.scene.value("full_well", "electron"), "[electron] full-well capacity"),
         )
     in_one_array = len(rendered.readout.extensions) == 1
     return tuple(
@@ -99,7 +99,7 @@ def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 def unit_cards(unit: str | None) -> tuple[Card, ...]:
     """Return the card of the pixel unit, or no card if the arrays have no unit or different units."""
-    return (("BUNIT", unit, "unit of the pixels"),) if unit else ()
+    return (("BUNIT", unit, "pixel unit"),) if unit else ()
 
 
 def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequence[Card]) -> tuple[Card, ...]:
@@ -121,7 +121,7 @@ def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequen
     """
     repeated = (*_REPEATED_KEYWORDS, *(_READOUT_KEYWORDS if extension.unit == "adu" else ()))
     return (
-        ("INHERIT", True, "the first header of the file holds, too"),
+        ("INHERIT", True, "primary header also applies"),
         *(card for card in common if card[0] in repeated),
         *unit_cards(extension.unit),
         *extension.cards,
@@ -138,11 +138,15 @@ def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Car
     all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
     mosaic_section = sections.to_mosaic_section(rendered.detector, array_sections.ccd, all_detectors)
     return (
-        ("DATASEC", array_sections.data.text, "pixels of the detector"),
-        ("TRIMSEC", array_sections.data.text, "pixels to be kept"),
-        *((("BIASSEC", array_sections.bias.text, "columns that tell the bias"),) if array_sections.bias else ()),
-        ("CCDSEC", array_sections.ccd.text, "DATASEC on the detector"),
-        *((("DETSEC", mosaic_section, "DATASEC in the mosaic of the detectors"),) if mosaic_section else ()),
+        ("DATASEC", array_sections.data.text, "section with the detector pixels"),
+        ("TRIMSEC", array_sections.data.text, "section to keep when trimming"),
+        *(
+            (("BIASSEC", array_sections.bias.text, "section for measuring the bias level"),)
+            if array_sections.bias
+            else ()
+        ),
+        ("CCDSEC", array_sections.ccd.text, "DATASEC in detector coordinates"),
+        *((("DETSEC", mosaic_section, "DATASEC in mosaic coordinates"),) if mosaic_section else ()),
     )
 
 
@@ -169,11 +173,11 @@ def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Flo
     scene = rendered.scene
     saturated = "[adu] lowest level of a saturated pixel"
     if scene.ramp:
-        saturated = "[adu] full at last read; earlier: see CHI2"
+        saturated = "[adu] saturation at last read; see also CHI2"
     return (
         ("GAIN", scene.amplifier_values("gain", "electron / adu"), "[electron/adu] conversion gain"),
         *_read_noise(rendered),
-        ("BIAS", scene.amplifier_values("bias", "adu"), "[adu] bias level, added to every pixel"),
+        ("BIAS", scene.amplifier_values("bias", "adu"), "[adu] bias level of all pixels"),
         ("SATURATE", _saturation(rendered), saturated),
     )
 
@@ -186,34 +190,34 @@ def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, s
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     noise_per_read = scene.amplifier_values("read_noise", "electron")
-    drawn = "[electron] the same, as it was drawn"
+    drawn = "[electron] rms read noise added to the image"
     if not scene.ramp:
         noise = (read_noise.EFFECT.name in applied) * noise_per_read
         return (("RDNOISE", noise_per_read, "[electron] rms read noise"), ("RDNDRAWN", noise, drawn))
     contributions = {effect.name: effect.contribution(scene) for effect in (ramp_noise.EFFECT, ramp_noise.DRIFT)}
     return (
-        ("RDNOISE", math.hypot(*contributions.values()), "[electron] rms of the signal that reading adds"),
+        ("RDNOISE", math.hypot(*contributions.values()), "[electron] rms read noise of the ramp signal"),
         ("RDNDRAWN", math.hypot(*(part for name, part in contributions.items() if name in applied)), drawn),
-        ("FRNOISE", noise_per_read, "[electron] rms noise of one read"),
+        ("FRNOISE", noise_per_read, "[electron] rms read noise of a single read"),
     )
 
 
 _TRUTH_UNITS = {
-    "noise_free": ("electron", "unit of the pixels: expected, sources alone"),
-    "stars": ("electron", "unit of the pixels: expected, stars alone"),
-    "sky": ("electron", "unit of the pixels: expected, sky alone"),
-    "cosmic_rays": ("electron", "unit of the pixels: cosmic rays alone"),
-    "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
-    "satellites": ("electron", "unit of the pixels: expected, trails alone"),
-    "persistence": ("electron", "unit of the pixels: expected, persistence"),
+    "noise_free": ("electron", "pixel unit; expected signal of sources"),
+    "stars": ("electron", "pixel unit; expected signal of stars"),
+    "sky": ("electron", "pixel unit; expected signal of the sky"),
+    "cosmic_rays": ("electron", "pixel unit; signal of cosmic rays"),
+    "ghosts": ("electron", "pixel unit; expected signal of ghosts"),
+    "satellites": ("electron", "pixel unit; expected signal of satellites"),
+    "persistence": ("electron", "pixel unit; expected persistence signal"),
     **{
-        content: ("electron", f"unit of the pixels: expected, order {order} alone")
+        content: ("electron", f"pixel unit; expected signal of order {order}")
         for order, content in truth_maps.ORDER_MAPS.items()
     },
-    "ramp": ("adu", "unit of the pixels: groups as read"),
-    "saturation": ("", "1 where a pixel or the converter is saturated"),
-    "traps": ("", "traps of species 1 + 256 of 2 + 65536 of 3"),
-    "dipoles": ("electron", "unit of the pixels: brought by pumping"),
+    "ramp": ("adu", "pixel unit; values of the groups"),
+    "saturation": ("", "1: pixel or converter saturated, 0: other"),
+    "traps": ("", "n1 + 256 n2 + 65536 n3; n: traps per species"),
+    "dipoles": ("electron", "pixel unit; charge moved by trap pumping"),
 }
 
 
@@ -246,19 +250,19 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *((("TELESCOP", place.telescope, "telescope"),) if place.telescope else ()),
         ("INSTRUME", place.instrument, "instrument"),
         ("CHANNEL", exposure.channel, "channel"),
-        ("DETECTOR", rendered.detector.name, "detector"),
+        ("DETECTOR", rendered.detector.name, "detector name"),
         ("FILTER", exposure.band, "passband"),
         *((("GRISM", exposure.grism, "grism"),) if exposure.grism else ()),
-        *((("GRISMPA", exposure.grism_angle, "[deg] of the dispersion, x to y"),) if exposure.grism else ()),
+        *((("GRISMPA", exposure.grism_angle, "[deg] dispersion direction, from x to y"),) if exposure.grism else ()),
         ("IMAGETYP", exposure.image_type, "image type"),
         *(_lamp_cards(exposure.lamp, rendered) if exposure.lamp else ()),
         *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),
         *calibration_cards.cards(exposure, scene),
-        ("OBJECT", _object_name(exposure), "what is looked at"),
+        ("OBJECT", _object_name(exposure), "target or field"),
         ("RA", exposure.ra, "[deg] boresight right ascension"),
         ("DEC", exposure.dec, "[deg] boresight declination"),
-        *((("AIRMASS", air, "of the boresight"),) if air is not None else ()),
-        ("EXPOSURE", exposure.exposure_id, "identifier of the exposure"),
+        *((("AIRMASS", air, "airmass at the boresight"),) if air is not None else ()),
+        ("EXPOSURE", exposure.exposure_id, "exposure identifier"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
         ("DATE-OBS", _iso_date(start), "start of the exposure"),
         ("MJD-OBS", start, "[d] start of the exposure"),
@@ -266,12 +270,12 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *astrometry.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] pixel scale at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
-        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] FWHM of a point source, with the pixel"),
-        ("SEEING", exposure.seeing, "[arcsec] FWHM of the atmosphere"),
+        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] PSF FWHM including the pixel"),
+        ("SEEING", exposure.seeing, "[arcsec] FWHM of the atmospheric seeing"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
         ("NMOVING", int((rendered.sources.trail_length > 0).sum()), "number of moving Solar System objects drawn"),
-        ("SRCREACH", rendered.complete_margin_arcsec, "[arcsec] sources complete beyond the detector"),
-        ("SEED", str(rendered.seed), "seed of the random numbers"),
+        ("SRCREACH", rendered.complete_margin_arcsec, "[arcsec] margin with complete sources"),
+        ("SEED", str(rendered.seed), "random-number seed"),
         *((("NOISSEED", str(rendered.noise_seed), "seed of the noise"),) if rendered.noise_seed is not None else ()),
         *((("REALIS", exposure.realisation, "realisation of the noise"),) if (exposure.realisation or 1) > 1 else ()),
         ("MISSION", rendered.scene.mission.fingerprint, ""),
@@ -284,7 +288,7 @@ def _lamp_cards(lamp: int, rendered: RenderedDetector) -> tuple[Card, ...]:
     level = rendered.scene.value("flat.signal", "electron")
     return (
         ("LAMP", lamp, "LED of the calibration unit"),
-        ("LAMPSIG", level, "[electron] of it where it is seen best"),
+        ("LAMPSIG", level, "[electron] maximum signal of the lamp"),
     )
 
 
@@ -299,8 +303,8 @@ def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     errors = {name: math.hypot(*(cause.get(name, 0.0) for cause in causes)) for name in _ERRORS}
     allowed = asdict(rendered.accuracy)
     return (
-        *((f"ACC{short}", allowed[name], f"allowed error: {text}") for name, (short, text) in _ERRORS.items()),
-        *((f"ERR{short}", errors[name], f"largest error: {text}") for name, (short, text) in _ERRORS.items()),
+        *((f"ACC{short}", allowed[name], text.format("allowed")) for name, (short, text) in _ERRORS.items()),
+        *((f"ERR{short}", errors[name], text.format("largest")) for name, (short, text) in _ERRORS.items()),
     )
 
 
@@ -359,10 +363,10 @@ def _effect_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     effects_by_name = {e.name: e for e in find_effects(exposed.channel, exposed.image_type, where)}
     for number, decision in enumerate(rendered.decisions, start=1):
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
-        cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
+        cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "on if margin>1"))
         if decision.applied and decision.name in effects_by_name:
             numbers = random_identity(
                 effects_by_name[decision.name], exposed, rendered.detector.name, rendered.seed, rendered.noise_seed
             )
-            cards.append((f"EFKEY{number}", rng.key_hex(*numbers), "key of its random numbers"))
+            cards.append((f"EFKEY{number}", rng.key_hex(*numbers), "random-number key of the effect"))
     return tuple(cards)

@@ -18,7 +18,7 @@ from truesky.render.channels import image_types
 
 # Keywords of the WCS error in a header without the true pointing (FITS, paper I).
 ERRORS = ("CSYER1", "CSYER2")
-_TEXT = "[deg] rms error of CRVAL; true: .head"
+_TEXT = "[deg] rms error of CRVAL; true WCS in .head"
 
 
 def commanded_pointing(

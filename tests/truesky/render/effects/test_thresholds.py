@@ -83,7 +83,7 @@ CASES = {
     "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
     "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
     "detector_crosstalk": lambda x: replace(
-        scene(crosstalk_detectors=1e-4), elsewhere=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
+        scene(crosstalk_detectors=1e-4), neighbour_charge=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
     ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
