@@ -1,4 +1,4 @@
-"""Whatever is wrong with what a command is given: one line that names it, exit status 2, nothing written, soon."""
+"""Invalid input of a command gives one line that names it and exit status 2, quickly and without output files."""
 
 import os
 import signal
@@ -137,7 +137,7 @@ NO_MISSION = [name for name in TEXTS if "of vertices" in name or "sky" in name o
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    """Nothing is started, and what waits for a pipe or the end of a device is stopped."""
+    """Prevent the start of jobs, and stop readers that wait for a pipe or the end of a device."""
 
     def fail(*arguments):
         raise AssertionError("a session was asked for")
@@ -156,7 +156,7 @@ def tree(folder):
 
 
 def refused(folder, capsys, call, *arguments):
-    """The one line that a command ends with."""
+    """Return the single error line of a command."""
     before, started = tree(folder), time.process_time()
     assert call(*arguments) == 2
     assert time.process_time() - started < MOST_SECONDS
@@ -173,7 +173,7 @@ def good(tmp_path):
 
 
 @pytest.mark.parametrize("call", OF_LAKE.values(), ids=OF_LAKE)
-def test_a_lake_that_is_none(tmp_path, capsys, good, call):
+def test_an_invalid_lake_is_refused(tmp_path, capsys, good, call):
     for what in ("NUL", "5,000 characters", "5,000 folders", "no such user", "empty"):
         name = NAMES[what]
         refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] not in ("", "~") else name, good)
@@ -184,7 +184,7 @@ def test_a_lake_that_is_none(tmp_path, capsys, good, call):
 
 
 @pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
-def test_a_request_that_is_none(tmp_path, capsys, call):
+def test_an_invalid_request_file_is_refused(tmp_path, capsys, call):
     for name in NAMES.values():
         refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] != "~" else name, str(tmp_path / "new"))
     for thing, make in THINGS.items():
@@ -195,7 +195,7 @@ def test_a_request_that_is_none(tmp_path, capsys, call):
 
 
 @pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
-def test_a_request_of_bad_contents(tmp_path, capsys, call):
+def test_a_request_with_invalid_content_is_refused(tmp_path, capsys, call):
     for name, text in TEXTS.items():
         if name in NO_MISSION and call is OF_REQUEST["mission diff"]:
             continue
@@ -205,7 +205,7 @@ def test_a_request_of_bad_contents(tmp_path, capsys, call):
 
 
 @pytest.mark.parametrize("call", OF_TARGET.values(), ids=OF_TARGET)
-def test_a_file_that_cannot_be_written(tmp_path, capsys, call):
+def test_an_unwritable_output_file_is_refused(tmp_path, capsys, call):
     lake = tmp_path / "lake"
     lake.mkdir()
     publish.make_version(lake, plain_plan(), plain_work)
@@ -262,7 +262,7 @@ OWN = {
 
 
 def quoted(text):
-    """As TOML has it."""
+    """Return a text as a TOML string."""
     return '"' + text.replace("\0", "\\u0000").replace("\n", "\\n") + '"'
 
 
@@ -274,7 +274,7 @@ def warm():
 
 @pytest.mark.usefixtures("warm")
 @pytest.mark.parametrize(("key", "read"), OWN.values(), ids=OWN)
-def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
+def test_an_invalid_file_named_in_a_request_is_refused(tmp_path, key, read):
     names = [name for what, name in NAMES.items() if what not in ("not of this encoding", "empty")]
     for suffix in (".fits", ".csv", ".parquet"):
         for thing, make in THINGS.items():
@@ -297,7 +297,7 @@ def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
     assert tree(tmp_path) == before
 
 
-def test_every_kind_of_file_has_a_size_that_is_named(tmp_path, monkeypatch):
+def test_every_kind_of_file_has_a_size_limit(tmp_path, monkeypatch):
     for size, kind in enumerate(user_files.MAX_BYTES):
         monkeypatch.setitem(user_files.MAX_BYTES, kind, size)
     for size, kind in enumerate(user_files.MAX_BYTES):
@@ -327,7 +327,7 @@ def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch
         pytest.param(b"caf\xc3\xa9", b"export LC_ALL=C.UTF-8", marks=pytest.mark.nightly),
     ],
 )
-def test_a_question_mark_is_a_letter_where_no_java_was(tmp_path, name, words):
+def test_a_question_mark_is_valid_without_java(tmp_path, name, words):
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
     environment.pop("PYSPARK_GATEWAY_PORT", None)
     asked = [sys.executable, JOB, "--lake", tmp_path / "lake"]

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.effects.values() for e in kind}
 
 
-def test_its_pages(tmp_path, monkeypatch):
+def test_pages_of_the_site(tmp_path, monkeypatch):
     """Each is in the contents; every effect is described, with its figure, of which one is drawn by day."""
     # Sphinx and nbconvert take seconds to load, in each process of tests.
     from scripts import docs_references, make_docs
