@@ -111,7 +111,7 @@ def whole(folder):
                     if image.data is not None:
                         yield f"{entry['path']}[{number}]", np.asarray(image.data)
     for path in sorted(cache.cache_dir().rglob("*.npy")):
-        # How fast the machine was is no result.
+        # Timings are not results.
         if not path.parent.name.startswith("calibration-"):
             yield path.relative_to(cache.cache_dir()).as_posix(), np.load(path)
 

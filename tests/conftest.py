@@ -26,7 +26,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 
 
 # If tests run in several processes (pytest-xdist, --dist loadfile), all tests of a file run in the same one, and so do
-# the files of a group: those whose tests share the Spark session, and those whose tests share the drawn skies.
+# the files of a group, which share the Spark session or the drawn skies.
 _SHARED = {"spark": "Spark", "drawn": "sky", "flat_sky": "sky"}
 _GROUPS = {
     "Spark": (

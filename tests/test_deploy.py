@@ -206,7 +206,7 @@ def test_the_image_checks_a_request_and_runs_a_job(image, tmp_path):
 
     done = run("truesky", "check", where / "requests" / "demo.toml")
     assert done.returncode == 0, done.stderr
-    # As Kubernetes starts a driver; the table of spectra is the smallest that a job makes by itself.
+    # Start a driver like Kubernetes; the table of spectra is the smallest that a single job makes.
     request = tmp_path / "small.toml"
     text = (where / "requests" / "demo.toml").read_text()
     for key, value in (("galaxy_limit", 18.0), ("star_limit", 15.0), ("lensing_nside", 64)):

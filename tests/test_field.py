@@ -152,13 +152,13 @@ def product(field, channel, content):
 def image(request, field):
     channel = request.param
     path = product(field, channel, "science")
-    # Of the pixels, without what a raw file has around them.
+    # Header of the pixels, without prescan and overscan.
     header = fits.Header(card for card in read_back.frame(path).cards)
     noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
     diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
     charge, delayed = fits.getdata(product(field, channel, "cosmic_rays")), 0.0
-    # What has bled lies where no source does.
+    # Bled charge is at positions without sources.
     hit = (charge > 0) | ndimage.binary_dilation(read_back.frame(path).data >= header["SATURATE"], iterations=3)
     if channel == "VIS":
         held = np.minimum(noise_free + charge, 2e5) + diffuse

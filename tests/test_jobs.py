@@ -139,7 +139,7 @@ sys.exit(max(submitted_job.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, b
     assert manifests[0] == manifests[1]
 
 
-# Of any script by day: tests/house/test_environment.py.
+# Daily tests of spark-submit with other scripts are in tests/house/test_environment.py.
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_spark_submit_returns_message_and_status(tmp_path):

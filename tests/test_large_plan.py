@@ -32,7 +32,7 @@ from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "mjd": 60400.0}
 AREA = {"cone": {"ra": 60.0, "dec": -50.0, "radius": 1.0}}
 REQUEST = from_table({"name": "large", "seed": 7, "area": AREA, "observation": [BLOCK]})
-# Of these exposures a detector is rendered.
+# Exposures of which a detector is rendered.
 MADE = (1, 3)
 # A part of 50,000 detectors is 30 MB in memory, and may be there several times.
 MOST_GB = 0.3
@@ -190,7 +190,7 @@ def test_selection_by_partition_equals_selection_of_the_whole(small, narrow):
     assert found.exposures.equals(exposures.filter(pc.is_in(exposures["exposure_id"], pa.array([*numbers]))))
     counts = Counter(every["exposure_id"].to_pylist())
     assert found.detector_counts == {number: counts[number] for number in numbers}
-    # What is left in their detectors by whatever was exposed before.
+    # Persistence of earlier exposures in their detectors.
     rows = {row.exposure_id: row for row in map(ExposureRow.from_row, exposures.to_pylist())}
     before = persistence.previous_tasks(every.to_pylist(), rows, variants.mission_lookup(mission_of(request.mission)))
     mine = {key: list(map(place, some)) for key, some in earlier.items() if key in set(map(place, kept))}

@@ -26,7 +26,7 @@ LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
 
 
 def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
-    """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
+    """Return (frame, size, light of the stamp on it) for one source with a limit on its stamp size."""
     source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
     beam = psf_of(camera) if seeing is None else moffat_psf(seeing, 3.0, 0.2)
     settings, noise = settings_for(accuracy), NOISE[camera]

@@ -91,7 +91,7 @@ def test_a_line_that_crosses_a_bands_edge(library, accuracy, band):
         dark, lit = (fluxes(library, accuracy, z_obs=z, mag_r01=28.0, **{column: flux}) for flux in (0.0, 1e-16))
         assert (lit >= dark).all()
         seen = 1e-16 * np.interp(rest * (1.0 + z), curve.wavelength, passbands.weights(curve))
-        # The wings see what lies beside: a few per cent of the band's best where it is steep.
+        # The wings of the line sample neighbouring wavelengths, whose response differs by a few per cent.
         best = units.ujy_of_cgs(1e-16 * passbands.weights(curve).max())
         assert np.abs(lit[:, band] - dark[:, band] - units.ujy_of_cgs(seen)).max() < 0.03 * best
 

@@ -78,7 +78,7 @@ def source_of(camera, electrons, **where_and_shape):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("camera", ["vis", "lsstcam"])
 def test_flux_is_right_without_ringing(camera, kind):
-    # A frame that holds the largest stamp of these, and what is drawn beyond it.
+    # A frame for the largest stamp and the light drawn outside it.
     side = 4 * SIDE
     source = source_of(camera, 1e4, column=side / 2 + 0.3, row=side / 2 - 0.4, **SHAPES[kind])
     image, size = drawn(source, psf_of(camera), side)
@@ -215,7 +215,7 @@ def test_any_source_is_finite_and_has_its_flux(what, camera, accuracy):
     settings = settings_for(accuracy)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
     assert cost.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
-    # The largest have tests of their own.
+    # Separate tests draw the largest sources.
     if sizes[0] > 1024:
         return
     side = int(sizes[0])
@@ -259,11 +259,11 @@ def test_any_shift_by_whole_pixels_moves_the_image(kind, dx, dy, x, y):
     source.column[:] += dx
     source.row[:] += dy
     moved = stamps.draw(source, np.array([128]), psf_of("vis"), 192, 192)
-    # Beside a half pixel the stamp itself may lie one farther; what lies beyond it is on blocks of the frame.
+    # Near a half pixel, the stamp may be shifted by one more pixel; light outside it is drawn on blocks of the frame.
     middle = slice(76, 116)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
     np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
-    # Of a stamp that nothing is taken off, half as large, too.
+    # Repeat with a stamp of half the size, which is not corrected.
     source.column[:] -= 32.0
     source.row[:] -= 32.0
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
@@ -280,7 +280,7 @@ def test_any_shift_by_whole_pixels_moves_the_image(kind, dx, dy, x, y):
 def test_a_galaxy_is_symmetric_under_half_a_turn(kind, angle):
     source = centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind]), 48.0)
     image = stamps.draw(source, np.array([96]), psf_of("vis"), 97, 97)
-    # What lies beyond the stamp is on blocks, which have another middle.
+    # Light outside the stamp is drawn on blocks, which have another centre.
     inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
     # A stamp that nothing is taken off is so to its edges.
@@ -342,7 +342,7 @@ SLIM = {
 }
 
 
-# Of the large ones by day one is enough.
+# Large sources that only nightly tests draw.
 LARGE = ("on edge", "turned a little")
 
 
@@ -380,7 +380,7 @@ def test_correction_is_at_most_the_light_outside_the_stamp(index):
     """The quadratic model of the aliased light of a slim galaxy may exceed the light outside."""
     shape = {"bulge_fraction": 1.0, "bulge_sersic_index": index, "bulge_half_light_radius": 3.0}
     light = 0.0
-    # Its stamp lies beside the frame, left and right, alike on the blocks: there is no more than what leaves it.
+    # The stamp is outside the frame, to the left and to the right: the frame receives only the light that leaves it.
     for column in (-26.0, 2078.0):
         source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
         light += stamps.draw(source, np.array([48]), psf_of("vis"), 2048, 2048).sum()
@@ -484,7 +484,7 @@ def test_photons_fall_where_the_image_is_bright(camera, kind):
     assert bright.sum() > 20
     assert (pull**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / bright.sum()))
     assert abs(pull).max() < 6
-    # What lies farther out, in one sum.
+    # Pixels farther out are summed.
     outside = ~bright
     assert counted[outside].sum() == pytest.approx(image[outside].sum(), abs=5 * np.sqrt(image[outside].sum() + 25))
 

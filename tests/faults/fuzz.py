@@ -224,7 +224,7 @@ def run(name, first, count, keep=None):
         seeds = target.seeds()
         for seed in seeds:
             (folder / "in" / f"x{target.ending}").write_bytes(seed)
-            # What is slow only once: imports, caches.
+            # Imports and caches are slow only the first time.
             target.read(folder / "in" / f"x{target.ending}")
         found, last = [], first + count
         while first < last:

@@ -59,7 +59,7 @@ class Lake(RuleBasedStateMachine):
         if any((self.root / "plain").glob("*")):
             garbage.collect(self.root, "plain", delete=True)
         else:
-            # Not begun, or killed before it had more than the folder: there is no table yet, and gc says so.
+            # The run was not started, or was killed before it wrote files: gc reports that there is no table.
             with pytest.raises(BadInput, match="no table plain"):
                 garbage.collect(self.root, "plain", delete=True)
 

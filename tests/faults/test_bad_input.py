@@ -40,7 +40,7 @@ from truesky.request.from_toml import parse
 from truesky.running import submitted_job
 
 JOB = Path(__file__).resolve().parents[2] / "jobs" / "render" / "plan_exposures.py"
-# What has no bound takes minutes; a slow machine's imports take seconds.
+# An unbounded read takes minutes; imports on a slow machine take seconds.
 MOST_SECONDS = 30.0
 JOBS = {
     module.JOB.name: module.JOB
@@ -54,7 +54,7 @@ def run(name, lake, path):
     return submitted_job.main(JOBS[name], ["--lake", lake, "--request", path])
 
 
-# Commands by what they are given: a lake, a request, a file or folder to write to.
+# Commands by their argument: a lake, a request, an output file or folder.
 OF_LAKE = {
     **{name: partial(run, name) for name in JOBS},
     "explore": lambda lake, good: explore.main(["SELECT 1", "--lake", lake]),
@@ -85,7 +85,7 @@ OF_TARGET = {
     "export_galaxies": lambda out, lake: export_galaxies.main(["--lake", lake, "--out", out, "--form", "fits"]),
 }
 
-# Names that no file can have, or that nobody would wait for.
+# Names that files cannot have, or whose reading would not end.
 NAMES = {
     "NUL": "a\0b", "5,000 characters": "x" * 5000, "5,000 folders": "x/" * 5000 + "y", "no such user": "~nosuchuser/x",
     "a line break": "a\nb/c", "not of this encoding": "\ud800x", "empty": "",
@@ -101,7 +101,7 @@ def loop(path):
     path.symlink_to(path)
 
 
-# Things that are no file, or no end of one: what makes them at a path.
+# Functions that make unusual files at a path.
 THINGS = {
     "a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a folder": lambda path: path.mkdir(),
     "10 GB": sparse, "a loop": loop, "nothing": lambda path: None,
@@ -268,7 +268,7 @@ def quoted(text):
 
 @pytest.fixture(scope="module")
 def warm():
-    """What is made once a machine, and costs more than a refusal may."""
+    """Fill the caches that are made once per machine, because they take longer than the limit."""
     inputs.read(UserCurves())
 
 

@@ -28,8 +28,8 @@ from truesky.render.render_exposures import read_truth
 TABLES = all_tables(["vis"])
 CELL = layout.cell_file(5, 1607)
 ROWS = 2
-# Bits of each file: a sample, or all of them; of larger files, which are mostly footer, one of each byte. Of those one
-# in so many, prime to 8, for all readers but one: they compare the same blocks. So do they of a sample.
+# Number of flipped bits per file: a sample, or all bits. In larger files, which are mostly footer, one bit per byte.
+# Most readers test only every n-th of these (n is prime to 8), because all readers compare the same blocks.
 SMALL = 8192
 SPREAD, SHARE = 17, 3
 BITS = [pytest.param(24, id="some"), pytest.param(None, id="every", marks=pytest.mark.nightly)]
@@ -37,7 +37,7 @@ MEMORY = 1_000_000_000
 
 
 def published(root, table, rows, name="a"):
-    """A version of a table that holds these rows in one file, and the same rows beside it, as jobs keep some."""
+    """Publish a version of a table with given rows in one file, and the same rows in a sidecar file."""
     part = Task(CELL if table.is_catalogue else "all.parquet", {})
     beside = {"beside/x.parquet": lambda path: parquet.write(path, rows, table)}
     publish.make_version(root, Plan(table, {"name": name}, (part,)), lambda lake, facts: Output(rows, beside))
@@ -45,7 +45,7 @@ def published(root, table, rows, name="a"):
 
 
 def asking(version, text):
-    """What the explorer's process does with a query that it let through."""
+    """Return the result of an allowed query in the process of the explorer."""
     query = check_query(text, {version.table: version.key})
     root = version.folder.parents[1]
 
@@ -216,7 +216,7 @@ def test_checksums_of_read_blocks_are_verified(large, flips):
         assert good.num_rows
         for column, group, start, end in spans(large, part):
             needed = not column or (column in columns and group in groups)
-            # What is read with the footer.
+            # These bytes are read together with the footer.
             with_footer = end > path.stat().st_size - (64 << 10)
             # A page's header is where its chunk begins.
             for bit in [8 * start, 8 * start + 60, *rng.integers(8 * start, 8 * end, flips).tolist()]:

@@ -5,7 +5,7 @@ import pytest
 from tests.faults import fuzz
 
 RUNS, MANY_RUNS = 30, 6_000
-# Each mutation of a query asks DuckDB's parser, in a session of its own.
+# Each mutation of a query starts a new DuckDB session for its parser.
 SLOW = {"SQL": 10}
 
 

@@ -132,7 +132,7 @@ def test_render_with_a_killed_and_a_slow_worker(local, request_file, tmp_path):
             said, _ = driver.communicate(timeout=3000)
         assert driver.returncode == 0, said
         (log,) = (events(path) for path in (tmp_path / "events").iterdir())
-        # What the slow one still did when the job had ended, it has done: nothing of it is seen.
+        # Wait for the slow worker: its late results have no effect.
         time.sleep(5.0)
     check_events(log)
     check_once(lake)

@@ -88,7 +88,7 @@ def test_the_second_of_two_publishers_gets_an_error(every, seeds, plain_phases, 
             assert promise.current(root, "plain") in {promise.key("plain", seed) for seed in won}, where
             if len(set(seeds)) == 2:
                 assert len(won) == 1, where
-                # Who lost can begin again from what is there now.
+                # The second publisher can start again from the current version.
                 promise.make(root, "plain", 9)
                 assert promise.current(root, "plain") == promise.key("plain", 9)
 
@@ -108,7 +108,7 @@ def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
             version = read.version(lake, kind)
             rows = version.rows()
         except (BadInput, Damaged) as error:
-            # gc may remove an old version under a reader's feet; then it says so.
+            # gc may remove an old version while it is read; the error reports it.
             gone.append(str(error))
             continue
         whole += 1

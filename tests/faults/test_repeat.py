@@ -127,7 +127,7 @@ def test_tasks_of_another_version_are_not_reused(lake, change):
         publish.make_version(lake, before, counted(made))
     publish.make_version(lake, after, counted(made))
     assert made == [0, 1, 2, 0, 1, 2]
-    # What was done for the first plan is still good for it.
+    # Tasks of the first plan can still be resumed for it.
     publish.make_version(lake, before, counted(made))
     assert made[6:] == [1]
 

@@ -293,7 +293,7 @@ print(conf.get("spark.authenticate"), conf.get("spark.ui.enabled"))
 """
 
 
-# What a session itself listens to: tests/truesky/running/test_session.py.
+# tests/truesky/running/test_session.py tests the ports of a session.
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_a_session_without_configuration_is_private_and_finds_python(tmp_path):
@@ -319,13 +319,13 @@ def test_a_session_without_configuration_is_private_and_finds_python(tmp_path):
 @pytest.mark.parametrize("some", [slice(2), pytest.param(slice(None), marks=pytest.mark.nightly)], ids=["two", "all"])
 def test_submitted_files_run_from_any_folder(environment, some):
     if (Path(sys.prefix) / "spark-conf").is_dir():
-        # What make prepared starts faster than a new one.
+        # The environment of make starts faster than a new one.
         environment = Path(sys.prefix)
     else:
         prepared(environment)
     modules = {f"truesky.{path.parent.name}.{path.stem}" for path in SUBMITTED}
     assert {stage.module for stage in (*run.CATALOGUES, *run.IMAGES)} < modules
-    # What spark-submit runs is this Python; a Java for each file would say nothing more.
+    # spark-submit runs this Python, so a Java process for each file would test nothing more.
     files = SUBMITTED[some]
     starters = ["spark-submit", *["python"] * (len(files) - 1)]
     with ThreadPoolExecutor(2) as two_at_a_time:

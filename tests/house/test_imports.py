@@ -72,7 +72,7 @@ def unsafe(tree: ast.AST) -> list[str]:
 # Modules that read Parquet; what they have that writes, or is of no file.
 PARQUET = ("pyarrow.parquet", "pyarrow.dataset", "pyarrow.orc")
 NO_READING = {"write_table", "ParquetWriter", "Expression", "field", "scalar"}
-# The one door; Parquet of other programs, in a process of its own.
+# The reader of lakes, and the reader of user files, which runs in a separate process.
 PARQUET_READERS = {"lake_schema/store/parquet.py", "lake_schema/external/files.py"}
 
 

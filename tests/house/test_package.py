@@ -27,7 +27,7 @@ from lake_schema.store import provenance
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGES = ("lake_schema", "truesky")
-# Whatever else lies in the packages is no part of them.
+# Endings of files in the packages that are not distributed.
 NOT_SHIPPED = {".pyc"}
 
 
@@ -57,7 +57,7 @@ def test_wheel_contains_all_files_of_the_packages(wheel):
     there = {path.relative_to(ROOT) for path in of_packages if path.suffix not in NOT_SHIPPED}
     examples = {path.relative_to(ROOT) for folder in ("requests", "notebooks") for path in (ROOT / folder).iterdir()}
     expected = {path.as_posix() for path in there} | {f"truesky/{path.as_posix()}" for path in examples}
-    # It wants a clone.
+    # This notebook requires a clone.
     expected = {name for name in expected if not name.endswith("/02_speed_for_accuracy.ipynb")}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected
@@ -74,7 +74,7 @@ def test_metadata(wheel):
     assert "Private :: Do Not Upload" in metadata.get_all("Classifier")
 
 
-# What a user's machine may have set for a Spark of another kind.
+# Environment variables that a user may have set for another Spark.
 FOREIGN = {
     "SPARK_HOME": "/nowhere", "SPARK_CONF_DIR": "/nowhere", "SPARK_ENV_LOADED": "1", "PYSPARK_PYTHON": "/bin/false",
     "PYSPARK_DRIVER_PYTHON": "/bin/false", "PYSPARK_DRIVER_PYTHON_OPTS": "notebook",
@@ -188,7 +188,7 @@ def test_dependencies_are_pinned_within_their_ranges():
         assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)]), line
 
 
-# What users install for some commands alone.
+# Extras that users install for some commands.
 EXTRAS = ("page", "reduction", "s3")
 
 

@@ -136,7 +136,7 @@ def test_only_readout_modes_use_quadrants():
     assert knowing == {"channels"}
 
 
-# A channel with one effect; and the camera that it is of, which is declared in lake_schema: LSSTCam under another name.
+# A channel with one effect, and its camera, declared in lake_schema: LSSTCam under another name.
 DUMMY = '''"""A channel that makes everything three times as bright."""
 
 from truesky.render.camera import bands
@@ -215,7 +215,7 @@ def test_a_new_channel_changes_two_files_of_the_renderer(monkeypatch, tmp_path):
     ((wanted, _),) = survey.exposures(request, mission)
     exposures = planned_exposures.table([wanted], [mission])
     (row,) = exposures.to_pylist()
-    # Of a dark zenith, and here the Moon is up.
+    # The parameter is for a dark zenith, and the Moon is up here.
     assert 1.0 < row["sky"] / mission.value("ext.dummycam.lsst_r.sky") < 5.0
     table = tasks.table(exposures, [wanted.detectors], mission, Densities(mission, Universe()))
     (task,) = table.to_pylist()

@@ -16,7 +16,7 @@ SOURCES = sorted(
     for path in (ROOT / folder).rglob("*.py")
     if not any(path.is_relative_to(folder) for folder in MEASURE)
 )
-# What numpy and scipy hand to BLAS or LAPACK.
+# Functions of numpy and scipy that use BLAS or LAPACK.
 NAMES = {
     "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
     "polyfit", "leggauss", "hermgauss", "laggauss", "roots_legendre", "lstsq", "pinv", "eigh", "svd", "cholesky",
