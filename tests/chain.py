@@ -1,4 +1,4 @@
-"""What the chain makes, in this process, as digests in JSON: python -m tests.chain table|quick|whole FOLDER.
+"""Print digests of the arrays of the chain as JSON: python -m tests.chain table|quick|whole FOLDER.
 
 table  the table of galaxies' fluxes in one band
 quick  tables of galaxies' fluxes, of the PSF, of shapes; products and solutions as they occur
@@ -44,14 +44,14 @@ REQUEST = {
 
 
 def random_galaxies(n):
-    """Rows that integration and the tables read."""
+    """Return rows for integration and for the tables."""
     from benchmarks.fluxes import sample
 
     return galaxies_from_table(sample(n, 1), templates.galaxy_library())
 
 
 def table():
-    """The table of galaxies' fluxes, with the templates that it is made from."""
+    """Return the table of galaxy fluxes and its templates."""
     library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
     setting = min((choice.setting for choice in settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
     yield "templates", library.flux
@@ -59,7 +59,7 @@ def table():
 
 
 def quick():
-    """Arrays by name, of a few seconds."""
+    """Return arrays by name that take a few seconds."""
     from tests.truesky.render import fields
     from truesky.render.psf import euclid
     from truesky.render.sources import galaxy_shapes, sersic
@@ -84,7 +84,7 @@ def quick():
 
 
 def whole(folder):
-    """Of the lake, column by column and image by image; then all that lies in the cache."""
+    """Return digests of each column and image of the lake and of all files in the cache."""
     from truesky.catalogue import build_galaxies, build_stars
     from truesky.fluxes import compute_fluxes
     from truesky.render import plan_exposures, render_exposures
@@ -111,13 +111,13 @@ def whole(folder):
                     if image.data is not None:
                         yield f"{entry['path']}[{number}]", np.asarray(image.data)
     for path in sorted(cache.cache_dir().rglob("*.npy")):
-        # How fast the machine was is no result.
+        # Timings are not results.
         if not path.parent.name.startswith("calibration-"):
             yield path.relative_to(cache.cache_dir()).as_posix(), np.load(path)
 
 
 def values_of(column):
-    """A column's numbers; of text and lists their form in JSON."""
+    """Return the numbers of a column, or the JSON text of strings and lists."""
     if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
         return column.to_numpy()
     return np.frombuffer(json.dumps(column.to_pylist(), default=str).encode(), np.uint8)

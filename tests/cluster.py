@@ -1,4 +1,4 @@
-"""A cluster of processes on loopback: a standalone master of Spark and its workers, and jobs that are submitted to it.
+"""Run a cluster of processes on loopback: a standalone Spark master, workers, and submitted jobs.
 
 Everything goes through spark-submit, as it would from a login node; what a job was told, and who did its tasks, is in
 Spark's event log.
@@ -21,13 +21,13 @@ ROOT = Path(__file__).parents[1]
 
 
 def environment():
-    """The workers find the package where this test does."""
+    """Return an environment in which workers find the package."""
     spark_home = str(Path(find_spec("pyspark").origin).parent)
     return {**os.environ, "SPARK_HOME": spark_home, "PYTHONPATH": str(ROOT), "SPARK_DAEMON_MEMORY": "256m"}
 
 
 def command(script, lake, request_file, *options):
-    """The words of a spark-submit of one of our jobs."""
+    """Return the command line of spark-submit for a job."""
     submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
     return [submit, *options, str(ROOT / script), "--lake", str(lake), "--request", str(request_file)]
 
@@ -87,7 +87,7 @@ def _answers(port):
 
 
 def told(folder, **more):
-    """Options of spark-submit: little memory, an event log in `folder`, and more settings."""
+    """Return options of spark-submit: little memory, an event log in `folder`, and further settings."""
     settings = {
         "spark.executor.memory": "512m",
         "spark.eventLog.enabled": "true",
@@ -114,7 +114,7 @@ def below(pid):
 
 
 def different(one, other):
-    """Tables whose manifests, the sha256 of every file among them, differ; every byte of one is hashed."""
+    """Return the tables whose manifests differ, including the sha256 of every file; all bytes of one are hashed."""
     assert layout.table_names(one) == layout.table_names(other)
     assert len(layout.table_names(one)) > 10
     versions = [{name: read.version(root, name) for name in layout.table_names(root)} for root in (one, other)]

@@ -1,4 +1,4 @@
-"""What all tests share: a cache and an environment of their own, one Spark session, hypothesis profiles."""
+"""Shared fixtures: a separate cache and environment, one Spark session, hypothesis profiles."""
 
 import gc
 import os
@@ -26,7 +26,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 
 
 # If tests run in several processes (pytest-xdist, --dist loadfile), all tests of a file run in the same one, and so do
-# the files of a group: those whose tests share the Spark session, and those whose tests share the drawn skies.
+# the files of a group, which share the Spark session or the drawn skies.
 _SHARED = {"spark": "Spark", "drawn": "sky", "flat_sky": "sky"}
 _GROUPS = {
     "Spark": (
@@ -90,7 +90,7 @@ def pytest_unconfigure():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport():
-    """With $TRUESKY_NO_SKIPS a test that is skipped fails: a run of one test must not end well without it."""
+    """Let skipped tests fail if $TRUESKY_NO_SKIPS is set."""
     report = yield
     if report.skipped and os.environ.get("TRUESKY_NO_SKIPS"):
         report.outcome = "failed"
@@ -99,7 +99,7 @@ def pytest_runtest_makereport():
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """By file, or by what files share."""
+    """Return the group of a test: its file, or the fixture that files share."""
     if config.getvalue("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -113,7 +113,7 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture(scope="session", autouse=True)
 def _no_waiting_for_the_disc():
-    """Accidents here are of calls and processes, not of power: what is written need not have reached the disc."""
+    """Disable fsync, because tests simulate failures of calls and processes, not of power."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
@@ -128,7 +128,7 @@ def _memory_is_reused():
 
 @pytest.fixture(scope="session")
 def spark():
-    """One local session for the whole run, on the Java that the environment chose."""
+    """One local Spark session for all tests, with the Java of the environment."""
     from truesky.running.session import get_session
 
     running = get_session("tests")
@@ -146,7 +146,7 @@ def lake(tmp_path):
 
 @pytest.fixture(scope="session")
 def object_storage():
-    """An S3 service on loopback, whose buckets are each test's own to name."""
+    """An S3 service on loopback; each test names its buckets."""
     from tests import object_storage as storage
 
     with storage.service() as running:
@@ -155,7 +155,7 @@ def object_storage():
 
 @pytest.fixture
 def bucket(object_storage, monkeypatch, request):
-    """The service with an empty bucket, its name, and an environment that leads there."""
+    """Return the service, the name of an empty bucket, and environment variables for access."""
     from tests import object_storage as storage
 
     for name, value in {**storage.CREDENTIALS, "AWS_ENDPOINT_URL": object_storage.url}.items():

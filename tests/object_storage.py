@@ -26,7 +26,7 @@ class Recorder:
 
 
 class Service:
-    """Its address, its objects by boto3, and what was asked of it."""
+    """Address of a service, its objects by boto3, and the received requests."""
 
     def __init__(self, url, recorder):
         import boto3

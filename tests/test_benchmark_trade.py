@@ -81,7 +81,7 @@ def test_an_approximation_keeps_what_it_should(name):
         assert 10 * simple.shapes.sersic_index == pytest.approx(np.rint(10 * simple.shapes.sersic_index))
 
 
-def test_stamps_of_a_folding_threshold_hold_all_but_that():
+def test_stamps_contain_the_light_above_the_folding_threshold():
     """The fraction of the PSF outside the stamp is below the folding threshold."""
     some, psf = scenes.sample(VIS, 3, 6), scenes.scene_psf(VIS, 1)
     settings = settings_for(SURVEY)

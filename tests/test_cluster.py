@@ -45,7 +45,7 @@ def local(tmp_path_factory, request_file):
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """(address of a master with two workers of one core, folder of what its applications log)."""
+    """Return the address of a master with two workers of one core, and the folder of its logs."""
     folder = tmp_path_factory.mktemp("cluster")
     (folder / "events").mkdir()
     with running(folder, ("one", "two")) as (master, _):

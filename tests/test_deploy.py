@@ -1,4 +1,4 @@
-"""The image and the recipes for Kubernetes and YARN, as far as they can be tried without a cluster or Docker."""
+"""Test the container image and the recipes for Kubernetes and YARN without a cluster or Docker."""
 
 import os
 import re
@@ -28,7 +28,7 @@ PREFIXES = {
 
 
 def steps():
-    """(instruction, rest) of every step of the Dockerfile, in order."""
+    """Return (instruction, arguments) of every step of the Dockerfile, in order."""
     text = re.sub(r"\\\n", " ", (DEPLOY / "Dockerfile").read_text())
     lines = [line.strip() for line in text.splitlines()]
     return [tuple(line.split(maxsplit=1)) for line in lines if line and not line.startswith("#")]
@@ -40,7 +40,7 @@ def told(recipe):
     return dict(line.split(maxsplit=1) for line in lines if line and not line.startswith("#"))
 
 
-def test_the_image_is_made_of_what_is_there_and_runs_as_nobody_else():
+def test_the_image_copies_existing_files_and_has_an_unprivileged_user():
     found = steps()
     words = [word for word, _ in found]
     assert set(words) <= {"FROM", "RUN", "WORKDIR", "COPY", "ENV", "USER", "ENTRYPOINT", "CMD"}
@@ -60,7 +60,7 @@ def test_the_image_is_made_of_what_is_there_and_runs_as_nobody_else():
     assert {"jobs", "lake_schema", "truesky", "requests"} <= copied
 
 
-def test_what_spark_asks_an_image_for_is_what_the_entrypoint_understands():
+def test_entrypoint_supports_all_commands_of_spark():
     done = subprocess.run(["bash", "-n", DEPLOY / "entrypoint.sh"], check=False)
     assert done.returncode == 0
     assert os.access(DEPLOY / "entrypoint.sh", os.X_OK)
@@ -77,7 +77,7 @@ def test_what_spark_asks_an_image_for_is_what_the_entrypoint_understands():
 
 
 def constants(*parts):
-    """What the classes of Spark's own jars hold, texts among them."""
+    """Return the constants in the classes of the jars of Spark, including strings."""
     found = []
     for part in parts:
         (jar,) = SPARK.glob(f"jars/spark-{part}_*.jar")
@@ -87,7 +87,7 @@ def constants(*parts):
     return b"\0".join(found)
 
 
-def test_every_setting_of_the_recipes_is_one_of_sparks():
+def test_settings_of_recipes_exist_in_spark():
     known = constants("core", "kubernetes", "yarn")
     for recipe in RECIPES:
         for key in told(recipe):
@@ -98,7 +98,7 @@ def test_every_setting_of_the_recipes_is_one_of_sparks():
     assert b"spark.executor.memoryOverhed" not in known
 
 
-def test_the_docs_name_what_is_there():
+def test_files_named_in_the_docs_exist():
     text = (ROOT / "docs" / "cluster.md").read_text()
     for name in ("Dockerfile", "entrypoint.sh", "kubernetes.conf", "yarn.conf"):
         assert f"../deploy/{name}" in text
@@ -113,7 +113,7 @@ def environment(**more):
 
 
 def submitted(*options, **more):
-    """What spark-submit says that gets no farther than to whom it is sent."""
+    """Return the output of a spark-submit that stops at the connection to its server."""
     command = [SPARK / "bin" / "spark-submit", "--verbose", *options]
     command += ["--lake", "/lake", "--request", "/lake/requests/demo.toml"]
     done = subprocess.run(
@@ -126,7 +126,7 @@ def submitted(*options, **more):
 
 @pytest.mark.nightly
 @pytest.mark.spark
-def test_spark_submit_takes_the_recipe_for_kubernetes_as_far_as_its_server():
+def test_spark_submit_accepts_the_recipe_for_kubernetes():
     script = "local:///opt/truesky/jobs/render/render_exposures.py"
     said = submitted(
         "--properties-file", DEPLOY / "kubernetes.conf", "--master", "k8s://https://127.0.0.1:1", "--deploy-mode",
@@ -140,7 +140,7 @@ def test_spark_submit_takes_the_recipe_for_kubernetes_as_far_as_its_server():
 
 @pytest.mark.nightly
 @pytest.mark.spark
-def test_spark_submit_takes_the_recipe_for_yarn_as_far_as_its_manager(tmp_path):
+def test_spark_submit_accepts_the_recipe_for_yarn(tmp_path):
     values = {
         "yarn.resourcemanager.address": "127.0.0.1:1",
         "yarn.resourcemanager.connect.max-wait.ms": "2000",
@@ -163,7 +163,7 @@ def test_spark_submit_takes_the_recipe_for_yarn_as_far_as_its_manager(tmp_path):
 
 
 def in_a_folder(folder, step):
-    """A step's command as it runs below a folder, without the right to make users."""
+    """Return the command of a step for a given root folder, without the creation of users."""
     step = re.sub(r"(?<![\w/.])/(opt|var/cache)/truesky", rf"{folder}/\1/truesky", step)
     step = re.sub(r"^python ", f"{shlex.quote(getattr(sys, '_base_executable', sys.executable))} ", step)
     return "true" if step.startswith(("useradd", "chown")) else step
@@ -171,7 +171,7 @@ def in_a_folder(folder, step):
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
-    """A folder in which every step of the Dockerfile has been done, and the environment that it ends with."""
+    """Return a folder after all steps of the Dockerfile, and the final environment."""
     folder = tmp_path_factory.mktemp("image")
     kept, where = environment(HOME=str(folder)), folder
     for word, rest in steps():
@@ -206,7 +206,7 @@ def test_the_image_checks_a_request_and_runs_a_job(image, tmp_path):
 
     done = run("truesky", "check", where / "requests" / "demo.toml")
     assert done.returncode == 0, done.stderr
-    # As Kubernetes starts a driver; the table of spectra is the smallest that a job makes by itself.
+    # Start a driver like Kubernetes; the table of spectra is the smallest that a single job makes.
     request = tmp_path / "small.toml"
     text = (where / "requests" / "demo.toml").read_text()
     for key, value in (("galaxy_limit", 18.0), ("star_limit", 15.0), ("lensing_nside", 64)):
@@ -249,7 +249,7 @@ def test_the_image_starts_an_executor_that_asks_for_its_driver(image):
 
 @pytest.mark.nightly
 def test_a_packed_environment_runs_from_another_folder(tmp_path):
-    """As YARN unpacks it: truesky installed as a wheel, nothing of the clone in reach."""
+    """YARN unpacks it in this way: truesky is installed from a wheel, without the clone."""
     import tarfile
 
     made, packed, there = tmp_path / "made", tmp_path / "truesky.tar.gz", tmp_path / "container" / "environment"

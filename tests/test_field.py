@@ -80,13 +80,13 @@ def field(spark, tmp_path_factory):
 
 
 def published_digests():
-    """sha256 by table, as docs/promises.md lists them."""
+    """Return the sha256 of each table from docs/promises.md."""
     text = (Path(__file__).parents[1] / "docs" / "promises.md").read_text(encoding="utf-8")
     return {table: digest for digest, table in re.findall(r"^([0-9a-f]{64})  (\w+)$", text, re.MULTILINE)}
 
 
-def test_the_tables_are_those_that_the_documentation_lists(field):
-    """On machines of the documented kind with the pinned packages; elsewhere last bits may differ."""
+def test_tables_have_the_published_checksums(field):
+    """Compare on documented machines with the pinned packages; on others, last bits may differ."""
     pins = (Path(__file__).parents[1] / "requirements" / "run.txt").read_text(encoding="utf-8")
     pinned = dict(re.findall(r"^([\w.-]+)==(\S+) ", pins, re.MULTILINE))
     # PyPI regards `dust_extinction` and `dust-extinction` as one name; the pins have the second form.
@@ -133,7 +133,7 @@ def test_python_reads_images_and_truth(field):
         assert sky.separation(near["ra"].to_numpy(), near["dec"].to_numpy(), ra, dec).max() <= 0.02
 
 
-def test_python_runs_a_request_and_keeps_what_is_there(field):
+def test_python_runs_a_request_and_reuses_tables(field):
     before = {path.name for path in field.glob("*/v-*")}
     with truesky.run(DEMO, field) as lake:
         assert lake.sql("SELECT count(*) AS n FROM tasks")["n"].tolist() == [2]
@@ -152,13 +152,13 @@ def product(field, channel, content):
 def image(request, field):
     channel = request.param
     path = product(field, channel, "science")
-    # Of the pixels, without what a raw file has around them.
+    # Header of the pixels, without prescan and overscan.
     header = fits.Header(card for card in read_back.frame(path).cards)
     noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
     diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
     charge, delayed = fits.getdata(product(field, channel, "cosmic_rays")), 0.0
-    # What has bled lies where no source does.
+    # Bled charge is at positions without sources.
     hit = (charge > 0) | ndimage.binary_dilation(read_back.frame(path).data >= header["SATURATE"], iterations=3)
     if channel == "VIS":
         held = np.minimum(noise_free + charge, 2e5) + diffuse
@@ -186,7 +186,7 @@ def scene_of(header):
 
 
 def trailed(expected, header):
-    """What traps make of expected charge: it is not lost, it comes later."""
+    """Return expected charge after capture and release by traps, which delay charge but lose none."""
     scene = scene_of(header)
     sizes = quadrants.overscan_sizes(scene)
     charge = quadrants.apply(expected, *sizes)
@@ -196,7 +196,7 @@ def trailed(expected, header):
 
 
 def calibrated_electrons(path, header):
-    """Counted electrons, as a perfect calibration gives them back."""
+    """Return the electrons of a perfectly calibrated image."""
     scene = scene_of(header)
     with fits.open(path) as units:
         if scene.layout is not None:
@@ -209,13 +209,13 @@ def calibrated_electrons(path, header):
 
 
 def applied(header):
-    """Names of the effects that are in an image."""
+    """Return the names of the effects applied to an image."""
     states = [header[key].split(":") for key in header if key.startswith("EFFECT")]
     return {name for name, state in states if state.split(",")[0].split()[0] == "on"}
 
 
 def diffuse_electrons(header):
-    """What every pixel has of the sky, by its area, and of the dark current."""
+    """Return the electrons of sky, by pixel area, and dark current in every pixel."""
     electrons = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
     if "pixel_area" not in applied(header):
         return electrons
@@ -268,8 +268,8 @@ def photometry(image):
     return index, aperture(image.electrons), aperture(image.noise_free), noise
 
 
-def test_the_forecast_is_what_was_measured(field):
-    """Memory and bytes of every detector within 30 %; its time depends on who else uses the machine."""
+def test_forecast_agrees_with_measured_costs(field):
+    """Memory and size of every detector agree within 30 %; time depends on the load of the machine."""
     rows, tasks = archive.products(field).to_pylist(), read.version(field, "tasks").rows().to_pylist()
     assert len(tasks) == 2
     for task in tasks:
@@ -299,7 +299,7 @@ def test_bright_unblended_sources_are_found(image, photometry):
     assert abs(np.median((y[which] - image.y[bright])[found])) < 0.15
 
 
-def test_photometry_is_right_and_as_noisy_as_predicted(image, photometry):
+def test_photometry_and_its_noise_agree_with_prediction(image, photometry):
     _, measured, truth, noise = photometry
     bright = truth > 10 * noise
     # A saturated source has lost what the converter could not hold.
@@ -313,13 +313,13 @@ def test_photometry_is_right_and_as_noisy_as_predicted(image, photometry):
     assert 0.9 < spread < 1.3
 
 
-def test_the_frame_holds_the_light_of_its_sources(image):
-    """What lies on the detector, summed, within what wings carry over its edges."""
+def test_frame_contains_the_light_of_its_sources(image):
+    """The total light agrees, up to the wings that cross the edges of the detector."""
     assert image.noise_free.sum() == pytest.approx(image.expected.sum(), rel=0.02)
     assert image.noise_free.min() > -1e-3 * np.sqrt(np.median(image.variance))
 
 
-def test_the_background_is_the_predicted_one(image):
+def test_background_agrees_with_prediction(image):
     """Sample of a fifth of the pixels or more; significance 6e-7 of their mean (5 standard errors)."""
     empty = (image.noise_free < 0.05 * np.sqrt(image.variance)) & ~image.bad
     assert empty.mean() > 0.2
@@ -331,7 +331,7 @@ def test_the_background_is_the_predicted_one(image):
 
 @pytest.mark.parametrize("content", ["science", "noise_free"])
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])
-def test_files_are_good_fits(field, channel, content):
+def test_files_are_valid_fits(field, channel, content):
     path = product(field, channel, content)
     with fits.open(path, checksum=True) as hdus:
         hdus.verify("exception")
@@ -346,7 +346,7 @@ def test_files_are_good_fits(field, channel, content):
         assert [unit.shape for unit in fits.open(path)[1:]] == [(2086, 2128)] * 4
 
 
-def test_a_picture_names_the_brightest_of_the_frame(field, image):
+def test_preview_labels_the_brightest_sources(field, image):
     channel = image.header["CHANNEL"]
     products = read.version(field, "products").rows().to_pylist()
     (row,) = (row for row in products if (row["channel"], row["content"]) == (channel, "science"))
@@ -368,20 +368,20 @@ def test_other_tools_can_open_the_lake(field):
     assert len(found) == near.sum() > 100
 
 
-def test_fluxes_lie_beside_their_catalogues(field):
+def test_fluxes_have_the_cells_of_their_catalogues(field):
     for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
         left, right = read.version(field, catalogue), read.version(field, fluxes)
         assert left.partitions == right.partitions
         assert left.rows(["id"]).equals(right.rows(["id"]))
 
 
-def test_every_table_is_sound(field):
+def test_every_table_is_valid(field):
     assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(read.table_names(field))
     for name in read.table_names(field):
         assert read.find_faults(read.version(field, name), deep=True) == []
 
 
-def test_the_demo_covers_only_what_its_detectors_touch(field):
+def test_demo_covers_only_cells_of_its_detectors(field):
     tasks = read.version(field, "tasks").rows(["cells"])["cells"].to_pylist()
     touched = sorted({cell for cells in tasks for cell in cells})
     drawn = parse(DEMO).area.cells()
@@ -389,8 +389,8 @@ def test_the_demo_covers_only_what_its_detectors_touch(field):
     assert len(drawn) * sky.cell_area(8) <= 0.6
 
 
-def test_counts_are_those_of_the_sky(field):
-    """102 galaxies an arcmin2 with I_E < 26, as deep surveys and the Flagship mock have, within 15 %."""
+def test_galaxy_counts_agree_with_observations(field):
+    """102 galaxies per arcmin2 with I_E < 26, as in deep surveys and the Flagship mock, within 15 %."""
     area = len(parse(DEMO).area.cells()) * sky.cell_area(8) * 3600
     galaxies = read.version(field, "galaxies")
     assert galaxies.num_rows / area == pytest.approx(102, rel=0.15)

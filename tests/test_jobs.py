@@ -1,4 +1,4 @@
-"""The submitted jobs as their users meet them: help, bad requests, and the same bytes under any master."""
+"""Test submitted jobs: help, invalid requests, and equal bytes under any master."""
 
 import shutil
 import subprocess
@@ -58,8 +58,8 @@ def submit(*arguments):
     return subprocess.run([command, *map(str, arguments)], capture_output=True, text=True, cwd="/", timeout=300)
 
 
-def test_no_job_is_forgotten():
-    """Here, and in the table of docs/jobs.md."""
+def test_all_jobs_are_tested_and_documented():
+    """All jobs are in this list and in the table of docs/jobs.md."""
     found = set((ROOT / "jobs").rglob("*.py"))
     modules = {path.stem for path in (ROOT / "truesky").rglob("*.py") if "\nJOB = Job(" in path.read_text()}
     assert {path.stem for path in found} == modules
@@ -96,7 +96,7 @@ def test_a_bad_pointing_is_refused_before_the_first_job_runs(words, key, tmp_pat
 
 
 @pytest.mark.parametrize("job", LATER, ids=lambda job: job.name)
-def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
+def test_missing_input_tables_are_named(job, tmp_path, capsys):
     path = tmp_path / "r.toml"
     path.write_text(SMALL)
     assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
@@ -139,10 +139,10 @@ sys.exit(max(submitted_job.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, b
     assert manifests[0] == manifests[1]
 
 
-# Of any script by day: tests/house/test_environment.py.
+# Daily tests of spark-submit with other scripts are in tests/house/test_environment.py.
 @pytest.mark.spark
 @pytest.mark.nightly
-def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
+def test_spark_submit_returns_message_and_status(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(BAD[1][0])
     script = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
@@ -155,7 +155,7 @@ def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
 
 
 def test_a_generation_cell_is_the_same_in_every_request(tmp_path):
-    """Whatever else is asked for, a cell's rows are the same bytes."""
+    """The bytes of the rows of a cell do not depend on the rest of the request."""
     wanted = from_table(tomllib.loads(SMALL))
     for module in (build_galaxies, build_stars):
         for step in module.steps(tmp_path, wanted):

@@ -1,4 +1,4 @@
-"""A plan that is larger than memory: whoever reads it takes a part after the other, or what is asked for."""
+"""Readers of a plan that is larger than memory read one partition at a time, or only the requested rows."""
 
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -32,14 +32,14 @@ from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "mjd": 60400.0}
 AREA = {"cone": {"ra": 60.0, "dec": -50.0, "radius": 1.0}}
 REQUEST = from_table({"name": "large", "seed": 7, "area": AREA, "observation": [BLOCK]})
-# Of these exposures a detector is rendered.
+# Exposures of which a detector is rendered.
 MADE = (1, 3)
 # A part of 50,000 detectors is 30 MB in memory, and may be there several times.
 MOST_GB = 0.3
 
 
 def repeated(rows, start, times, many):
-    """Rows of a field again and again, a day after one another; many : exposures of the field."""
+    """Repeat the rows of a field, one day apart; `many` is the number of exposures of the field."""
     found = []
     for i in range(start, start + times):
         own = rows.set_column(0, "exposure_id", pa.array(rows["exposure_id"].to_numpy() + i * many))
@@ -51,7 +51,7 @@ def repeated(rows, start, times, many):
 
 
 def published(root, number, times):
-    """A lake with a plan of so many parts, each so many times a field, and two detectors that are made."""
+    """Make a lake with a plan of given partitions, each with repeated fields, and two rendered detectors."""
     _, exposures, tasks = plan_exposures.plan(None, REQUEST)
     many, began = exposures.num_rows, exposures["mjd"].to_numpy()
     assert exposures.column_names[0] == tasks.column_names[0] == "exposure_id"
@@ -120,7 +120,7 @@ def paged(root, ask):
 
 
 def in_view(lake):
-    """Elsewhere than the plan: what is there would be more than a page shows."""
+    """Return a position outside the plan, because the plan has more rows than a page shows."""
     return sky_maps.exposure_footprints(lake, np.array([200.0, 10.0, 1.0]))
 
 
@@ -145,13 +145,13 @@ ALSO = {"render, one detector": partial(chosen, detectors=("3-4",))}
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A lake with a plan of six parts; rows of a field."""
+    """Make a lake with a plan of six partitions; return it with the rows of a field."""
     root = layout.resolve_lake(tmp_path_factory.mktemp("small") / "lake")
     return root, published(root, 6, 1)
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_no_more_is_read_at_once_than_a_part(small, name, monkeypatch):
+def test_at_most_one_partition_is_read_at_once(small, name, monkeypatch):
     root, (exposures, tasks) = small
     monkeypatch.setattr(sky_maps, "LARGE_PLAN", tasks.num_rows)
     read_rows, seen = read.Version.rows, []
@@ -174,7 +174,7 @@ NARROW = ({"limit": None}, {"limit": 5}, {"limit": 500}, {"detectors": ("3-4",)}
 
 
 @pytest.mark.parametrize("narrow", NARROW)
-def test_what_is_chosen_of_parts_is_what_is_chosen_of_the_whole(small, narrow):
+def test_selection_by_partition_equals_selection_of_the_whole(small, narrow):
     root, (_, tasks) = small
     own, request = versions(root), replace(REQUEST, **narrow)
     every, exposures = planning.sort_by_cost(own["tasks"].rows()), own["exposures"].rows()
@@ -190,7 +190,7 @@ def test_what_is_chosen_of_parts_is_what_is_chosen_of_the_whole(small, narrow):
     assert found.exposures.equals(exposures.filter(pc.is_in(exposures["exposure_id"], pa.array([*numbers]))))
     counts = Counter(every["exposure_id"].to_pylist())
     assert found.detector_counts == {number: counts[number] for number in numbers}
-    # What is left in their detectors by whatever was exposed before.
+    # Persistence of earlier exposures in their detectors.
     rows = {row.exposure_id: row for row in map(ExposureRow.from_row, exposures.to_pylist())}
     before = persistence.previous_tasks(every.to_pylist(), rows, variants.mission_lookup(mission_of(request.mission)))
     mine = {key: list(map(place, some)) for key, some in earlier.items() if key in set(map(place, kept))}
@@ -204,7 +204,7 @@ def place(task):
 
 
 def growth(name, small, large):
-    """GB that a reader takes of a large plan beyond what the process holds after it has read a small one."""
+    """Return the additional memory (GB) for a large plan compared with a small one."""
     reader = {**READERS, **ALSO}[name]
     reader(small)
     reset_peak_memory()

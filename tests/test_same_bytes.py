@@ -1,4 +1,4 @@
-"""The chain's arrays do not know how many threads there were, which BLAS was chosen, or what lay in the cache."""
+"""The arrays of the chain do not depend on threads, BLAS or cache."""
 
 import json
 import os
@@ -25,13 +25,13 @@ on_avx2 = pytest.mark.skipif(
 
 
 def environment(setting):
-    """This process's variables with others of the instruction set."""
+    """Return the environment variables of this process with another instruction set."""
     chosen = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "NUMBA_DISABLE", "ARROW_USER")
     return {**{name: value for name, value in os.environ.items() if not name.startswith(chosen)}, **setting}
 
 
 def digests(what, folder, cached, threads, kernel, python=sys.executable, setting=()):
-    """Of what tests/chain.py makes in a process of its own; the compiled code is this process's."""
+    """Return digests from tests/chain.py in a separate process, with the compiled code of this process."""
     folder.mkdir(exist_ok=True)
     variables = {
         "OMP_NUM_THREADS": str(threads),
@@ -54,7 +54,7 @@ def differing(one, other):
 
 @pytest.fixture(scope="module")
 def standard(tmp_path_factory):
-    """Digests from a cold cache, by one thread, with the standard instruction set: the reference of all comparisons."""
+    """Reference digests: cold cache, one thread, standard instruction set."""
     folder = tmp_path_factory.mktemp("standard")
     return digests("quick", folder, folder / "cache", 1, KERNELS[0])
 
@@ -67,7 +67,7 @@ def test_threads_and_kernels_change_no_bit(standard, tmp_path):
 
 @pytest.mark.nightly
 def test_the_whole_chain(tmp_path):
-    """Cold and warm, one thread and two, both kernels: a lake, two CCDs and every array that was kept."""
+    """Compare a lake, two CCDs and all cached arrays: cold and warm, one and two threads, both kernels."""
     first = digests("whole", tmp_path / "0", tmp_path / "cache", 1, KERNELS[0])
     assert len(first) > 150
     assert any(".fits" in name for name in first)
@@ -103,8 +103,8 @@ def emulator():
         {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
     ],
 )
-def test_only_the_standard_kind_keeps_the_promise(standard, tmp_path, setting):
-    """numpy without AVX2 stands for another kind: it is reported as one, and its results do differ."""
+def test_other_instruction_sets_are_reported(standard, tmp_path, setting):
+    """numpy without AVX2 represents another instruction set: it is reported, and its results differ."""
     command = [sys.executable, "-c", "from lake_schema.store.provenance import machine; print(machine())"]
     kind = subprocess.run(command, env=environment(setting), capture_output=True, text=True, check=True).stdout.strip()
     if kind == machine():
@@ -129,7 +129,7 @@ def test_emulated_cpus_compute_the_same(standard, tmp_path, cpu):
 
 @pytest.mark.nightly
 @pytest.mark.skipif("TRUESKY_OTHER_PYTHON" not in os.environ, reason="names a Python of another version with truesky")
-def test_another_python_makes_the_same(tmp_path):
+def test_another_python_gives_the_same_bytes(tmp_path):
     other = os.environ["TRUESKY_OTHER_PYTHON"]
     first, again = (
         digests("whole", tmp_path / str(n), tmp_path / f"cache {n}", 1, KERNELS[0], python)

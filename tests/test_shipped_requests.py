@@ -1,4 +1,4 @@
-"""Every request that is shipped goes through all jobs, made small by its keys: area, depth, detectors, exposures.
+"""Run all jobs for every shipped request, reduced in area, depth, detectors and exposures.
 
 That of the demo does so every day, as it is (test_field.py); and the check takes each (`test_checks.py` of requests).
 """
@@ -30,12 +30,12 @@ MISSION = resolve()
 
 
 def middle(camera):
-    """The detector nearest to the middle of a camera."""
+    """Return the detector nearest to the centre of a camera."""
     return min(detectors.detectors(camera, MISSION), key=lambda d: d.x**2 + d.y**2).name
 
 
 def small(name):
-    """The table of a shipped request, with one detector of a camera, a field, a frame of each kind, bright sources."""
+    """Return a shipped request with one detector per camera, one field, one frame per type and bright sources."""
     table = tomllib.loads((REQUESTS / f"{name}.toml").read_text())
     table["accuracy"] = "draft"
     table["universe"] = {"galaxy_limit": 18.0, "star_limit": 14.0, "box_cells": 192, "lensing_nside": 64}
@@ -60,7 +60,7 @@ def small(name):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", [path.stem for path in sorted(REQUESTS.glob("*.toml"))])
-def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
+def test_shipped_requests_run_through_all_jobs(name, tmp_path, monkeypatch):
     # The parts here, not in Spark's workers.
     monkeypatch.setattr(submitted_job, "_spark_map", lambda function, parts, *rest: map(function, parts))
     request = from_table(small(name))
@@ -86,7 +86,7 @@ def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
 
 
 def test_the_pilot_observation_has_every_kind_of_image():
-    """All that is rendered, deep fields apart, which are the wide survey's again; every band of every ground survey."""
+    """It has all image types except deep fields, which equal the wide survey, and all bands of ground surveys."""
     request = parse(REQUESTS / "pilot_one_observation.toml")
     found = [exposure for exposure, _ in survey.exposures(request, MISSION)]
     rendered = {(channel, kind) for channel, kinds in RENDERED_TYPES.items() for kind in kinds if kind != "deep"}

@@ -1,4 +1,4 @@
-"""A relative tolerance that is what it says.
+"""Comparison in which the given relative tolerance applies.
 
 pytest.approx passes what lies within the larger of its two tolerances, and the absolute one is 1e-12 where none is
 given: of a flux of 1e-30 W/m2, every other flux of that size is "within 1e-9".
@@ -14,7 +14,7 @@ _approx = pytest.approx
 
 
 def approx(expected, rel=None, abs=None, nan_ok=False):
-    """pytest.approx, which refuses numbers whose relative tolerance would be overruled by the absolute one not given.
+    """Return pytest.approx; refuse numbers for which the default absolute tolerance exceeds the relative one.
 
     Zero has no relative tolerance, so it is let pass: it is compared within 1e-12.
     """
@@ -29,7 +29,7 @@ def approx(expected, rel=None, abs=None, nan_ok=False):
 
 
 def smallest(expected):
-    """The smallest size of the numbers in a number, array, sequence or mapping; zeros and what is not finite aside."""
+    """Return the smallest finite non-zero absolute value of a number, array, sequence or mapping."""
     if isinstance(expected, Mapping):
         expected = list(expected.values())
     if isinstance(expected, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Small made-up tables, built from the declarations, so that a column is tested the day it is declared."""
+"""Make small artificial tables from the declarations, so that new columns are tested."""
 
 import numpy as np
 
@@ -45,7 +45,7 @@ PLAIN = Table(
 
 
 def plain_work(root, facts):
-    """Rows whose values tell the seed, so that a mixture of two versions shows."""
+    """Return rows whose values depend on the seed, so that mixed versions are detected."""
     first = facts["part"] * 100
     return Output(PLAIN.build({"id": np.arange(first, first + 20), "value": np.full(20, float(facts["seed"]))}))
 
@@ -55,7 +55,7 @@ def plain_plan(seed=1, parts=3):
 
 
 def rows_of(table, n, seed=0):
-    """n rows of any declared table, every value inside its bounds, ids unique, positions consistent."""
+    """Return n valid rows of any declared table, with unique identifiers and consistent positions."""
     rng = np.random.default_rng(seed)
     columns = {column.name: _values(column, n, rng) for column in table.columns}
     if table.is_catalogue:

@@ -1,4 +1,4 @@
-"""The brightest sources in the longest exposures: as much light as they have, no pixel below none, none left out."""
+"""The brightest sources in the longest exposures have their flux, no negative pixels, and are all drawn."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
 
 
 def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
-    """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
+    """Return (frame, size, light of the stamp on it) for one source with a limit on its stamp size."""
     source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
     beam = psf_of(camera) if seeing is None else moffat_psf(seeing, 3.0, 0.2)
     settings, noise = settings_for(accuracy), NOISE[camera]
@@ -61,15 +61,15 @@ def test_no_pixel_overflows(electrons, camera, accuracy, shape):
 @example(30.0 * 10 ** (0.4 * 28.17), 0.73, SURVEY)
 @example(10.0**10.5, 0.4375, DRAFT)
 @example(10.0**9.5, 0.4, DRAFT)
-def test_nothing_rings_about_a_bright_star(electrons, seeing, accuracy):
-    """Behind any seeing, where a pixel samples it: no pixel of the frame is below none by a tenth of its noise."""
+def test_bright_stars_have_no_ringing(electrons, seeing, accuracy):
+    """For any sampled seeing, no pixel of the frame is negative by more than a tenth of its noise."""
     image, *_ = drawn("lsstcam", electrons, seeing, accuracy=accuracy)
     unit = fourier.units_of(np.array([electrons]))
     assert image.min() > -0.1 * NOISE["lsstcam"] - 1.0 / unit - 1e-12 * electrons * (electrons > 1e14)
 
 
-def test_what_fits_is_as_fine_as_ever():
-    """The frame's integers are as fine as their sum allows, whatever the order."""
+def test_frame_resolution_depends_only_on_the_total_charge():
+    """The resolution of the frame's integers is as fine as their sum allows, in any order."""
     assert fourier.units_of(np.array([])) == fourier.units_of(np.full(10, 1e11)) == frame.FIXED_POINT
     light = 10.0 ** np.random.default_rng(1).uniform(0, 17, 1000)
     unit = fourier.units_of(light)
@@ -80,7 +80,7 @@ def test_what_fits_is_as_fine_as_ever():
 
 @pytest.mark.parametrize(("mag", "seconds"), [(-1.46, 560.5), (8.0, 1e6)])
 def test_the_brightest_star_in_the_longest_exposure(mag, seconds):
-    """From the catalogue to the file: in the truth, full wells, no dark hole."""
+    """The star is in the truth, and its pixels are saturated, without a dark centre."""
     quiet = nominal.off("cosmic_rays", "readout_cosmic_rays")
     one = nominal.rendered(
         small("vis", "3-4", 256), [mag, 20.0], [100.2, 30.0], [110.7, 220.0], seconds=seconds, forced=quiet
@@ -95,14 +95,14 @@ def test_the_brightest_star_in_the_longest_exposure(mag, seconds):
     assert full.min() > 0.9 * full.max()
 
 
-def test_more_than_a_frame_counts_is_refused():
+def test_more_charge_than_the_maximum_is_refused():
     with pytest.raises(BadInput, match="electrons"):
         nominal.rendered(small("vis", "3-4", 64), [-20.0], [30.0], [30.0], seconds=1e6)
 
 
 @pytest.mark.parametrize("ratio", [0.01, pytest.param(0.02, marks=pytest.mark.nightly)])
-def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
-    """Slimmer than the table of galaxies allows, too, against galsim's ellipse."""
+def test_axis_ratio_is_drawn_exactly(ratio):
+    """Compare with an ellipse of galsim, also for ratios below the limit of the table of galaxies."""
     source = source_of(
         "vis", 1e6, column=64.0, row=64.0, bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_axis_ratio=ratio
     )
@@ -112,7 +112,7 @@ def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
     np.testing.assert_allclose(image[34:94, 34:94], expected[34:94, 34:94], atol=1e-3 * expected.max())
 
 
-def test_a_slimmer_bulge_than_the_table_allows_is_no_galaxy():
+def test_a_bulge_slimmer_than_the_limit_is_refused():
     (column,) = (c for c in GALAXIES.columns if c.name == "bulge_axis_ratio")
     for ratio, wrong in ((0.01, 1), (0.02, 0)):
         values = pa.chunked_array([pa.array([1.0, ratio], pa.float32())])

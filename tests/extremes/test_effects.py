@@ -1,4 +1,4 @@
-"""Effects at the edges of what a detector may meet: finite, conserving, bounded in time."""
+"""Effects on extreme frames are finite, conserve charge and take bounded time."""
 
 import time
 
@@ -18,7 +18,7 @@ HANGS = 120.0
 
 
 def scenes(shape):
-    """Frames that break simple code."""
+    """Return extreme frames."""
     ny, nx = shape
     star, column, ends = np.zeros(shape), np.full(shape, 130.0), np.zeros(shape)
     star[ny // 3, nx // 3] = 1e11
@@ -63,7 +63,7 @@ def test_single_rows_and_columns(name, shape):
 
 @pytest.mark.parametrize("shape", [(SIDE, SIDE), (1, SIDE), (SIDE, 1), (1, 1)])
 def test_bleeding_and_transfer_account_for_every_electron(shape):
-    """Charge in = charge out + what is still trapped + what left through the registers."""
+    """The input charge equals output charge + trapped charge + charge that left through the registers."""
     for frame in scenes((max(shape), max(shape))).values():
         part = np.ascontiguousarray(frame[: shape[0], : shape[1]])
         held, lost = bleeding.bleed(part, 2e5, [(0, len(part), False)])
@@ -86,7 +86,7 @@ def test_no_traps_and_far_beyond_the_end_of_life(age):
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1e5])
-def test_exposure_times_from_nothing_to_a_day(seconds):
+def test_exposure_times_from_zero_to_one_day(seconds):
     scene = Scene(resolve(), "vis", seconds, 0.25, 1e4)
     assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT)]).all()
     expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
@@ -97,7 +97,7 @@ def test_exposure_times_from_nothing_to_a_day(seconds):
 
 
 @pytest.mark.parametrize("mean", [1e-300, 1e9, 1e18])
-def test_counting_the_countless(mean):
+def test_poisson_noise_of_very_large_means(mean):
     """Sample of 40,000 pixels; significance 6e-5 of the mean (4 standard errors), 2e-5 of the variance (3 %)."""
     counted = poisson.apply(np.full((200, 200), mean), rng=np.random.default_rng(1))
     assert counted.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean) / 200)

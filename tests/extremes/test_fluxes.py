@@ -1,4 +1,4 @@
-"""Band fluxes where numbers are at their ends: finite, monotone where physics says so, or refused by name."""
+"""Band fluxes of extreme inputs are finite and monotone, or the input is refused by name."""
 
 from decimal import Decimal, localcontext
 
@@ -62,7 +62,7 @@ def test_redshift_zero_is_the_limit(library):
     np.testing.assert_allclose(at[2], at[0], rtol=1e-4)
 
 
-def test_the_ends_of_the_tables_fit_what_lies_beyond(library):
+def test_tables_are_continuous_at_their_ends(library):
     for name, ends in (("z_obs", (3.03 - 1e-6, 3.03 + 1e-6)), ("a_v", (1.55 - 1e-6, 1.55 + 1e-6))):
         inside, outside = fluxes(library, **{name: np.array(ends)})
         np.testing.assert_allclose(outside, inside, rtol=2e-3)
@@ -91,7 +91,7 @@ def test_a_line_that_crosses_a_bands_edge(library, accuracy, band):
         dark, lit = (fluxes(library, accuracy, z_obs=z, mag_r01=28.0, **{column: flux}) for flux in (0.0, 1e-16))
         assert (lit >= dark).all()
         seen = 1e-16 * np.interp(rest * (1.0 + z), curve.wavelength, passbands.weights(curve))
-        # The wings see what lies beside: a few per cent of the band's best where it is steep.
+        # The wings of the line sample neighbouring wavelengths, whose response differs by a few per cent.
         best = units.ujy_of_cgs(1e-16 * passbands.weights(curve).max())
         assert np.abs(lit[:, band] - dark[:, band] - units.ujy_of_cgs(seen)).max() < 0.03 * best
 
@@ -157,7 +157,7 @@ def test_just_inside_the_critical_curve(library, kappa):
         ("mag_r01", 61.0), ("abs_mag_r01", -31.0), ("flux_halpha", -1e-18), ("flux_halpha", np.inf), ("kind", 7),
     ],
 )  # fmt: skip
-def test_what_is_beyond_is_refused_by_name(library, column, value):
+def test_values_outside_the_limits_are_refused_by_name(library, column, value):
     with pytest.raises(
         BadInput, match="magnification" if column in ("kappa", "gamma1") and np.isfinite(value) else column
     ):

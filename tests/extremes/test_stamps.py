@@ -1,4 +1,4 @@
-"""Drawing at the edges of what a catalogue may hold: finite, bounded, and with the flux that was asked for.
+"""Drawings of extreme sources are finite, take bounded time and have the requested flux.
 
 Photons that are shot one by one are the independent reference: positions drawn from the profile's own distribution,
 lensed, spread by the seeing disc, counted in pixels.
@@ -65,7 +65,7 @@ def drawn(source, psf, side=SIDE, accuracy=SURVEY):
 
 @cache
 def compiled():
-    """Both precisions once, or the clock counts the compiler."""
+    """Draw once in both precisions, so that compilation is not timed."""
     for electrons in (1e4, 1e8):
         drawn(source_of("vis", electrons, bulge_fraction=0.5), psf_of("vis"))
 
@@ -77,8 +77,8 @@ def source_of(camera, electrons, **where_and_shape):
 
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("camera", ["vis", "lsstcam"])
-def test_flux_is_right_and_nothing_rings(camera, kind):
-    # A frame that holds the largest stamp of these, and what is drawn beyond it.
+def test_flux_is_right_without_ringing(camera, kind):
+    # A frame for the largest stamp and the light drawn outside it.
     side = 4 * SIDE
     source = source_of(camera, 1e4, column=side / 2 + 0.3, row=side / 2 - 0.4, **SHAPES[kind])
     image, size = drawn(source, psf_of(camera), side)
@@ -89,7 +89,7 @@ def test_flux_is_right_and_nothing_rings(camera, kind):
 
 
 @pytest.mark.parametrize("kind", ["bulge", pytest.param("disc", marks=pytest.mark.nightly)])
-def test_the_largest_are_bounded_in_time(kind):
+def test_largest_sources_are_drawn_in_bounded_time(kind):
     compiled()
     start = time.process_time()
     image, size = drawn(source_of("vis", 1e6, **HUGE[kind]), psf_of("vis"))
@@ -101,7 +101,7 @@ def test_the_largest_are_bounded_in_time(kind):
 
 @pytest.mark.parametrize("electrons", [1e-6, 1.0, 1e7 - 1, 1e7 + 1, 1e11])
 def test_linear_in_flux(electrons):
-    """Single and double precision alike."""
+    """Check single and double precision."""
     whole, _ = drawn(source_of("lsstcam", electrons), psf_of("lsstcam"))
     settings = settings_for(SURVEY)
     one = source_of("lsstcam", 1e5)
@@ -111,8 +111,8 @@ def test_linear_in_flux(electrons):
 
 
 @pytest.mark.parametrize("electrons", [1e8, 1e10])
-def test_a_bright_star_shines_as_far_as_it_shows(electrons):
-    """Behind an atmosphere: a Moffat's light at any distance, sampled on pixels."""
+def test_wings_of_bright_stars_are_complete(electrons):
+    """With an atmosphere, the light at any distance is that of a Moffat profile sampled on pixels."""
     image, size = drawn(source_of("lsstcam", electrons, column=500.0, row=500.0), psf_of("lsstcam"), 1000)
     assert size >= (128 if electrons == 1e8 else 256)
     profile = psf_of("lsstcam").profile
@@ -132,7 +132,7 @@ def test_a_bright_star_shines_as_far_as_it_shows(electrons):
     ],
 )
 def test_edges_and_corners(x, y, least, most):
-    """A detector sees what a larger one sees there; of a source on its edge, half."""
+    """The image is a cutout of a larger image; a detector receives half of a source on its edge."""
     source = source_of("vis", 1e4, inclination=40.0)
     image, _ = drawn(replace(source, column=np.array([x]), row=np.array([y])), psf_of("vis"))
     moved = replace(source, column=np.array([x + SIDE]), row=np.array([y + SIDE]))
@@ -186,7 +186,7 @@ def test_any_order_gives_the_same_bits(seed):
 
 @st.composite
 def anything(draw):
-    """Any galaxy or point that a catalogue may hold, and its electrons."""
+    """Return any allowed galaxy or point source and its electrons."""
     size = st.floats(-4, np.log10(60)).map(lambda x: 10**x)
     g, angle = draw(st.floats(0, 0.9)), draw(st.floats(0, np.pi))
     kappa = draw(st.sampled_from([0.0, -0.2, 0.5, 0.9]))
@@ -207,7 +207,7 @@ def anything(draw):
 
 
 @given(anything(), st.sampled_from(["vis", "lsstcam"]), st.sampled_from([DRAFT, SURVEY]))
-def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
+def test_any_source_is_finite_and_has_its_flux(what, camera, accuracy):
     """On a frame as large as the stamp nothing is lost but what the profile has outside; memory and seconds are bounded
     before anything is drawn."""
     shape, electrons = what
@@ -215,7 +215,7 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     settings = settings_for(accuracy)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
     assert cost.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
-    # The largest have tests of their own.
+    # Separate tests draw the largest sources.
     if sizes[0] > 1024:
         return
     side = int(sizes[0])
@@ -253,17 +253,17 @@ def centred(source, at=32.0):
 
 
 @given(st.sampled_from(sorted(SHAPES)), st.integers(-9, 9), st.integers(-9, 9), st.floats(92, 100), st.floats(92, 100))
-def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
+def test_any_shift_by_whole_pixels_moves_the_image(kind, dx, dy, x, y):
     source = source_of("vis", 1e4, column=x, row=y, **SHAPES[kind])
     base = stamps.draw(source, np.array([128]), psf_of("vis"), 192, 192)
     source.column[:] += dx
     source.row[:] += dy
     moved = stamps.draw(source, np.array([128]), psf_of("vis"), 192, 192)
-    # Beside a half pixel the stamp itself may lie one farther; what lies beyond it is on blocks of the frame.
+    # Near a half pixel, the stamp may be shifted by one more pixel; light outside it is drawn on blocks of the frame.
     middle = slice(76, 116)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
     np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
-    # Of a stamp that nothing is taken off, half as large, too.
+    # Repeat with a stamp of half the size, which is not corrected.
     source.column[:] -= 32.0
     source.row[:] -= 32.0
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
@@ -277,10 +277,10 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
 
 
 @given(st.sampled_from([kind for kind in SHAPES if "gamma1" not in SHAPES[kind]]), st.floats(0, 180))
-def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
+def test_a_galaxy_is_symmetric_under_half_a_turn(kind, angle):
     source = centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind]), 48.0)
     image = stamps.draw(source, np.array([96]), psf_of("vis"), 97, 97)
-    # What lies beyond the stamp is on blocks, which have another middle.
+    # Light outside the stamp is drawn on blocks, which have another centre.
     inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
     # A stamp that nothing is taken off is so to its edges.
@@ -342,7 +342,7 @@ SLIM = {
 }
 
 
-# Of the large ones by day one is enough.
+# Large sources that only nightly tests draw.
 LARGE = ("on edge", "turned a little")
 
 
@@ -352,8 +352,8 @@ LARGE = ("on edge", "turned a little")
 @pytest.mark.parametrize(
     "accuracy", [pytest.param(DRAFT, id="draft", marks=pytest.mark.nightly), pytest.param(SURVEY, id="survey")]
 )
-def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
-    """A frame of twice the stamp: nothing is doubled, and no pixel is darker than the noise allows."""
+def test_correction_of_slim_galaxies_removes_only_their_light(kind, accuracy):
+    """In a frame of twice the stamp size, no light is counted twice and no pixel is too dark."""
     shape = {"bulge_fraction": 1.0} | SLIM[kind]
     size = drawn(source_of("vis", 1e5, **shape), psf_of("vis"), accuracy=accuracy)[1]
     side = 2 * size
@@ -364,8 +364,8 @@ def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     assert image.min() > -accuracy.background * NOISE
 
 
-def test_light_of_a_disc_on_edge_leaves_its_stamp():
-    """It is as thick as it is high: as much leaves a small stamp as a large one has there."""
+def test_light_of_an_edge_on_disc_leaves_its_stamp():
+    """The light that leaves a small stamp equals the light that a large stamp has there."""
     source = source_of("vis", 1e6, inclination=90.0, disk_half_light_radius=0.8, position_angle=33.0)
     centred(source, 128.0)
     small, large = (stamps.draw(source, np.array([size]), psf_of("vis"), SIDE, SIDE) for size in (48, 512))
@@ -376,11 +376,11 @@ def test_light_of_a_disc_on_edge_leaves_its_stamp():
 
 
 @pytest.mark.parametrize("index", [1.4, 2.0, 3.0, 4.0])
-def test_a_stamp_gives_no_more_than_what_is_outside(index):
-    """The quadratic that describes what a slim galaxy's images send in may hold more than all of it."""
+def test_correction_is_at_most_the_light_outside_the_stamp(index):
+    """The quadratic model of the aliased light of a slim galaxy may exceed the light outside."""
     shape = {"bulge_fraction": 1.0, "bulge_sersic_index": index, "bulge_half_light_radius": 3.0}
     light = 0.0
-    # Its stamp lies beside the frame, left and right, alike on the blocks: there is no more than what leaves it.
+    # The stamp is outside the frame, to the left and to the right: the frame receives only the light that leaves it.
     for column in (-26.0, 2078.0):
         source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
         light += stamps.draw(source, np.array([48]), psf_of("vis"), 2048, 2048).sum()
@@ -390,7 +390,7 @@ def test_a_stamp_gives_no_more_than_what_is_outside(index):
 
 @cache
 def response(size, q):
-    """Of the ellipticity in a Gaussian window to shear, of a galaxy whose images overlap on small stamps."""
+    """Return the response of the weighted ellipticity to shear for a galaxy with aliased light on small stamps."""
     shape = {"bulge_fraction": 1.0, "bulge_sersic_index": 3.0, "bulge_half_light_radius": 1.0, "bulge_axis_ratio": q}
     y, x = np.mgrid[:128, :128] - 64
     found = []
@@ -402,22 +402,22 @@ def response(size, q):
 
 
 @pytest.mark.parametrize("q", [0.08, 0.1, 0.12])
-def test_of_steep_light_nothing_is_taken_off(q):
-    """Too slim for a quadratic: it is no worse than a stamp that keeps all of its light."""
+def test_steep_profiles_are_not_corrected(q):
+    """A galaxy too slim for a quadratic is drawn as well as on a stamp that keeps all of its light."""
     wrong = abs(response(64, q) - response(512, q))
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
         kept = abs(response.__wrapped__(64, q) - response(512, q))
     assert wrong < 1.05 * kept + 1e-3
 
 
-def test_what_is_taken_off_ends_by_and_by():
-    """From slim galaxies to round ones: no step that a sheared pair would take for shear."""
+def test_correction_fades_smoothly_with_axis_ratio():
+    """There is no step between slim and round galaxies that would bias the shear of a pair."""
     wrong = [abs(response(64, q) - response(512, q)) for q in np.arange(0.14, 0.22, 0.01).round(2).tolist()]
     assert max(wrong) < 0.6
 
 
-def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
-    """Along the stamp's own axes the terms of x^2 and of y^2 may take each other off, while both are small."""
+def test_correction_fades_smoothly_if_terms_cancel():
+    """Along the axes of the stamp, the terms x^2 and y^2 may cancel if both are small."""
     taken = []
     for q in np.arange(0.2, 0.3, 0.002):
         one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
@@ -443,7 +443,7 @@ def test_single_precision_is_as_good_as_double(camera, kind, monkeypatch):
 
 
 def photons(source, shape, n, rng, seeing, beta):
-    """Pixels (column, row) that n photons of a galaxy fall on."""
+    """Return the pixels (column, row) of n photons of a galaxy."""
     row = {**{k: v[0] for k, v in galaxies(0.0, 0.0, **shape).to_pydict().items()}}
     in_bulge = rng.random(n) < row["bulge_fraction"]
     index, angle = row["bulge_sersic_index"], 2 * np.pi * rng.random(n)
@@ -484,7 +484,7 @@ def test_photons_fall_where_the_image_is_bright(camera, kind):
     assert bright.sum() > 20
     assert (pull**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / bright.sum()))
     assert abs(pull).max() < 6
-    # What lies farther out, in one sum.
+    # Pixels farther out are summed.
     outside = ~bright
     assert counted[outside].sum() == pytest.approx(image[outside].sum(), abs=5 * np.sqrt(image[outside].sum() + 25))
 
@@ -496,8 +496,8 @@ def test_photons_fall_where_the_image_is_bright(camera, kind):
 @pytest.mark.parametrize(
     ("ra", "dec"), [(0.0, 90.0), (123.0, -90.0), (77.0, 89.9999), (0.0, 0.0), (359.99999, -45.0), (180.0, 60.0)]
 )
-def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
-    """A galaxy and a star by their sky positions: on their pixels, of their flux."""
+def test_sources_at_poles_and_at_zero_right_ascension(camera, ra, dec):
+    """A galaxy and a star at given sky positions have the right pixels and fluxes."""
     detector = small(camera, "3-4" if camera == "vis" else "R22_S11", 128)
     system = wcs(detector, *boresight_for(detector, ra, dec, 33.0))
     places = np.array([[40.2, 90.7], [88.4, 31.9]])
@@ -521,6 +521,6 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
     np.testing.assert_allclose(centre, places[0] - (10, 60), atol=0.05)
 
 
-def test_nothing_is_drawn_of_no_flux():
+def test_sources_without_flux_are_not_drawn():
     image, _ = drawn(source_of("vis", 0.0, **SHAPES["slim"]), psf_of("vis"))
     assert not image.any()

@@ -1,4 +1,4 @@
-"""Universes at the ends of what a request may ask for, and the heaviest halo there is in front of the field."""
+"""Test extreme requests, and the heaviest halo in front of a field."""
 
 from functools import cache
 
@@ -38,7 +38,7 @@ def drawn(seed, limit, z_max, cell=CELL):
 
 
 def with_either(cases):
-    """(case, seed): by day the one or the other end of the seeds in turn, by night both."""
+    """Return (case, seed): the smallest and largest seed in turn, or both in nightly runs."""
     return [
         pytest.param(*case, seed, marks=[] if number % 2 == turn else [pytest.mark.nightly])
         for number, case in enumerate(cases)
@@ -49,7 +49,7 @@ def with_either(cases):
 @pytest.mark.parametrize(
     ("limit", "z_max", "seed"), with_either([(16.0, 0.01), (29.0, 0.01), (16.0, 6.0), (29.0, 0.1)])
 )
-def test_the_ends_of_limit_and_redshift(seed, limit, z_max):
+def test_smallest_and_largest_limits_and_redshifts(seed, limit, z_max):
     rows, halos = drawn(seed, limit, z_max)
     assert validate.find_violations(rows, GALAXIES) == []
     assert validate.find_violations(halos, HALOS) == []
@@ -64,8 +64,8 @@ def test_the_ends_of_limit_and_redshift(seed, limit, z_max):
 @pytest.mark.parametrize(
     ("ra", "dec", "seed"), with_either([(0.0, 90.0), (0.0, -90.0), (0.0, 0.0), (266.405, -28.936)])
 )
-def test_poles_the_first_meridian_and_the_centre_of_the_galaxy(seed, ra, dec):
-    """Galaxies, and stars within the limit of the plane."""
+def test_poles_first_meridian_and_galactic_centre(seed, ra, dec):
+    """Draw galaxies, and stars up to the limit for the Galactic plane."""
     cell = int(sky.cell_at([ra], [dec], ids.GENERATION_ORDER)[0])
     rows, _ = drawn(seed, 19.0, 0.3, cell)
     assert validate.find_violations(rows, GALAXIES) == []
@@ -114,8 +114,8 @@ def lensed(heavy, ra, dec, chi):
     return {name: values.astype(float) for name, values in found.items()}
 
 
-def test_the_heaviest_halo_bends_and_shears_what_is_behind_it(heavy):
-    """By an arcminute and a half at most, away from its centre; and nothing in front of it."""
+def test_heaviest_halo_deflects_and_shears_background_galaxies(heavy):
+    """Deflections point away from its centre and are at most 1.5 arcmin; foreground galaxies stay in place."""
     ra, dec = heavy[2]
     far, near = (float(cosmology.comoving_distance(z)) for z in (1.0, 0.03))
     east = ra + np.array([1.0, 3.0, 8.0]) / 60.0 / np.cos(np.radians(dec))
@@ -131,7 +131,7 @@ def test_the_heaviest_halo_bends_and_shears_what_is_behind_it(heavy):
 
 
 def test_a_galaxy_exactly_behind_a_centre(heavy):
-    """Where the box shows the halo: it stays there, and its numbers are finite; a step aside it does not."""
+    """A galaxy at the centre of the halo stays in place with finite values; one next to it is deflected."""
     universe, cells, place = heavy
     around = halo_lensing.lens_of_cell(universe.lens, cells, CELL)
     near, far = (np.full(2, float(cosmology.comoving_distance(z))) for z in (0.05, 1.0))
@@ -149,7 +149,7 @@ def test_a_galaxy_exactly_behind_a_centre(heavy):
 
 
 def test_the_catalogue_behind_the_heaviest_halo(heavy):
-    """Rows are within their bounds; what lies at a caustic is set apart, and nothing is lost."""
+    """Rows are within their bounds; galaxies at caustics are separate, and no galaxy is lost."""
     universe, cells, _ = heavy
     rows = galaxies.draw(CELL, universe, cells, dust_map.load(SEED))
     hosts = galaxies.halo_table(CELL, universe.population, cells)

@@ -1,4 +1,4 @@
-"""A whole VIS exposure at the edges of what may be asked for: finite, within the converter, every electron counted."""
+"""VIS exposures with extreme settings are finite and in the range of the converter, and conserve charge."""
 
 import time
 from dataclasses import replace
@@ -35,7 +35,7 @@ def scene_of(shape, seconds=nominal.TIME, peak=1e11, light=0.0, middle=0, **over
 
 
 def through(frame, one, kind="science", forced=None, watch=None):
-    """Every effect of a kind of image, wanted or not."""
+    """Return every effect of an image type, required or not."""
     effects = vis.EFFECTS[kind]
     forced = {effect.name: True for effect in effects} | (forced or {})
     return apply_all(frame, effects, replace(one, forced=forced), lambda effect: stream(1, effect.name), watch)[0]
@@ -43,7 +43,7 @@ def through(frame, one, kind="science", forced=None, watch=None):
 
 @cache
 def compiled(age):
-    """All effects once, or the clock counts the compiler."""
+    """Apply all effects once, so that compilation is not timed."""
     for kind in vis.EFFECTS:
         through(np.zeros((2, 2)), scene_of((2, 2), light=1e11, **{"vis.cti.age": (age, "")}), kind)
 
@@ -75,8 +75,8 @@ def test_every_effect_on_every_frame(shape, age):
         ("vis.fpa.parallel_overscan", "pix"),
     ],
 )
-def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
-    """At both ends of what is allowed; beyond, the key is named before anything is drawn."""
+def test_effects_accept_all_allowed_values(key, unit):
+    """Effects accept the limits of each value; values outside are refused by name before drawing."""
     least, most = (edge(value[i] for value in bounds_of_parameter(key)) for i, edge in enumerate((max, min)))
     shape = (8, 8)
     for value in (least, most):
@@ -91,7 +91,7 @@ def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
 
 @pytest.mark.parametrize("kind", vis.EFFECTS)
 def test_rows_between_the_halves_are_not_read(kind):
-    """Four rows, in a frame as full as may be: quadrants are smaller by them, and hold what both halves do."""
+    """With four such rows in a full frame, quadrants are smaller and contain only the pixels of both halves."""
     frame = max(scenes((SIDE, SIDE)).values(), key=np.sum)
     one = scene_of((SIDE, SIDE), light=float(frame.max()), middle=4)
     found = {}
@@ -113,8 +113,8 @@ def test_rows_between_the_halves_are_not_read(kind):
 
 @pytest.mark.parametrize("seconds", [0.0, 1e5])
 @pytest.mark.parametrize("kind", vis.EFFECTS)
-def test_exposures_of_no_time_and_of_a_day(kind, seconds):
-    """In no time there is neither sky nor dark current; in a day the sky is near full well."""
+def test_exposure_times_of_zero_and_one_day(kind, seconds):
+    """There is no sky or dark current in 0 s; the sky is near full well in one day."""
     one = scene_of((SIDE, SIDE), seconds, peak=0.0)
     quiet = nominal.off("cosmic_rays", "readout_cosmic_rays", "hot_pixels", "pixel_response")
     through(np.zeros((2, 2)), scene_of((2, 2), seconds, peak=0.0), kind)
@@ -132,8 +132,8 @@ def test_exposures_of_no_time_and_of_a_day(kind, seconds):
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1e5])
-def test_sources_in_no_time_and_in_a_day(seconds):
-    """From the catalogue on: nothing of them, or all that wells and converter hold."""
+def test_sources_with_exposure_times_of_zero_and_one_day(seconds):
+    """Sources give no electrons in 0 s, and saturate in one day."""
     started = time.process_time()
     places = [100.0, 30.0, 200.0], [100.0, 220.0, 40.0]
     one = nominal.rendered(
@@ -148,7 +148,7 @@ def test_sources_in_no_time_and_in_a_day(seconds):
 
 
 def counted(frame, one):
-    """Electrons through bleeding and both transfers: (before, after, trapped, lost); no other effect between them."""
+    """Return electrons (before, after, trapped, lost) for bleeding and both transfers."""
     seen = {}
 
     def watch(name, before, after):
@@ -168,7 +168,7 @@ def counted(frame, one):
 
 
 @pytest.mark.parametrize("scene", scenes((2, 2)))
-def test_charge_is_in_the_frame_or_trapped_or_counted_as_lost(scene):
+def test_charge_is_conserved(scene):
     frame = scenes((SIDE, SIDE))[scene]
     before, after, trapped, lost = counted(frame, scene_of((SIDE, SIDE), **END))
     assert after.sum() + trapped + lost == pytest.approx(before, rel=1e-12)
@@ -178,7 +178,7 @@ def test_charge_is_in_the_frame_or_trapped_or_counted_as_lost(scene):
 
 
 def test_the_brightest_star_is_rendered():
-    """1e11 electrons: a frame full of charge, no number lost, and its neighbour's light still counted."""
+    """A star of 1e11 electrons saturates the frame; values are finite, and the neighbour keeps its light."""
     detector = small("vis", "3-4", 256)
     mag = 25.93 + 2.5 * np.log10(nominal.TIME / 1e11)
     started = time.process_time()

@@ -1,4 +1,4 @@
-"""A disc that fails: every call that changes it is counted, and the n-th can raise, stop the world, or wait.
+"""Simulate disc failures: calls that change the disc are counted, and the n-th can raise, end the process, or wait.
 
 with Disc(lake, fail_at=7): ...          the 7th call raises OSError
 with Disc(lake, die_at=7): ...           from the 7th call on nothing reaches the disc, as after kill -9
@@ -16,11 +16,11 @@ from lake_schema.store import parquet
 
 
 class Killed(BaseException):
-    """The process is dead; nothing that it still does can be seen from outside."""
+    """Raised when the simulated process dies; later operations have no effect on the disc."""
 
 
 class Disc:
-    """Counts `mkdir`, `open` for writing, `flush`, `fsync`, `rename`, `symlink`, `unlink`, `rmdir`, Parquet writes."""
+    """Count `mkdir`, `open` for writing, `flush`, `fsync`, `rename`, `symlink`, `unlink`, `rmdir`, Parquet writes."""
 
     def __init__(self, root, fail_at=0, die_at=0, at=None):
         self.root, self.fail_at, self.die_at, self.at = str(Path(root).resolve()), fail_at, die_at, at
@@ -106,7 +106,7 @@ class Disc:
 
 
 class _Text(io.StringIO):
-    """A text file whose flush is counted; what was not flushed before a death never reaches the disc."""
+    """Text file whose flush is counted; text that was not flushed before a death is lost."""
 
     def __init__(self, stream, disc, path):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Readers of what users give, fed with mutations of good files, with structure and with bytes.
+"""Run readers of user files on mutations of valid files, of their structure and of their bytes.
 
 A reader returns or raises a LakeError of one line, within bounds of time and memory, and writes nothing. Mutations are
 numbered: the same number of a target is the same input, on any machine.
@@ -63,7 +63,7 @@ TARGETS = {name: Target(*rest) for name, rest in fuzz_targets.TARGETS.items()}
 
 
 def mutated(seeds, number):
-    """The mutation of a number: one to six changes of one of the seeds."""
+    """Return mutation `number`: one to six changes of one of the seeds."""
     rng = random.Random(number)
     data = rng.choice(seeds)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
@@ -148,7 +148,7 @@ def line(data, rng, seeds):
 
 
 def card(data, rng, seeds):
-    """A card of a FITS header gets another value, or another card's place."""
+    """Replace the value of a FITS card, or move the card."""
     if not data.startswith(b"SIMPLE"):
         return number(data, rng, seeds)
     end = 80 * rng.choice((30, 40, 80))
@@ -173,7 +173,7 @@ def _too_long(signum, frame):
 
 
 def judged(target, path):
-    """What is wrong with how a reader takes a file, empty where nothing is."""
+    """Return the fault of a reader for a file, or "" if there is none."""
     started = time.process_time()
     signal.setitimer(signal.ITIMER_PROF, 5 * MOST_SECONDS)
     try:
@@ -193,7 +193,7 @@ def judged(target, path):
 
 
 def _child(target, seeds, folder, numbers, report):
-    """In a process of its own: what a mutation breaks must not be us."""
+    """Run mutations in a separate process, which may crash."""
     faulthandler.disable()
     signal.signal(signal.SIGPROF, _too_long)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -224,7 +224,7 @@ def run(name, first, count, keep=None):
         seeds = target.seeds()
         for seed in seeds:
             (folder / "in" / f"x{target.ending}").write_bytes(seed)
-            # What is slow only once: imports, caches.
+            # Imports and caches are slow only the first time.
             target.read(folder / "in" / f"x{target.ending}")
         found, last = [], first + count
         while first < last:

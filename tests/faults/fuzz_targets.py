@@ -1,4 +1,4 @@
-"""What is fuzzed: of each reader good inputs, what reads one, its ending, and whether it may kill its process."""
+"""Targets of fuzzing: valid inputs, reader, file ending, and whether the reader may end its process."""
 
 import io
 import json
@@ -116,7 +116,7 @@ VIS,vis,euclid_vis,10.0,-20.5,30.0,60906.5,560,,,,,,science
 
 
 def written(write):
-    """The bytes that something writes to a path."""
+    """Return the bytes that a function writes to a path."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / "x")
         return (Path(folder) / "x").read_bytes()
@@ -227,7 +227,7 @@ def lake():
 
 
 def of_manifest(path):
-    """With a seal of its own, so that what is behind the seal is tried as well."""
+    """Add a valid seal, so that the content is tested as well."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "lake"
         shutil.copytree(lake(), root, symlinks=True)
@@ -297,7 +297,7 @@ def psfex():
 
 
 def basel():
-    """One model, of the wavelengths that every file of these has the number of."""
+    """Return one model with the number of wavelengths of all these files."""
     grid = np.linspace(100.0, 24_000.0, 1221)
     text = "".join(f"{x:10.1f}" + "\n" * (i % 8 == 7) for i, x in enumerate(grid)) + "\n"
     head = f"{1:6d}{5750:6d}{4.5:6.2f}{-0.5:6.2f}{2.0:6.2f}{0.7:6.2f}\n"
@@ -306,7 +306,7 @@ def basel():
 
 
 def table_targets(name, columns, reader, **more):
-    """A reader of tables, by ending."""
+    """Return the targets of a reader of tables for each file ending."""
     return {
         f"{name}, CSV": (lambda: [as_csv(columns)], reader, ".csv"),
         f"{name}, FITS": (lambda: [as_fits(columns, **more), packed(as_fits(columns, **more))], reader, ".fits"),

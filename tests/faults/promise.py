@@ -1,4 +1,4 @@
-"""What must hold after any accident: a reader sees a whole version or none, a second run repairs it."""
+"""Check versions after a failure: a reader finds a complete version or none, and a second run repairs the lake."""
 
 from functools import partial
 
@@ -20,7 +20,7 @@ def key(kind, seed):
 
 
 def current(root, kind, request=None):
-    """Key of the version that a reader sees, None where there is none; fails where it is not whole."""
+    """Return the key of the current version, or None; fail if it is incomplete."""
     try:
         version = read.version(root, kind, request=request)
     except BadInput:
@@ -34,6 +34,6 @@ def current(root, kind, request=None):
 
 
 def sums(root, kind, version_key=None):
-    """sha256 of every file of a version, the manifest included in its digest."""
+    """Return the sha256 of every file of a version, including the manifest."""
     manifest = read.version(root, kind, version_key).manifest
     return {entry["path"]: entry["sha256"] for entry in manifest["files"]}

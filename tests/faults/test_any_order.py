@@ -1,4 +1,4 @@
-"""Publish, fail, die, resume, read, verify, clean in any order: the promise holds at every step."""
+"""Publish, fail, die, resume, read, verify and clean in any order: versions are complete at every step."""
 
 import os
 import tempfile
@@ -19,7 +19,7 @@ CALL = st.integers(1, 70)
 
 
 class Lake(RuleBasedStateMachine):
-    """One table; the model is the set of keys that may be current."""
+    """State machine of one table; its model is the set of keys that may be current."""
 
     opened = Bundle("opened")
 
@@ -59,7 +59,7 @@ class Lake(RuleBasedStateMachine):
         if any((self.root / "plain").glob("*")):
             garbage.collect(self.root, "plain", delete=True)
         else:
-            # Not begun, or killed before it had more than the folder: there is no table yet, and gc says so.
+            # The run was not started, or was killed before it wrote files: gc reports that there is no table.
             with pytest.raises(BadInput, match="no table plain"):
                 garbage.collect(self.root, "plain", delete=True)
 
@@ -101,13 +101,13 @@ class Lake(RuleBasedStateMachine):
     ("sequences", "steps"),
     [pytest.param(25, 12, id="short"), pytest.param(200, 20, id="long", marks=pytest.mark.nightly)],
 )
-def test_the_promise_in_any_order(sequences, steps):
+def test_versions_stay_complete_in_any_order_of_operations(sequences, steps):
     profile = settings(max_examples=sequences, stateful_step_count=steps, deadline=None)
     run_state_machine_as_test(Lake, settings=profile)
 
 
-def test_the_machine_can_fail():
-    """A publisher that swaps its link before the folder is whole is caught."""
+def test_the_state_machine_detects_a_bad_publisher():
+    """A publisher that changes the link before the folder is complete is detected."""
 
     class Broken(Lake):
         def _make(self, seed, **accident):

@@ -1,4 +1,4 @@
-"""Whatever is wrong with what a command is given: one line that names it, exit status 2, nothing written, soon."""
+"""Invalid input of a command gives one line that names it and exit status 2, quickly and without output files."""
 
 import os
 import signal
@@ -40,7 +40,7 @@ from truesky.request.from_toml import parse
 from truesky.running import submitted_job
 
 JOB = Path(__file__).resolve().parents[2] / "jobs" / "render" / "plan_exposures.py"
-# What has no bound takes minutes; a slow machine's imports take seconds.
+# An unbounded read takes minutes; imports on a slow machine take seconds.
 MOST_SECONDS = 30.0
 JOBS = {
     module.JOB.name: module.JOB
@@ -54,7 +54,7 @@ def run(name, lake, path):
     return submitted_job.main(JOBS[name], ["--lake", lake, "--request", path])
 
 
-# Commands by what they are given: a lake, a request, a file or folder to write to.
+# Commands by their argument: a lake, a request, an output file or folder.
 OF_LAKE = {
     **{name: partial(run, name) for name in JOBS},
     "explore": lambda lake, good: explore.main(["SELECT 1", "--lake", lake]),
@@ -85,7 +85,7 @@ OF_TARGET = {
     "export_galaxies": lambda out, lake: export_galaxies.main(["--lake", lake, "--out", out, "--form", "fits"]),
 }
 
-# Names that no file can have, or that nobody would wait for.
+# Names that files cannot have, or whose reading would not end.
 NAMES = {
     "NUL": "a\0b", "5,000 characters": "x" * 5000, "5,000 folders": "x/" * 5000 + "y", "no such user": "~nosuchuser/x",
     "a line break": "a\nb/c", "not of this encoding": "\ud800x", "empty": "",
@@ -101,7 +101,7 @@ def loop(path):
     path.symlink_to(path)
 
 
-# Things that are no file, or no end of one: what makes them at a path.
+# Functions that make unusual files at a path.
 THINGS = {
     "a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a folder": lambda path: path.mkdir(),
     "10 GB": sparse, "a loop": loop, "nothing": lambda path: None,
@@ -137,7 +137,7 @@ NO_MISSION = [name for name in TEXTS if "of vertices" in name or "sky" in name o
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    """Nothing is started, and what waits for a pipe or the end of a device is stopped."""
+    """Prevent the start of jobs, and stop readers that wait for a pipe or the end of a device."""
 
     def fail(*arguments):
         raise AssertionError("a session was asked for")
@@ -156,7 +156,7 @@ def tree(folder):
 
 
 def refused(folder, capsys, call, *arguments):
-    """The one line that a command ends with."""
+    """Return the single error line of a command."""
     before, started = tree(folder), time.process_time()
     assert call(*arguments) == 2
     assert time.process_time() - started < MOST_SECONDS
@@ -173,7 +173,7 @@ def good(tmp_path):
 
 
 @pytest.mark.parametrize("call", OF_LAKE.values(), ids=OF_LAKE)
-def test_a_lake_that_is_none(tmp_path, capsys, good, call):
+def test_an_invalid_lake_is_refused(tmp_path, capsys, good, call):
     for what in ("NUL", "5,000 characters", "5,000 folders", "no such user", "empty"):
         name = NAMES[what]
         refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] not in ("", "~") else name, good)
@@ -184,7 +184,7 @@ def test_a_lake_that_is_none(tmp_path, capsys, good, call):
 
 
 @pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
-def test_a_request_that_is_none(tmp_path, capsys, call):
+def test_an_invalid_request_file_is_refused(tmp_path, capsys, call):
     for name in NAMES.values():
         refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] != "~" else name, str(tmp_path / "new"))
     for thing, make in THINGS.items():
@@ -195,7 +195,7 @@ def test_a_request_that_is_none(tmp_path, capsys, call):
 
 
 @pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
-def test_a_request_of_bad_contents(tmp_path, capsys, call):
+def test_a_request_with_invalid_content_is_refused(tmp_path, capsys, call):
     for name, text in TEXTS.items():
         if name in NO_MISSION and call is OF_REQUEST["mission diff"]:
             continue
@@ -205,7 +205,7 @@ def test_a_request_of_bad_contents(tmp_path, capsys, call):
 
 
 @pytest.mark.parametrize("call", OF_TARGET.values(), ids=OF_TARGET)
-def test_a_file_that_cannot_be_written(tmp_path, capsys, call):
+def test_an_unwritable_output_file_is_refused(tmp_path, capsys, call):
     lake = tmp_path / "lake"
     lake.mkdir()
     publish.make_version(lake, plain_plan(), plain_work)
@@ -262,19 +262,19 @@ OWN = {
 
 
 def quoted(text):
-    """As TOML has it."""
+    """Return a text as a TOML string."""
     return '"' + text.replace("\0", "\\u0000").replace("\n", "\\n") + '"'
 
 
 @pytest.fixture(scope="module")
 def warm():
-    """What is made once a machine, and costs more than a refusal may."""
+    """Fill the caches that are made once per machine, because they take longer than the limit."""
     inputs.read(UserCurves())
 
 
 @pytest.mark.usefixtures("warm")
 @pytest.mark.parametrize(("key", "read"), OWN.values(), ids=OWN)
-def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
+def test_an_invalid_file_named_in_a_request_is_refused(tmp_path, key, read):
     names = [name for what, name in NAMES.items() if what not in ("not of this encoding", "empty")]
     for suffix in (".fits", ".csv", ".parquet"):
         for thing, make in THINGS.items():
@@ -297,7 +297,7 @@ def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
     assert tree(tmp_path) == before
 
 
-def test_every_kind_of_file_has_a_size_that_is_named(tmp_path, monkeypatch):
+def test_every_kind_of_file_has_a_size_limit(tmp_path, monkeypatch):
     for size, kind in enumerate(user_files.MAX_BYTES):
         monkeypatch.setitem(user_files.MAX_BYTES, kind, size)
     for size, kind in enumerate(user_files.MAX_BYTES):
@@ -327,7 +327,7 @@ def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch
         pytest.param(b"caf\xc3\xa9", b"export LC_ALL=C.UTF-8", marks=pytest.mark.nightly),
     ],
 )
-def test_a_question_mark_is_a_letter_where_no_java_was(tmp_path, name, words):
+def test_a_question_mark_is_valid_without_java(tmp_path, name, words):
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
     environment.pop("PYSPARK_GATEWAY_PORT", None)
     asked = [sys.executable, JOB, "--lake", tmp_path / "lake"]

@@ -28,8 +28,8 @@ from truesky.render.render_exposures import read_truth
 TABLES = all_tables(["vis"])
 CELL = layout.cell_file(5, 1607)
 ROWS = 2
-# Bits of each file: a sample, or all of them; of larger files, which are mostly footer, one of each byte. Of those one
-# in so many, prime to 8, for all readers but one: they compare the same blocks. So do they of a sample.
+# Number of flipped bits per file: a sample, or all bits. In larger files, which are mostly footer, one bit per byte.
+# Most readers test only every n-th of these (n is prime to 8), because all readers compare the same blocks.
 SMALL = 8192
 SPREAD, SHARE = 17, 3
 BITS = [pytest.param(24, id="some"), pytest.param(None, id="every", marks=pytest.mark.nightly)]
@@ -37,7 +37,7 @@ MEMORY = 1_000_000_000
 
 
 def published(root, table, rows, name="a"):
-    """A version of a table that holds these rows in one file, and the same rows beside it, as jobs keep some."""
+    """Publish a version of a table with given rows in one file, and the same rows in a sidecar file."""
     part = Task(CELL if table.is_catalogue else "all.parquet", {})
     beside = {"beside/x.parquet": lambda path: parquet.write(path, rows, table)}
     publish.make_version(root, Plan(table, {"name": name}, (part,)), lambda lake, facts: Output(rows, beside))
@@ -45,7 +45,7 @@ def published(root, table, rows, name="a"):
 
 
 def asking(version, text):
-    """What the explorer's process does with a query that it let through."""
+    """Return the result of an allowed query in the process of the explorer."""
     query = check_query(text, {version.table: version.key})
     root = version.folder.parents[1]
 
@@ -57,7 +57,7 @@ def asking(version, text):
 
 
 def readers(version, table):
-    """Name -> a function that reads the version, once open, as `rows`, the jobs, the explorer and cones do."""
+    """Return name -> function that reads an open version like `rows`, the jobs, the explorer and cones."""
     names = [column.name for column in table.columns]
     some = [names[0], names[-1]]
     found = {
@@ -76,14 +76,14 @@ def readers(version, table):
 
 
 def flip(path, bit):
-    """Turn one bit of a file over, without a new time of change or a new file: twice is not at all."""
+    """Flip one bit of a file in place and keep its time; a second call restores the file."""
     with path.open("r+b", buffering=0) as stream:
         (byte,) = os.pread(stream.fileno(), 1, bit // 8)
         os.pwrite(stream.fileno(), bytes([byte ^ 1 << bit % 8]), bit // 8)
 
 
 def answer(reader):
-    """What a reader gives: (rows, None) or (None, why it refused)."""
+    """Return (rows, None), or (None, message) if the reader refuses the file."""
     try:
         return reader(), None
     except Damaged as error:
@@ -91,7 +91,7 @@ def answer(reader):
 
 
 def harmed(path, bits, reader, step=1):
-    """(bits with which a reader refused the file by name, bits tried); with any other it must give the same rows.
+    """Return (bits for which a reader refused the file by name, bits tried); other bits must not change the rows.
 
     bits : how many, None = all of them, or one in `step`
     """
@@ -122,8 +122,8 @@ def test_a_flipped_bit_of_any_table_is_refused_by_name(lake, table, bits, record
 
 @pytest.mark.parametrize("bits", BITS)
 @pytest.mark.parametrize("name", ["quarantine", "rendered_truth", "gaia"])
-def test_a_flipped_bit_beside_a_table_is_refused_by_name(lake, name, bits, record_property):
-    """What other tables are made from: rows beside a part, rows of a margin."""
+def test_a_flipped_bit_in_a_sidecar_file_is_refused_by_name(lake, name, bits, record_property):
+    """Check the rows that other tables are made from: sidecar files of a task and rows of a margin."""
     (table,) = (table for table in TABLES if table.name == name)
     version = published(lake, table, rows_of(table, ROWS))
     files = {"beside/x.parquet": lambda: version.read_sidecar("beside/x.parquet")}
@@ -136,7 +136,7 @@ def test_a_flipped_bit_beside_a_table_is_refused_by_name(lake, name, bits, recor
 
 
 def rows_beside(root, name, beside, relative, facts):
-    """A version of a table of two rows, with rows of another table in a file beside it."""
+    """Make a version of a table of two rows, with rows of another table in a sidecar file."""
     (table,) = (table for table in TABLES if table.name == name)
     given = rows_of(table, ROWS)
     part = Task(CELL if table.is_catalogue else "all.parquet", facts)
@@ -148,7 +148,7 @@ def rows_beside(root, name, beside, relative, facts):
 @pytest.mark.parametrize("bits", BITS)
 @pytest.mark.parametrize("made", ["rendered_truth", "quarantine"])
 def test_a_table_is_not_made_from_rows_with_a_flipped_bit(lake, made, bits):
-    """The jobs that gather what other jobs kept beside their tables."""
+    """Run the jobs that read the sidecar files of other jobs."""
     (table,) = (table for table in TABLES if table.name == made)
     if made == "quarantine":
         cells = [1607 << 6]
@@ -174,7 +174,7 @@ def test_a_table_is_not_made_from_rows_with_a_flipped_bit(lake, made, bits):
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory):
-    """A file of several row groups, whose columns lie in blocks of their own."""
+    """Return a file of several row groups, in which each column has separate blocks."""
     root = tmp_path_factory.mktemp("large")
     rows = toy_rows(1607, 3 * parquet.ROWS_PER_GROUP)
     # Identifiers in no order, whose pages are not small.
@@ -183,7 +183,7 @@ def large(tmp_path_factory):
 
 
 def spans(version, part):
-    """(column or "", row group, first byte, last byte + 1) of all that the file holds, the footer last."""
+    """Return (column or "", row group, first byte, last byte + 1) of all sections of the file; the footer is last."""
     path = version.partition_path(part)
     about = pq.read_metadata(path)
     found = []
@@ -196,8 +196,8 @@ def spans(version, part):
 
 
 @pytest.mark.parametrize("flips", [1, pytest.param(300, marks=pytest.mark.nightly)])
-def test_of_a_large_file_what_is_read_is_compared(large, flips):
-    """A flip in what is asked for is refused, also where a page's own checksum does not reach; others are not seen."""
+def test_checksums_of_read_blocks_are_verified(large, flips):
+    """A flipped bit in the read columns is refused, also outside the checksums of pages; other bits have no effect."""
     part = large.partitions[0]
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
     ra, dec = (large.rows([name])[name].to_numpy()[parquet.ROWS_PER_GROUP + 1000] for name in ("ra", "dec"))
@@ -216,7 +216,7 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
         assert good.num_rows
         for column, group, start, end in spans(large, part):
             needed = not column or (column in columns and group in groups)
-            # What is read with the footer.
+            # These bytes are read together with the footer.
             with_footer = end > path.stat().st_size - (64 << 10)
             # A page's header is where its chunk begins.
             for bit in [8 * start, 8 * start + 60, *rng.integers(8 * start, 8 * end, flips).tolist()]:
@@ -228,8 +228,8 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
                 assert needed or with_footer or not why
 
 
-def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
-    """A reading of one column in one row group asks for few bytes beside those."""
+def test_reading_a_column_reads_only_its_bytes(large, monkeypatch):
+    """Reading one column of one row group reads few other bytes."""
     read_bytes = []
     one = blocks.VerifiedFile._read_range
 
@@ -247,8 +247,8 @@ def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
 
 
 @pytest.mark.parametrize("what", ["columns", "row groups"])
-def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
-    """Each piece carries a checksum that is right, wherever it stands."""
+def test_swapped_pieces_of_equal_length_are_refused(lake, what):
+    """The checksum of each piece stays correct at the other position."""
     n = 2 * parquet.ROWS_PER_GROUP
     rows = replace(PLAIN, name="wide", columns=tuple(replace(PLAIN.columns[1], name=c) for c in "ab"), key=("a",))
     rng = np.random.default_rng(3)
@@ -271,8 +271,8 @@ def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
     assert read.find_faults(version, deep=True) == [f"{path} has other contents than the manifest says"]
 
 
-def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
-    """A hand that rewrites a file and its entry, but not how many rows there were."""
+def test_a_number_of_rows_that_differs_from_the_manifest_is_refused(lake):
+    """Rewrite a file and its entry in the manifest, but not the number of rows."""
     folder = publish.make_version(lake, plain_plan(), plain_work)
     version = read.version(lake, "plain")
     path = version.partition_path("1.parquet")
@@ -310,7 +310,7 @@ def packed(path):
 
 
 def swapped(whole, rng):
-    """The bytes of a file with two stretches of its 4-byte words in each other's places, and not the same words."""
+    """Return the bytes of a file with two different ranges of 4-byte words swapped."""
     words = np.frombuffer(whole, ">u4")
     while True:
         n = int(rng.integers(1, 40))
@@ -325,8 +325,8 @@ def swapped(whole, rng):
 
 
 @pytest.mark.parametrize("writer", [picture, packed])
-def test_pieces_of_an_image_that_changed_places_are_refused(lake, writer):
-    """The sums that FITS keeps do not see it; the manifest's sha256 does."""
+def test_swapped_pieces_of_an_image_are_refused(lake, writer):
+    """The checksums in FITS do not detect it; the sha256 in the manifest does."""
     publish.make_version(
         lake, plain_plan(parts=1), lambda root, facts: Output(plain_work(root, facts).rows, {"images/a.fits": writer})
     )
@@ -340,8 +340,8 @@ def test_pieces_of_an_image_that_changed_places_are_refused(lake, writer):
 
 
 @pytest.mark.parametrize("trials", [300, pytest.param(20_000, marks=pytest.mark.nightly)])
-def test_a_packed_image_whose_pieces_changed_places_is_read_or_refused_in_one_line(tmp_path, trials):
-    """Outside a lake: its checksums are right, so what is unpacked may be anything."""
+def test_a_compressed_image_with_swapped_pieces_is_read_or_refused(tmp_path, trials):
+    """Outside a lake, the checksums stay correct, so the decompressed values are arbitrary."""
     path = tmp_path / "a.fits"
     packed(path)
     whole, rng, refused = path.read_bytes(), np.random.default_rng(7), 0

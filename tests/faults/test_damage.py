@@ -1,4 +1,4 @@
-"""Published files that are harmed afterwards: no reader of ours takes a changed byte for a number."""
+"""Damage published files: no reader returns a number from a changed byte."""
 
 import os
 import shutil
@@ -99,7 +99,7 @@ def test_a_truncated_file_is_refused_before_use(toy, images, kind):
 
 @pytest.mark.parametrize("kind", ["rows", "image"])
 @pytest.mark.parametrize("harm", ["delete", "add", "rename", "link", "swap parts", "swap versions"])
-def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
+def test_an_edited_folder_is_named(lake, toy, images, kind, harm):
     version = toy if kind == "rows" else images
     first, second = (
         (version.partition_path(p) for p in version.partitions[:2])
@@ -146,7 +146,7 @@ def test_a_damaged_version_is_not_published_again(toy, lake):
 
 
 @given(st.data())
-def test_verify_finds_any_one_change(tmp_path_factory, data):
+def test_verify_detects_any_change(tmp_path_factory, data):
     root = tmp_path_factory.mktemp("lake")
     folder = promise.make(root, "plain", data.draw(st.integers(1, 5)))
     assert read.find_faults(read.version(root, "plain"), deep=True) == []
@@ -171,8 +171,8 @@ def test_verify_finds_any_one_change(tmp_path_factory, data):
         assert change in ("flip", "append")
 
 
-def test_rows_of_another_cell_are_found_by_verify(lake):
-    """A hand that rewrites a file and its manifest is still found out by the rows themselves."""
+def test_verify_detects_rows_of_another_cell(lake):
+    """The rows reveal the change even if a file and its manifest are rewritten."""
     from lake_schema.store import manifest, parquet
 
     folder = publish.make_version(lake, toy_plan(), toy_work)

@@ -1,4 +1,4 @@
-"""A disc that fails or stops at any of its calls: the last version stays whole, and the next run repairs everything."""
+"""Let the disc fail or stop at any call: the last version stays complete, and the next run repairs the lake."""
 
 import shutil
 
@@ -28,7 +28,7 @@ def wanted(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def older(tmp_path_factory):
-    """Kind -> a function that gives a new lake with an older version, which is made once."""
+    """Return kind -> function that returns a new lake with an older version, which is made once."""
     roots = {kind: tmp_path_factory.mktemp("older") for kind in promise.KINDS}
     for kind, root in roots.items():
         promise.make(root, kind, 1)
@@ -40,7 +40,7 @@ def older(tmp_path_factory):
 
 
 def calls(older, kind):
-    """How often a run touches the disc where an older version is there."""
+    """Return the number of disc calls of a run if there is an older version."""
     root = older(kind)
     with Disc(root) as disc:
         promise.make(root, kind, 2)
@@ -71,7 +71,7 @@ def test_any_call_may_fail(kind, stride, wanted, older):
 
 @pytest.mark.parametrize(("kind", "stride"), SHORT + LONG)
 def test_death_at_any_call(kind, stride, wanted, older):
-    """From one call on nothing reaches the disc, not even what `finally` would do: kill -9 without a process."""
+    """After a given call nothing reaches the disc, including `finally` blocks, like kill -9."""
     seen = set()
     for n in range(calls(older, kind), 0, -stride):
         root = older(kind)
@@ -110,7 +110,7 @@ def test_death_in_gc_leaves_no_half_version(older):
 
 @pytest.fixture(scope="module")
 def two_requests(tmp_path_factory):
-    """A function that gives a new lake in which a and b have a version each, and an older one is nobody's."""
+    """Return a function that makes a lake with a version of each of a and b and an unused older version."""
     root = tmp_path_factory.mktemp("two")
     for name, seed in (("a", 4), ("a", 1), ("b", 3)):
         promise.make(root, "plain", seed, name=name)
@@ -122,7 +122,7 @@ def versions(root):
 
 
 @pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.nightly)])
-def test_death_between_any_two_steps_leaves_every_request_its_version(stride, two_requests):
+def test_death_at_any_step_keeps_the_versions_of_all_requests(stride, two_requests):
     """The one that publishes has its old or its new version, whole, the other its own; then gc takes from neither.
 
     Every step that changes a link is tried, and one in `stride` of the others.
@@ -149,7 +149,7 @@ def test_death_between_any_two_steps_leaves_every_request_its_version(stride, tw
     assert found == {first, new}
 
 
-def test_death_in_gc_leaves_what_names_link_to(two_requests):
+def test_death_in_gc_keeps_linked_versions(two_requests):
     root = two_requests()
     with Disc(root) as disc:
         assert garbage.collect(root, delete=True) == [layout.version_folder(root, "plain", promise.key("plain", 4))]
@@ -180,13 +180,13 @@ def test_a_full_disc_is_a_clear_error(lake, work, most_bytes, file):
     assert read.find_faults(read.version(lake, "plain"), deep=True) == []
 
 
-def test_parts_that_failed_leave_no_temporary_files(lake):
+def test_failed_tasks_leave_no_temporary_files(lake):
     with Disc(lake, fail_at=5), pytest.raises(TasksFailed):
         promise.make(lake, "plain", 1)
     assert not list(lake.rglob("*.tmp*"))
 
 
-def test_a_plan_without_parts_is_an_empty_table(lake):
+def test_a_plan_without_tasks_gives_an_empty_table(lake):
     plan = plain_plan()
     publish.make_version(lake, Plan(plan.table, plan.facts, ()), plain_work)
     assert read.version(lake, "plain").rows().num_rows == 0

@@ -1,11 +1,11 @@
-"""Mutations of what users give: a line or a result, in bounded time and memory, and nothing left behind."""
+"""Mutated user files give an error line or a result, in bounded time and memory, without leftover files."""
 
 import pytest
 
 from tests.faults import fuzz
 
 RUNS, MANY_RUNS = 30, 6_000
-# Each mutation of a query asks DuckDB's parser, in a session of its own.
+# Each mutation of a query starts a new DuckDB session for its parser.
 SLOW = {"SQL": 10}
 
 
@@ -21,7 +21,7 @@ def test_many_mutations_are_read_or_refused(name, tmp_path):
 
 
 class Faulty:
-    """Readers that break each of the rules."""
+    """Readers that violate each of the rules."""
 
     @staticmethod
     def raises(path):
@@ -59,7 +59,7 @@ class Faulty:
         ("lingers", "TimeoutError"),
     ],
 )  # fmt: skip
-def test_what_breaks_a_rule_is_found(monkeypatch, reader, words):
+def test_violations_of_the_rules_are_detected(monkeypatch, reader, words):
     calls = []
 
     def read(path):
@@ -75,7 +75,7 @@ def test_what_breaks_a_rule_is_found(monkeypatch, reader, words):
     assert words in found[1]
 
 
-def test_a_number_is_always_the_same_mutation():
+def test_mutations_are_reproducible():
     seeds = [b"one = 1", b"two = [2, 3]"]
     assert [fuzz.mutated(seeds, n) for n in range(50)] == [fuzz.mutated(seeds, n) for n in range(50)]
     assert len({fuzz.mutated(seeds, n) for n in range(500)}) > 300
@@ -98,6 +98,6 @@ def test_a_number_is_always_the_same_mutation():
         ("Tycho-2", 17636),
     ],
 )
-def test_what_once_broke_is_refused(name, number):
-    """A column without numbers, a number of 40 digits, a degree, a seal, a key or axes without end."""
+def test_inputs_that_once_failed_are_refused(name, number):
+    """Examples: a column without numbers, a number of 40 digits, a huge degree, seal, key or number of axes."""
     assert fuzz.run(name, number, 1) == []

@@ -1,4 +1,4 @@
-"""A render on a cluster of which a worker dies and another is slow: each detector once, as one machine makes it."""
+"""Render on a cluster with a killed and a slow worker: each detector once, with the same bytes as in local mode."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def local(tmp_path_factory, request_file):
 
 @contextmanager
 def slowed(worker):
-    """A machine that has to stop again and again: whatever runs on a worker."""
+    """Stop and continue the processes of a worker repeatedly, to simulate a slow machine."""
     done = threading.Event()
 
     def stutter():
@@ -96,7 +96,7 @@ def tell(pids, number):
 
 
 def is_at_work(worker):
-    """Whether its executor has started Python for a task."""
+    """Return True if the executor has started Python for a task."""
     for pid in below(worker.pid):
         with suppress(OSError):
             if "pyspark.daemon" in Path(f"/proc/{pid}/cmdline").read_text():
@@ -110,7 +110,7 @@ def wait_for(driver, condition):
         time.sleep(0.1)
 
 
-def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
+def test_render_with_a_killed_and_a_slow_worker(local, request_file, tmp_path):
     lake = layout.resolve_lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
     for name in ("products", "rendered_truth"):
         shutil.rmtree(lake / name)
@@ -132,7 +132,7 @@ def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
             said, _ = driver.communicate(timeout=3000)
         assert driver.returncode == 0, said
         (log,) = (events(path) for path in (tmp_path / "events").iterdir())
-        # What the slow one still did when the job had ended, it has done: nothing of it is seen.
+        # Wait for the slow worker: its late results have no effect.
         time.sleep(5.0)
     check_events(log)
     check_once(lake)
@@ -140,7 +140,7 @@ def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
 
 
 def check_events(log):
-    """The dead one's tasks ran again; so did those of the slow one, of which the first copy to end counts."""
+    """Tasks of the killed and the slow worker ran again; the first copy that ends counts."""
     of = {kind: [one for one in log if one["Event"] == f"SparkListener{kind}"] for kind in
           ("ExecutorAdded", "ExecutorRemoved", "TaskStart", "TaskEnd", "StageSubmitted")}  # fmt: skip
     assert len(of["ExecutorAdded"]) == 4

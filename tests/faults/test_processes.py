@@ -1,4 +1,4 @@
-"""Processes that are killed, that race each other, that read while another publishes."""
+"""Test killed processes, concurrent publishers, and readers during publication."""
 
 import io
 import os
@@ -15,7 +15,7 @@ from tests.faults.disc import Disc
 
 
 def phases(root, kind):
-    """The numbers of the calls to the disc at which a run goes from one state to the next."""
+    """Return the indices of the disc calls at which a run changes its state."""
     promise.make(root, kind, 1)
     with Disc(root) as disc:
         promise.make(root, kind, 2)
@@ -57,7 +57,7 @@ def test_kill_9_at_every_phase(kind, wanted, tmp_path_factory):
 
 
 def race(root, seeds, stops):
-    """Two publishers, each paused at a call to the disc: the first, then the second, then both go on."""
+    """Run two publishers; each pauses at a disc call, first one, then the other, then both continue."""
     promise.make(root, "plain", 1)
     base = promise.key("plain", 1)
     answers = victims.CONTEXT.SimpleQueue()
@@ -75,7 +75,7 @@ def race(root, seeds, stops):
 
 @pytest.mark.parametrize("seeds", [(2, 2), (2, 3)], ids=["same plan", "two plans"])
 @pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.nightly)])
-def test_the_loser_of_a_race_is_told(every, seeds, plain_phases, tmp_path_factory):
+def test_the_second_of_two_publishers_gets_an_error(every, seeds, plain_phases, tmp_path_factory):
     stops = list(plain_phases.values())
     for i, first in enumerate(stops):
         for second in stops[i % every :: every]:
@@ -88,7 +88,7 @@ def test_the_loser_of_a_race_is_told(every, seeds, plain_phases, tmp_path_factor
             assert promise.current(root, "plain") in {promise.key("plain", seed) for seed in won}, where
             if len(set(seeds)) == 2:
                 assert len(won) == 1, where
-                # Who lost can begin again from what is there now.
+                # The second publisher can start again from the current version.
                 promise.make(root, "plain", 9)
                 assert promise.current(root, "plain") == promise.key("plain", 9)
 
@@ -108,7 +108,7 @@ def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
             version = read.version(lake, kind)
             rows = version.rows()
         except (BadInput, Damaged) as error:
-            # gc may remove an old version under a reader's feet; then it says so.
+            # gc may remove an old version while it is read; the error reports it.
             gone.append(str(error))
             continue
         whole += 1
@@ -145,8 +145,8 @@ def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
         assert promise.current(lake, "plain") == promise.key("plain", seed)
 
 
-def test_a_version_that_is_removed_while_it_is_read_is_said_to_be_missing(lake, tmp_path_factory):
-    """Each call of a reader to the disc, with the version gone just before it."""
+def test_a_version_removed_during_reading_is_reported_missing(lake, tmp_path_factory):
+    """Remove the version before each disc call of a reader."""
     promise.make(lake, "plain", 1)
     calls = _reads(lake, 0)
     assert calls > 5

@@ -1,4 +1,4 @@
-"""The same request gives the same bytes, whoever runs it and however often it broke; another one reuses nothing."""
+"""The same request gives the same bytes after any interruption; a different request reuses nothing."""
 
 import hashlib
 import os
@@ -42,7 +42,7 @@ def threads(workers):
 
 
 def retried(function, parts):
-    """Every part twice, as a scheduler may run it."""
+    """Run every task twice, as a scheduler may do."""
     return [function(part) for part in [*parts, *parts]]
 
 
@@ -53,7 +53,7 @@ HOW = (
 )
 
 
-def test_the_same_bytes_however_they_were_made(tmp_path):
+def test_bytes_do_not_depend_on_scheduling(tmp_path):
     found = {}
     for how, mapper in HOW.items():
         for past in ("fresh", "resumed"):
@@ -94,8 +94,8 @@ def _elsewhere(environment, umask):
 
 
 @pytest.mark.parametrize(("environment", "umask"), WORLDS)
-def test_the_same_bytes_in_another_place_and_time(environment, umask, capsys):
-    """As in this process, whose hashes of texts have another seed."""
+def test_bytes_do_not_depend_on_environment_and_time(environment, umask, capsys):
+    """Compare with this process, which has another seed of string hashes."""
     exec(_PRINT_SUMS, {})
     here = capsys.readouterr().out
     assert len(here) > 1000
@@ -118,7 +118,7 @@ def counted(made):
 @pytest.mark.parametrize(
     "change", [{"input": "b"}, {"mission": "b"}, {"request": {"seed": 2}}, {"code": "b"}], ids=lambda c: next(iter(c))
 )
-def test_nothing_stale_is_resumed(lake, change):
+def test_tasks_of_another_version_are_not_reused(lake, change):
     facts = {"seed": 1, "input": "a", "mission": "a", "request": {"seed": 1}, "code": "a"}
     before = Plan(PLAIN, facts, plain_plan().tasks)
     after = Plan(PLAIN, {**facts, **change}, plain_plan().tasks)
@@ -127,13 +127,13 @@ def test_nothing_stale_is_resumed(lake, change):
         publish.make_version(lake, before, counted(made))
     publish.make_version(lake, after, counted(made))
     assert made == [0, 1, 2, 0, 1, 2]
-    # What was done for the first plan is still good for it.
+    # Tasks of the first plan can still be resumed for it.
     publish.make_version(lake, before, counted(made))
     assert made[6:] == [1]
 
 
-def test_a_table_made_from_another_knows_it(lake):
-    """One changed row of an input changes its fingerprint, and so the key of what is made from it."""
+def test_fingerprint_depends_on_input_tables(lake):
+    """A changed row of an input changes its fingerprint and the key of tables made from it."""
     keys, prints = set(), set()
     for seed in (1, 2):
         publish.make_version(lake, plain_plan(seed), plain_work)
@@ -143,7 +143,7 @@ def test_a_table_made_from_another_knows_it(lake):
     assert len(keys) == len(prints) == 2
 
 
-def test_a_byte_of_code_or_data_is_another_code(tmp_path):
+def test_code_fingerprint_depends_on_every_byte(tmp_path):
     for package in ("lake_schema", "truesky"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     before = code_version(tmp_path)
@@ -179,12 +179,12 @@ def fewer(root, facts):
     ("work", "words"),
     [(silent, "must return an Output, got NoneType"), (fewer, "must have 20 rows by the plan, got 19")],
 )
-def test_a_maker_that_returns_too_little(lake, work, words):
+def test_a_task_with_an_incomplete_receipt_is_refused(lake, work, words):
     with pytest.raises(TasksFailed, match=words):
         publish.make_version(lake, plain_plan(), work)
 
 
-def test_a_part_that_raises_is_named_and_the_others_are_kept(lake):
+def test_a_task_that_raises_is_named_and_other_tasks_are_kept(lake):
     promise.make(lake, "plain", 1)
 
     def work(root, facts):
@@ -206,14 +206,14 @@ def toy_with_ids(root, facts):
 
 
 @pytest.mark.parametrize("number", [7, 7 << 46 | 7])
-def test_an_id_in_two_cells_names_both(lake, number):
+def test_a_duplicate_identifier_is_refused_with_both_cells(lake, number):
     parts = tuple(Task(p.name, {**p.facts, "id": number}) for p in toy_plan().tasks[:2])
     with pytest.raises(BadInput, match=rf"table toy: id {number} is in Npix=1607.parquet and in Npix=1608.parquet"):
         publish.make_version(lake, Plan(TOY, {}, parts), toy_with_ids)
     assert promise.current(lake, "toy") is None
 
 
-def test_scattered_ids_are_compared_too(lake):
+def test_duplicates_of_scattered_identifiers_are_detected(lake):
     rng = np.random.default_rng(1)
     spread = rng.integers(0, 2**62, 3000)
 
@@ -225,7 +225,7 @@ def test_scattered_ids_are_compared_too(lake):
         publish.make_version(lake, Plan(PLAIN, {}, tuple(Task(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
 
 
-def test_a_key_of_two_columns_in_two_parts(lake):
+def test_a_duplicate_key_of_two_columns_is_refused(lake):
     table = Table("pairs", 1, (Column("a", "int64", doc="a"), Column("b", "string", doc="b")), "Pairs.", key=("a", "b"))
 
     def work(root, facts):
@@ -239,7 +239,7 @@ def test_a_key_of_two_columns_in_two_parts(lake):
     ("column", "value", "words"),
     [("_healpix_29", (1607 << 48) + 5, "does not match its ra, dec"), ("_healpix_29", 1608 << 48, "another cell")],
 )
-def test_positions_that_do_not_agree(lake, column, value, words):
+def test_inconsistent_positions_are_refused(lake, column, value, words):
     def work(root, facts):
         rows = toy_rows(1607, 5)
         index = rows[column].to_numpy().copy()

@@ -1,4 +1,4 @@
-"""Accidents under Spark: kernels that raise, workers that die, drivers that are stopped or killed."""
+"""Failures under Spark: tasks that raise, workers that die, drivers that are stopped or killed."""
 
 import json
 import os
@@ -25,7 +25,7 @@ SLOW_JOB = Path(slow_job.__file__)
 
 
 def poisoned(root, facts):
-    """Toy rows, with what the files `raise-N`, `die-N` and `die-once-N` in the lake ask of part N."""
+    """Return toy rows, or fail as files `raise-N`, `die-N` and `die-once-N` in the lake require for task N."""
     part = facts["part"]
     if (root / f"raise-{part}").exists():
         raise ValueError("row 17: no such template")
@@ -71,7 +71,7 @@ def wanted(tmp_path_factory):
         pytest.param("die-1", "1.parquet: its worker ended unexpectedly", marks=pytest.mark.nightly),
     ],
 )
-def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm, words):
+def test_a_failed_task_is_named_and_other_tasks_are_kept(run, lake, wanted, harm, words):
     (lake / harm).touch()
     status, lines = run()
     assert (status, len(lines)) == (1, 1)
@@ -95,7 +95,7 @@ def test_a_worker_that_dies_once_is_replaced(run, lake, wanted):
 
 
 def started(lake, request_file):
-    """A spark-submit of the slow job, in a process group of its own."""
+    """Start spark-submit with the slow job in a new process group."""
     (lake / "slow").touch()
     submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
     command = [submit, str(SLOW_JOB), "--lake", str(lake), "--request", str(request_file)]
@@ -103,7 +103,7 @@ def started(lake, request_file):
 
 
 def receipts(lake):
-    """Of parts that are done: a worker that is stopped while it writes one leaves a temporary file, with a dot."""
+    """Return the receipts of finished tasks, without the temporary files of stopped workers (with a dot)."""
     return list(lake.glob("plain/.receipts-*/[!.]*.json"))
 
 
@@ -117,7 +117,7 @@ def past_first_receipt(lake, driver):
 
 @pytest.fixture
 def driver(lake, request_file):
-    """At work."""
+    """A driver that runs the slow job."""
     promise.make(lake, "plain", 1)
     running = started(lake, request_file)
     yield running
@@ -135,7 +135,7 @@ def driver(lake, request_file):
         pytest.param(signal.SIGKILL, "group", -signal.SIGKILL, id="SIGKILL to the group", marks=pytest.mark.nightly),
     ],
 )
-def test_a_driver_that_is_stopped(driver, lake, spark, request_file, number, whom, status):
+def test_a_stopped_driver_can_be_resumed(driver, lake, spark, request_file, number, whom, status):
     past_first_receipt(lake, driver)
     left = below(driver.pid)
     assert len(left) >= 3

@@ -1,4 +1,4 @@
-"""Processes that have accidents: forked from a clean server, so that each costs milliseconds."""
+"""Processes that fail, forked from a clean server so that each takes milliseconds."""
 
 import multiprocessing
 import os
@@ -22,7 +22,7 @@ CONTEXT.set_forkserver_preload(["tests.faults.victims"])
 
 
 def start(target, *args):
-    """A child process under way."""
+    """Start a child process."""
     process = CONTEXT.Process(target=target, args=args)
     process.start()
     return process
@@ -33,14 +33,14 @@ def _no_fsync(descriptor):
 
 
 def run(target, *args):
-    """Exit code of a child process."""
+    """Run a child process and return its exit code."""
     process = start(target, *args)
     process.join()
     return process.exitcode
 
 
 def kill_at(root, kind, seed, n):
-    """Publish, and be killed at the n-th call to the disc."""
+    """Publish a version, and end at the n-th disc call."""
     os.fsync = _no_fsync
 
     def shoot(call, what, path):
@@ -52,7 +52,7 @@ def kill_at(root, kind, seed, n):
 
 
 def stop_at(root, kind, seed, n, base, reached, go, answers):
-    """Publish, and wait at the n-th call to the disc until told to go on."""
+    """Publish a version, and wait at the n-th disc call for a signal to continue."""
     os.fsync, locks.TABLE_TIMEOUT, locks.SHORT_TIMEOUT = _no_fsync, PATIENCE, PATIENCE
 
     def wait(call, what, path):
@@ -71,7 +71,7 @@ def stop_at(root, kind, seed, n, base, reached, go, answers):
 
 
 def publish_many(root, kind, versions, stop):
-    """Publish one version after another until told to stop, the old ones removed now and then."""
+    """Publish versions and sometimes remove old ones until a signal to stop."""
     os.fsync = _no_fsync
     n = 0
     while n < versions or not stop.is_set():
@@ -88,7 +88,7 @@ def with_image(root, facts):
 
 
 def on_a_small_disc(root, work, most_bytes, answers):
-    """Publish where no file may grow larger."""
+    """Publish with a limit on the size of files."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
     try:
         publish.make_version(root, plain_plan(2), work)

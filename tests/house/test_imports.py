@@ -1,4 +1,4 @@
-"""Who may import whom, and what no file of the product may do."""
+"""Check imports between packages, and forbidden operations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def facts() -> dict[str, tuple[bool, list[str], list[str]]]:
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Every module or name that the file imports, with dots, wherever in the file it does."""
+    """Yield the dotted name of every module or object that a file imports, including imports in functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -49,12 +49,12 @@ def imported(tree: ast.AST) -> Iterator[str]:
 
 
 def touches_fits(tree: ast.AST) -> bool:
-    """Whether the file reads or writes FITS by astropy."""
+    """Return True if a file reads or writes FITS with astropy."""
     return any(f"{name}.".startswith("astropy.io.fits.") for name in imported(tree))
 
 
 def unsafe(tree: ast.AST) -> list[str]:
-    """What the file does that could run somebody else's code."""
+    """Return the operations of a file that could run untrusted code."""
     found = [name for name in imported(tree) if name.split(".")[0] in UNSAFE_MODULES]
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
@@ -72,12 +72,12 @@ def unsafe(tree: ast.AST) -> list[str]:
 # Modules that read Parquet; what they have that writes, or is of no file.
 PARQUET = ("pyarrow.parquet", "pyarrow.dataset", "pyarrow.orc")
 NO_READING = {"write_table", "ParquetWriter", "Expression", "field", "scalar"}
-# The one door; Parquet of other programs, in a process of its own.
+# The reader of lakes, and the reader of user files, which runs in a separate process.
 PARQUET_READERS = {"lake_schema/store/parquet.py", "lake_schema/external/files.py"}
 
 
 def parquet_readings(tree: ast.AST) -> list[str]:
-    """What the file does to read Parquet: of pyarrow, pandas, polars, DuckDB's SQL, Spark."""
+    """Return the operations of a file that read Parquet: by pyarrow, pandas, polars, DuckDB or Spark."""
     names = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -99,8 +99,8 @@ def parquet_readings(tree: ast.AST) -> list[str]:
     return found
 
 
-def test_every_module_has_its_layer():
-    """A new module is refused until pyproject.toml says what it may import; each package of truesky has layers."""
+def test_every_module_has_a_layer():
+    """pyproject.toml lists the allowed imports of every module; each package of truesky has layers."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     within = {one["containers"][0]: one for one in contracts if "containers" in one}
     packages = {f"truesky.{path.parent.name}" for path in (ROOT / "truesky").glob("*/__init__.py")}
@@ -108,14 +108,14 @@ def test_every_module_has_its_layer():
     assert [name for name, one in within.items() if not one.get("exhaustive") or "exhaustive_ignores" in one] == []
 
 
-def test_one_room_knows_fits():
+def test_only_the_fits_package_uses_astropy_fits():
     assert {path for path, (touches, _, _) in facts().items() if touches} == {
         f"lake_schema/fits/{name}.py" for name in ("external", "images", "joined", "ldac", "psfex", "tables", "write")
     }
 
 
-def test_parquet_is_read_through_one_door():
-    """Whoever else read it would take a changed byte for a number."""
+def test_only_one_module_reads_parquet():
+    """This module compares checksums, so that damaged files are detected."""
     found = {path: set(readings) for path, (_, readings, _) in facts().items() if readings}
     # Rows that a process was handed in a file of Arrow's own, which is removed with it.
     handed = found.pop("truesky/explore/session.py")
@@ -139,11 +139,11 @@ def test_parquet_is_read_through_one_door():
         ("from lake_schema.store import parquet\nparquet.read(folder, entry)", False),
     ],
 )
-def test_a_reading_of_parquet_is_recognised(text, expected):
+def test_reading_parquet_is_detected(text, expected):
     assert bool(parquet_readings(ast.parse(text))) is expected
 
 
-def test_no_file_runs_somebody_else_s_code():
+def test_no_file_runs_untrusted_code():
     assert {path: found for path, (_, _, found) in facts().items() if found} == {}
 
 
@@ -160,11 +160,11 @@ def test_no_file_runs_somebody_else_s_code():
         "import subprocess\nsubprocess.run('ls', shell=flag)",
     ],
 )
-def test_unsafe_is_recognised(text):
+def test_unsafe_code_is_detected(text):
     assert unsafe(ast.parse(text))
 
 
-def test_safe_is_let_through():
+def test_safe_code_is_accepted():
     text = "import numpy as np, subprocess\nnp.load('x', allow_pickle=False)\nsubprocess.run(['ls'])"
     assert unsafe(ast.parse(text)) == []
 
@@ -179,5 +179,5 @@ def test_safe_is_let_through():
         ("from lake_schema import fits", False),
     ],
 )
-def test_fits_is_recognised(text, expected):
+def test_use_of_fits_is_detected(text, expected):
     assert touches_fits(ast.parse(text)) is expected

@@ -1,4 +1,4 @@
-"""Names: no module hides one of the standard library's, and nothing depends on where the tree was written."""
+"""Check names of modules, and references to files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_BYTES = 1_000_000
 
 
 def files() -> list[Path]:
-    """Everything that is tracked, or would be by `git add .`."""
+    """Return all files that git tracks or would add."""
     command = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     try:
         listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\0")
@@ -31,12 +31,12 @@ def files() -> list[Path]:
     return [ROOT / name for name in listed if name and (ROOT / name).is_file()]
 
 
-def test_no_module_hides_the_standard_library():
+def test_no_module_shadows_the_standard_library():
     assert MODULES
     assert [path for path in MODULES if path.stem in sys.stdlib_module_names] == []
 
 
-def test_nothing_points_elsewhere():
+def test_no_file_refers_to_anything_outside_the_repository():
     found = []
     for path in files():
         text = path.read_bytes().decode("utf-8", errors="replace")
@@ -47,17 +47,17 @@ def test_nothing_points_elsewhere():
 @pytest.mark.parametrize(
     "text", ["see /" + "home/me/x", ".." + "/shared/facts", "fixes issue" + " 12", "Issue" + " #3"]
 )
-def test_elsewhere_is_recognised(text):
+def test_references_outside_the_repository_are_detected(text):
     assert ELSEWHERE.search(text)
 
 
 @pytest.mark.parametrize("text", ["the home/work balance", "/path/to/python", "issue of 2024", "framework/work"])
-def test_here_is_let_through(text):
+def test_other_texts_are_accepted(text):
     assert not ELSEWHERE.search(text)
 
 
-def test_files_that_are_named_are_there():
-    """In comments, docstrings and pages, too, which nothing else would compare with the tree."""
+def test_files_named_in_texts_exist():
+    """Files named in code, comments, docstrings and documentation exist."""
     there = {path.relative_to(ROOT) for path in files()}
     there |= {folder for path in there for folder in path.parents}
     modules, found = {path.name for path in there}, []
@@ -76,8 +76,8 @@ def test_no_large_file():
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 
 
-def test_links_of_pages_lead_somewhere():
-    """Relative links of the README, of docs/ and of the notebooks; the first page of the site is tested with it."""
+def test_links_of_pages_exist():
+    """Targets of relative links in the README, docs/ and the notebooks exist; index.md is tested with the site."""
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*"), *(ROOT / "notebooks").glob("*")]
     lost = [
         f"{page.relative_to(ROOT)}: {link}"

@@ -1,4 +1,4 @@
-"""The distribution: what goes in, which version it says it is, and what it is installed with."""
+"""Check the files, version and dependencies of the distribution."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from lake_schema.store import provenance
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGES = ("lake_schema", "truesky")
-# Whatever else lies in the packages is no part of them.
+# Endings of files in the packages that are not distributed.
 NOT_SHIPPED = {".pyc"}
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The file of a wheel, built without a network from a copy, so that nothing is left in the tree."""
+    """Return the path of a wheel, built offline from a copy of the repository."""
     copy = tmp_path_factory.mktemp("wheel")
     for name in (*PACKAGES, "requests", "notebooks"):
         shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -52,12 +52,12 @@ def wheel(built):
         yield archive
 
 
-def test_everything_of_the_packages_ships(wheel):
+def test_wheel_contains_all_files_of_the_packages(wheel):
     of_packages = {path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()}
     there = {path.relative_to(ROOT) for path in of_packages if path.suffix not in NOT_SHIPPED}
     examples = {path.relative_to(ROOT) for folder in ("requests", "notebooks") for path in (ROOT / folder).iterdir()}
     expected = {path.as_posix() for path in there} | {f"truesky/{path.as_posix()}" for path in examples}
-    # It wants a clone.
+    # This notebook requires a clone.
     expected = {name for name in expected if not name.endswith("/02_speed_for_accuracy.ipynb")}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected
@@ -74,7 +74,7 @@ def test_metadata(wheel):
     assert "Private :: Do Not Upload" in metadata.get_all("Classifier")
 
 
-# What a user's machine may have set for a Spark of another kind.
+# Environment variables that a user may have set for another Spark.
 FOREIGN = {
     "SPARK_HOME": "/nowhere", "SPARK_CONF_DIR": "/nowhere", "SPARK_ENV_LOADED": "1", "PYSPARK_PYTHON": "/bin/false",
     "PYSPARK_DRIVER_PYTHON": "/bin/false", "PYSPARK_DRIVER_PYTHON_OPTS": "notebook",
@@ -84,7 +84,7 @@ FOREIGN = {
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_an_installed_wheel_runs_a_request_from_an_empty_folder(built, tmp_path):
-    """The commands of docs/command.md, in a fresh environment that sees the packages truesky wants, and no clone."""
+    """The commands of docs/command.md work in a new environment without a clone of the repository."""
     environment, folder = tmp_path / "venv", tmp_path / "empty"
     venv.EnvBuilder(with_pip=False, symlinks=True).create(environment)
     folder.mkdir()
@@ -122,7 +122,7 @@ def test_changes_name_the_version():
 
 
 def pinned(name: str) -> list[tuple[Requirement, list[str]]]:
-    """What a file of requirements pins, each with its hashes; files that it names are followed."""
+    """Return the packages that a requirements file pins, with hashes, including files that it refers to."""
     text = (ROOT / "requirements" / f"{name}.txt").read_text().replace("\\\n", "")
     found = []
     for line in text.splitlines():
@@ -156,8 +156,8 @@ def test_every_package_has_one_version_and_hashes(name):
 
 
 @pytest.mark.parametrize(("extra", "names"), [("", ("build", "run")), ("test", ("build", "run", "test"))])
-def test_what_is_installed_without_dependencies_is_all_that_is_wanted(extra, names):
-    """pip is told not to look: a list that lacks what one of its packages wants would be noticed by an import only."""
+def test_packages_installed_without_dependencies_are_complete(extra, names):
+    """pip does not resolve dependencies here, so a missing package would only be noticed at import."""
     listed = {canonicalize_name(requirement.name) for name in names for requirement, _ in pinned(name)}
     todo, seen = [("truesky", extra)], set()
     while todo:
@@ -173,7 +173,7 @@ def test_what_is_installed_without_dependencies_is_all_that_is_wanted(extra, nam
     assert len(seen) > 30
 
 
-def test_what_is_wanted_is_pinned_within_its_range():
+def test_dependencies_are_pinned_within_their_ranges():
     project = PROJECT["project"]
     wanted = [
         *project["dependencies"],
@@ -188,12 +188,12 @@ def test_what_is_wanted_is_pinned_within_its_range():
         assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)]), line
 
 
-# What users install for some commands alone.
+# Extras that users install for some commands.
 EXTRAS = ("page", "reduction", "s3")
 
 
 def test_the_oldest_versions_are_the_lower_bounds():
-    """A lower bound that cannot be installed with the other ones would not be tested."""
+    """The lower bounds can be installed together."""
     project = PROJECT["project"]
     lines = [
         *project["dependencies"],
@@ -213,8 +213,8 @@ PARTS = {"llvmlite", "py4j", "botocore"}
 @pytest.mark.parametrize(
     ("folders", "extras"), [(("lake_schema", "truesky"), EXTRAS), (("tests",), ("test", "docs", *EXTRAS))]
 )
-def test_what_is_imported_is_named(folders, extras):
-    """Not only what comes with another package, which may do without it tomorrow; in programs kept as text, too."""
+def test_imported_packages_are_declared(folders, extras):
+    """Direct imports are declared even if another package requires them, also in programs stored as text."""
     project = PROJECT["project"]
     lines = [*project["dependencies"], *(line for extra in extras for line in project["optional-dependencies"][extra])]
     named = {canonicalize_name(Requirement(line).name) for line in lines} | PARTS
@@ -231,7 +231,7 @@ def test_what_is_imported_is_named(folders, extras):
     assert missing == {}
 
 
-def test_a_package_of_two_versions_is_not_pinned(monkeypatch):
+def test_a_package_with_two_versions_is_not_pinned(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "scripts")
     pin_packages = importlib.import_module("pin_packages")
     assert pin_packages.read("a==1 \\\n    --hash=x\nb==2\n") == {"a": ["a==1 \\", "    --hash=x"], "b": ["b==2"]}

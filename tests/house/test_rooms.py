@@ -1,4 +1,4 @@
-"""How large a room, a file and a function may be, and where a channel may be named."""
+"""Limit the size of packages, files and functions, and the files that contain names of channels."""
 
 import ast
 import graphlib
@@ -33,7 +33,7 @@ MODULES, LINES, FUNCTION, PARAMETERS = 16, 400, 60, 8
 
 
 def functions(tree):
-    """(name, parameters, lines, whether it is compiled) of every function; self and cls are no parameters."""
+    """Return (name, parameters, lines, True if compiled) of every function, without self and cls."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
             given = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
@@ -56,17 +56,17 @@ def lines_of_code(text):
     return len(text.splitlines()) - sum(docstrings)
 
 
-def test_no_room_is_crowded():
+def test_number_of_modules_per_package_is_limited():
     modules = Counter(path.parent.as_posix() for path in SOURCES if path.name != "__init__.py")
     assert {room: n for room, n in modules.items() if n > MODULES} == {}
 
 
-def test_no_file_is_long():
+def test_length_of_files_is_limited():
     long = {path.as_posix(): n for path in SOURCES if (n := lines_of_code(path.read_text())) > LINES}
     assert long == {}
 
 
-def test_no_function_is_large():
+def test_size_of_functions_is_limited():
     larger = {}
     for path in SOURCES:
         for name, parameters, lines, compiled in functions(ast.parse(path.read_text())):
@@ -76,13 +76,13 @@ def test_no_function_is_large():
     assert larger == {}
 
 
-def test_functions_are_measured():
+def test_size_of_functions_is_measured():
     text = "@jit\ndef a(x): pass\ndef b(self, x, *, y=1):\n    return x\n"
     assert sorted(functions(ast.parse(text))) == [("a", 1, 1, True), ("b", 2, 2, False)]
 
 
-def test_channels_are_named_where_they_are_made():
-    """Whatever differs from channel to channel is asked of the channel, not of its name."""
+def test_channel_names_are_only_in_allowed_files():
+    """Code uses attributes of a channel instead of its name."""
     name = re.compile("|".join(f"[\"']{code}[\"']" for code, _ in CHANNELS))
     own = [ROOT / "truesky" / "render" / room for room in ("channels", "planning", "camera")]
     found = [
@@ -94,7 +94,7 @@ def test_channels_are_named_where_they_are_made():
 
 
 def texts(tree):
-    """Strings of a file that are no docstrings, the constant parts of f-strings among them."""
+    """Return the strings of a file without docstrings, including the constant parts of f-strings."""
     docs = {
         id(first.value)
         for node in ast.walk(tree)
@@ -109,8 +109,8 @@ def texts(tree):
 CAMERA = re.compile(r"(vis|nisp|ext)(\.|$)")
 
 
-def test_cameras_are_named_where_they_are_made():
-    """A parameter of a camera is asked for by the detector's own section of the mission database."""
+def test_camera_names_are_only_in_allowed_files():
+    """Code finds the parameters of a camera by the section of the detector."""
     own = [ROOT / "truesky" / "render" / room for room in ("channels", "planning", "camera")]
     named = {
         path.relative_to(ROOT).as_posix(): found
@@ -121,22 +121,22 @@ def test_cameras_are_named_where_they_are_made():
     assert named == {}
 
 
-def test_what_names_a_camera_is_found():
+def test_camera_names_are_detected():
     tree = ast.parse(
         '"""vis"""\ndef f(a):\n    """nisp"""\n    return a in ("vis", "nisp", "ext_law"), f"ext.{a}", "vis.x"'
     )
     assert sorted(text for text in texts(tree) if CAMERA.match(text)) == ["ext.", "nisp", "vis", "vis.x"]
 
 
-def test_quadrants_are_known_where_they_are_read():
-    """What is assembled from a readout is asked of the channel's readout mode."""
+def test_only_readout_modes_use_quadrants():
+    """Other code uses the readout mode of a channel to assemble images."""
     render = ROOT / "truesky" / "render"
     quadrants = render / "effects" / "readout" / "quadrants.py"
     knowing = {path.relative_to(render).parts[0] for path in render.rglob("*.py") if quadrants in imported(path)}
     assert knowing == {"channels"}
 
 
-# A channel with one effect; and the camera that it is of, which is declared in lake_schema: LSSTCam under another name.
+# A channel with one effect, and its camera, declared in lake_schema: LSSTCam under another name.
 DUMMY = '''"""A channel that makes everything three times as bright."""
 
 from truesky.render.camera import bands
@@ -166,7 +166,7 @@ TOUCHED = {"channels/dummy.py": DUMMY, "channels/registry.py": None}
 
 
 def with_the_dummy(monkeypatch):
-    """The renderer with the files of TOUCHED, and nothing else, added or changed; the dummy's module."""
+    """Add or change the files of TOUCHED in the renderer, and return the module of the dummy channel."""
     text = (ROOT / "truesky" / "render" / "channels" / "registry.py").read_text()
     for old, new in (
         ("import ground", "import dummy, ground"),
@@ -185,7 +185,7 @@ def with_the_dummy(monkeypatch):
 
 
 def with_its_camera(monkeypatch):
-    """The mission database with the records of a camera more."""
+    """Add a camera to the mission database."""
 
     def copied(records):
         own = [r for r in records if r.key.startswith("ext.lsstcam.")]
@@ -197,8 +197,8 @@ def with_its_camera(monkeypatch):
     return resolve(copied(parameter.read_all_parameters()), models=copied(model.read_models()))
 
 
-def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
-    """One of one effect and one camera is planned, forecast, rendered, written and read with no more than these."""
+def test_a_new_channel_changes_two_files_of_the_renderer(monkeypatch, tmp_path):
+    """A channel with one effect and one camera is planned, forecast, rendered, written and read."""
     from tests.truesky.render import fields
     from tests.truesky.render.exposure.test_render import field
 
@@ -215,7 +215,7 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     ((wanted, _),) = survey.exposures(request, mission)
     exposures = planned_exposures.table([wanted], [mission])
     (row,) = exposures.to_pylist()
-    # Of a dark zenith, and here the Moon is up.
+    # The parameter is for a dark zenith, and the Moon is up here.
     assert 1.0 < row["sky"] / mission.value("ext.dummycam.lsst_r.sky") < 5.0
     table = tasks.table(exposures, [wanted.detectors], mission, Densities(mission, Universe()))
     (task,) = table.to_pylist()
@@ -234,7 +234,7 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     np.testing.assert_array_equal(read_back.frame(path).data, one.science)
 
 
-def test_a_channel_that_nothing_renders_has_no_effects():
+def test_a_channel_without_renderer_has_no_effects():
     others = [name for name in (*dict(CHANNELS), "RADIO") if name not in registry.CHANNELS]
     assert "RADIO" in others
     assert [registry.find_effects_or_none(name, "science") for name in others] == [None] * len(others)
@@ -246,8 +246,8 @@ def test_an_effect_without_a_cost_is_refused():
         replace(ground.CHANNEL, effects={"science": (effect,)})
 
 
-def test_array_types_are_named_once():
-    """All modules take their names from lake_schema/arrays.py."""
+def test_array_types_are_defined_once():
+    """All modules import array types from lake_schema/arrays.py."""
     named = re.findall(r"^(\w+) = (npt\.NDArray\[.+\])$", (ROOT / "lake_schema" / "arrays.py").read_text(), re.M)
     assert ("Float", "npt.NDArray[np.float64]") in named
     spelt = {path.as_posix() for path in SOURCES for _, form in named if form in path.read_text()}
@@ -255,7 +255,7 @@ def test_array_types_are_named_once():
 
 
 def imported(path):
-    """Modules of the project that a file imports, at its top or within functions."""
+    """Return the modules of the project that a file imports, including imports in functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("lake_schema", "truesky"):
             for name in node.names:
@@ -263,7 +263,7 @@ def imported(path):
                 yield from (MODULES_BY_NAME[module] for module in both if module in MODULES_BY_NAME)
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    """Not even within functions: what is imported late to avoid a circle is one."""
+def test_there_are_no_circular_imports():
+    """Imports in functions count as well."""
     graph = graphlib.TopologicalSorter({path: set(imported(path)) for path in SOURCES if path.name != "__init__.py"})
     graph.prepare()

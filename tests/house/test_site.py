@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.effects.values() for e in kind}
 
 
-def test_its_pages(tmp_path, monkeypatch):
+def test_pages_of_the_site(tmp_path, monkeypatch):
     """Each is in the contents; every effect is described, with its figure, of which one is drawn by day."""
     # Sphinx and nbconvert take seconds to load, in each process of tests.
     from scripts import docs_references, make_docs
@@ -33,7 +33,7 @@ def test_its_pages(tmp_path, monkeypatch):
     assert {f"tutorials/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")} <= pages
     effects = (tmp_path / "effects.md").read_text()
     assert [name for name in EFFECTS if f" {name}\n" not in effects] == []
-    # Those that need more than a small frame, or another camera, are described alone.
+    # Effects that require a large frame or another camera have no figure.
     assert all(
         (tmp_path / name).is_file() for name in re.findall(r"!\[Frame before and after \w+\]\(([^)]*)\)", effects)
     )
@@ -55,7 +55,7 @@ def test_the_site(tmp_path):
         assert (site / "tutorials" / f"{notebook.stem}.html").exists()
     effects = (site / "effects.html").read_text()
     assert all(f">{name}<" in effects for name in EFFECTS)
-    # Those that need more than a small frame, or another camera, are described alone.
+    # Effects that require a large frame or another camera have no figure.
     assert len(re.findall(r'<img alt="Frame before and after \w+', effects)) >= len(EFFECTS) - 4
     loaded = re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(https?://[^"]*)"', home + effects)
     assert loaded == []

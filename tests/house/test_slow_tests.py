@@ -11,7 +11,7 @@ from tests.slow_tests import LIMIT, SLOW, Watch
 NAME = "test_x.py::test_y"
 
 
-def test_the_list_is_short_and_gives_reasons():
+def test_list_of_slow_tests_is_short_and_has_reasons():
     rows = slow_tests.read()
     assert len(rows) <= slow_tests.LONGEST
     with slow_tests.LIST.open(encoding="utf-8") as stream:
@@ -30,7 +30,7 @@ def warnings():
 
 @pytest.fixture
 def watch(tmp_path, warnings):
-    """A plugin whose run has an old cache, and that is at a test."""
+    """Return a plugin that runs a test with an old cache."""
     cache = tmp_path / "cache"
     (cache / "array").mkdir(parents=True)
     for folder in (cache / "array", cache):
@@ -48,7 +48,7 @@ def test_a_slow_test_fails(watch, warnings):
     assert warnings == []
 
 
-def test_between_the_limits_there_is_a_warning(watch, warnings):
+def test_a_test_between_the_limits_causes_a_warning(watch, warnings):
     watch.judge(NAME, SLOW, 2000.0)
     assert warnings == []
     watch.judge(NAME, LIMIT, 2000.0)
@@ -57,21 +57,21 @@ def test_between_the_limits_there_is_a_warning(watch, warnings):
 
 
 def test_a_child_of_an_earlier_test_is_not_counted(watch, monkeypatch):
-    """Its CPU time is added when it is waited for, during a test that takes 2 s."""
+    """The CPU time of a child process is added when it ends, during a test that takes 2 s."""
     monkeypatch.setattr(slow_tests.time, "time", lambda: 1002.0)
     watch.clock = lambda: 120.0
     assert watch.seconds_since(1000.0, 100.0) == 2.0
     assert watch.seconds_since(900.0, 100.0) == 20.0
 
 
-def test_an_empty_list_warns_of_all(watch, warnings):
+def test_an_empty_list_causes_warnings_for_all_tests(watch, warnings):
     watch.listed = {}
     watch.judge(NAME, 100.0, 2000.0)
     (line,) = warnings
     assert line.startswith(f"{NAME} took 100.0 s")
 
 
-def test_listed_and_nightly_ones_may_take_long(watch, warnings):
+def test_listed_and_nightly_tests_may_be_slow(watch, warnings):
     for name in ("test_listed", "field"):
         watch.judge(f"test_x.py::{name}", 100.0, 2000.0)
     watch.item.get_closest_marker = lambda name: name == "nightly"
@@ -79,7 +79,7 @@ def test_listed_and_nightly_ones_may_take_long(watch, warnings):
     assert warnings == []
 
 
-def test_whoever_fills_the_cache_may_take_long(watch, warnings):
+def test_a_test_that_fills_the_cache_may_be_slow(watch, warnings):
     watch.judge(NAME, 100.0, 999.0)
     os.utime(watch.cache / "array", (3000.0, 3000.0))
     watch.judge(NAME, 100.0, 2000.0)
@@ -87,7 +87,7 @@ def test_whoever_fills_the_cache_may_take_long(watch, warnings):
 
 
 def clock_of(*seconds):
-    """A clock that shows these times, one after another."""
+    """Return a clock that shows the given times in turn."""
     left = iter(seconds)
     return lambda: next(left)
 
@@ -113,7 +113,7 @@ def test_calls_and_fixtures_are_measured(watch, monkeypatch):
     assert result_of(watch.pytest_fixture_setup(fixture)) == "result"
 
 
-def test_entries_that_do_not_exist_are_found():
+def test_entries_of_missing_tests_are_detected():
     items = [SimpleNamespace(nodeid="tests/test_field.py::test_a[x]", fixturenames=["field"])]
     field, jobs, folder = "tests/test_field.py", "tests/test_jobs.py", "tests"
     there = [f"{field}::test_a[x]", f"{field}::field", f"{jobs}::test_b", f"{folder}::spark"]

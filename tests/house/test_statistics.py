@@ -1,4 +1,4 @@
-"""A statistical test says how large its sample is, and how often a correct program would fail it by chance."""
+"""Require that statistical tests state sample and significance (how often a correct program fails by chance)."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ FEWEST, MOST = 3, 6
 
 
 def is_root(node):
-    """Whether a number is a square root, of something that is not a constant."""
+    """Return True if a number is the square root of an expression that is not constant."""
     if isinstance(node, ast.Call) and ast.unparse(node.func) in ("np.sqrt", "math.sqrt"):
         inside = node.args[0]
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and ast.unparse(node.right) == "0.5":
@@ -24,7 +24,7 @@ def is_root(node):
 
 
 def is_limit(node):
-    """Whether an expression is a few standard errors: a number times or over what has a square root."""
+    """Return True if an expression is a few standard errors: a number times or divided by a square root."""
     if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Mult | ast.Div):
         return False
     first = node.left
@@ -35,7 +35,7 @@ def is_limit(node):
 
 
 def silent(text):
-    """Functions that compare with a law or a few standard errors, and say neither sample nor significance."""
+    """Return functions that compare with a distribution or standard errors without sample and significance."""
     for function in ast.walk(ast.parse(text)):
         if isinstance(function, ast.FunctionDef):
             parts = list(ast.walk(function))
@@ -46,7 +46,7 @@ def silent(text):
                 yield function.name
 
 
-def test_sample_and_significance_are_said():
+def test_statistical_tests_state_sample_and_significance():
     found = {path.relative_to(TESTS).as_posix(): list(silent(path.read_text())) for path in TESTS.rglob("*.py")}
     assert {path: names for path, names in found.items() if names} == {}
 
@@ -64,5 +64,5 @@ def test_sample_and_significance_are_said():
         ("'''A sample of 50.'''\n    assert stats.chisquare(x).pvalue > 1e-3", True),
     ],
 )
-def test_silent_ones_are_found(line, found):
+def test_statements_without_significance_are_detected(line, found):
     assert list(silent(f"def test_x():\n    {line}\n")) == ["test_x"] * found

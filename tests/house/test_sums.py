@@ -1,4 +1,4 @@
-"""Published bytes are not sums of a library of linear algebra, which change with threads and processor.
+"""Check that published numbers do not use BLAS or LAPACK, whose sums depend on threads and processor.
 
 The validation and the reduction measure what is published; their results are the same up to rounding.
 """
@@ -16,7 +16,7 @@ SOURCES = sorted(
     for path in (ROOT / folder).rglob("*.py")
     if not any(path.is_relative_to(folder) for folder in MEASURE)
 )
-# What numpy and scipy hand to BLAS or LAPACK.
+# Functions of numpy and scipy that use BLAS or LAPACK.
 NAMES = {
     "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
     "polyfit", "leggauss", "hermgauss", "laggauss", "roots_legendre", "lstsq", "pinv", "eigh", "svd", "cholesky",
@@ -42,10 +42,10 @@ def faults(tree):
      "from numpy.linalg import inv", "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd",
      "numba.njit(parallel=True)"],
 )  # fmt: skip
-def test_what_would_be_found(text):
+def test_forbidden_products_are_detected(text):
     assert list(faults(ast.parse(text)))
 
 
-def test_products_are_those_of_sums():
+def test_only_reproducible_products_are_used():
     found = [f"{p.relative_to(ROOT)}:{line}" for p in SOURCES for line in faults(ast.parse(p.read_text()))]
     assert found == [], "truesky/numerics/matrices.py has products and solutions whose last bit is the same everywhere"

@@ -1,4 +1,4 @@
-"""No test compares numbers within a tolerance that it does not state."""
+"""Require that tests state the tolerances of comparisons."""
 
 import ast
 from pathlib import Path
@@ -20,7 +20,7 @@ TINY = 1e-15
     ],
     ids=str,
 )  # fmt: skip
-def test_tiny_numbers_have_no_relative_tolerance_without_an_absolute_one(expected):
+def test_tiny_numbers_need_an_absolute_tolerance(expected):
     for tolerance in ({}, {"rel": 1e-3}, {"rel": 1e-9, "nan_ok": True}):
         with pytest.raises(ValueError, match=r"approx of 1e-15 .* give rel and abs=0.0"):
             pytest.approx(expected, **tolerance)
@@ -28,7 +28,7 @@ def test_tiny_numbers_have_no_relative_tolerance_without_an_absolute_one(expecte
         assert expected == pytest.approx(expected, rel=1e-3, abs=0.0, nan_ok=True)
 
 
-def test_nor_have_relative_tolerances_below_the_absolute_one():
+def test_small_relative_tolerances_need_an_absolute_tolerance():
     with pytest.raises(ValueError, match="approx of 1 within 1e-12"):
         pytest.approx(1.0, rel=1e-13)
     with pytest.raises(ValueError, match="approx of 2e-07 within 1e-12"):
@@ -37,20 +37,20 @@ def test_nor_have_relative_tolerances_below_the_absolute_one():
 
 
 @pytest.mark.parametrize("expected", [0.0, 1.0, -3e-6, [0.0, 5.0], {}, [], np.zeros(3), np.nan, np.inf, {"a": None}])
-def test_others_are_compared_as_ever(expected):
+def test_other_numbers_are_compared_as_by_pytest(expected):
     assert expected == pytest.approx(expected, nan_ok=True)
     assert pytest.approx(3.0, rel=0.1) == 3.2
     assert pytest.approx(3.0, rel=0.1) != 3.4
     assert pytest.approx(0.0, abs=0.1) == 0.05
 
 
-def test_every_test_has_this_one():
+def test_all_tests_use_the_strict_approx():
     assert pytest.approx is tolerances.approx
     assert not [path for path in TESTS.rglob("*.py") if "import approx" in path.read_text() and path != Path(__file__)]
 
 
-def test_numpy_s_absolute_tolerance_is_stated_where_it_is_not_zero():
-    """That of isclose and allclose is 1e-8, that of assert_allclose is 0."""
+def test_absolute_tolerance_of_numpy_comparisons_is_stated():
+    """The default is 1e-8 for isclose and allclose, and 0 for assert_allclose."""
     silent = [
         f"{path.relative_to(TESTS)}:{call.lineno}"
         for path in sorted(TESTS.rglob("*.py"))
