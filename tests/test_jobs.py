@@ -104,7 +104,7 @@ def test_missing_input_tables_are_named(job, tmp_path, capsys):
         "compute_fluxes": "no table galaxies",
         "build_strong_lenses": "no table galaxies",
         "build_gaia": "no table stars",
-        "plan_exposures": "pointing and observation are missing",
+        "plan_exposures": "it must have a pointing or an observation",
         "render_exposures": "no table mission",
     }
     assert missing[job.name] in capsys.readouterr().err

@@ -161,7 +161,7 @@ def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _
 def _objects(rows: pa.Table) -> list[str]:
     """Return the rows as JSON. Values without a JSON form, such as dates and decimals, become strings."""
     if len(set(rows.column_names)) != rows.num_columns:
-        raise BadInput("--sql: two columns of the result have the same name; give one of them another with AS")
+        raise BadInput("--sql: two columns of the result have the same name: rename one with AS")
     try:
         return [json.dumps(row, default=str, allow_nan=False) for row in rows.to_pylist()]
     except (ValueError, OverflowError, TypeError, pa.ArrowException) as error:

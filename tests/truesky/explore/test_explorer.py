@@ -108,7 +108,7 @@ def test_identifiers_beside_missing_ones_stay_whole(explorer):
 
 
 def test_astropy_has_no_two_columns_of_one_name(explorer):
-    with pytest.raises(BadInput, match="same name"):
+    with pytest.raises(BadInput, match="are called"):
         explorer.sql("SELECT 1 AS a, 2 AS a", into="astropy")
     assert explorer.sql("SELECT 1 AS a, 2 AS a").shape == (1, 2)
 
@@ -386,7 +386,7 @@ def test_types_that_fits_cannot_hold(explorer, tmp_path):
     assert found["n"].mask.all()
     assert found["d"][0] == "2020-01-01"
     assert found["s"][0] == explorer.sql(text)["s"][0]
-    with pytest.raises(BadInput, match="same name"):
+    with pytest.raises(BadInput, match="are called"):
         explorer.export("SELECT 1 AS a, 2 AS a", tmp_path / "b.fits")
 
 

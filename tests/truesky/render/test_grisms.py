@@ -72,9 +72,9 @@ def test_sensitivity_agrees_with_the_zero_point():
     ("more", "message"),
     [
         (["--detectors", "DET99"], "DET99"),
-        (["--exposure", "3"], "--lake and --exposure are given together"),
-        (["--lake", "nowhere"], "--lake and --exposure are given together"),
-        (["--name", "a"], "--lake is missing"),
+        (["--exposure", "3"], "--lake and --exposure must be given together"),
+        (["--lake", "nowhere"], "--lake and --exposure must be given together"),
+        (["--name", "a"], "--name requires --lake"),
     ],
 )
 def test_errors_are_one_line_and_no_file_is_written(tmp_path, capsys, more, message):

@@ -84,7 +84,7 @@ def test_response_of_many_galaxies_with_separate_psfs(scene, tier):
 
 def test_small_stamps_bias_the_response():
     """Test the measurement itself: stamps of half the size bias the response."""
-    small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, min_size=1.6)
+    small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, min_size_arcsec=1.6)
     assert abs(biases(VIS, "bulge", 20.0, small)[0]) > 1e-3
 
 

@@ -152,7 +152,7 @@ def test_invalid_ramp_parameters_are_refused_with_the_request(key, value, unit):
 
 def test_too_much_capacitance_is_refused_with_the_request():
     overrides = {f"nisp.ipc.{part}": {"value": 0.07, "unit": ""} for part in ("side", "diagonal")}
-    with pytest.raises(BadInput, match=r"nisp\.ipc: 0\.56 of a pixel's charge"):
+    with pytest.raises(BadInput, match=r"nisp\.ipc: neighbours receive 0\.56 of a pixel's charge"):
         from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
 
 
