@@ -127,19 +127,19 @@ def _messages(tree: ast.AST) -> Iterator[Text]:
         else:
             continue
         for value in values:
-            text = _constant_text(value)
+            text = constant_text(value)
             if " " in text.strip():
                 yield Text(value.lineno, MESSAGE, text)
 
 
-def _constant_text(node: ast.AST) -> str:
+def constant_text(node: ast.AST) -> str:
     """Return the text of a string expression, with {} for each value in it."""
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else ""
     if isinstance(node, ast.JoinedStr):
-        return "".join(_constant_text(part) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+        return "".join(constant_text(part) if isinstance(part, ast.Constant) else "{}" for part in node.values)
     if isinstance(node, ast.BinOp):
-        return _constant_text(node.left) + _constant_text(node.right)
+        return constant_text(node.left) + constant_text(node.right)
     return ""
 
 

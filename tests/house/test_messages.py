@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts.plain_words import _constant_text
+from scripts.plain_words import constant_text
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(path for package in ("lake_schema", "truesky") for path in (ROOT / package).rglob("*.py"))
@@ -40,7 +40,7 @@ def messages(tree: ast.AST) -> list[tuple[int, str]]:
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
-            text = _constant_text(node.exc.args[0])
+            text = constant_text(node.exc.args[0])
             if ast.unparse(node.exc.func) in ERRORS and text:
                 found.append((node.lineno, text))
     return found

@@ -43,10 +43,12 @@ def to_rate(image: ImageFile) -> ReducedImage:
     if image.card("BUNIT") == "electron/s":
         return image.reduced
     # Signal that 1 e-/s gives in the exposure, in units of the image (BUNIT).
-    time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
+    units_per_rate = float(image.card("EXPTIME")) / float(image.card("GAIN"))
     counts = image.reduced
     return ReducedImage(
-        (counts.image / time).astype(np.float32), (counts.weight * time**2).astype(np.float32), counts.flags
+        (counts.image / units_per_rate).astype(np.float32),
+        (counts.weight * units_per_rate**2).astype(np.float32),
+        counts.flags,
     )
 
 
