@@ -30,7 +30,7 @@ help:
 	@echo '                  goes on where it was stopped'
 	@echo 'make test         all tests'
 	@echo 'make test-oldest  fast tests with the lowest versions that pyproject.toml allows'
-	@echo 'make check        style, types, who may import whom, plain English'
+	@echo 'make check        style, spelling, types, who may import whom, plain English'
 	@echo 'make bench        all benchmarks'
 	@echo 'make docs         the documentation as a site in out/site, its notebooks run on the lake of make demo'
 	@echo 'make clean        remove what was computed (.venv, .venv-oldest and the cache stay)'
@@ -50,7 +50,7 @@ test-oldest: .venv-oldest/installed
 	    -m 'not nightly and not spark' tests/lake_schema $(addprefix tests/truesky/,explore fluxes numerics randomness request)
 
 check: .venv/installed-test
-	@$(RUN) ruff check . && ruff format --check . && mypy && lint-imports --no-cache && python -m scripts.plain_words --check
+	@$(RUN) ruff check . && ruff format --check . && codespell && mypy && lint-imports --no-cache && python -m scripts.plain_words --check
 
 bench: .venv/installed-bench spark
 	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; python -m "benchmarks.$${name%.py}"; done

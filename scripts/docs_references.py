@@ -1,4 +1,8 @@
-"""Write the pages of the documentation site that are made from the code: keys, parameters, effects, accuracy, API."""
+"""Make the Markdown pages of the documentation site whose content comes from the code.
+
+The pages list the keys of a request (TOML file of a user), the parameters of the instruments, the effects on images,
+the settings of accuracy, and the Python interface.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ from truesky.render.effects.scene import Frame, Lights, NeighbourCharge, Scene
 from truesky.render.exposure import sky_through_grism
 from truesky.request import accuracy, from_toml, observations, schema, toml_values
 
-# Modules that users import.
+# Modules that users import, in the order of the page of the Python interface.
 API = (
     "truesky.api.lake",
     "truesky.api.tables",
@@ -40,11 +44,11 @@ API = (
     "truesky.explore.explorer",
     "truesky.render.products.read_back",
 )
-# Side of the frame on which effects are shown, pixels.
+# Width and height of the small detector image on which effects are shown, pixels.
 _SIDE = 320
 
 
-# A request with an entry in each list, so that the parser reads every key.
+# A valid request (as the dictionary of its TOML file) with one entry in each list, so that the parser reads every key.
 _SAMPLE_REQUEST = {
     "name": "x",
     "seed": 1,
@@ -52,7 +56,7 @@ _SAMPLE_REQUEST = {
     "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
     "observation": [{"channels": ["VIS"]}],
 }
-# Functions that read a value, and the type of the value.
+# Functions of truesky.request.toml_values that read one value of a request, and the type of the value for the page.
 _VALUE_KINDS = {
     "number": "number",
     "optional_number": "number",
@@ -65,7 +69,11 @@ _VALUE_KINDS = {
 
 
 def request_page() -> str:
-    """Return the page of the request keys: the docstring of the parser, and a table of the keys that it reads."""
+    """Return the Markdown page about the keys of a request (TOML file of a user).
+
+    It contains the docstring of the parser, a table of the keys that have a single value, with limits and defaults, and
+    the docstrings of some sections.
+    """
     head = inspect.cleandoc(from_toml.__doc__ or "")
     lines = ["# Keys of a request", "", "```text", head, "```", "", "## Values, bounds, defaults", ""]
     lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
@@ -78,7 +86,11 @@ def request_page() -> str:
 
 
 def _request_keys() -> dict[str, tuple[str, str, str]]:
-    """Return the type, the limits or allowed values, and the default of each key with a single value."""
+    """Return the type, the limits or allowed values, and the default, as texts, of each key of a request by its path.
+
+    The parser runs on a sample request, and all its calls of functions that read a value are recorded. Keys that other
+    functions read, such as tables, are not included.
+    """
     keys: dict[str, tuple[str, str, str]] = {}
 
     def record_keys(name: str, reader: Callable[..., object]) -> Callable[..., object]:
@@ -92,7 +104,7 @@ def _request_keys() -> dict[str, tuple[str, str, str]]:
             if "lo" in bound and "hi" in bound:
                 bounds = f"{bound['lo']:g} to {bound['hi']:g}"
             default = bound.get("default")
-            # NaN marks a number without default.
+            # The reading functions use NaN as the default of a number that has none.
             default_text = "" if default is None or default != default else f"`{json.dumps(default)}`"
             keys[path] = (_VALUE_KINDS[name], bounds, default_text)
             return reader(*positional, **keywords)
@@ -111,7 +123,7 @@ def _request_keys() -> dict[str, tuple[str, str, str]]:
 
 
 def mission_page(mission: MissionConfiguration) -> str:
-    """Return the page of all parameters in the default ladder."""
+    """Return the Markdown page with the default value, unit, status and source of every parameter of the mission."""
     lines = [
         "# The mission database",
         "",
@@ -129,9 +141,10 @@ def mission_page(mission: MissionConfiguration) -> str:
 
 
 def effects_page(into: Path, mission: MissionConfiguration) -> str:
-    """Return the page of all effects: docstring of the module, parameters, and the change of a small frame.
+    """Return the Markdown page about all effects on images (such as cosmic rays or charge transfer inefficiency).
 
-    `into` is the folder of the site; the figures are written to its folder `effects`.
+    For each effect it contains the docstring of its module, its parameters, and a figure of a small image before and
+    after the effect. The figures are written to a new folder `effects` in the existing folder `into`.
     """
     names = {"VIS": "science", "NISP-P": "science", "NISP-S": "science", "EXT": "science"}
     channels = {name: channel.effects for name, channel in registry.CHANNELS.items()}
@@ -168,7 +181,10 @@ def effects_page(into: Path, mission: MissionConfiguration) -> str:
 
 
 def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """Return a small VIS detector with points, squares of light, and a bright star whose ghost falls on it."""
+    """Return an image (electrons) of 320 x 320 pixels and the description of a VIS exposure, to show effects on it.
+
+    The image has points and squares of light. A bright star has a ghost on it.
+    """
     detector = detectors.detector("vis", "3-4", mission)
     small = type(detector)("3-4", "vis", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
@@ -178,7 +194,10 @@ def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _effect_parameters(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
-    """Return the keys of the mission parameters that each effect reads."""
+    """Return the keys of the mission parameters that each effect reads, by name of the effect.
+
+    They are found by recording the reads while an effect takes its parameters from the description of an exposure.
+    """
     _, scene = _scene(mission)
     (_, infrared), (_, ground_scene) = _infrared_scene(mission), _ground_scene(mission)
     parameters, read_value = {}, MissionConfiguration.value
@@ -199,7 +218,12 @@ def _effect_parameters(effects: list[Effect], mission: MissionConfiguration) -> 
 
 
 def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
-    """Draw each effect: the frame before, the frame after, and the difference. Return the names of the effects."""
+    """Draw a figure of each effect: the image before it, the image after it, and the difference.
+
+    Effects of sky images and of NISP-P flats are applied one after another, in physical order, to a small image. Each
+    effect of VIS flats and of trap pumping is applied to the unchanged image. The files are written to a new folder
+    `effects` in `into`. Return the names of the effects with a figure; effects that do not change the image have none.
+    """
     frame, scene = _scene(mission)
     folder = into / "effects"
     folder.mkdir()
@@ -208,7 +232,7 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
     for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.PUMPING)):
         input_frame = frame if effect in vis.SKY else light
         output_frame = effect.apply(input_frame, *effect.parameters(scene), rng=stream(1, effect.name))
-        # Some effects have no visible influence on a small frame.
+        # Some effects do not change such a small image, so they get no figure.
         if input_frame.shape != output_frame.shape or np.ptp(output_frame - input_frame) > 0.0:
             _draw_figure(
                 folder / f"{effect.name}.png",
@@ -237,7 +261,11 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
 
 
 def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """Return a small LSSTCam detector with points, squares of light, satellites, and a star on another detector."""
+    """Return an image of 320 x 320 pixels and the description of an LSSTCam exposure, to show effects on it.
+
+    The image has points and squares of light. The exposure has many satellite trails, and charge of a saturated star on
+    another detector.
+    """
     small = replace(detectors.detector("lsstcam", "R22_S11", mission), nx=_SIDE, ny=_SIDE)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
     crossed = mission.with_overrides({"survey.satellites.rate": (3.0, "1 / (deg s)")})
@@ -253,7 +281,11 @@ def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """Return a small NISP detector with points, squares of light, persistence, and a ghost of the filter."""
+    """Return an image of 320 x 320 pixels and the description of a NISP photometric exposure, to show effects on it.
+
+    The image has points and squares of light. The exposure has persistence, and a bright star with a ghost of the
+    filter.
+    """
     detector = detectors.detector("nisp", "DET22", mission)
     small = type(detector)("DET22", "nisp", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
@@ -275,7 +307,10 @@ def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """Return a small NISP detector that receives zeroth-order light from the edge of the field stop."""
+    """Return an image of 320 x 320 pixels and the description of a NISP spectroscopic exposure, to show effects on it.
+
+    The detector is at a position at which the zeroth order of the sky background ends at the edge of the field stop.
+    """
     frame, scene = _infrared_scene(mission)
     assert scene.detector is not None
     exposure = ExposureRow(
@@ -294,7 +329,11 @@ def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _ramp_image(frame: Frame, name: str) -> Frame:
-    """Return one image: the last group minus the first one, or another plane if the effect changes only that."""
+    """Return one image of a ramp (a stack of readouts), on which the change by the effect `name` can be seen.
+
+    For a float32 ramp this is the last group minus the first one, or the first group for the effect "reset_level". For
+    other stacks it is one plane. A two-dimensional frame is returned unchanged.
+    """
     if frame.ndim == 2:
         return frame
     if frame.dtype == np.float32:
@@ -303,7 +342,10 @@ def _ramp_image(frame: Frame, name: str) -> Frame:
 
 
 def _assemble_quadrants(frame: Frame) -> Frame:
-    """Return one image with the quadrants at their positions, including prescan and overscan."""
+    """Return one image of a VIS detector from its four quadrants, including their prescan and overscan.
+
+    A two-dimensional frame is returned unchanged.
+    """
     if frame.ndim == 2:
         return frame
     placed = [quadrants.to_detector_axes(frame[i], i) for i in range(4)]
@@ -333,7 +375,10 @@ def _draw_figure(path: Path, input_frame: Frame, output_frame: Frame, name: str)
 
 
 def accuracy_page(into: Path) -> str:
-    """Return the page of accuracy and computing time: the measured settings, and the presets."""
+    """Return the Markdown page about the errors and the CPU time of drawing sources for each setting of accuracy.
+
+    The figure is written to accuracy.png in the existing folder `into`.
+    """
     rows = sorted(accuracy.rows(), key=lambda row: row["seconds"])
     titles = {
         "flux": "flux, relative",
@@ -374,7 +419,10 @@ def accuracy_page(into: Path) -> str:
 
 
 def api_page() -> str:
-    """Return the page of the Python interface."""
+    """Return the Markdown page of the Python interface, with a directive of Sphinx for each module that `API` lists.
+
+    Sphinx replaces the directives by the docstrings of the modules.
+    """
     lines = ["# Python interface", ""]
     for module in API:
         lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]

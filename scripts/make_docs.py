@@ -1,9 +1,10 @@
-"""Write the documentation site: the pages of docs/, the notebooks, and references made from the code.
+"""Write the documentation site: the pages of docs/, the notebooks, and reference pages made from the code.
 
     python -m scripts.make_docs [--out out/site] [--notebooks]
 
-With --notebooks, the notebooks are run on the lake that `make demo` leaves in out/demo, and pictures of the page over
-that lake are taken. Otherwise the notebooks are shown as stored, without figures. Nothing is downloaded.
+With --notebooks, the notebooks are run on the lake (folder of tables and images) that `make demo` leaves in out/demo,
+and screenshots of the web page of this lake are taken. Otherwise the notebooks are shown as stored, without figures.
+Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import re
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import nbformat
@@ -26,7 +26,8 @@ from lake_schema.mission.configuration import resolve
 from scripts import docs_references, page_pictures, structure_picture
 
 ROOT = Path(__file__).resolve().parents[1]
-# Chapters of the site: title and pages. Pages of docs/ that no chapter names are how-to pages.
+# Chapters of the site: title and pages. "notebooks" means the pages of all notebooks, and "others" all pages of docs/
+# that no other chapter names.
 CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Tutorials", ("notebooks",)),
     ("How to", ("others",)),
@@ -45,6 +46,14 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ),
     ("Contributing", ("contributing.md",)),
 )
+# Checks of numpydoc that every documented object must pass: summaries (SS), parameters (PR), returned values (RT) and
+# sections (GL).
+VALIDATION_CHECKS = (
+    *("SS01", "SS02", "SS03", "SS05"),
+    *("PR01", "PR02", "PR03", "PR04", "PR07", "PR10"),
+    *("RT01", "RT03"),
+    *("GL06", "GL07"),
+)
 _DEMO, _DEMO_LAKE = ROOT / "requests" / "demo.toml", ROOT / "out" / "demo" / "lake"
 _FOLDERS = "deploy|jobs|truesky|lake_schema|requests|benchmarks|tests|scripts"
 _FILE = re.compile(rf"\[([^\]]*)\]\((?:\.\./)*(?:(?:{_FOLDERS})/|README)[^)]*\)")
@@ -52,12 +61,15 @@ _NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
 
 
 def notebooks(into: Path, run: bool) -> list[str]:
-    """Write the notebooks as pages and return the names of the pages; `run` executes them first."""
+    """Write the notebooks as Markdown pages below the folder `into`, and return the paths of the pages relative to it.
+
+    If `run` is True, the notebooks are executed first.
+    """
     pages = []
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
-            # Notebooks about a field use the lake of `make demo`; the others make a lake.
+            # Most notebooks use the lake of `make demo`. Those about shear and slitless spectra make a lake themselves.
             makes_own_lake = path.stem.endswith(("shear", "slitless"))
             demo = {} if makes_own_lake else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
             client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
@@ -73,11 +85,11 @@ def notebooks(into: Path, run: bool) -> list[str]:
     return pages
 
 
-# ------------------------------------------------------------------------------------------------ the site
-
-
 def pages(into: Path, run: bool) -> None:
-    """Write all pages to a folder; `run` executes the notebooks."""
+    """Write all pages of the site, as Markdown with figures, to the existing folder `into`.
+
+    If `run` is True, the notebooks are executed and pictures of galaxies and of the web page are added.
+    """
     shutil.copytree(ROOT / "docs", into, dirs_exist_ok=True)
     mission = resolve()
     generated = {
@@ -97,7 +109,7 @@ def pages(into: Path, run: bool) -> None:
     listed = {"notebooks": tutorials, "others": sorted({path.name for path in into.glob("*.md")} - named)}
     for path in into.glob("*.md"):
         text = _NOTEBOOK.sub(r"](tutorials/\1.md)", path.read_text(encoding="utf-8"))
-        # Links to files that the site does not contain become names.
+        # Replace links to files of the repository that are not on the site by the text of the link.
         path.write_text(_FILE.sub(r"`\1`", text).replace("](docs/", "]("), encoding="utf-8")
     with (into / "index.md").open("a", encoding="utf-8") as home:
         for title, names in CHAPTERS:
@@ -106,7 +118,7 @@ def pages(into: Path, run: bool) -> None:
 
 
 def _with_pictures(into: Path) -> None:
-    """Add pictures of spiral galaxies and, if a browser is available, of the page over a lake."""
+    """Add the picture of spiral galaxies and, if a browser is available, screenshots of the web page of a lake."""
     structure_picture.write(into / "structure.jpg")
     if why := page_pictures.missing_requirement():
         print(f"docs: no pictures of the page: {why}")
@@ -117,31 +129,28 @@ def _with_pictures(into: Path) -> None:
 
 
 def build(source: Path, out: Path) -> int:
-    """Build the site from a folder of pages. Return 0 if there are no errors and no warnings."""
+    """Build the HTML site in `out` with Sphinx from a folder of pages; return 0 if there are no errors or warnings."""
     configuration = {
         "project": "truesky",
-        "extensions": ["myst_parser", "sphinx.ext.autodoc"],
+        "extensions": ["myst_parser", "sphinx.ext.autodoc", "numpydoc"],
+        "default_role": "code",
         "html_theme": "pydata_sphinx_theme",
         "html_theme_options": {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]},
         "html_copy_source": False,
         "myst_heading_anchors": 3,
         "autodoc_default_options": {"members": True, "member-order": "bysource"},
         "autodoc_typehints": "none",
+        # Members are listed by autodoc, in the order of the source.
+        "numpydoc_show_class_members": False,
+        "numpydoc_validation_checks": set(VALIDATION_CHECKS),
     }
     site = Sphinx(source, None, out, source / "_built", "html", configuration, status=None, warningiserror=True)
-    site.connect("autodoc-process-docstring", _show_verbatim)
     site.build()
     return site.statuscode
 
 
-def _show_verbatim(*event: Any) -> None:
-    """Show a docstring exactly as it is written."""
-    lines = event[-1]
-    lines[1:] = ["", "::", "", *("    " + line for line in lines[1:]), ""] if any(lines[1:]) else []
-
-
 def main() -> None:
-    """Run the command."""
+    """Run the command; SystemExit is raised if Sphinx reports an error or a warning."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site")
     parser.add_argument("--notebooks", action="store_true", help="run the notebooks to make their figures")
