@@ -1,4 +1,7 @@
-"""Declaration of the table `exposures`: one row per exposure of the telescope or of a ground camera."""
+"""Declaration of the table `exposures`: one row per exposure of Euclid or of a ground camera.
+
+It also contains the codes of the channels and image types, and the passbands of each channel.
+"""
 
 from __future__ import annotations
 
@@ -17,30 +20,32 @@ CHANNELS = (
 IMAGE_TYPES = (
     ("science", "sky exposure of a wide survey"),
     ("deep", "sky exposure of a deep field"),
-    ("bias", "read-out alone"),
-    ("dark", "closed shutter or cold shutter"),
+    ("bias", "read-out without exposure"),
+    ("dark", "exposure without light"),
     ("flat", "calibration lamp"),
     ("charge_injection", "rows filled electronically, which traps delay"),
     ("self_calibration", "dense field, many dithers"),
     ("standard_star", "standard star"),
-    ("persistence", "dark after a bright exposure, which shows what that left in the detector"),
-    ("planetary_nebula", "emission lines for the wavelength scale"),
-    ("trap_pumping", "charge shuffled to and fro over the traps, each of which makes a dipole"),
-    ("defocus", "sky exposure out of focus, for the wavefront"),
-    ("bleeding", "stars that fill their pixels, at known places of every detector"),
-    ("stray_light", "sky exposure with a bright star beside the field"),
-    ("white_dwarf", "white dwarfs at known places of every detector"),
+    ("persistence", "dark after a bright exposure, which shows the persistence of its light"),
+    ("planetary_nebula", "planetary nebula, whose emission lines calibrate the wavelength scale"),
+    ("trap_pumping", "charge moved back and forth over the traps, which makes a dipole at each trap"),
+    ("defocus", "defocused sky exposure, from which the wavefront is measured"),
+    ("bleeding", "saturated stars at known positions of every detector"),
+    ("stray_light", "sky exposure with a bright star just outside the field"),
+    ("white_dwarf", "white dwarfs at known positions of every detector"),
 )
-# Passbands of Euclid's channels, for the checks of requests. A test compares them with the planner's passbands.
+# Passbands of each of Euclid's channels. They are also in the code that plans exposures, which is not imported here; a
+# test compares them.
 EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
     "VIS": ("euclid_vis",),
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
     "NISP-S": ("nisp_red", "nisp_blue"),
 }
-# Passband whose fluxes select the sources that a slitless channel draws.
+# Passband by whose fluxes sources are selected for the images of a slitless channel, by channel.
 SELECTION_BANDS: Mapping[str, str] = {"NISP-S": "euclid_h"}
-# Image types that can be rendered, by channel; all others can only be planned. This copies the registry of
-# channels, because requests are checked without importing the renderer. test_checks.py compares the two.
+# Image types of which images can be simulated, by channel. Exposures of the other types can be planned, but not
+# rendered. truesky's registry of channels contains the same list, but takes long to import;
+# tests/truesky/request/test_checks.py compares both.
 RENDERED_TYPES: Mapping[str, tuple[str, ...]] = {
     "VIS": (
         "science",
@@ -147,7 +152,10 @@ EXPOSURES = Table(
 
 @dataclass(frozen=True, slots=True)
 class ExposureRow:
-    """One row of the table `exposures`, with one attribute per column; None stands for null."""
+    """One row of the table `exposures`: an exposure of Euclid or of a ground camera.
+
+    There is one attribute per column of the table, with the same name and unit. None stands for a null.
+    """
 
     exposure_id: int
     channel: str
@@ -178,5 +186,8 @@ class ExposureRow:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:
-        """Make an instance from a row of an Arrow table; raise KeyError if a column is missing."""
+        """Make an instance from a row of an Arrow table, a mapping of column names to values.
+
+        Raise KeyError if a column is missing; other columns are ignored.
+        """
         return cls(**{name: row[name] for name in cls.__slots__})

@@ -1,8 +1,8 @@
-"""Declaration of the true positions and electrons of drawn sources.
+"""Declaration of the tables of true positions and electrons of the sources in simulated images.
 
-The table `rendered_truth` has one row per source of a detector, and `rendered_spectra` one row per spectral order.
-Sources outside a detector have no row if only their faint wings beyond the stamp reach it. Stars with noticeable
-diffraction spikes are an exception.
+The table `rendered_truth` has one row per source of a detector, and `rendered_spectra` one row per spectral order of a
+source. A source outside a detector has no row if only its faint wings reach the detector, beyond the stamp (square
+around the source) in which it is drawn. Stars with noticeable diffraction spikes have a row in this case, too.
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ RENDERED_SPECTRA = Table(
             "float64",
             "",
             "phys.size;arith.ratio",
-            "part of a first order's length on the detector beside which a trace of another source lies, nearer than "
-            "both are wide and with at least a pixel's noise in a column: one sigma of a resolution element; of other "
-            "orders null",
+            "fraction of a first order's length on the detector that overlaps with the trace of another source. A "
+            "column overlaps if the rows of the traces differ by less than the sum of their half widths, and the other "
+            "has at least as many electrons as the noise of a pixel; null for other orders",
             0.0,
             1.0,
             nullable=True,
