@@ -1,8 +1,8 @@
-"""Create the Spark session: the submitter's configuration plus settings that workers need to import this package.
+"""Create the Spark session, with the user's configuration and settings that worker processes need.
 
-The module sets neither master nor memory, because `builder.master` would silently override the options of spark-submit.
-These settings belong in spark-defaults.conf. If the master is not local, the module adds no path or address of this
-machine to the configuration.
+The module sets neither Spark's master nor its memory, because values in Python would silently override the options of
+spark-submit. They belong in spark-defaults.conf. If the master is on another machine, the module adds no path or
+address of this machine to the configuration. Only the path of the workers' Python is by default that of this process.
 """
 
 from __future__ import annotations
@@ -25,14 +25,17 @@ from pyspark.sql import SparkSession
 
 from lake_schema import instruction_set
 
-# Defaults that prevent access from outside. The configuration may override them.
+# Settings that prevent access from other machines. The user's configuration may override them.
 _SECURE_SETTINGS = {"spark.ui.enabled": "false"}
-# Prefix of Spark's settings of Unix domain sockets, and the longest folder name that leaves room for Spark's own name:
-# a socket's path has at most 104 characters on macOS and 108 on Linux. A longer one falls back to TCP.
-_SOCKET_PREFIX, _MAX_SOCKET_DIR = "spark.python.unix.domain.socket", 56
-# Spark creates a secret for a local master. The secret of a cluster must be configured on all machines
-# (docs/cluster.md).
+# Prefix of Spark's settings for Unix domain sockets.
+_SOCKET_PREFIX = "spark.python.unix.domain.socket"
+# Largest length of the path of the sockets' folder, to which Spark adds a file name. The path of a socket has at most
+# 104 characters on macOS and 108 on Linux. With a longer folder, TCP is used.
+_MAX_SOCKET_DIR = 56
+# Names of masters on this machine, such as local[4].
 _LOCAL = re.compile(r"local(\[[^\]]*\])?")
+# Settings for a master on this machine, for which Spark creates a secret. For a cluster, the secret must be configured
+# on all machines (docs/cluster.md).
 _SECURE_LOCAL_SETTINGS = {
     "spark.driver.bindAddress": "127.0.0.1",
     "spark.driver.host": "127.0.0.1",
@@ -41,18 +44,22 @@ _SECURE_LOCAL_SETTINGS = {
 
 
 def get_session(name: str) -> SparkSession:
-    """Return the running session, or create one with this name."""
-    # PySpark 4 warns of pandas 3 once. The warning is irrelevant because no rows pass through pandas.
+    """Return the active Spark session of this process, or create one with the given application name.
+
+    Settings of this module do not replace values in the user's configuration.
+    """
+    # Ignore PySpark 4's warning of pandas 3. It is irrelevant because no rows pass through pandas.
     warnings.filterwarnings("ignore", "PySpark does not yet fully support pandas", FutureWarning)
-    # If Java is stopped in the middle of a message, its listener in this process would print a traceback. The command
-    # reports the end of Java in one line.
+    # Silence the server that receives messages from Java: it would print a traceback if Java is stopped in the middle
+    # of a message. The command reports the end of Java in one line.
     for listener in (accumulators.AccumulatorTCPServer, accumulators.AccumulatorUnixServer):
         listener.handle_error = _ignore_error  # type: ignore[assignment]
     SparkContext._ensure_initialized()
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
     settings = dict(_SECURE_SETTINGS)
-    # Set variables in the environment because a worker may import numpy before any module of this package.
+    # Limit the CPU instructions that numpy and Arrow use in workers, so that results have the same bits. These
+    # environment variables must be set before a worker starts: it may import numpy before any module of this package.
     settings |= {f"spark.executorEnv.{name}": value for name, value in instruction_set.variables().items()}
     local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
     if local:
@@ -60,8 +67,9 @@ def get_session(name: str) -> SparkSession:
         if len(socket_dir()) <= _MAX_SOCKET_DIR:
             settings |= {f"{_SOCKET_PREFIX}.enabled": "true", f"{_SOCKET_PREFIX}.dir": socket_dir()}
             settings["spark.python.daemon.module"] = "truesky.running.spark_workers"
-    # PySpark reads the workers' Python from this variable only, and would otherwise use any `python3` on PATH. Local
-    # workers use the Python of this process. Other machines use the configured Python, by default the same path.
+    # PySpark reads the workers' Python from $PYSPARK_PYTHON only, and would otherwise use any `python3` on PATH.
+    # Workers use the Python in the configuration, by default the Python of this process. If they are on other machines
+    # and the configuration has no Python, a value of $PYSPARK_PYTHON is kept.
     worker_python = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))
     os.environ["PYSPARK_PYTHON"] = worker_python or sys.executable
     for key, value in settings.items():
@@ -69,16 +77,18 @@ def get_session(name: str) -> SparkSession:
     previous_handler = signal.getsignal(signal.SIGINT)
     running = builder.getOrCreate()
     if threading.current_thread() is threading.main_thread():
-        # The handler of PySpark calls Java at the moment of the interrupt, which fails. Restore the previous handler.
+        # PySpark has set a handler of Ctrl-C that calls Java, which fails at the moment of an interrupt. Restore the
+        # previous handler.
         signal.signal(signal.SIGINT, previous_handler)
     return running
 
 
 @cache
 def socket_dir() -> str:
-    """Return a private folder of this process for sockets between Java and its Python workers.
+    """Return a temporary folder for the Unix domain sockets that connect Java and its Python workers.
 
-    Unix domain sockets are used because delayed acknowledgements of TCP cost 40 ms per task.
+    The first call creates it, and it is removed when the process ends. These sockets are used because TCP delays
+    acknowledgements, which costs 40 ms per task.
     """
     folder = tempfile.mkdtemp(prefix="truesky-")
     atexit.register(remove_socket_dir)
@@ -86,18 +96,20 @@ def socket_dir() -> str:
 
 
 def remove_socket_dir() -> None:
-    """Remove the folder of sockets if it exists."""
+    """Remove the folder of `socket_dir` and its contents, if it has been created."""
     if socket_dir.cache_info().currsize:
         shutil.rmtree(socket_dir(), ignore_errors=True)
 
 
 def _ignore_error(listener: object, request: object, client_address: object) -> None:
-    """Replace the error handler of socketserver, which prints a traceback."""
+    """Do nothing. It replaces an error handler of socketserver that prints a traceback."""
 
 
 def is_alive(spark: SparkSession) -> bool:
-    """Return True if the session's Java process still answers."""
+    """Return True if the session's Java process still answers and has not stopped its Spark context."""
     try:
-        return not spark.sparkContext._jsc.sc().isStopped()
+        java_context = spark.sparkContext._jsc
+        # PySpark sets `_jsc` to None when the session is stopped in Python.
+        return java_context is not None and not java_context.sc().isStopped()
     except (Py4JError, OSError, LookupError):
         return False

@@ -1,6 +1,7 @@
 """The Spark session: one, and it reads a lake's files as every other reader does."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import duckdb
 import psutil
@@ -8,7 +9,7 @@ import pytest
 
 from lake_schema.store import publish, read
 from tests.universe import CELLS, toy_plan, toy_work
-from truesky.running.session import get_session
+from truesky.running.session import get_session, is_alive
 
 pytestmark = pytest.mark.spark
 
@@ -43,3 +44,15 @@ def test_nobody_else_can_reach_it(spark):
 
 def test_there_is_one_session(spark):
     assert get_session("another").sparkContext is spark.sparkContext
+
+
+@pytest.mark.parametrize("stopped_in", ["Python", "Java"])
+def test_a_stopped_session_is_not_alive(stopped_in):
+    """PySpark's `stop` removes the reference to the Java context."""
+    stopped = SimpleNamespace(sc=lambda: SimpleNamespace(isStopped=lambda: True))
+    java_context = None if stopped_in == "Python" else stopped
+    assert not is_alive(SimpleNamespace(sparkContext=SimpleNamespace(_jsc=java_context)))
+
+
+def test_the_session_of_the_tests_is_alive(spark):
+    assert is_alive(spark)
