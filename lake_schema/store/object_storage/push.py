@@ -1,9 +1,9 @@
 """Push a lake to object storage: truesky push LAKE s3://BUCKET/PREFIX [--endpoint-url URL] [--only TABLE ...].
 
-Objects of versions never change, so existing objects are not sent again, and a run that was killed can be continued.
-After all objects exist and their checksums have been compared, one conditional put replaces the object `current`.
-Readers therefore see either the old or the new set of versions. If two pushes run at the same time, the second one
-fails. Nothing is removed.
+A lake is a folder of tables, each with immutable versions. Files of versions never change, so objects that exist are
+not sent again, and a run that was killed can be continued. After all objects exist and their checksums have been
+compared, one conditional put replaces the object `current`, which lists the published versions. Readers therefore see
+either the old or the new list. If two pushes run at the same time, the one that ends later fails. Nothing is removed.
 """
 
 from __future__ import annotations
@@ -25,31 +25,36 @@ from lake_schema.store.object_storage import s3
 from lake_schema.store.object_storage.s3 import CURRENT, MANIFEST, Address, PublishedVersions
 from lake_schema.store.provenance import file_sha256
 
-# S3 allows 5 GB per put; larger files are sent in parts, each with a checksum.
-_MAX_PUT_BYTES, _PART_BYTES = 1 << 30, 256 << 20
+# Size in bytes of the largest file that is sent in one put (S3 allows 5 GB). Larger files are sent in parts.
+_MAX_PUT_BYTES = 1 << 30
+# Size in bytes of a part of a larger file. S3 stores a checksum of each part.
+_PART_BYTES = 256 << 20
+# Number of bytes of an object that are read at a time.
 _CHUNK_BYTES = 8 << 20
+# Default number of objects that are sent at the same time.
 THREADS = 16
-# Error codes of services if the condition of a put is not met, or if another put is in progress.
+# Error codes of services if the condition of a put is not met, or if another put of the same object is in progress.
 _REFUSED_CODES = {"PreconditionFailed", "ConditionalRequestConflict", "412", "409"}
+# Error codes of services if an object does not exist.
 _ABSENT_CODES = {"NoSuchKey", "404", "NotFound"}
 
 
 @dataclass(frozen=True, slots=True)
 class PushReport:
-    """Result of pushing one version.
+    """Result of pushing one version of a table to object storage.
 
     Attributes
     ----------
     table : str
         Name of the table.
     key : str
-        Key of the version.
+        Key of the version, 16 hexadecimal digits.
     objects : int
-        Number of its objects.
+        Number of objects (files) of the version.
     size : int
-        Total size in bytes.
+        Total size of the objects in bytes.
     sent : int
-        Number of objects that were sent.
+        Number of objects that were sent, because they did not exist with the same contents.
     sent_size : int
         Total size of the objects that were sent, in bytes.
     """
@@ -64,7 +69,7 @@ class PushReport:
 
 @dataclass(frozen=True, slots=True)
 class _Object:
-    """A file of a version and the name of its object."""
+    """A file of a version: its path, the name of its object in the lake, its size in bytes and its sha256."""
 
     path: Path
     name: str
@@ -73,9 +78,10 @@ class _Object:
 
 
 class Bucket:
-    """Objects of one lake, accessed through boto3.
+    """Objects of one lake on object storage, accessed through boto3.
 
-    Methods raise BadInput if the service does not answer, the bucket does not exist, or access is denied.
+    The constructor and all methods raise BadInput if the service does not answer, the bucket does not exist, or access
+    is denied. The constructor also raises it if boto3 is not installed.
 
     Parameters
     ----------
@@ -93,12 +99,13 @@ class Bucket:
         config = Config(
             connect_timeout=s3.CONNECT_TIMEOUT,
             read_timeout=s3.REQUEST_TIMEOUT,
-            retries={"mode": "standard", "max_attempts": s3.MAX_ATTEMPTS},
+            retries={"mode": "standard", "total_max_attempts": s3.MAX_ATTEMPTS},
             max_pool_connections=2 * THREADS,
         )
         options: dict[str, Any] = {"endpoint_url": address.service} if address.service else {}
         with self._errors_as_bad_input():
-            # Any region works as the default: other services have only one, and Amazon redirects to the right one.
+            # boto3 needs a region. Any default works: Amazon redirects to the right region, and other services have
+            # only one.
             session = boto3.session.Session()
             region = address.region or session.region_name or "us-east-1"
             self._client = session.client("s3", region_name=region, config=config, **options)
@@ -119,12 +126,14 @@ class Bucket:
             raise BadInput(f"{self.address}: {error}") from None
 
     def read_published(self) -> tuple[PublishedVersions, str | None]:
-        """Return the published versions, and the ETag of the object `current` or None if it does not exist.
+        """Read the object `current`, and return the versions that it lists and its ETag.
+
+        If the object does not exist, return an empty list of versions and None.
 
         Raises
         ------
         Damaged
-            If the object has another form.
+            If the object is not a valid list of versions.
         """
         if (current := self._read_object(CURRENT)) is None:
             return PublishedVersions({}, {}), None
@@ -139,9 +148,10 @@ class Bucket:
                 return None
 
     def has_object(self, item: _Object) -> bool:
-        """Return True if an object exists with the contents of its file, by its checksum or else by reading it.
+        """Return True if the object of a file exists and has the same contents.
 
-        An object that was sent in parts of another size counts as missing. Errors of the service raise BadInput.
+        The checksum that the service stores is compared. If the service stores no checksum, the object is read. An
+        object that another program sent in parts of another size has another checksum, so the result is False.
         """
         from botocore.exceptions import ClientError
 
@@ -156,11 +166,12 @@ class Bucket:
             if response["ContentLength"] != item.size:
                 return False
             if checksum := response.get("ChecksumSHA256"):
-                # For an object sent in parts, this is a checksum of checksums; Amazon appends "-" and their number.
+                # The checksum of an object that was sent in parts is a hash of the hashes of its parts. Amazon appends
+                # "-" and the number of parts to it; other services do so only in the ETag.
                 checksum_value, in_parts, _ = checksum.partition("-")
                 in_parts = in_parts or "-" in response["ETag"]
                 return bool(checksum_value == (_multipart_checksum(item) if in_parts else _base64(item.sha256)))
-            # The object was sent by another program, or the service stores no checksums.
+            # Read the whole object, because the service stores no sha256 of it. Another program may have sent it.
             file_hash = hashlib.sha256()
             body = self._client.get_object(Bucket=self.address.bucket, Key=object_key)["Body"]
             for piece in body.iter_chunks(_CHUNK_BYTES):
@@ -168,7 +179,7 @@ class Bucket:
             return file_hash.hexdigest() == item.sha256
 
     def send(self, item: _Object) -> None:
-        """Send a file with its checksum."""
+        """Send a file to its object, which is replaced, and let the service compare the sha256 of the data."""
         target = {"Bucket": self.address.bucket, "Key": self.address.key(item.name)}
         with self._errors_as_bad_input():
             if item.size <= _MAX_PUT_BYTES:
@@ -190,9 +201,9 @@ class Bucket:
                 raise BadInput(f"{self.address}: {error}") from None
 
     def supports_conditions(self, name: str) -> bool:
-        """Return True if the service refuses a put whose condition is not met.
+        """Return True if the service refuses a put whose condition ("only if the object does not exist") is not met.
 
-        `name` is an existing object; the test does not change its contents.
+        The test puts the object `name` with its existing contents, so it changes nothing in any case.
 
         Raises
         ------
@@ -204,11 +215,16 @@ class Bucket:
         return not self._put_if(name, existing[0], {"IfNoneMatch": "*"})
 
     def replace_current(self, published: PublishedVersions, tag: str | None) -> bool:
-        """Replace `current` if its ETag is still `tag`, or for None if it does not exist; return True on success."""
+        """Replace the object `current` by a new list of versions, unless another process has changed it.
+
+        The condition is that its ETag is still `tag`, or that it does not exist if `tag` is None. Return True if the
+        object has the new contents.
+        """
         condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
         if self._put_if(CURRENT, published.to_bytes(), condition):
             return True
-        # If the answer to a successful put was lost, the retry fails although `current` is as requested.
+        # Compare the contents: if the answer to a successful put was lost, boto3 has repeated the put, and the second
+        # one was refused because the first one had changed the ETag.
         current = self._read_object(CURRENT)
         return current is not None and current[0] == published.to_bytes()
 
@@ -230,7 +246,10 @@ def _base64(sha256: str) -> str:
 
 
 def _multipart_checksum(item: _Object) -> str:
-    """Return the sha256 of the sha256 of all parts, as S3 computes it."""
+    """Return the checksum of a file that is sent in parts, as S3 computes it: base64 of a sha256.
+
+    It is the sha256 of the concatenated sha256 of all parts, each of `_PART_BYTES` bytes except the last one.
+    """
     combined_hash = hashlib.sha256()
     with item.path.open("rb") as stream:
         while part := stream.read(_PART_BYTES):
@@ -238,11 +257,14 @@ def _multipart_checksum(item: _Object) -> str:
     return base64.b64encode(combined_hash.digest()).decode()
 
 
-# ------------------------------------------------------------------------------------------------ a lake
+# ------------------------------------- pushing all versions of a lake
 
 
 def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = THREADS) -> Iterator[PushReport]:
-    """Send the published versions of a lake and yield a report for each; then replace `current`.
+    """Send the published versions of a lake to object storage, and yield a report after each version.
+
+    At the end, the object `current` is replaced, which lists the published versions. Iterate to the end: otherwise
+    nothing is published.
 
     Parameters
     ----------
@@ -251,15 +273,15 @@ def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = 
     address : Address
         Address of the lake on object storage.
     only : sequence of str, optional
-        Tables to push; other tables on object storage stay. By default, all tables are pushed, and the published
-        versions become the versions of this lake.
+        Names of the tables to push; other tables on object storage stay. By default, all tables are pushed, and
+        afterwards exactly the versions of this lake are published.
     threads : int, optional
         Number of objects that are sent at the same time.
 
     Yields
     ------
     PushReport
-        Report of a version, when all its objects exist.
+        Report of a version, when all its objects exist and their checksums have been compared.
 
     Raises
     ------
@@ -280,7 +302,8 @@ def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = 
     }
     for number, (table, key) in enumerate(sorted(versions)):
         report = _push_version(bucket, _objects_of_version(root, table, key), table, key, threads)
-        # This test needs an object. It runs after the first version, before other versions are sent for hours.
+        # The test of the service needs an existing object, so it runs after the first version. It must not run later,
+        # because sending all versions may take hours.
         if number == 0 and not bucket.supports_conditions(f"{table}/v-{key}/{MANIFEST}"):
             raise BadInput(f"{address}: the storage ignores conditions of puts, so two pushes could mix versions")
         yield report
@@ -289,7 +312,10 @@ def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = 
 
 
 def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
-    """Return the published versions of some or all tables; raise BadInput if a table does not exist."""
+    """Return the versions to which links of a lake lead, for the tables in `only` or by default for all tables.
+
+    Raise BadInput if the lake has no tables, or one of `only` does not exist.
+    """
     if not (table_names := layout.table_names(root)):
         raise BadInput(f"lake {root} holds no table")
     if unknown := sorted(set(only) - set(table_names)):
@@ -305,7 +331,10 @@ def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
 def _merge_published(
     remote_versions: PublishedVersions, local_versions: PublishedVersions, only: Sequence[str]
 ) -> PublishedVersions:
-    """Return the versions that are to be published."""
+    """Return the list of versions that `current` will contain after the push.
+
+    Without `only`, it is the list of the local lake. Otherwise the tables in `only` are replaced in the remote list.
+    """
     if not only:
         return local_versions
     keys_by_request: dict[str, dict[str, str]] = {}
@@ -317,7 +346,10 @@ def _merge_published(
 
 
 def _objects_of_version(root: Path, table: str, key: str) -> list[_Object]:
-    """Return the files of a version, its manifest last; raise Damaged if they differ from the manifest."""
+    """Return the files of a local version with the names of their objects; the manifest is the last one.
+
+    Raise Damaged if the files differ from the manifest (list of files with sizes and sha256).
+    """
     folder = layout.version_folder(root, table, key)
     facts = manifest.load(folder, table)
     if faults := manifest.faults(folder, facts):
@@ -340,7 +372,7 @@ def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: s
 
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # The manifest is sent last: if it exists, the version is complete.
+            # Send the manifest last, so that a version whose manifest exists is complete.
             is_sent = [*pool.map(upload_if_missing, objects[:-1]), upload_if_missing(objects[-1])]
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -349,13 +381,13 @@ def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: s
     return PushReport(table, key, len(objects), sum(item.size for item in objects), len(sent_sizes), sum(sent_sizes))
 
 
-# ------------------------------------------------------------------------------------------------ the command
+# ------------------------------------- the command `truesky push`
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status.
+    """Run the command `truesky push` and return its exit status.
 
-    The status is 0 for success, 1 for a fault of the lake or if another push came first, and 2 for a wrong call.
+    The status is 0 for success, 1 for a damaged lake or if another push ended first, and 2 for wrong arguments.
     """
     parser = argparse.ArgumentParser(
         prog="python -m lake_schema.store.object_storage.push",
