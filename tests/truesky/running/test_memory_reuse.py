@@ -1,4 +1,4 @@
-"""Memory that is kept while arrays come and go, and given back: as the C library counts it, not as a machine does."""
+"""Memory is kept between arrays and then returned, by the counters of the C library instead of the machine."""
 
 import ctypes
 import functools
@@ -18,15 +18,15 @@ SIZE = 64 << 20
 
 @pytest.fixture(scope="module", autouse=True)
 def _memory_is_reused():
-    """These tests measure memory, so none is kept for them."""
+    """Disable the fixture that keeps memory, because these tests measure memory."""
 
 
 class Counted(ctypes.Structure):
-    """mallinfo2 of malloc.h.
+    """Structure that mallinfo2 of malloc.h returns.
 
     arena    : bytes of the heap, of which uordblks are in use and fordblks are free
-    hblkhd   : bytes that the operating system was asked for directly
-    keepcost : free bytes at the heap's end, which could be given back
+    hblkhd   : bytes that were requested directly from the operating system
+    keepcost : free bytes at the end of the heap, which could be returned
     """
 
     _fields_ = tuple(
@@ -38,7 +38,7 @@ class Counted(ctypes.Structure):
 
 
 def counts():
-    """mallinfo2, or nothing where the C library has none."""
+    """Return mallinfo2, or None if the C library does not contain it."""
     try:
         function = ctypes.CDLL(None).mallinfo2
     except (AttributeError, OSError, TypeError):
@@ -59,15 +59,15 @@ def alone(test):
     """Run a test in a separate process: in a used heap, even a large array may find free memory."""
 
     @functools.wraps(test)
-    def in_a_process():
+    def in_a_process(**arguments):
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            pool.submit(_called, test.__name__).result(300)
+            pool.submit(_called, test.__name__, arguments).result(300)
 
     return in_a_process
 
 
-def _called(name):
-    globals()[name].__wrapped__()
+def _called(name, arguments):
+    globals()[name].__wrapped__(**arguments)
 
 
 def heap_and_mapped():
@@ -107,7 +107,7 @@ def test_later_arrays_find_the_memory_of_those_before():
             array = np.ones(SIZE, np.uint8)
             places.add(array.ctypes.data)
             del array
-            # It stays with the process when the array is gone; nothing comes from elsewhere.
+            # The process keeps the memory when the array is deleted, and none is requested directly.
             assert COUNTS().fordblks >= SIZE
             size, mapped = heap_and_mapped()
             assert mapped == mapped_before
@@ -128,7 +128,7 @@ def test_it_is_given_back():
     array = np.ones(SIZE, np.uint8)
     assert heap_and_mapped()[1] >= mapped + SIZE
     del array
-    # And smaller ones, which are in the heap, leave nothing at its end.
+    # Smaller arrays are in the heap. They leave no free memory at its end.
     many = [np.ones(100_000, np.uint8) for _ in range(SIZE // 100_000)]
     assert COUNTS().uordblks >= SIZE - 100_000
     del many
@@ -150,18 +150,25 @@ def test_it_is_given_back_after_an_error():
     assert resident() < before + SIZE // 8
 
 
+def library_without_functions(name):
+    return object()
+
+
 def no_such_library(name):
     raise OSError(f"{name}: not found")
 
 
-@pytest.mark.parametrize("opened", [lambda name: object(), no_such_library])
-def test_another_library_is_left_alone(monkeypatch, opened):
-    """One without GNU's functions, and none at all."""
-    monkeypatch.setattr(memory_reuse.ctypes, "CDLL", opened)
-    monkeypatch.setattr(memory_reuse, "_library", memory_reuse._library.__wrapped__)
-    with memory_reuse.retain_freed_memory():
-        assert memory_reuse._library() is None
-        array = np.ones(SIZE, np.uint8)
-        if COUNTS is not None:
-            assert heap_and_mapped()[1] >= SIZE
-        del array
+@pytest.mark.parametrize("opened", [library_without_functions, no_such_library])
+@alone
+def test_another_library_is_left_alone(opened):
+    """The library does not have GNU's functions, or does not exist."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(memory_reuse.ctypes, "CDLL", opened)
+        monkeypatch.setattr(memory_reuse, "_library", memory_reuse._library.__wrapped__)
+        with memory_reuse.retain_freed_memory():
+            assert memory_reuse._library() is None
+            if COUNTS is not None:
+                mapped = heap_and_mapped()[1]
+                array = np.ones(SIZE, np.uint8)
+                assert heap_and_mapped()[1] >= mapped + SIZE
+                del array
