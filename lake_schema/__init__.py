@@ -1,4 +1,7 @@
-"""Declarations of the lake's tables, sky geometry and mission database, and the code that stores and reads lakes."""
+"""Everything about a lake (a folder of versioned tables) that does not simulate: declarations, storage and reading.
+
+The package also contains sky geometry, and the mission database with the numbers of telescopes, cameras and survey.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lake_schema import instruction_set
 
-# The limit has no effect once numpy is imported.
+# Limit the processor instructions of numpy and other libraries first: the limit has no effect after numpy is imported.
 instruction_set.limit()
 
 if TYPE_CHECKING:
@@ -18,7 +21,7 @@ __all__ = ["layout", "read"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import `layout` and `read` from `lake_schema.store` when they are first used."""
+    """Import `lake_schema.store.layout` or `.read` when it is first used; raise AttributeError for other names."""
     if name in __all__:
         return import_module(f"lake_schema.store.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

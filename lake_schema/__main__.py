@@ -19,7 +19,10 @@ from lake_schema.store.object_storage.s3 import Folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0 success, 1 a fault of the lake, 2 a wrong call."""
+    """Run the command with the given arguments, by default those of the process, and return its exit status.
+
+    The status is 0 for success, 1 for a damaged lake, and 2 for wrong arguments.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["mission"]:
         from lake_schema.mission import commands as mission
@@ -65,12 +68,15 @@ def _run_command(options: argparse.Namespace) -> int:
         versions = _versions_of_table(root, name, request)
         return max(int(_verify(v, options.deep) if options.command == "verify" else _describe(v)) for v in versions)
 
-    # A fault of one table is reported, and the other tables are still inspected.
+    # Run each table separately: if an error ends the inspection of one table, the others are still inspected.
     return max(command.run("lake_schema", lambda name=name: inspect_table(name)) for name in selected)  # type: ignore[misc]
 
 
 def _versions_of_table(root: Folder, name: str, request: str | None) -> list[read.Version]:
-    """Return the current version of a table and the versions of its requests, or only the version of one request."""
+    """Open the current version of a table and the versions of all requests, each version once.
+
+    If `request` (name of a set of settings) is given, open only its version. Raise BadInput if no version exists.
+    """
     if request:
         return [read.version(root, name, request=request)]
     current, keys_by_request = layout.current_key(root, name), request_links.keys_by_request(root, name)

@@ -1,4 +1,4 @@
-"""Check arguments of functions that users call; an error message names the argument."""
+"""Check arguments of public functions; the message of every error contains the name of the argument."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lake_schema.errors import BadInput, OutOfRange
 
 
 def check_number(name: str, value: object, lo: float = -math.inf, hi: float = math.inf) -> float:
-    """Return a number as a float if it lies within its bounds.
+    """Return a number as a float if it lies within its bounds, which are included.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     value : object
         Value that the user gave.
     lo, hi : float, optional
-        Smallest and largest number that is allowed.
+        Smallest and largest number that is allowed. By default all numbers are allowed, including infinities.
 
     Returns
     -------
@@ -29,12 +29,12 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     Raises
     ------
     BadInput
-        If it is not a number.
+        If the value is not a number; a str such as "1" is not accepted.
     OutOfRange
-        If it is NaN or lies outside its bounds.
+        If the value is NaN or lies outside its bounds.
     """
     try:
-        # The comparison refuses a text, even if float() could read it.
+        # Compare before converting: the comparison raises TypeError for a str, which float() might accept.
         is_within, converted = bool(lo <= value <= hi), float(value)  # type: ignore[operator, arg-type]
     except (TypeError, ValueError, OverflowError):
         raise BadInput(f"{name} = {value!r} is not a number") from None
@@ -44,7 +44,7 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
 
 
 def check_integer(name: str, value: object, lo: int, hi: int) -> int:
-    """Return a whole number as an int if it lies within its bounds.
+    """Return a whole number as an int if it lies within its bounds, which are included.
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
     Raises
     ------
     BadInput
-        If it is not a whole number.
+        If the value is not an integer; a float such as 2.0 is not accepted.
     OutOfRange
-        If it lies outside its bounds.
+        If the value lies outside its bounds.
     """
     try:
         converted = operator.index(value)  # type: ignore[arg-type]
@@ -77,26 +77,28 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
 
 
 def check_integers(name: str, value: Iterable[object], lo: int, hi: int) -> list[int]:
-    """Return whole numbers as a list of int if they lie within their bounds.
+    """Return whole numbers as a list of int if all of them lie within the bounds, which are included.
 
     Parameters
     ----------
     name : str
         Name of the argument, for the message.
     value : iterable
-        Values that the user gave.
+        Values that the user gave; it may be empty.
     lo, hi : int
         Smallest and largest number that is allowed.
 
     Returns
     -------
     list of int
-        The numbers.
+        The numbers, in the same order.
 
     Raises
     ------
     BadInput
-        If `value` is not a list, or if `check_integer` refuses an element.
+        If `value` is not iterable, or if an element is not an integer.
+    OutOfRange
+        If an element lies outside the bounds.
     """
     if not isinstance(value, Iterable):
         raise BadInput(f"{name} = {value!r} is not a list of whole numbers")
@@ -104,12 +106,14 @@ def check_integers(name: str, value: Iterable[object], lo: int, hi: int) -> list
 
 
 def check_names(name: str, value: str | Sequence[str]) -> tuple[str, ...]:
-    """Return one name or several as a tuple.
+    """Return a str as a tuple of length 1, and a sequence of str as a tuple.
+
+    `name` is the name of the argument, for the message.
 
     Raises
     ------
     BadInput
-        If the value is neither a text nor a sequence of texts.
+        If `value` is neither a str nor a sequence of str.
     """
     if isinstance(value, str):
         return (value,)

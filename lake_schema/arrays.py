@@ -1,4 +1,4 @@
-"""Short names of array types, and the conversion of NumPy values to Python values."""
+"""Short names of NumPy array types for annotations, such as Float, and the conversion of NumPy values to Python."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Array = npt.NDArray[Any]
 
 
 def as_python(value: object) -> Any:
-    """Convert a NumPy scalar to a Python number, text or boolean, and an array to a list.
+    """Convert a NumPy scalar to a Python number, str or bool, and an array to a nested list; for example for JSON.
 
     Raises
     ------
     TypeError
-        If the value is neither a scalar nor an array, or has another type, such as a date.
+        If the value is neither a NumPy scalar nor an array, or its elements are not booleans, integers, floats or str.
     """
-    # tolist() turns some dates into numbers, so only these kinds are allowed.
+    # Allow booleans, integers, floats and str only: tolist() would turn some dates into numbers.
     if isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufU":
         return value.tolist()
     raise TypeError(f"{value!r} is of type {type(value).__name__}")

@@ -1,6 +1,6 @@
-"""Run commands with a defined end: one line per error on stderr and a defined exit status.
+"""Run the body of a command-line program: print errors as one line on stderr, and return a defined exit status.
 
-The exit status is 2 for wrong input and 1 for a damaged lake or an error of the operating system.
+The exit status is 2 for wrong input, and 1 for a damaged file of a lake or an error of the operating system.
 """
 
 from __future__ import annotations
@@ -30,17 +30,20 @@ def run(name: str, body: Callable[[], int]) -> int:
     Returns
     -------
     int
-        The value that `body` returns, 2 if it raises BadInput, 1 if the lake is damaged or the operating system fails.
+        The value that `body` returns, 2 if it raises BadInput, and 1 if it raises another LakeError, OSError or
+        MemoryError. For these, one line is printed on stderr. 1 is also returned, without a message, if the reader of
+        stdout has closed the pipe. Other exceptions are not caught.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Some terminals cannot show all characters of a name.
+        # Print characters that the terminal's encoding lacks as escape sequences, instead of raising an error.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = body()
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        # The reader has closed the pipe; without this, Python would report the error again at exit.
+        # The reader of the pipe has closed it. Redirect stdout to /dev/null, because Python would otherwise print the
+        # same error again when it flushes stdout at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except BadInput as error:
@@ -55,24 +58,25 @@ def exit_with_status(main: Callable[..., int], *arguments: object) -> NoReturn:
     Parameters
     ----------
     main : callable
-        Function that returns an exit status. If it raises an error, the process ends with that error as usual.
+        Function that returns an exit status, or raises SystemExit with one. Other exceptions are not caught.
     *arguments : object
         Arguments of `main`.
 
     Raises
     ------
     SystemExit
-        If `main` raises one with a text, which Python prints.
+        If `main` raises SystemExit with a message instead of a number. Python then prints the message.
 
     Notes
     -----
-    The process ends without waiting for Arrow's threads. A thread that closes a Python file while the interpreter shuts
-    down aborts the process (apache/arrow#34314), although all work is done.
+    Functions registered with atexit are called and the output is flushed. Then the process ends without waiting for
+    Arrow's threads: a thread that closes a Python file while the interpreter shuts down would abort the process
+    (apache/arrow#34314).
     """
     try:
         code = main(*arguments)
     except SystemExit as stop:
-        # argparse exits with a number; Python itself prints a text.
+        # argparse raises SystemExit with a number. If the code is a message, raise it again, so that Python prints it.
         if not isinstance(stop.code, int):
             raise
         code = stop.code
@@ -84,18 +88,18 @@ def exit_with_status(main: Callable[..., int], *arguments: object) -> NoReturn:
 
 
 def limit_resource(name: str, limit: int) -> None:
-    """Limit a resource of this process, if the operating system can.
+    """Limit a resource of this process, such as its memory; do nothing if the operating system cannot limit it.
 
     Parameters
     ----------
     name : str
-        Name of a limit in the module `resource`, such as "RLIMIT_AS".
+        Name of a limit in the module `resource`, such as "RLIMIT_AS" (memory) or "RLIMIT_CPU" (CPU time).
     limit : int
-        Limit in bytes, or in seconds of CPU time.
+        Limit in bytes, or for CPU time in seconds.
 
     Notes
     -----
-    macOS cannot limit the memory of a process, so only the system bounds a hostile file or query there.
+    macOS cannot limit the memory of a process, so a hostile file or query can use all memory of the machine there.
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         resource.setrlimit(getattr(resource, name), (limit, limit))
@@ -109,7 +113,7 @@ def print_error(name: str, error: object, code: int) -> int:
     name : str
         Name of the command.
     error : object
-        Error or text; it is shortened to one line.
+        Exception or message; it is shortened to one line of at most 1000 characters.
     code : int
         Exit status.
 

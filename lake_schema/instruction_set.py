@@ -1,10 +1,11 @@
 """Limit numerical libraries to x86-64-v3 instructions, so that every x86-64 CPU computes the same bytes.
 
-numpy, numba, Arrow and OpenBLAS use AVX-512 if the CPU has it, and their AVX-512 code rounds last bits differently.
-Importing `lake_schema` therefore limits them to x86-64-v3 (AVX2 and FMA, in nearly all desktop and server CPUs since
-2015). This must happen before numpy is imported. The environment variable TRUESKY_CPU=native removes the limit.
+numpy, numba, Arrow and OpenBLAS use AVX-512 instructions if the CPU has them, and the results then differ in the last
+bits. Importing `lake_schema` therefore limits them to the instruction set x86-64-v3 (AVX2 and FMA, in nearly all
+desktop and server CPUs since 2015). The limits are environment variables, which have no effect after numpy is imported.
+The environment variable TRUESKY_CPU=native removes the limit.
 
-The module uses the standard library only when it is imported.
+Importing this module imports the standard library only, because numpy must not be imported before the limit is set.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lake_schema.errors import BadInput
 SETTING = "TRUESKY_CPU"
 PORTABLE, NATIVE = "portable", "native"
 LEVEL = "x86-64-v3"
-# numpy's dispatch groups above x86-64-v3, by their names since numpy 2.4.
+# numpy's names, since version 2.4, of the groups of instructions that x86-64-v3 does not contain.
 _NUMPY_GROUPS_ABOVE = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
 _NUMPY_DISABLE, _NUMPY_ENABLE = "NPY_DISABLE_CPU_FEATURES", "NPY_ENABLE_CPU_FEATURES"
 _ARROW, _ARROW_LEVEL = "ARROW_USER_SIMD_LEVEL", "AVX2"
@@ -35,25 +36,31 @@ _DEFAULTS = {
     _NUMBA_SVML: "1",
     _BLAS: _BLAS_CORE,
 }
-# Variables that must fit the CPU: code for x86-64-v3 does not run on an older one.
+# Environment variables that are set only if the CPU executes x86-64-v3: they make numba and OpenBLAS compile or select
+# code that does not run on an older CPU.
 _FOR_THIS_CPU = (_NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, _BLAS)
-# Other settings of numba that change the order of sums or the functions that are used.
+# Environment variables of numba that change the order of sums or the functions that compiled code calls.
 _OTHER_NUMBA_VARIABLES = (
     "NUMBA_DISABLE_JIT", "NUMBA_ENABLE_AVX", "NUMBA_LOOP_VECTORIZE", "NUMBA_OPT", "NUMBA_SLP_VECTORIZE",
 )  # fmt: skip
-# LLVM's names of the features that x86-64-v3 adds to v2. https://gitlab.com/x86-psABIs/x86-64-ABI, table 3.1
+# CPU features that x86-64-v3 has and x86-64-v2 lacks, by their names in LLVM (https://gitlab.com/x86-psABIs/x86-64-ABI,
+# table 3.1).
 _LEVEL_FEATURES = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
-# Linux's names of the same features.
+# File in which Linux lists the features of the CPU, and its names of the features that x86-64-v3 adds to x86-64-v2.
 _CPUINFO, _LEVEL_FLAGS = Path("/proc/cpuinfo"), {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 
 
 def is_portable() -> bool:
-    """Return True unless the user asked for all instructions of this CPU."""
+    """Return True if libraries are limited to x86-64-v3, False if the user has set TRUESKY_CPU=native."""
     return _read_setting() != NATIVE
 
 
 def limit() -> None:
-    """Set the environment variables of the libraries; call this before they are imported."""
+    """Set the environment variables that limit numpy, Arrow, numba and OpenBLAS to x86-64-v3 instructions.
+
+    Call this function before these libraries are imported. The variables of numba and OpenBLAS are set only if Linux
+    reports that the CPU has these instructions, else `limit_numba` sets them later.
+    """
     os.environ.update(variables())
     if is_portable() and _linux_lists_level():
         _limit_for_this_cpu()
@@ -69,15 +76,17 @@ def _limit_for_this_cpu() -> None:
 
 
 def variables() -> dict[str, str]:
-    """Environment variables that limit numpy and Arrow in a Python process that starts with them.
+    """Return environment variables that limit numpy and Arrow to x86-64-v3 in a Python process that starts with them.
 
-    A CPU of another architecture, or an older one, ignores them, so a driver can send them to any worker.
+    They have no effect on a CPU that is older or of another architecture, so Spark can send them to all its workers.
+    The result also contains TRUESKY_CPU if it is set. Without a limit, it contains nothing else.
     """
     setting = {SETTING: os.environ[SETTING]} if SETTING in os.environ else {}
     if not is_portable() or not _is_x86():
         return setting
     setting[_ARROW] = os.environ.get(_ARROW, _ARROW_LEVEL)
-    # numpy refuses to start with both of its variables; `check` reports the conflict.
+    # numpy cannot be imported if both of its variables are set. If the user has set the other one, set none here;
+    # `check` reports it if numpy then uses too many instructions.
     if _NUMPY_ENABLE not in os.environ:
         chosen = os.environ.get(_NUMPY_DISABLE, "").replace(",", " ").split()
         setting[_NUMPY_DISABLE] = " ".join(dict.fromkeys((*chosen, *_NUMPY_GROUPS_ABOVE)))
@@ -85,24 +94,27 @@ def variables() -> dict[str, str]:
 
 
 def limit_numba() -> None:
-    """Set the environment variables of numba; call this before numba is imported.
+    """Set the environment variables that limit numba and OpenBLAS to x86-64-v3, if this CPU has these instructions.
 
-    `limit` has done so already where the operating system lists the features of the CPU quickly.
+    Call this function before numba is imported. On Linux, `limit` has set the variables already. On other systems, it
+    has not, because the features of the CPU must be read with llvmlite, whose import is slow.
     """
     if not is_portable() or not _has_level():
         return
     _limit_for_this_cpu()
     if "numba" in sys.modules:
-        # Too late for functions that are compiled already; `check` reports that.
+        # numba has been imported before, so it must read the variables again. Functions that it has compiled stay as
+        # they are; `check` reports them.
         sys.modules["numba"].config.reload_config()
 
 
 @cache
 def kind() -> str:
-    """Describe what determines the last bits of this process's results.
+    """Return a text with the instruction sets and the C library that determine the last bits of results.
 
-    Two machines of the same kind compute the same bytes. The standard kind is "x86-64-v3" with the C library's
-    version; every other kind lists the architecture, numba's target and the instruction sets that numpy and Arrow use.
+    Processes with equal texts compute the same bytes. With the limit to x86-64-v3, the text is "x86-64-v3" and the
+    version of the C library. Otherwise it lists the architecture, the CPU for which numba compiles, and the instruction
+    sets that numpy and Arrow use.
 
     Returns
     -------
@@ -127,15 +139,15 @@ def kind() -> str:
 
 
 def numba_target() -> tuple[str, str]:
-    """CPU name and features for which numba compiles in this process.
+    """Return the name and the features of the CPU for which numba compiles in this process.
 
     Returns
     -------
     name : str
-        Name of the CPU as LLVM knows it.
+        Name of the CPU in LLVM, such as "x86-64-v3" or "znver5".
     features : str
-        Empty if the name determines the features; else what the user chose, or a hash of the features of this CPU,
-        whose names take hundreds of characters.
+        "" if the features follow from the name, else the value of $NUMBA_CPU_FEATURES. If numba was imported before the
+        limit was set, "features:" and a hash of the features of this CPU.
     """
     limit_numba()
     if "numba" in sys.modules:
@@ -152,7 +164,11 @@ def numba_target() -> tuple[str, str]:
 
 
 def _other_numba_settings() -> tuple[str, ...]:
-    """Further settings of numba in the environment that are not the defaults."""
+    """Return "NAME=value" for each environment variable of numba that is set and may change results.
+
+    NUMBA_DISABLE_INTEL_SVML is left out if it has the value that truesky sets. The variables with the name and the
+    features of the CPU are not included.
+    """
     settings = [f"{name}={os.environ[name]}" for name in _OTHER_NUMBA_VARIABLES if name in os.environ]
     if os.environ.get(_NUMBA_SVML, _DEFAULTS[_NUMBA_SVML]) != _DEFAULTS[_NUMBA_SVML]:
         settings.append(f"{_NUMBA_SVML}={os.environ[_NUMBA_SVML]}")
@@ -160,18 +176,20 @@ def _other_numba_settings() -> tuple[str, ...]:
 
 
 def check() -> str | None:
-    """Check that the setting is valid and in effect.
+    """Check that TRUESKY_CPU has a valid value, and that the limit to x86-64-v3 instructions is in effect.
 
     Returns
     -------
     str or None
-        A line about the difference from the standard kind, if the user's environment variables cause one.
+        None if results are the same as on other machines with the limit, if there is no limit, or if this CPU does not
+        have all x86-64-v3 instructions. Else a warning in one line: the user's environment variables change the last
+        bits of results.
 
     Raises
     ------
     BadInput
-        If TRUESKY_CPU has an unknown value, or if numpy, numba or Arrow uses instructions above x86-64-v3
-        nevertheless.
+        If TRUESKY_CPU is neither "portable" nor "native", or if numpy, numba or Arrow uses instructions above x86-64-v3
+        although they are limited, for example because numpy was imported before truesky.
     """
     if _read_setting() not in (PORTABLE, NATIVE):
         raise BadInput(f"{SETTING} must be {PORTABLE} or {NATIVE}, got {_read_setting()!r}")
@@ -203,7 +221,10 @@ def check() -> str | None:
 
 @cache
 def require_limit() -> None:
-    """Raise BadInput, as `check` does, if this process must not compute published bytes; looks once per process."""
+    """Raise BadInput if the limit to x86-64-v3 instructions is set but not in effect, see `check`.
+
+    After a call without an error, later calls of the process do not check again.
+    """
     check()
 
 
@@ -212,7 +233,10 @@ def _is_x86() -> bool:
 
 
 def _linux_lists_level() -> bool:
-    """Return True if Linux lists all features of x86-64-v3 for this CPU; quick, needs no other package."""
+    """Return True if /proc/cpuinfo lists all features of x86-64-v3 for this CPU; False on other systems than Linux.
+
+    Unlike `_has_level`, the function is fast, because it does not import llvmlite.
+    """
     if not _is_x86():
         return False
     try:
@@ -225,7 +249,7 @@ def _linux_lists_level() -> bool:
 
 @cache
 def _has_level() -> bool:
-    """Return True if this CPU executes x86-64-v3."""
+    """Return True if this CPU executes all x86-64-v3 instructions, according to llvmlite."""
     if not _is_x86():
         return False
     import llvmlite.binding
@@ -236,11 +260,14 @@ def _has_level() -> bool:
 
 @cache
 def _numpy_in_use() -> tuple[str, ...]:
-    """Dispatch groups above the baseline that numpy's functions use in this process, sorted."""
+    """Return numpy's names of the instruction sets that its functions use in this process, sorted.
+
+    The baseline, which all CPUs have, is left out.
+    """
     from numpy.lib import introspect
 
     targets = {kind["current"] for kinds in introspect.opt_func_info().values() for kind in kinds.values()}
-    # A target can name several groups; the baseline is written as baseline(...).
+    # A text lists one or more names of instruction sets; if it begins with "baseline", it is the baseline.
     return tuple(sorted({word for target in targets if not target.startswith("baseline") for word in target.split()}))
 
 

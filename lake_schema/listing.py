@@ -1,4 +1,7 @@
-"""List the versions of all tables of a lake, with the requests that use them and their inputs."""
+"""List the versions of all tables of a lake, with their sizes, their inputs, and the requests that use them.
+
+A version is one publication of a table; a request is a named set of settings for which tables are made.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +15,27 @@ from lake_schema.store.object_storage.s3 import MANIFEST, Folder
 
 _HEADINGS = ("names", "table", "version", "current", "published", "rows", "bytes", "made of")
 _RIGHT_ALIGNED = {"rows", "bytes"}
-# Digits of a key that are shown; they suffice to distinguish the versions of a lake.
+# Number of hexadecimal digits of a version's key that are printed, out of 16. They suffice to tell versions apart.
 _KEY_DIGITS = 8
 
 
 def rows(root: Folder) -> list[dict[str, Any]]:
-    """Return one mapping per version, sorted by table and then by date.
+    """Return one dict per version of each table of a lake, sorted by table and then by time of publication.
 
     Returns
     -------
     list of dict
-        Keys of each mapping:
+        Keys of each dict:
 
-        - ``table``, ``version``: name of the table and key of the version
-        - ``names``: names of the requests that use the version
+        - ``table``, ``version``: name of the table and key of the version (16 hexadecimal digits)
+        - ``names``: names of the requests (named sets of settings) that use the version
         - ``current``: True if the version was published last
-        - ``published``: time of publication, UTC, ISO 8601
-        - ``rows``: number of rows
-        - ``bytes``: total size of its files, including files that it shares with other versions
-        - ``made_of``: keys of the versions from which it was made, by table
-        - ``error``: reason why the version cannot be read, only if it cannot
+        - ``published``: time of publication, UTC, ISO 8601, or "" if the version cannot be read
+        - ``rows``: number of rows, or None if the version cannot be read
+        - ``bytes``: total size of its files, including files that other versions share, or None if the version
+          cannot be read
+        - ``made_of``: keys of the existing versions from which it was made, by name of their table
+        - ``error``: reason why the version cannot be read; the key is missing for a sound version
 
     Raises
     ------
@@ -81,7 +85,7 @@ def _input_keys(root: Folder, facts: Mapping[str, Any], table_names: Sequence[st
 
 
 def format_table(version_rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the mappings of `rows` as aligned columns with a heading."""
+    """Format the dicts that `rows` returns as lines of text with aligned columns and a heading."""
     lines = [_HEADINGS, *(_format_cells(row) for row in version_rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     aligned_right = [head in _RIGHT_ALIGNED for head in _HEADINGS]

@@ -8,25 +8,29 @@ import numpy.typing as npt
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
-# Exact by definition: SI Brochure (BIPM 2019).
+# Speed of light (km/s and angstrom/s), Planck constant (erg s) and Boltzmann constant (erg/K). They are exact by
+# definition: SI Brochure (BIPM 2019).
 LIGHT_KM_S = 299_792.458
 LIGHT_ANGSTROM_S = 2.99792458e18
 PLANCK_ERG_S = 6.62607015e-27
 BOLTZMANN_ERG_K = 1.380649e-16
 
-# Oke & Gunn 1983: m_AB = -2.5 log10(f_nu / erg s-1 cm-2 Hz-1) - 48.6.
+# Zero point of AB magnitudes: m_AB = -2.5 log10(f_nu / erg s-1 cm-2 Hz-1) - 48.6 (Oke & Gunn 1983).
 AB_CGS = 48.6
+# One microjansky in erg s-1 cm-2 Hz-1.
 UJY_CGS = 1e-29
-# The same zero point for microjansky, 72.5 - 48.6. It is split so that f_nu_of_mag loses no digits.
+# Zero point of AB magnitudes for flux densities in microjansky, 72.5 - 48.6.
 AB_UJY = 23.9
+# Zero point AB_UJY as the difference 24.0 - 0.1. The binary number 24.0 is exact, so f_nu_of_mag loses no digits.
 _AB_UJY_WHOLE, _AB_UJY_REST = 24.0, 0.1
 
-# A magnitude outside these limits is a mistake, and f_nu would exceed the range of single precision.
+# Smallest and largest AB magnitude that is accepted; a magnitude beyond them is a mistake. They correspond to 4e29 and
+# 4e-31 microjansky, which single precision can represent.
 MAG_LO, MAG_HI = -50.0, 100.0
 
 
 def f_nu_of_mag(mag_ab: npt.ArrayLike) -> Float:
-    """Convert AB magnitudes to f_nu in microjansky, with a relative error of 4e-15.
+    """Convert AB magnitudes (any shape) to flux densities f_nu in microjansky, with a relative error of 4e-15.
 
     Raises
     ------
@@ -45,14 +49,15 @@ def f_nu_of_mag(mag_ab: npt.ArrayLike) -> Float:
     bad = ~((mag >= MAG_LO) & (mag <= MAG_HI))
     if bad.any():
         raise OutOfRange("mag_ab", float(mag[bad].ravel()[0]), MAG_LO, MAG_HI)
-    # Separating whole decades keeps the rounding error of the rest independent of the magnitude.
+    # Split the exponent into an integer and a rest of at most 0.5, so that the relative error of the flux density does
+    # not increase with the magnitude.
     decades = np.rint((_AB_UJY_WHOLE - mag) / 2.5)
     rest = (_AB_UJY_WHOLE - 2.5 * decades) - mag - _AB_UJY_REST
     return np.asarray(10.0**decades * 10.0 ** (rest / 2.5))
 
 
 def mag_of_f_nu(f_nu: npt.ArrayLike) -> Float:
-    """Convert f_nu in microjansky to AB magnitudes; 0 gives +inf.
+    """Convert flux densities f_nu in microjansky (any shape) to AB magnitudes; a flux density of 0 gives +inf.
 
     Raises
     ------
@@ -68,12 +73,12 @@ def mag_of_f_nu(f_nu: npt.ArrayLike) -> Float:
 
 
 def cgs_of_ujy(f_nu: npt.ArrayLike) -> Float:
-    """Convert microjansky to erg s-1 cm-2 Hz-1."""
+    """Convert flux densities (any shape) from microjansky to erg s-1 cm-2 Hz-1; nothing is checked."""
     return np.asarray(f_nu, float) * UJY_CGS
 
 
 def ujy_of_cgs(f_nu: npt.ArrayLike) -> Float:
-    """Convert erg s-1 cm-2 Hz-1 to microjansky."""
+    """Convert flux densities (any shape) from erg s-1 cm-2 Hz-1 to microjansky; nothing is checked."""
     return np.asarray(f_nu, float) / UJY_CGS
 
 
@@ -83,11 +88,12 @@ def electron_rate(f_nu: npt.ArrayLike, collecting_area: float, log_width: float)
     Parameters
     ----------
     f_nu : float array, any shape
-        Flux density in microjansky, averaged as int f_nu T dln(lambda) / int T dln(lambda).
+        Flux density in microjansky, averaged over the band as int f_nu T dln(lambda) / int T dln(lambda). T is the
+        total throughput of the band in electrons per arriving photon. Values are not checked.
     collecting_area : float
-        Collecting area in cm2, above 0.
+        Collecting area of the telescope in cm2, above 0.
     log_width : float
-        int T dln(lambda), above 0, with the total throughput T in electrons per arriving photon.
+        Integral of the throughput, int T dln(lambda), above 0.
 
     Returns
     -------
@@ -106,5 +112,9 @@ def electron_rate(f_nu: npt.ArrayLike, collecting_area: float, log_width: float)
 
 
 def zero_point(collecting_area: float, log_width: float) -> float:
-    """Return the AB magnitude of a source that gives one electron per second. Parameters: see `electron_rate`."""
+    """Return the AB magnitude of a source that gives one detected electron per second.
+
+    `collecting_area` is in cm2. `log_width` is int T dln(lambda) with the throughput T in electrons per photon.
+    OutOfRange is raised if one of them is not positive and finite.
+    """
     return float(AB_UJY + 2.5 * np.log10(electron_rate(1.0, collecting_area, log_width)))

@@ -1,7 +1,7 @@
 """Open, check and write files that a user names, and parse TOML.
 
-Only regular files are opened: a pipe might never answer, and a device might never end. Each kind of file has a largest
-size. All errors are BadInput with one line that names the file.
+Only regular files are opened: reading a pipe might block, and reading a device might never end. Each type of file, such
+as "request" (settings) or "catalogue", has a largest size. All errors are BadInput with one line that names the file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from typing import IO, Any
 from lake_schema.errors import BadInput
 
 _MB, _GB = 1 << 20, 1 << 30
-# Largest size of each kind of file in bytes. Catalogues are read in pieces, all other files into memory.
+# Largest size in bytes of each type of file that a user can name. Catalogues are read in pieces; all other files must
+# fit into memory.
 MAX_BYTES = {
     "request": _MB,
     "table of pointings": 64 * _MB,
@@ -38,11 +39,18 @@ MAX_BYTES = {
     "calibrated image": 16 * _GB,
     "manifest": 4 * _GB,
 }
-_MAX_SHOWN_LENGTH, _MAX_PATH_LENGTH = 200, 4096
-# Limits of a TOML text: parts of a dotted key, nested brackets, characters of a number or bare key. Requests stay far
-# below them.
-_MAX_KEY_PARTS, _MAX_DEPTH, _MAX_WORD_LENGTH = 16, 16, 200
-# Strings and comments are skipped as a whole; tomllib reports their errors.
+# Largest number of characters of a path in an error message; the middle of a longer path is left out.
+_MAX_SHOWN_LENGTH = 200
+# Largest number of characters of a path.
+_MAX_PATH_LENGTH = 4096
+# Largest number of parts of a dotted key (a.b.c) in a TOML text.
+_MAX_KEY_PARTS = 16
+# Largest number of nested brackets in a TOML text.
+_MAX_DEPTH = 16
+# Largest number of characters of a number or unquoted key in a TOML text.
+_MAX_WORD_LENGTH = 200
+# Pattern of one TOML token. A string or comment is one token, so brackets and dots in it are not counted. The pattern
+# need not detect wrong syntax, because tomllib does so.
 _TOKEN = re.compile(
     r'"""(?:[^"\\]++|\\.|"(?!"")|""(?!"))*+"{3,5}'
     r"|'''(?:[^']++|'(?!'')|''(?!'))*+'{3,5}"
@@ -54,11 +62,14 @@ _TOKEN = re.compile(
 
 
 def expand_path(text: str | Path, folder: Path | None = None) -> Path:
-    """Return the path for a text that a user typed: ~ is expanded, and a relative path starts at `folder` if given."""
+    """Return the path for a text that a user typed, with ~ expanded; a relative path starts at `folder` if given.
+
+    Raise BadInput if `text` is not a str or Path, is longer than 4096 characters, or ~ names an unknown user.
+    """
     if not isinstance(text, str | Path):
         raise BadInput(f"{format_path(repr(text))} is not a path")
     if len(str(text)) > _MAX_PATH_LENGTH:
-        # Resolving the links of a path takes time proportional to the square of its length.
+        # Refuse long paths, because the time to resolve symbolic links grows with the square of the length.
         raise BadInput(f"{format_path(text)}: File name too long")
     try:
         path = Path(text).expanduser()
@@ -70,23 +81,26 @@ def expand_path(text: str | Path, folder: Path | None = None) -> Path:
 
 
 def format_path(path: str | Path) -> str:
-    """Return a path as messages show it: one line of printable characters, shortened in the middle if it is long."""
+    """Return a path for an error message: one line of at most 200 printable characters.
+
+    If the path has more than 200 characters, its first and last 80 are shown with "..." between them.
+    """
     name = str(path)
     printable = name if name.isprintable() else ascii(name)[1:-1]
     return printable if len(printable) <= _MAX_SHOWN_LENGTH else f"{printable[:80]}...{printable[-80:]}"
 
 
 def check_file(path: Path, kind: str, key: str = "") -> Path:
-    """Check that a path is a readable regular file within the size limit of its kind, and return it.
+    """Check that a path is a readable regular file of at most a given size, and return the path.
 
     Parameters
     ----------
     path : Path
         Path of the file.
     kind : str
-        Kind of file, a key of `MAX_BYTES`.
+        Type of file, a key of `MAX_BYTES`, such as "catalogue". It determines the largest size.
     key : str, optional
-        Key of the request that names the file, for the message.
+        Name of the setting that contains the path, for the message.
 
     Returns
     -------
@@ -107,14 +121,19 @@ def check_file(path: Path, kind: str, key: str = "") -> Path:
 
 @contextmanager
 def open_file(path: Path, kind: str) -> Iterator[IO[bytes]]:
-    """Open a regular file that is within the size limit of its kind, as a stream of bytes."""
+    """Open a regular file as a stream of bytes for the body of a `with` statement.
+
+    `kind` is the type of file, a key of `MAX_BYTES`, which determines the largest size. BadInput is raised if the file
+    does not exist, is not a regular file, cannot be opened, or is too large.
+    """
     with os.fdopen(_open_descriptor(path, kind), "rb") as stream:
         yield stream
 
 
 def _open_descriptor(path: Path, kind: str) -> int:
     try:
-        # Opening some devices has effects, so the type is checked before; it is checked again because it may change.
+        # Check the type before opening, because opening some devices has side effects. Check it again below, because
+        # another process may replace the file in between.
         _check_regular_file(path, kind, os.stat(path))
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
@@ -122,7 +141,7 @@ def _open_descriptor(path: Path, kind: str) -> int:
     except OSError as error:
         raise BadInput(f"{format_path(path)}: {error.strerror}") from None
     except ValueError as error:
-        # The path contains a NUL character, or a character that the file system does not support.
+        # Possible reasons: a NUL character in the path, or a character that the file system does not support.
         raise BadInput(f"{format_path(path)}: {error}") from None
     try:
         _check_regular_file(path, kind, os.fstat(descriptor))
@@ -150,9 +169,13 @@ _FILE_TYPES = (
 
 
 def read_text(path: Path, kind: str) -> str:
-    """Return the text of a UTF-8 file, without the byte order mark that Excel and Notepad write."""
+    """Return the text of a UTF-8 file, without the byte order mark that Excel and Notepad write at its start.
+
+    `kind` is the type of file, a key of `MAX_BYTES`. BadInput is raised if the file cannot be read, is larger than the
+    limit of its type, or is not UTF-8.
+    """
     with open_file(path, kind) as stream:
-        # The file may have grown since its size was checked.
+        # Read at most one byte more than the limit, because the file may have grown since `open_file` checked its size.
         data = stream.read(MAX_BYTES[kind] + 1)
     if len(data) > MAX_BYTES[kind]:
         raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the limit for a {kind}")
@@ -164,19 +187,27 @@ def read_text(path: Path, kind: str) -> str:
 
 @contextmanager
 def check_reachable(path: Path) -> Iterator[None]:
-    """Turn errors of the operating system about a path into BadInput; a path that does not exist yet is accepted."""
+    """Raise BadInput in place of errors of the operating system about a path in the body of a `with` statement.
+
+    At the end of the body, the path is looked up on disc, so that one that is too long raises BadInput, for example. A
+    path that does not exist is accepted.
+    """
     try:
         yield
         os.lstat(path)
     except FileNotFoundError:
         pass
     except (OSError, RuntimeError, ValueError) as error:
-        # Python before 3.13 reports a loop of links as a RuntimeError.
+        # RuntimeError: Python before 3.13 raises it for a loop of symbolic links.
         raise BadInput(f"{format_path(path)}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def check_target(path: Path, endings: Sequence[str] = ()) -> Path:
-    """Check that a file with one of the endings can be written to an existing folder, and return its path."""
+    """Check that a file can be written at a path, and return the path. The file itself may exist and be replaced.
+
+    `endings` are the allowed endings in lower case, such as ".fits"; by default any ending is allowed. BadInput is
+    raised for another ending, or if the folder does not exist or is not writable, or the path is a folder or device.
+    """
     if endings and path.suffix.lower() not in endings:
         raise BadInput(f"{format_path(path)}: the ending is not one of {', '.join(endings)}")
     with check_reachable(path):
@@ -189,7 +220,10 @@ def check_target(path: Path, endings: Sequence[str] = ()) -> Path:
 
 
 def check_folder(path: Path) -> Path:
-    """Check that a path is a writable folder, or that a folder can be created there, and return the path."""
+    """Check that a path is a writable folder, or that a folder can be created there, and return the path.
+
+    Raise BadInput otherwise. Nothing is created.
+    """
     with check_reachable(path):
         if os.path.lexists(path) and not path.is_dir():
             raise BadInput(f"{format_path(path)}: exists and is not a folder")
@@ -207,7 +241,11 @@ def _refuse_unwritable(path: Path, folder: Path) -> None:
 
 @contextmanager
 def replace_atomically(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; what is written there replaces `path` in one rename, or is removed."""
+    """Yield a temporary path in the folder of `path`, to which the body of the `with` statement must write a file.
+
+    At the end, the file is renamed to `path`, which it replaces. If the body raises an exception, the file is removed
+    and `path` is not changed.
+    """
     temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
     try:
         yield temporary
@@ -216,15 +254,18 @@ def replace_atomically(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-# ------------------------------------------------------------------------------------------------ TOML
+# ------------------------------------- parsing of TOML texts
 
 
 def read_toml(path: Path, kind: str) -> dict[str, Any]:
-    """Read a TOML file into a dict."""
+    """Read a TOML file into a dict; raise BadInput if it cannot be read, is too large, or is not valid TOML.
+
+    `kind` is the type of file, a key of `MAX_BYTES`, which determines the largest size.
+    """
     try:
         return parse_toml(read_text(path, kind).replace("\r\n", "\n"))
     except ValueError as error:
-        # tomllib raises ValueError for a syntax error and for an invalid date.
+        # tomllib raises a ValueError for a syntax error and also for an invalid date.
         raise BadInput(f"{format_path(path)}: {' '.join(str(error).split())}") from None
 
 
@@ -234,7 +275,8 @@ def parse_toml(source: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the text is not TOML, or has long keys or deep nesting, on which the parser takes quadratic time or recurses.
+        If the text is not valid TOML. Also for keys of more than 16 parts, more than 16 nested brackets, and numbers or
+        keys above 200 characters, for which tomllib would be very slow or exceed Python's recursion limit.
     """
     _refuse_deep(source)
     return tomllib.loads(source)

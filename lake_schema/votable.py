@@ -1,8 +1,8 @@
-"""Describe the columns of Parquet files by a VOTable header in the footer, for clients that do not read Arrow metadata.
+"""Write units and descriptions of columns as a VOTable header into the footer of Parquet files.
 
-The header is a VOTable without data whose fields are the columns of the file, with unit and UCD. It follows the
-VOParquet convention. The archives of Rubin and IRSA write it, and astropy (`Table.read(file,
-format="parquet.votable")`), TOPCAT and hats read it.
+The header is a VOTable without data, whose fields are the columns of the file with unit and UCD. It follows the
+VOParquet convention, which the archives of Rubin and IRSA use. astropy (`Table.read(file, format="parquet.votable")`)
+and TOPCAT read it, and hats can write it. They do not read units from Arrow metadata.
 
 References
 ----------
@@ -29,31 +29,34 @@ _TYPES = {
 
 
 def footer_metadata(rows: pa.Table, table: Table) -> dict[str, str]:
-    """Return the VOTable entries for the footer of a Parquet file that contains these rows of a table.
+    """Return the key-value metadata that the footer of a Parquet file needs: version of VOParquet, and VOTable header.
 
-    The header is that of the declared table. The rows are only needed for the longest text of each text column.
+    The header describes the columns that `table` declares. `rows` are the rows of the file; only the length of the
+    longest text in each text column is taken from them.
     """
     texts = [column.name for column in table.columns if column.type == "string"]
-    # astropy's VOTable reader takes a text of unknown length for an object, but its Parquet reader does not.
+    # Give the largest length of texts in the header. For a text of unknown length, astropy would make a column of
+    # Python objects.
     text_lengths = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)
     return {VERSION: "1.0", CONTENT: table_header(table, text_lengths)}
 
 
 @lru_cache(maxsize=64)
 def table_header(table: Table, text_lengths: tuple[tuple[str, int], ...] = ()) -> str:
-    """Return the columns of a table as a VOTable without data, in XML.
+    """Return a VOTable in XML that describes the columns of a table and has no data.
 
     Parameters
     ----------
     table : Table
         Declaration of the table.
     text_lengths : tuple of (str, int), optional
-        Largest number of characters of each text column.
+        Name of a text column and the number of characters of its longest text. Columns that are not listed have an
+        unknown length.
 
     Returns
     -------
     str
-        The VOTable.
+        The XML text of the VOTable.
     """
     root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": _NAMESPACE})
     table_element = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})

@@ -1,1 +1,1 @@
-"""Reading of tables from files of other programs."""
+"""Reading of tables from Parquet, FITS, CSV and HDF5 files of other programs, which may be damaged or hostile."""

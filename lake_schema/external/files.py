@@ -1,11 +1,11 @@
-"""Read Parquet files of other programs in a separate process, with limits on everything.
+"""Read Parquet files of other programs in a separate process with limited memory and time.
 
-A file can be made so that its reader crashes. Therefore a process with little memory and time reads it and sends plain
-Arrow batches::
+A hostile or damaged file can crash its reader or fill the memory. Therefore a separate process reads it, and sends the
+rows as a stream of Arrow batches::
 
     python -m lake_schema.external.files FILE NUMBER COLUMN ... >stream
 
-The first NUMBER columns are required; the other ones are sent if they exist.
+The first NUMBER columns must exist; the other ones are sent if they exist.
 """
 
 from __future__ import annotations
@@ -25,44 +25,55 @@ import pyarrow.parquet as pq
 from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 
+# First and last four bytes of a Parquet file.
 _MAGIC = b"PAR1"
-# Largest footer in bytes, and largest length of a list in it. The latter limits the numbers of columns and row groups,
-# and the nesting of columns.
+# Largest number of bytes of the footer of a Parquet file.
 _MAX_FOOTER_BYTES = 32 << 20
+# Largest length of a list in the footer: it limits the numbers of columns and row groups, and the nesting of columns.
 _MAX_ENTRIES = 5000
-# Largest uncompressed size of a row group in bytes; row groups that truesky writes have at most a tenth of it.
+# Largest uncompressed size in bytes of the selected columns of a row group; the number of its rows has the same limit.
 _MAX_GROUP_BYTES = 256 << 20
-# Size limits (bytes) of a text column per batch: dictionary-encoded, and plain (64 bytes per row).
-_MAX_DICTIONARY_BYTES, _MAX_TEXT_BYTES = 1 << 20, 4 << 20
+# Largest size in bytes of the dictionary of a column of texts in a batch.
+_MAX_DICTIONARY_BYTES = 1 << 20
+# Largest size in bytes of a column of texts without a dictionary in a batch: 64 bytes per row.
+_MAX_TEXT_BYTES = 4 << 20
+# Largest number of rows in a batch.
 _ROWS_PER_BATCH = 65_536
-# Limits of the reading process: address space in bytes, minimum of CPU time in s, and file size per additional second.
+# Largest address space of the reading process, in bytes.
 _MAX_MEMORY = 3 << 29
-_MIN_SECONDS, _BYTES_PER_SECOND = 10, 10_000_000
+# CPU time in s that the reading process may use for a small file.
+_MIN_SECONDS = 10
+# Size of a file in bytes for which the reading process may use one more second of CPU time.
+_BYTES_PER_SECOND = 10_000_000
+# Exit status of the reading process if it refuses the file; its stderr then contains the message.
 _REFUSED_STATUS = 2
 _ROOT = Path(__file__).resolve().parents[2]
 
 
 def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of some columns of a file in its order, with dictionary-encoded texts to save memory.
+    """Yield the rows of some columns of a Parquet file in batches, in the order of the file.
 
     Parameters
     ----------
     path : Path
         The file.
     columns : sequence of str
-        Names of flat columns of numbers, booleans or texts.
+        Names of columns that must exist, with one number, boolean or text per row. Texts are dictionary-encoded, to
+        save memory.
     text_columns : sequence of str, optional
-        Further columns, which are sent without dictionaries; columns that do not exist are left out.
+        Names of further columns, with the same types, whose texts are not dictionary-encoded. Columns that do not exist
+        are left out.
 
     Yields
     ------
     pyarrow.RecordBatch
-        Rows.
+        Up to 65,536 rows.
 
     Raises
     ------
     BadInput
-        If the file is not Parquet, is damaged, or exceeds the limits.
+        If the file is not Parquet, is damaged, or exceeds the limits of size, memory or time, or if a column is missing
+        or has another type.
     """
     _refuse_large_footer(path)
     yield from read_in_subprocess(__name__, path, columns, text_columns)
@@ -71,12 +82,12 @@ def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
 def read_in_subprocess(
     module: str, path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()
 ) -> Iterator[pa.RecordBatch]:
-    """Yield the batches that a module sends from a separate process.
+    """Run a module in a separate process that reads a file, and yield the batches of rows that it sends.
 
     Parameters
     ----------
     module : str
-        Name of a module that calls `main` with its reader.
+        Name of a module that calls `main` of this module with a function that reads its file format.
     path : Path
         The file.
     columns : sequence of str
@@ -88,6 +99,11 @@ def read_in_subprocess(
     ------
     pyarrow.RecordBatch
         Rows.
+
+    Raises
+    ------
+    BadInput
+        If the process refuses the file, or ends with another error. Rows that it sent before have been yielded.
     """
     command = [sys.executable, "-m", module, str(path.resolve()), str(len(columns)), *columns, *text_columns]
     environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
@@ -104,7 +120,7 @@ def _receive_batches(path: Path, reader: subprocess.Popen[bytes]) -> Iterator[pa
         with pa.ipc.open_stream(reader.stdout) as stream:
             yield from stream
     except (OSError, pa.ArrowException):
-        # The process ended early; its stderr contains the reason.
+        # The stream is incomplete, because the process has ended with an error. Its stderr is reported below.
         pass
     _, stderr = reader.communicate()
     if reader.returncode == _REFUSED_STATUS:
@@ -128,13 +144,15 @@ def _refuse_large_footer(path: Path) -> None:
         )
 
 
-# ----------------------------------------------------------------------------------------- in the separate process
+# ------------------------------------- functions that run in the separate process
 
 
 def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[str], IO[bytes]], None]) -> int:
-    """Write the batches of a file to stdout as an Arrow stream, or an error to stderr, and return the exit status.
+    """Limit the memory and CPU time of this process, read a file, and write its rows to stdout as an Arrow stream.
 
-    `argv` is FILE NUMBER COLUMN ..., and `sender` is the function that writes the batches.
+    `argv` is FILE NUMBER COLUMN ..., of which the first NUMBER columns must exist. `sender` reads the file and writes
+    the stream; its arguments are the path, the required columns, the other columns and the output file. Return the exit
+    status: 0, or 2 if `sender` raises BadInput, whose message is then written to stderr.
     """
     path, required_count, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
     seconds = _MIN_SECONDS + path.stat().st_size // _BYTES_PER_SECOND
@@ -152,23 +170,24 @@ def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[st
 
 
 def send_batches(path: Path, required: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream.
+    """Read some columns of a Parquet file, and write their rows as a stream of Arrow batches.
 
     Parameters
     ----------
     path : Path
         A Parquet file of another program.
     required : sequence of str
-        Columns that must exist.
+        Names of columns that must exist.
     text_columns : sequence of str
-        Columns that are left out if they do not exist.
+        Names of columns that are left out if they do not exist.
     out : binary file
-        File for the stream.
+        File to which the stream is written.
 
     Raises
     ------
     BadInput
-        If the file exceeds the limits, or Arrow cannot read it.
+        If the file exceeds the limits of its size, a required column is missing or has an unsuitable type, or Arrow
+        cannot read the file.
     """
     try:
         with _open_file(path, required, text_columns) as (file, columns):
@@ -195,7 +214,10 @@ def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) 
 def _open_file(
     path: Path, required: Sequence[str], text_columns: Sequence[str]
 ) -> Iterator[tuple[pq.ParquetFile, list[str]]]:
-    """Yield the file and the names of the columns to read."""
+    """Open a Parquet file, and yield it and the names of those columns to read that exist.
+
+    Raise BadInput if a required column is missing, or a column or row group is not suitable.
+    """
     limits: dict[str, Any] = {
         "thrift_container_size_limit": _MAX_ENTRIES,
         "thrift_string_size_limit": _MAX_FOOTER_BYTES,
@@ -211,21 +233,21 @@ def _open_file(
 
 
 def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
-    """Raise BadInput if columns are missing from a file or occur more than once; the message lists all missing columns.
+    """Raise BadInput if required columns are missing from a file or occur more than once.
 
     Parameters
     ----------
     path : Path
         The file, for the message.
     names : sequence of str
-        Names of the columns of the file.
+        Names of all columns of the file.
     columns : sequence of str
         Names of the required columns.
 
     Raises
     ------
     BadInput
-        If a column is missing or not unique.
+        If a required column is missing or occurs more than once. The message lists all missing columns.
     """
     count = Counter(names)
     if missing := [column for column in dict.fromkeys(columns) if not count[column]]:

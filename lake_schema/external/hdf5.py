@@ -1,8 +1,9 @@
-"""Read HDF5 files of other programs in OpenCosmo's layout, in a separate process and with limits on everything.
+"""Read galaxy catalogues in HDF5 files with OpenCosmo's layout, in a separate process with limited memory and time.
 
-A column is a dataset with one axis in a group `data`; its attribute `unit` gives the unit. The group is either at the
-top, or in one group per slice of a light-cone; slices are read in the order of their names. If a group `header/file`
-gives a type of data, it must be galaxies. As for Parquet, a process with little memory and time reads the file::
+A column is a dataset with one axis in a group `data`; its attribute `unit` gives the unit. The group `data` is at the
+top of the file, or in one group per slice (redshift shell) of a light-cone. Slices are read in the order of their
+names. If a group `header/file` gives the type of the data, it must be galaxies. The separate process reads the file and
+sends its rows as a stream of Arrow batches, because a hostile file could crash its reader::
 
     python -m lake_schema.external.hdf5 FILE NUMBER COLUMN ... >stream
 """
@@ -19,46 +20,55 @@ import pyarrow as pa
 from lake_schema.errors import BadInput
 from lake_schema.external import files
 
+# First bytes of an HDF5 file.
 MAGIC = b"\x89HDF\r\n\x1a\n"
+# Values of the attribute `data_type` in OpenCosmo's headers that stand for catalogues of galaxies.
 _TYPES = ("diffsky_fits", "synthetic_galaxies")
+# Largest number of rows in a batch.
 _ROWS_PER_BATCH = 65_536
-# Largest number of groups in a file (each slice of a light cone is a group), of characters in a unit, and of bytes in
-# an unpacked chunk.
-_MAX_GROUPS, _MAX_UNIT_LENGTH, _MAX_CHUNK_BYTES = 4096, 64, 64 << 20
+# Largest number of groups at the top of a file, and of columns in a group `data`.
+_MAX_GROUPS = 4096
+# Largest number of characters of a unit; the rest of a longer unit is cut off.
+_MAX_UNIT_LENGTH = 64
+# Largest number of bytes of a chunk of a dataset after decompression.
+_MAX_CHUNK_BYTES = 64 << 20
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of some columns of numbers in the order of the file; the metadata of a field contain its unit.
+    """Yield the rows of some columns of numbers of an HDF5 file as Arrow batches, in the order of the file.
+
+    The metadata of the Arrow field of a column contain its unit, if the file gives it.
 
     Raises
     ------
     BadInput
-        If the file is damaged, has no rows or exceeds the limits. The message names a faulty dataset.
+        If the file is damaged, has no rows, lacks a column, or exceeds the limits of size, memory or time. The message
+        names the dataset if it is known.
     """
     yield from files.read_in_subprocess(__name__, path, columns)
 
 
-# ----------------------------------------------------------------------------------------- in the separate process
+# ------------------------------------- functions that run in the separate process
 
 
 def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream.
+    """Read some columns of an HDF5 file, and write their rows as a stream of Arrow batches.
 
     Parameters
     ----------
     path : Path
         An HDF5 file of another program.
     columns : sequence of str
-        Names of columns of numbers.
+        Names of columns of numbers, at least one.
     text_columns : sequence of str
         Not used; `files.main` requires this parameter.
     out : binary file
-        File for the stream.
+        File to which the stream is written.
 
     Raises
     ------
     BadInput
-        If the file exceeds the limits, or h5py cannot read it.
+        If the file has no rows, lacks a column, exceeds a limit, or cannot be read by h5py.
     """
     import h5py
 
@@ -75,7 +85,11 @@ def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
 
 
 def _data_groups(path: Path, file: Any) -> list[Any]:
-    """Return the groups `data` of a file, after checking the types of data in its headers."""
+    """Return the groups `data` of a file: one for the whole file, or one per slice (redshift shell).
+
+    Each group contains columns. Raise BadInput if the file has no group `data`, or if a header gives a type of data
+    other than galaxies.
+    """
     import h5py
 
     if len(file) > _MAX_GROUPS:
@@ -102,7 +116,10 @@ def _numeric_sort_key(name: str) -> tuple[int, str]:
 
 
 def _hard_linked_item(path: Path, group: Any, name: str) -> Any:
-    """Return an item that is stored in the file itself; links to other places are refused."""
+    """Return a group or dataset by its name; raise BadInput if it is a soft or external link, or is missing.
+
+    An external link could lead to any file of the user.
+    """
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):

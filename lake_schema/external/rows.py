@@ -1,7 +1,7 @@
-"""Read tables of numbers of other programs in bounded batches: Parquet, FITS, CSV and HDF5.
+"""Read catalogues of other programs in batches of limited size, from Parquet, FITS, CSV and HDF5 files.
 
-Parquet and HDF5 files are read in a separate process, FITS and CSV files in pieces. The ending of a file determines its
-format, or its first bytes if the ending is unknown.
+Parquet and HDF5 files are read in a separate process, because a hostile file could crash it. The ending of a file
+determines its format, or its first bytes if the ending is unknown.
 """
 
 from __future__ import annotations
@@ -24,27 +24,34 @@ from lake_schema.external import files as external_files
 from lake_schema.external import hdf5
 from lake_schema.fits import external
 
-_BLOCK_BYTES, _HEADER_BYTES = 8 << 20, 1 << 16
-# Largest number of characters of a text, and of columns of a CSV file.
-_MAX_TEXT_LENGTH, _MAX_COLUMNS = 64, 4096
+# Number of bytes of a CSV file that Arrow parses at a time.
+_BLOCK_BYTES = 8 << 20
+# Number of bytes at the start of a file that are checked; the line of titles of a CSV file must fit into them.
+_HEADER_BYTES = 1 << 16
+# Largest number of characters of an entry in a column of texts.
+_MAX_TEXT_LENGTH = 64
+# Largest number of columns of a CSV file.
+_MAX_COLUMNS = 4096
+# Endings of the files of each format, in lower case.
 _CSV, _FITS, _PARQUET, _HDF5 = (".csv",), (".fits", ".fit"), (".parquet", ".parq"), (".hdf5", ".h5")
 _ENDINGS = (*_PARQUET, *_FITS, *_CSV, *_HDF5)
 
 
 @dataclass(frozen=True, slots=True)
 class RowBatch:
-    """Rows of one file.
+    """Consecutive rows of one file of another program.
 
     Attributes
     ----------
     file : Path
         The file.
     first_row : int
-        Number of the first row in the file, from 1.
+        Number of the first row of the batch in the file; the first row of the file is 1.
     columns : mapping of str to array, shape (n,)
-        Values by title: numbers, NaN for missing floats; or texts (type object), "" for missing ones.
+        Values by name of the column: numbers, with NaN for missing ones, or texts (type object), with "" for missing
+        ones.
     units : mapping of str to str
-        Units that the file gives, by title.
+        Units that the file gives, by name of the column.
     """
 
     file: Path
@@ -54,12 +61,15 @@ class RowBatch:
 
 
 def find_files(path: Path) -> list[Path]:
-    """Return the files for a path: the file itself, or the Parquet files, else the HDF5 files, of a folder.
+    """Return the files of a catalogue: the file at a path, or all Parquet files in a folder, sorted.
+
+    If a folder contains no Parquet files, its HDF5 files are returned. Subfolders are searched, too.
 
     Raises
     ------
     BadInput
-        If there is no such file, the folder contains no such files, or the ending is unknown.
+        If the file does not exist, its ending is unknown, its contents have another format, or the folder contains
+        neither Parquet nor HDF5 files.
     """
     if _is_folder(path):
         paths = _files_of_folder(path)
@@ -79,9 +89,10 @@ def _is_folder(path: Path) -> bool:
 
 
 def check_format(file: Path, kind: str = "catalogue") -> Path:
-    """Return the path of a file if its first bytes fit its format; this quick check precedes reading it.
+    """Check that the first bytes of a file fit its format (Parquet, FITS, CSV or HDF5), and return its path.
 
-    `kind` is a key of `user_files.MAX_BYTES`.
+    The ending of the file determines the format. `kind` is the type of file, a key of `user_files.MAX_BYTES`, which
+    limits its size. BadInput is raised if the first bytes are different, or the file does not exist or is too large.
     """
     form = _endings_of_format(file, kind)
     with user_files.open_file(file, kind) as stream:
@@ -98,7 +109,10 @@ def check_format(file: Path, kind: str = "catalogue") -> Path:
 
 
 def _refuse_wide(file: Path, start: bytes) -> None:
-    """Refuse a CSV file with too many columns; Arrow allocates at least 4 kB for each column, even if unread."""
+    """Raise BadInput if a CSV file has more than 4096 columns, or a line of titles of at least 65,536 bytes.
+
+    Arrow would allocate at least 4 kB for each column, even if it is not read.
+    """
     header_line = (start.splitlines() or [b""])[0]
     if len(header_line) == _HEADER_BYTES or header_line.count(b",") >= _MAX_COLUMNS:
         raise BadInput(
@@ -113,31 +127,33 @@ def read_batches(
     text_columns: Sequence[str] = (),
     kind: str = "catalogue",
 ) -> Iterator[RowBatch]:
-    """Yield the rows of one file in batches.
+    """Yield the rows of one Parquet, FITS, CSV or HDF5 file in batches.
 
     Parameters
     ----------
     file : Path
         The file.
     columns : sequence of str
-        Columns of numbers.
+        Names of columns of numbers, at least one.
     integer_columns : sequence of str, optional
-        Those of `columns` with integers, in which missing values are refused, because float64 cannot store 64-bit
-        integers.
+        Those of `columns` that must keep 64-bit integers. Except in FITS files, a missing value in them is an error,
+        because a column with missing values becomes float64, which cannot store all integers.
     text_columns : sequence of str, optional
-        Further columns with texts, or with integers that become texts; columns that do not exist are left out.
+        Further columns with texts, or with integers that become texts. Columns that do not exist are left out. They are
+        not read from HDF5 files.
     kind : str, optional
-        Kind of file, a key of `user_files.MAX_BYTES`.
+        Type of file, a key of `user_files.MAX_BYTES`, which limits its size.
 
     Yields
     ------
     RowBatch
-        Rows.
+        Rows of the file, in its order.
 
     Raises
     ------
-    BadInput, Damaged
-        If the file cannot be read. The message names the file, and a faulty column and row.
+    BadInput
+        If the file cannot be read, a column of `columns` is missing or has no numbers, or a text is longer than 64
+        characters. The message names the file, and the column and row if it is known.
     """
     first_row = 1
     endings = _endings_of_format(check_format(file, kind), kind)
@@ -170,7 +186,11 @@ def read_batches(
 
 
 def csv_column_names(file: Path, kind: str = "catalogue") -> list[str]:
-    """Return the titles of a CSV file's columns; raise BadInput if one occurs twice."""
+    """Return the names of the columns of a CSV file, in its order.
+
+    BadInput is raised if the file is not CSV in UTF-8, is too large for its type `kind` (a key of
+    `user_files.MAX_BYTES`), or a name occurs twice.
+    """
     try:
         with user_files.open_file(check_format(file, kind), kind) as stream, csv.open_csv(stream) as table:
             names = list(table.schema.names)
@@ -183,7 +203,7 @@ def csv_column_names(file: Path, kind: str = "catalogue") -> list[str]:
 
 
 def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, float]) -> Array:
-    """Return the values of a column unchanged if all are within bounds.
+    """Return the values of a column unchanged if all are within bounds, which are included.
 
     Parameters
     ----------
@@ -204,7 +224,8 @@ def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, fl
     Raises
     ------
     BadInput
-        If a value is out of bounds or NaN. The message names the first such row.
+        If a value is out of bounds or NaN. The message gives the first row with such a value, counted from 1, and how
+        many rows have such values.
     """
     low, high = bounds
     outside = ~((values >= low) & (values <= high))
@@ -216,9 +237,10 @@ def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, fl
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
-    """Return the Parquet files, else the HDF5 files, of a folder.
+    """Return the Parquet files in a folder and its subfolders, or without Parquet files the HDF5 files, sorted.
 
-    For a collection of HATS catalogues, only the dataset of the primary catalogue is used. It contains each row once.
+    A HATS collection also contains copies of rows near the edges of its cells (margin catalogue), so only the files of
+    its primary catalogue are returned.
     """
     properties = folder / "collection.properties"
     if properties.is_file():
@@ -237,7 +259,10 @@ def _unit(field: pa.Field) -> str:
 
 
 def _endings_of_format(file: Path, kind: str) -> tuple[str, ...]:
-    """Return the endings of the format of a file."""
+    """Return the tuple of endings that stands for the format of a file, such as `_FITS` for a FITS file.
+
+    If the file has another ending, its first bytes decide; a file that is neither Parquet nor FITS counts as CSV.
+    """
     for endings in (_PARQUET, _FITS, _CSV, _HDF5):
         if file.suffix.lower() in endings:
             return endings

@@ -1,1 +1,1 @@
-"""Reading and writing of FITS files."""
+"""Reading and writing of FITS files: images, binary tables, LDAC catalogues and PSFEx models."""

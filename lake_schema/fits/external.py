@@ -1,4 +1,7 @@
-"""Read FITS files of users and other programs, with limits on their size: tables, HEALPix maps and planes of images."""
+"""Read FITS files of users and other programs: tables, HEALPix maps, and images of two or three axes.
+
+The files may be damaged or hostile, so their sizes are limited and all errors become BadInput.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +23,42 @@ from lake_schema import user_files
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput, LakeError
 
+# Default number of rows in a batch.
 _ROWS_PER_BATCH = 65_536
-# Largest number of bytes of an unpacked gzip file, of pixels of a map, and of samples of planes.
-_MAX_UNPACKED_BYTES, _MAX_PIXELS, _MAX_SAMPLES = 512 << 20, 12 << 24, 64 << 20
-# Sizes of blocks and cards in bytes, and limits: axes of a unit, units of a file, bytes of a header.
-_BLOCK, _CARD = 2880, 80
-_MAX_AXES, _MAX_HDUS, _MAX_HEADER_BYTES = 9, 1000, 64 * _BLOCK
+# Largest number of bytes of a file that is packed by gzip, after unpacking.
+_MAX_UNPACKED_BYTES = 512 << 20
+# Largest number of pixels of a HEALPix map (order 12).
+_MAX_PIXELS = 12 << 24
+# Largest number of pixels of an image or cube.
+_MAX_SAMPLES = 64 << 20
+# Number of bytes of a block of a FITS file; headers and data end at a multiple of it.
+_BLOCK = 2880
+# Number of bytes of a header card.
+_CARD = 80
+# Largest number of axes of an image.
+_MAX_AXES = 9
+# Largest number of header-data units of a file.
+_MAX_HDUS = 1000
+# Largest number of bytes of a header.
+_MAX_HEADER_BYTES = 64 * _BLOCK
+# Largest number of columns of a table (limit of the FITS standard).
 _MAX_COLUMNS = 999
+# Pattern of a header card that determines the size of the data: keyword and integer.
 _SIZE_CARD = re.compile(rb"(?:HIERARCH +)?(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS) *= *([+-]?\d+)")
-# Largest width of a column of texts, in bytes.
+# Largest number of bytes per row in a column of texts.
 _MAX_TEXT_BYTES = 256
 
 
 def read_numbers(path: Path, kind: str) -> dict[str, Float]:
-    """Return the numeric columns of a file's first table as float64 arrays by title; TNULL becomes NaN.
+    """Return the numeric columns of the first binary table in a FITS file, as float64 arrays by name of the column.
+
+    Columns with texts, arrays or lists are left out. Integers that equal TNULL become NaN. `kind` is the type of file,
+    a key of `user_files.MAX_BYTES`, which limits its size.
 
     Raises
     ------
     BadInput
-        If the file is cut short or is not FITS, or has no table.
+        If the file is cut short, too large or not FITS, or has no table.
     """
     with _open_hdus(path, kind) as hdus:
         return _number_columns(_first_table(path, hdus))
@@ -51,32 +71,34 @@ def read_batches(
     rows_per_batch: int = _ROWS_PER_BATCH,
     kind: str = "catalogue",
 ) -> Iterator[tuple[dict[str, Array], dict[str, str]]]:
-    """Yield the rows of some columns of a file's first table in batches.
+    """Yield the rows of some columns of the first binary table in a FITS file, in batches.
 
     Parameters
     ----------
     path : Path
         The file.
     columns : sequence of str
-        Columns of numbers.
+        Names of columns with one number or boolean per row.
     text_columns : sequence of str, optional
-        Columns of texts or whole numbers; columns that do not exist are left out.
+        Names of columns with texts or whole numbers; columns that do not exist are left out.
     rows_per_batch : int, optional
-        Number of rows in a batch.
+        Largest number of rows in a batch.
     kind : str, optional
-        Kind of file, a key of `user_files.MAX_BYTES`, which limits its size.
+        Type of file, a key of `user_files.MAX_BYTES`, which limits its size.
 
     Yields
     ------
     arrays : dict of str to array, shape (n,)
-        Values by column; integers keep their type unless some are missing.
+        Values by column. Integers keep their type. If some in a batch equal TNULL (missing values), they become
+        NaN, and the column is float64 in this batch. Booleans become int8.
     units : dict of str to str
-        Units (TUNIT) by column, if the file gives them.
+        Units (TUNIT) by column, for columns of numbers that have one.
 
     Raises
     ------
     BadInput
-        If the file is cut short or is not FITS, or a column is missing or not numeric.
+        If the file is cut short, too large or not FITS, has no table, or a column of `columns` is missing or has lists
+        or texts.
     """
     with _open_hdus(path, kind) as hdus:
         hdu = _first_table(path, hdus)
@@ -98,8 +120,12 @@ def read_batches(
 
 
 def read_table(path: Path, kind: str) -> Any:
-    """Return the first table of a file as an astropy QTable with units; it raises the errors of `read_numbers`."""
-    # This import is slow and seldom needed.
+    """Return the first binary table in a FITS file as an astropy QTable with units.
+
+    Raise BadInput if the file is cut short, too large or not FITS, has no table, or a column contains lists. `kind` is
+    the type of file, a key of `user_files.MAX_BYTES`.
+    """
+    # Import here, because the import is slow and this function is seldom called.
     from astropy.table import QTable
 
     with _open_hdus(path, kind) as hdus:
@@ -116,13 +142,18 @@ def _refuse_no_numbers(path: Path, hdu: Any, columns_by_name: Mapping[str, Any],
 
 
 def _refuse_lists(path: Path, column: Any) -> None:
-    # Rows of variable length contain offsets, which cannot be checked before they are read.
+    # Refuse arrays of variable length (formats P and Q): their offsets may lead outside the file, which astropy does
+    # not check.
     if any(letter in str(column.format) for letter in "PQ"):
         raise BadInput(f"{path}: column {column.name} holds lists")
 
 
 def _text_column(path: Path, hdu: Any, name: str) -> Array:
-    """Return a column as stored bytes, or as integers; astropy would decode the texts of all rows at once."""
+    """Return a column of texts as stored bytes, or a column of integers as integers.
+
+    The bytes are decoded later in batches, because astropy would decode the texts of all rows at once. Raise BadInput
+    for other types, or texts of more than 256 bytes per row.
+    """
     stored = hdu.data.view(np.ndarray)[name]
     if stored.dtype.kind in "iu":
         stored = hdu.data[name]
@@ -148,7 +179,7 @@ def _native_numbers(values: Any, null: int | None) -> Array:
 
 
 def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
-    """Return a column of a HEALPix map.
+    """Return a column of a HEALPix map, which is stored in the first binary table of a FITS file.
 
     Parameters
     ----------
@@ -160,14 +191,15 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
     Returns
     -------
     values : float64 array, shape (n,)
-        Values of the pixels in the order of the file.
+        Values of the pixels in the order of the file (RING or NESTED, see the card ORDERING).
     cards : dict
-        Cards of its header.
+        Header of the table: values by keyword.
 
     Raises
     ------
     BadInput
-        If the file is cut short or is not FITS, or has no table or no such column.
+        If the file is cut short, too large or not FITS, has no table or no such column, or the column has lists, texts
+        or more than 12 * 4^12 pixels.
     """
     with _open_hdus(path, "map of dust") as hdus:
         hdu = _first_table(path, hdus)
@@ -185,30 +217,31 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
 def read_planes(
     path: Path, column: str, kind: str = "PSF", max_samples: int = _MAX_SAMPLES
 ) -> tuple[Float, dict[str, Any]]:
-    """Return the planes of a file: its first image with two or three axes, or an array in the first row of a table.
+    """Return the first image or cube of a FITS file, or an array of two or three axes in the first row of a table.
 
     Parameters
     ----------
     path : Path
         The file.
     column : str
-        Column of the table that contains the array.
+        Name of the column that contains the array, if the file stores it in a table.
     kind : str, optional
-        Kind of file, a key of `user_files.MAX_BYTES`, which limits its size.
+        Type of file, a key of `user_files.MAX_BYTES`, which limits its size.
     max_samples : int, optional
-        Largest number of samples.
+        Largest number of pixels of all planes together.
 
     Returns
     -------
     planes : float64 array, shape (ny, nx) or (n, ny, nx)
-        The planes.
+        The image, or the n planes of the cube.
     cards : dict
-        Cards of their header.
+        Header of the unit that contains the array: values by keyword.
 
     Raises
     ------
     BadInput
-        If the file is cut short or is not FITS, has no planes or too many samples, or contains compressed images only.
+        If the file is cut short, too large or not FITS, has no such array or one with too many pixels, or contains
+        compressed images only.
     """
     with _open_hdus(path, kind) as hdus:
         for hdu in hdus:
@@ -243,19 +276,21 @@ def _number_columns(hdu: Any) -> dict[str, Float]:
 
 @contextmanager
 def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
-    """Open a FITS file, plain or packed by gzip, after its headers have been checked.
+    """Open a FITS file, plain or packed by gzip, for the body of a `with` statement, after checking its headers.
 
-    All errors of astropy become BadInput, because its readers raise many types of exceptions for damaged files.
+    BadInput is raised in place of every exception in the body that is not a LakeError, because astropy raises many
+    types of exceptions for damaged files.
     """
     with user_files.open_file(path, kind) as stream:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", AstropyUserWarning)
-                # Titles such as "RA(ICRS)" are common.
+                # Ignore warnings about names of columns such as "RA(ICRS)", which are against the standard but common.
                 warnings.simplefilter("ignore", fits.verify.VerifyWarning)
                 unpacked = _unpack(path, stream)
                 _check_headers(path, unpacked)
-                # Compressed images appear as tables and are not decompressed, because that code trusts its input.
+                # Do not decompress images: astropy's code for it does not check its input. Compressed images then
+                # appear as tables.
                 with fits.open(unpacked, memmap=unpacked is stream, disable_image_compression=True) as hdus:
                     yield hdus
         except LakeError:
@@ -289,7 +324,10 @@ def _unpack(path: Path, stream: IO[bytes]) -> IO[bytes]:
 
 
 def _check_headers(path: Path, stream: IO[bytes]) -> None:
-    """Refuse headers without an end and data that exceed the file, which would be mapped beyond its end."""
+    """Raise BadInput if headers have no end, have too many columns or axes, or give more data than the file contains.
+
+    Without this check, astropy would map the file into memory beyond its end.
+    """
     name, size, hdu_start = user_files.format_path(path), stream.seek(0, io.SEEK_END), 0
     for _ in range(_MAX_HDUS):
         stream.seek(hdu_start)
@@ -319,7 +357,10 @@ def _check_headers(path: Path, stream: IO[bytes]) -> None:
 
 
 def _header(name: str, stream: IO[bytes]) -> bytes:
-    """Return the blocks of a header, b"" at the end of the file."""
+    """Return the bytes of the header at the current position, b"" at the end of the file.
+
+    Raise BadInput if the header is cut short or has no END card within 64 blocks of 2880 bytes.
+    """
     header = b""
     while len(header) < _MAX_HEADER_BYTES:
         block = stream.read(_BLOCK)

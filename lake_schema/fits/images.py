@@ -1,4 +1,4 @@
-"""Write and read FITS images with checksums; equal input gives equal bytes."""
+"""Write and read FITS files of images with checksums; equal images and header cards give equal bytes."""
 
 from __future__ import annotations
 
@@ -19,9 +19,12 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import write
 from lake_schema.fits.write import MAX_BYTES
 
-# Rows of an image per compressed tile. With single rows, astropy takes twice as long to write and three times to read.
+# Number of rows of an image per compressed tile. With one row per tile, astropy takes twice as long to write and three
+# times as long to read.
 _ROWS_PER_TILE = 16
+# Header card: keyword, value and comment.
 Card = tuple[str, str | int | float | bool, str]
+# Structural keywords, which the writer sets; a card of an Image must not have one of them.
 STRUCTURE = {
     "SIMPLE",
     "XTENSION",
@@ -39,14 +42,14 @@ STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One header-data unit.
+    """One header-data unit of a FITS file, with image data or no data.
 
     Attributes
     ----------
     data : array, shape (ny, nx) or (n, ny, nx), or None
-        uint8, int16, uint16, int32, float32 or float64; None for a header without data.
+        Pixels of type uint8, int16, uint16, int32, float32 or float64; None for a header without data.
     cards : tuple of (str, str or int or float or bool, str)
-        Keyword, value and comment of each card in order, without structural keywords.
+        Keyword, value and comment of each header card in order, without structural keywords such as NAXIS.
     name : str
         Name of the extension (EXTNAME), "" for none.
     """
@@ -57,35 +60,36 @@ class Image:
 
 
 def cards_to_text(cards: Sequence[Card]) -> str:
-    """Return header cards as lines of text."""
+    """Return header cards as text, one line in FITS format per card; `cards_from_text` reads the text."""
     return "".join(_card_line(*card, repr(card[1])) for card in cards)
 
 
 @lru_cache(maxsize=4096, typed=True)
 def _card_line(keyword: str, value: Any, comment: str, value_text: str) -> str:
-    """Return a card as a line; cards are cached, because the images of a file share most cards.
+    """Return a header card as a line of text in FITS format, with a line end.
 
-    `value_text` distinguishes values that compare equal, such as 0.0 and -0.0.
+    Lines are cached, because most cards occur in many images. `value_text` is the repr of the value: as part of the
+    cache key, it distinguishes values that compare equal, such as 0.0 and -0.0.
     """
     return f"{str(fits.Card(keyword, value, comment)).rstrip()}\n"
 
 
 def cards_from_text(lines: str) -> tuple[Card, ...]:
-    """Return the header cards that `cards_to_text` wrote."""
+    """Return the header cards in a text from `cards_to_text`: keyword, value and comment of each line."""
     return tuple((card.keyword, card.value, card.comment) for card in map(fits.Card.fromstring, lines.splitlines()))
 
 
 def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:
-    """Write images to one file, which replaces `path` in one rename.
+    """Write images to one FITS file, which replaces `path` in one rename.
 
     Parameters
     ----------
     path : Path
         The file.
     images : sequence of Image
-        At least one image. The first one becomes the primary unit.
+        At least one image. The first one becomes the primary unit, the others become extensions.
     rice : bool, optional
-        True to compress integer images without loss (RICE_1 of FITS standard 4.0, section 10), in tiles of some rows. A
+        True to compress integer images without loss (RICE_1 of FITS standard 4.0, section 10), in tiles of 16 rows. A
         compressed image must be an extension, so a primary unit without pixels precedes a compressed first image.
 
     Raises
@@ -104,34 +108,35 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
 
 
 def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
-    """Read all images of a file from `write_images`, and verify CHECKSUM and DATASUM of each unit.
+    """Read all images of a FITS file that `write_images` wrote, and verify CHECKSUM and DATASUM of each unit.
 
     Parameters
     ----------
     path : Path
         The file.
     max_bytes : int, optional
-        Largest size of the data according to the headers.
+        Largest size of the data in bytes, stored or decompressed; by default 8 GB. It is compared with the size that
+        the headers give, before the data are read.
 
     Returns
     -------
     list of Image
-        The images.
+        The images, without an empty primary unit that precedes a compressed first image.
 
     Raises
     ------
     Damaged
-        If a checksum is wrong or missing, or the file is cut short.
+        If a checksum is wrong or missing, the file is cut short, or astropy cannot read it.
     BadInput
-        If the file is too large.
+        If the data exceed `max_bytes`.
 
     Notes
     -----
-    The checksums detect any single changed byte, but may miss exchanged bytes. For a file of a lake,
-    `Version.sidecar_path` compares the sha256.
+    The checksums detect any single changed byte, but may miss exchanged bytes. For a file of a published table,
+    `Version.sidecar_path` compares the sha256 instead.
     """
     with write.errors_as_damaged(path):
-        # Turn RuntimeWarnings from astropy's rescaling of the data into errors.
+        # Turn RuntimeWarnings into errors: astropy emits them if damaged scaling keywords make values overflow.
         warnings.simplefilter("error", RuntimeWarning)
         with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
             write.check_size(path, hdus, max_bytes)
@@ -146,17 +151,23 @@ def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
             return [image_from_hdu(hdu) for hdu in hdus[skip_primary:]]
 
 
-# ------------------------------------------------------------------------------------------------ writing
+# ------------------------------------- conversion between Image and the header-data units of astropy
 
 
 def primary_hdu(image: Image) -> fits.PrimaryHDU:
-    """Return an image as a primary unit of astropy."""
+    """Return an image as a primary header-data unit of astropy.
+
+    Raise BadInput if the data are not numbers in two or three dimensions, or FITS cannot store a card.
+    """
     hdu = fits.PrimaryHDU(data=None if image.data is None else _check_array(image.data))
     return _add_cards(hdu, image)
 
 
 def image_hdu(image: Image) -> fits.ImageHDU:
-    """Return an image as an image extension of astropy."""
+    """Return an image as an image extension of astropy.
+
+    Raise BadInput if the data are not numbers in two or three dimensions, or FITS cannot store a card.
+    """
     return _add_cards(fits.ImageHDU(data=None if image.data is None else _check_array(image.data)), image)
 
 
@@ -164,10 +175,11 @@ def _compressed_hdu(image: Image) -> fits.BinTableHDU:
     data = _check_array(np.asarray(image.data))
     tile = (*(1 for _ in data.shape[:-2]), min(_ROWS_PER_TILE, data.shape[-2]), data.shape[-1])
     hdu = _add_cards(fits.CompImageHDU(data=data, compression_type="RICE_1", tile_shape=tile), image)
-    # The checksums apply to the table in which the image is stored, so the unit is returned as that table.
+    # Return the binary table in which FITS stores the compressed image, not the image, because the checksums must be
+    # those of the table.
     stream = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(stream)
-    # The file stays open, because the rows are copied from it when the unit is written.
+    # Do not close the file in memory: astropy reads the rows of the table from it when the unit is written.
     return fits.open(io.BytesIO(stream.getvalue()), disable_image_compression=True)[1]
 
 
@@ -176,7 +188,7 @@ def _has_integers(image: Image) -> bool:
 
 
 def _is_empty_primary(hdu: Any) -> bool:
-    """Return True if a primary unit exists only because a file must begin with one."""
+    """Return True if a primary unit has no data and only structural cards, such as SIMPLE and NAXIS."""
     return hdu.header["NAXIS"] == 0 and all(card.keyword in STRUCTURE for card in hdu.header.cards)
 
 
@@ -188,7 +200,8 @@ def _add_cards(hdu: Any, image: Image) -> Any:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", AstropyUserWarning)
                 card = fits.Card(keyword, value, comment)
-                # Formatting checks the card. Without the error, astropy would cut a long comment and continue.
+                # Format the card only to check it: astropy warns if it must cut a long comment, and the filter above
+                # turns the warning into an error.
                 str(card)
         except (ValueError, AstropyUserWarning) as error:
             raise BadInput(f"FITS card {keyword}: {' '.join(str(error).split())}") from None
@@ -205,7 +218,7 @@ def _check_array(data: Array) -> Array:
 
 
 def image_from_hdu(hdu: Any) -> Image:
-    """Return a unit of astropy as an Image, with data in native byte order."""
+    """Return a header-data unit of astropy as an Image, with data in the byte order of this machine."""
     data = None if hdu.data is None else np.asarray(hdu.data)
     if data is not None:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)

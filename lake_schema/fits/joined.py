@@ -1,4 +1,4 @@
-"""Join FITS files of images to one file whose first header contains the cards that they have in common."""
+"""Join FITS files of images (the detectors of an exposure, for example); common cards move to the first header."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import images, write
 from lake_schema.fits.images import STRUCTURE, Card, Image
 
-# Names that astropy gives to images without a name.
+# Names of extensions that count as no name; astropy gives the second one to a compressed image.
 _DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 
 _INHERIT: tuple[Card, ...] = (("INHERIT", True, "primary header also applies"),)
@@ -25,20 +25,21 @@ def join(
     extra_cards: Sequence[Card],
     kept_keywords: Sequence[str] = (),
 ) -> None:
-    """Write the arrays of several files to one file, which replaces `path` in one rename.
+    """Write the images of several FITS files as extensions to one file, which replaces `path` in one rename.
 
     Parameters
     ----------
     path : Path
-        The file. It begins with a header without data.
+        The new file. It begins with a primary header without data.
     files : sequence of (str, Path)
-        Names and paths of files from `write_images`. The names of a file's arrays begin with its name.
+        Names and paths of files that `write_images` wrote. In the new file, the name of an extension (EXTNAME) begins
+        with the name of its file.
     shared_keywords : sequence of str
-        Keywords of the cards that move to the first header if they are equal in all files.
+        Keywords of the cards that move to the primary header if they are equal in all files.
     extra_cards : sequence of Card
-        Cards of the first header, after the shared ones.
+        Further cards of the primary header.
     kept_keywords : sequence of str, optional
-        Shared keywords that arrays keep in their headers as well.
+        Those of `shared_keywords` that also stay in the headers of the extensions.
 
     Raises
     ------
@@ -47,8 +48,8 @@ def join(
 
     Notes
     -----
-    Cards of a file's first header that are not shared, or differ, are copied to each of its arrays, unless the array
-    has such a card. Only the arrays of one file are in memory at a time.
+    The other cards of a file's first header are copied to the header of each of its images, unless the image has a card
+    with this keyword. Only the images of one file are in memory at a time.
     """
     if not files:
         raise BadInput(f"{path}: there are no files to join")
@@ -91,7 +92,10 @@ def _image_extension(hdu: Any, name: str, common_keywords: set[str], kept_keywor
 def _compressed_extension(
     hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any
 ) -> Any:
-    """Return the table in which a compressed image is stored, with new cards; its rows are not changed."""
+    """Return the table in which a compressed image is stored, with the name and cards that it has in the joined file.
+
+    The rows of the table are not changed, so the image is not decompressed.
+    """
     for key in (common_keywords - kept_keywords) & set(hdu.header):
         del hdu.header[key]
     for card in (*_INHERIT * ("INHERIT" not in hdu.header), *_cards_except(first_hdu, {*common_keywords, *hdu.header})):
@@ -101,7 +105,10 @@ def _compressed_extension(
 
 
 def _extension_name(array_name: str, file_name: str) -> str:
-    """Return the name of an array in the joined file: the name of its file and, if it has one, its own name."""
+    """Return the EXTNAME of an image in the joined file: FILE, or FILE.NAME if the image has a name.
+
+    A name that already begins with the name of the file is not changed.
+    """
     return (
         file_name
         if array_name in _DEFAULT_NAMES
@@ -112,7 +119,11 @@ def _extension_name(array_name: str, file_name: str) -> str:
 
 
 def _first_cards(file: Path) -> dict[str, Card]:
-    """Return the cards of the header that applies to a whole file: the first one with more than structural cards."""
+    """Return the cards, by keyword, of the header that describes a whole file, without structural cards.
+
+    This is usually the primary header. If it has structural cards only and the first image is compressed, it is the
+    header of the first image.
+    """
     with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
         skip_primary = len(hdus) > 1 and write.is_compressed(hdus[1]) and not _cards_except(hdus[0], set())
         return {card[0]: card for card in _cards_except(hdus[int(skip_primary)], set())}

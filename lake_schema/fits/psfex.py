@@ -1,4 +1,7 @@
-"""Write a PSF model in the form of PSFEx: planes that are multiplied by powers of the position on a detector."""
+"""Write a PSF model in the file format of PSFEx.
+
+The PSF at a position of a detector is a sum of images (planes), each multiplied by powers of the scaled position.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +18,28 @@ from lake_schema.fits import write as fits_file
 def write(
     path: Path, planes: Float32, step: float, fwhm: float, centre: tuple[float, float], scale: tuple[float, float]
 ) -> None:
-    """Write a model to a file, which is replaced in one rename.
+    """Write a PSF model to a PSFEx file, which is replaced in one rename.
 
     Parameters
     ----------
     path : Path
         The file.
     planes : float32 array, shape (n, s, s)
-        Planes of the powers 1, x, x^2 .. y, x y .. of a polynomial in two coordinates.
+        Images whose sum, weighted by the powers 1, x, x^2 .. y, x y .., is the PSF at the scaled position (x, y). For a
+        polynomial of degree d there are n = (d + 1) (d + 2) / 2 planes.
     step : float
-        Distance between samples of a plane, in pixels.
+        Distance between samples of a plane, in detector pixels.
     fwhm : float
-        FWHM of a star, in pixels.
+        FWHM of a star, in detector pixels.
     centre : tuple of (float, float)
-        Column and row at which x = y = 0, in pixels; the first pixel is 1.
+        Column and row of the detector at which x = y = 0, in pixels; the centre of the first pixel is 1.
     scale : tuple of (float, float)
-        Number of columns and rows that correspond to x = 1 and y = 1.
+        Number of columns that correspond to x = 1, and of rows that correspond to y = 1.
 
     Raises
     ------
     BadInput
-        If the number of planes does not fit a polynomial in two coordinates.
+        If no polynomial in two coordinates has n coefficients.
     """
     degree = round((np.sqrt(8 * len(planes) + 1) - 3) / 2)
     if (degree + 1) * (degree + 2) // 2 != len(planes):

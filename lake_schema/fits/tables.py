@@ -1,4 +1,4 @@
-"""Write declared tables with their units and UCDs as FITS binary tables."""
+"""Write rows of tables as FITS binary tables, with the units and UCDs that the tables declare."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.fits import write
 
-# Largest number of characters that fit in the card with a column's name.
+# Largest number of characters of a column's name, which must fit into one header card.
 _MAX_NAME_LENGTH = 68
 _TABLE_FORMATS = {
     "int64": "K",
@@ -35,24 +35,25 @@ _TABLE_FORMATS = {
 
 
 def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
-    """Export rows of a declared table as a binary table; lists become arrays of variable length.
+    """Write rows of a declared table to a file with a FITS binary table; lists become arrays of variable length.
 
     Parameters
     ----------
     path : Path
         The file, which is replaced in one rename.
     table : pyarrow.Table
-        Rows with all or some of the declared columns. Null becomes NaN, TNULL for integers, the byte 0 for booleans, ""
-        for texts, and an empty array for lists.
+        Rows with all or some of the declared columns. A null becomes NaN for floats, an unused integer (TNULL) for
+        integers, the byte 0 for booleans, "" for texts, and an empty array for lists.
     declared : Table
-        Declaration of the table.
+        Declaration of the table, with units and UCDs.
 
     Raises
     ------
     BadInput
-        If a column has a name that FITS cannot store.
+        If a column is not declared, or has a name that FITS cannot store: it must be ASCII with 1 to 68 characters.
     ValueError, TypeError
-        If a column has values that FITS cannot store.
+        If a column has values that FITS cannot store: texts that are not ASCII, nulls in a column in which every
+        integer of its type occurs, or nulls in a list of integers.
     """
     columns = [declared.column(name) for name in table.column_names]
     for column in columns:
@@ -64,7 +65,7 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
     for column in columns:
         if column.type == "bool":
             stored[column.name][table.column(column.name).is_null().to_numpy()] = 0
-            # astropy 7.2 would write its converted copy of the column, in which missing values are False.
+            # Discard astropy's converted copy of the column. astropy 7.2 would write it, and nulls are False in it.
             hdu.data._converted.pop(column.name, None)
     for number, column in enumerate(columns, start=1):
         if column.ucd:
@@ -90,7 +91,7 @@ def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
     if values.null_count == 0 or code in "DEL":
         filled = values.fill_null(False if code == "L" else float("nan")) if values.null_count else values
         return fits.Column(column.name, code, array=filled.to_numpy(), **unit_option)
-    # FITS has no signed bytes, so they are written as 16-bit integers.
+    # Write int8 columns as 16-bit integers, because FITS has no signed bytes.
     widened = values.cast(pa.int16()) if column.type == "int8" else values
     null_value = _lowest_unused_value(widened.drop_null().to_numpy())
     return fits.Column(
@@ -99,7 +100,7 @@ def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
 
 
 def _lowest_unused_value(values: Array) -> int:
-    """Return the lowest value of an integer type that does not occur."""
+    """Return the lowest integer of the array's type that is not in the array; raise ValueError if all are."""
     limits, unique_values = np.iinfo(values.dtype), np.unique(values)
     gaps = np.flatnonzero(unique_values != limits.min + np.arange(unique_values.size))
     lowest = int(limits.min) + int(gaps[0] if gaps.size else unique_values.size)
@@ -117,7 +118,10 @@ def _fits_lists(column: Column, values: pa.ChunkedArray, unit_option: dict[str, 
 
 
 def fits_unit(text: str) -> str:
-    """Return a unit in the spelling of FITS; units that FITS does not have, such as the electron, are unchanged."""
+    """Return an astropy unit string in the spelling of the FITS standard.
+
+    Units that FITS does not have, such as the electron, and strings that are not units are returned unchanged.
+    """
     try:
         units.Unit(text, format="fits")
     except ValueError:
@@ -126,28 +130,30 @@ def fits_unit(text: str) -> str:
     return text
 
 
-# ------------------------------------------------------------------------------------------------ any number of rows
+# ------------------------------------- writing a table that may be larger than the memory
 
-# Bytes of rows that are formatted at a time, and bytes of a block of a FITS file.
-_CHUNK_BYTES, _BLOCK = 8 << 20, 2880
-# Number of lowest values of an integer type among which an unused one is searched.
+# Number of bytes of rows that are formatted at a time.
+_CHUNK_BYTES = 8 << 20
+# Number of bytes of a block of a FITS file; headers and data end at a multiple of it.
+_BLOCK = 2880
+# Number of lowest values of a column's integer type among which one that does not occur is searched, to represent null.
 _SEARCHED_VALUES = 1 << 16
 
 
 @dataclass(slots=True)
 class _ColumnScan:
-    """Properties of all values of a column, which must be known before the first row is written.
+    """Properties of all values of a column, which determine its format in the header of a FITS table.
 
     Attributes
     ----------
     column : Column
         Declaration of the column.
     max_width : int
-        Largest number of bytes of a text, or largest length of a list.
+        Largest number of bytes of a text, or largest length of a list, in the column.
     has_missing : bool
         True if a value is null.
     is_used : bool array, shape (_SEARCHED_VALUES,)
-        True for the lowest values of an integer type that occur.
+        For an integer column: element i is True if the lowest value of the type plus i occurs.
     """
 
     column: Column
@@ -161,7 +167,7 @@ class _ColumnScan:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of a value in its row; a list has its length and the offset of its values."""
+        """NumPy type of the column in a row of the file. For a list, it is the length and the offset of the values."""
         if self.is_list:
             return np.dtype((">i8", (2,)))
         if self.column.type == "string":
@@ -176,7 +182,10 @@ class _ColumnScan:
 
     @property
     def null_value(self) -> int | None:
-        """Integer that represents null, None if no value is missing."""
+        """Integer that represents null, or None if no value is null or the column is not one of integers.
+
+        BadInput is raised if all of the lowest 65,536 values of the type occur.
+        """
         if not (self.has_missing and self.dtype.kind == "i" and not self.is_list):
             return None
         if self.is_used.all():
@@ -184,14 +193,14 @@ class _ColumnScan:
         return int(np.iinfo(self.dtype).min) + int(np.argmin(self.is_used))
 
     def scan(self, values: pa.Array) -> None:
-        """Update the properties with more values."""
+        """Update the properties of the column with the values of one more batch of rows."""
         self.has_missing |= values.null_count > 0
         if self.is_list or self.column.type == "string":
             lengths = pc.list_value_length(values) if self.is_list else pc.binary_length(values)
             self.max_width = max(self.max_width, pc.max(lengths).as_py() or 0)
         elif self.dtype.kind == "i":
             present_values = values.drop_null().to_numpy()
-            # For larger values, the difference would overflow the type.
+            # Select the low values before subtracting the minimum: for large values, the difference would overflow.
             low_values = present_values[present_values < np.iinfo(self.dtype).min + _SEARCHED_VALUES].astype(np.int64)
             self.is_used[low_values - np.iinfo(self.dtype).min] = True
 
@@ -199,23 +208,26 @@ class _ColumnScan:
 def stream_to_fits(
     file: IO[bytes], batches: Callable[[], Iterable[pa.RecordBatch]], declared: Table, max_bytes: int | None = None
 ) -> None:
-    """Write rows in batches as `table_to_fits` does, but without checksums and with 64-bit addresses of lists.
+    """Write rows, which may be larger than the memory, as a FITS binary table without checksums.
+
+    Nulls and lists are written as by `table_to_fits`, but the lengths and offsets of lists have 64 bits.
 
     Parameters
     ----------
     file : binary file
-        File that is open for writing.
+        File that is open for writing and supports seek.
     batches : callable
-        Function that returns all rows, of the declared types, as batches. It is called twice.
+        Function without arguments that returns an iterable of all rows, as batches with all declared columns. It is
+        called twice and must return the same rows.
     declared : Table
-        Declaration of the table.
+        Declaration of the table, with units and UCDs.
     max_bytes : int, optional
-        Largest number of bytes of the rows.
+        Largest number of bytes of the rows, without the values of lists; by default any number is allowed.
 
     Raises
     ------
     BadInput
-        If FITS cannot store a column, or the rows are too large.
+        If FITS cannot store the name or a value of a column, or the rows exceed `max_bytes`.
     """
     scans, rows = [_ColumnScan(column) for column in declared.columns], 0
     for column in declared.columns:
@@ -230,7 +242,8 @@ def stream_to_fits(
             f"a FITS file of the result has more than {max_bytes / 1e9:.3g} GB: ask for less, or another format"
         )
     with tempfile.TemporaryFile() as lists:
-        # The header contains the size of the values of lists, which follow the rows, so it is written again at the end.
+        # Write a provisional header. At the end it is written again with the total size of the values of lists, which
+        # is known only after all rows have been written.
         start = file.tell()
         file.write(_header(declared, scans, record_type.itemsize, rows, 0))
         for batch in batches():
@@ -246,7 +259,11 @@ def stream_to_fits(
 
 
 def _header(declared: Table, scans: list[_ColumnScan], width: int, rows: int, list_bytes: int) -> bytes:
-    """Return an empty primary unit and the header of the table; the length does not depend on the numbers."""
+    """Return the bytes of an empty primary unit and of the header of a table.
+
+    `width` is the number of bytes of a row, `list_bytes` the number of bytes of the values of lists after the rows. The
+    length of the result does not depend on `rows` and `list_bytes`.
+    """
     columns = []
     for scan in scans:
         unit_option = {"unit": fits_unit(scan.column.unit)} if scan.column.unit else {}
@@ -263,7 +280,10 @@ def _header(declared: Table, scans: list[_ColumnScan], width: int, rows: int, li
 
 
 def _records(batch: pa.RecordBatch, scans: list[_ColumnScan], record_type: np.dtype[Any], lists: IO[bytes]) -> bytes:
-    """Return rows as stored in the file; values of lists are appended to `lists`."""
+    """Return the bytes of a batch of rows in a FITS table, and append the values of its lists to the file `lists`.
+
+    Raise BadInput for a text that is not ASCII, or a null in a list of integers.
+    """
     out = np.zeros(batch.num_rows, record_type)
     _write_lists(out, [(f"f{k}", scan, batch.column(k)) for k, scan in enumerate(scans) if scan.is_list], lists)
     for name, scan, values in zip(record_type.names or (), scans, batch.columns, strict=True):
@@ -286,9 +306,9 @@ def _records(batch: pa.RecordBatch, scans: list[_ColumnScan], record_type: np.dt
 
 
 def _write_lists(out: Array, columns: list[tuple[str, _ColumnScan, pa.Array]], lists: IO[bytes]) -> None:
-    """Append the values of lists row by row to `lists`, and write their lengths and offsets to `out`.
+    """Append the values of lists to the file `lists`, and write their lengths and offsets into the records `out`.
 
-    The order does not depend on the number of rows in a batch.
+    The values are written row by row, so that the file does not depend on the division of the rows into batches.
     """
     element_types = [np.dtype(_fits_byte_type(_element_type(scan.column.type))) for _, scan, _ in columns]
     for k, row in enumerate(zip(*(values.to_pylist() for *_, values in columns), strict=True)):
@@ -306,7 +326,10 @@ def _element_type(list_type: str) -> str:
 
 
 def _fits_byte_type(kind: str) -> str:
-    """Return the type in a FITS file; FITS has no signed bytes, so they are written as 16-bit integers."""
+    """Return the big-endian NumPy type with which a FITS file stores a declared type, such as ">f4" for "float32".
+
+    int8 is stored as a 16-bit integer, because FITS has no signed bytes.
+    """
     return ">i2" if kind == "int8" else np.dtype(kind).newbyteorder(">").str
 
 

@@ -1,4 +1,7 @@
-"""Write FITS files atomically: to a temporary file in the same folder, which replaces the file in one rename."""
+"""Write FITS files atomically, and check the files when they are read again.
+
+A file is written under a temporary name in the same folder and renamed at the end, so that it is never incomplete.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,23 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from lake_schema.errors import BadInput, Damaged, LakeError
 
-# Headers that promise more data are a mistake or an attack; the largest products are much smaller.
+# Largest number of bytes of the data of a file that is read. truesky writes much smaller files, so a header that gives
+# more is a mistake or an attack.
 MAX_BYTES = 8 << 30
+# Number of bytes of a block of a FITS file; headers and data end at a multiple of it.
 _BLOCK = 2880
 
 
 def is_compressed(hdu: Any) -> bool:
-    """Return True if a unit is a table with a compressed image."""
+    """Return True if a header-data unit is a binary table that contains a compressed image (ZIMAGE)."""
     return bool(hdu.header.get("ZIMAGE", False))
 
 
 def write_atomically(path: Path, hdus: fits.HDUList) -> None:
-    """Write units with checksums to a file, which is replaced in one rename."""
+    """Add checksums to header-data units and write them to a file, which is replaced in one rename.
+
+    If writing fails, an existing file stays as it is, and OSError or the error of astropy is raised.
+    """
     for hdu in hdus:
         _add_checksums(hdu)
     with _open_atomically(path) as stream:
@@ -35,18 +43,22 @@ def write_atomically(path: Path, hdus: fits.HDUList) -> None:
 
 
 def write_one_by_one(path: Path, hdus: Iterable[Any]) -> None:
-    """Write units as `write_atomically` does, but with only one in memory at a time; the first is the primary unit."""
+    """Write header-data units with checksums to a file, with only one unit in memory at a time.
+
+    `hdus` may be a generator; its first element must be the primary unit. The file is replaced in one rename.
+    """
     with _open_atomically(path) as stream:
         for number, hdu in enumerate(hdus):
             _add_checksums(hdu)
             single_file = io.BytesIO()
             _write_hdus(single_file, fits.HDUList([hdu] if number == 0 else [fits.PrimaryHDU(), hdu]), path)
-            # An extension is written after an empty primary unit, which is one block long and is removed here.
+            # astropy cannot write an extension without a primary unit. Write the extension after an empty primary unit,
+            # which is one block long, and leave this block out.
             stream.write(single_file.getbuffer()[0 if number == 0 else _BLOCK :])
 
 
 def _add_checksums(hdu: Any) -> None:
-    # The default comments of astropy contain the time, so equal input would give different bytes.
+    # Replace astropy's default comments, which contain the current time, so that equal input gives equal bytes.
     hdu.add_datasum(when="checksum of the data")
     hdu.add_checksum(when="checksum of header and data", override_datasum=True)
 
@@ -59,7 +71,7 @@ def _open_atomically(path: Path) -> Iterator[IO[bytes]]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes private files, but products get the usual permissions.
+        # Give the file the usual permissions; `mkstemp` makes it readable for its owner only.
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except BaseException:
@@ -71,7 +83,8 @@ def _write_hdus(stream: IO[bytes], hdus: fits.HDUList, path: Path) -> None:
     try:
         hdus.writeto(stream, output_verify="exception")
     except AttributeError as error:
-        # astropy (up to 8.0) fails in its check of the free space; the original error is the context of this one.
+        # After an error of the file system, astropy (up to 8.0) checks the free space, which raises an AttributeError.
+        # Its context is the original error.
         raise OSError(f"{path}: {error.__context__}") from None
 
 
@@ -81,12 +94,15 @@ def _umask() -> int:
     return mask
 
 
-# ------------------------------------------------------------------------------------------------ reading
+# ------------------------------------- checks of files that truesky wrote
 
 
 @contextmanager
 def errors_as_damaged(path: Path) -> Iterator[None]:
-    """Turn all errors of astropy into Damaged, for files that truesky wrote."""
+    """Raise Damaged in place of any error or warning of astropy in the body of a `with` statement that reads a file.
+
+    Use it for files that truesky wrote. Exceptions of truesky itself (LakeError) pass unchanged.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)
@@ -98,23 +114,23 @@ def errors_as_damaged(path: Path) -> Iterator[None]:
 
 
 def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:
-    """Compare the size of the data according to the headers with the size of the file and with a limit.
+    """Check that the data size in the headers of a FITS file exceeds neither the file nor a limit.
 
     Parameters
     ----------
     path : Path
         The file.
     hdus : HDUList
-        Its units.
+        Header-data units of the file, whose data need not have been read.
     max_bytes : int
-        Largest number of bytes of the data, stored or decompressed.
+        Largest number of bytes of the data of all units together, as stored or after decompression.
 
     Raises
     ------
     BadInput
         If the data exceed `max_bytes`.
     Damaged
-        If the file is cut short.
+        If the headers give more data than the file contains, or a negative NAXIS.
     """
     stored, unpacked = 0, 0
     for hdu in hdus:
@@ -129,7 +145,10 @@ def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:
 
 
 def _data_size(path: Path, header: Any, prefix: str) -> int:
-    """Return the bytes of a unit's data; with the prefix Z, of the compressed image in it."""
+    """Return the number of bytes of a unit's data according to NAXIS and BITPIX in its header.
+
+    With the prefix "Z", return the number of bytes of the decompressed image, from ZNAXIS and ZBITPIX.
+    """
     axes = [int(header[f"{prefix}NAXIS{i}"]) for i in range(1, int(header[f"{prefix}NAXIS"]) + 1)]
     if any(axis < 0 for axis in axes):
         raise Damaged(f"{path}: has a negative NAXIS")

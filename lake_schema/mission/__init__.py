@@ -1,1 +1,4 @@
-"""The mission database: all numbers of the telescopes, cameras and survey, each with its status and source."""
+"""The mission database: all numbers of the telescopes, cameras and survey that the simulation uses.
+
+Each number has a status (required, designed, built, current best estimate, or simulated) and a source.
+"""

@@ -1,4 +1,4 @@
-"""Bounds of the mission parameters, read from bounds.csv and counts.csv."""
+"""Allowed ranges of the parameters of the mission database (bounds.csv), and which are whole numbers (counts.csv)."""
 
 from __future__ import annotations
 
@@ -23,33 +23,37 @@ def _read_bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
 
 @cache
 def bounds_of_parameter(key: str) -> tuple[tuple[float, float, str], ...]:
-    """Return all bounds of a parameter as tuples (lowest, highest, unit)."""
+    """Return all allowed ranges of a parameter as tuples (lowest, highest, unit); its value must be in every range.
+
+    The result is () if no pattern in bounds.csv matches the name `key`.
+    """
     return tuple((lo, hi, unit) for pattern, lo, hi, unit in _read_bounds() if pattern.fullmatch(key))
 
 
 @cache
 def is_count(key: str) -> bool:
-    """Return True if a parameter is a count and must be a whole number."""
+    """Return True if the parameter with the name `key` counts something, so that it must be a whole number."""
     with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
         return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
 
 
 def check_bounds(parameter: Parameter, key: str) -> None:
-    """Raise an error if a parameter is outside its bounds.
+    """Raise an error if the value of a parameter is outside its allowed ranges.
 
     Parameters
     ----------
     parameter : Parameter
-        The parameter.
+        Value and unit of the parameter.
     key : str
-        Its name, without a detector or an amplifier.
+        Name of the parameter for which the ranges are declared: without the name of a detector or amplifier that
+        `parameter.key` may contain, such as vis.gain for vis.gain@3-4.
 
     Raises
     ------
     BadInput
-        If it must be a whole number and is not, or if its unit does not fit the unit of its bound.
+        If the value must be a whole number and is not, or the unit cannot be converted to the unit of a range.
     OutOfRange
-        If it is outside its bounds.
+        If the value is outside a range.
     """
     if is_count(key) and parameter.value % 1.0:
         raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")

@@ -1,6 +1,7 @@
 """Read a ground camera that a user describes in a folder of CSV files.
 
-The camera is used in addition to the cameras of the mission database. The folder contains::
+The camera is used in addition to the cameras of the mission database, which is part of the package. The folder
+contains::
 
     my_camera/parameters.csv    name, value, unit, source            numbers of the camera
     my_camera/layout.csv        detector, type, nx, ny, x_mm, y_mm, rotation_deg     positions of detectors
@@ -9,7 +10,7 @@ The camera is used in addition to the cameras of the mission database. The folde
     my_camera/wavefront.csv     noll, x_power, y_power, coefficient_nm     optional, aberrations of the telescope
 
 The folder's name is the camera's name. Gain, read noise and full well are given in amplifiers.csv only. Blank values
-in bands.csv: without a curve, the band is truesky's passband of this name; without fringes, the band has no fringes.
+in bands.csv: without a curve, truesky's passband of this name is used; without fringes, the band has no fringes.
 Columns may have any order, and lines that begin with ``#`` are comments. ``python -m lake_schema mission camera FOLDER
 --like decam`` writes such a folder with the values of a known camera, to be edited.
 """
@@ -47,18 +48,18 @@ _MODEL_FILES = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAV
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Response of a band that truesky does not have.
+    """Response curve of a band of a user's camera, given as a file.
 
     Attributes
     ----------
     band : str
         Name of the band.
     file : Path
-        File of the response, the fraction of photons that are detected.
+        File of the response: the fraction of photons that are detected, against wavelength.
     medium : str
         Medium in which its wavelengths are measured, "air" or "vacuum".
     location : str
-        File and line that name it, for messages.
+        File and line that name the curve, for error messages.
     """
 
     band: str
@@ -69,7 +70,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera from a user's folder.
+    """A ground camera that a user describes in a folder.
 
     Attributes
     ----------
@@ -78,11 +79,11 @@ class Camera:
     parameters : tuple of Parameter
         Numbers of the camera and of its bands, with names that begin with ``ext.<name>.``
     models : tuple of Model
-        Layout, amplifiers and wavefront.
+        Records of the tables of detectors (layout), amplifiers and wavefront.
     contents : tuple of (str, bytes)
-        sha256 and contents of the models' files: the checked tables without comments, columns in their fixed order.
+        sha256 and contents of these tables, as checked CSV texts without comments and with columns in a fixed order.
     curves : tuple of Curve
-        Responses of bands that truesky does not have.
+        Response curves of the bands for which the folder contains a file.
     """
 
     name: str
@@ -93,7 +94,10 @@ class Camera:
 
     @property
     def sha256(self) -> str:
-        """Checksum of all numbers and files of the camera; it does not depend on the location of the folder."""
+        """sha256 (hexadecimal) of all numbers and tables of the camera, and of the names and media of its curves.
+
+        The contents of the curves' files, and the location of the folder, have no effect.
+        """
         lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
         lines += [f"{m.key}={m.sha256}\n" for m in self.models]
         lines += [f"{curve.band} {curve.medium}\n" for curve in self.curves]
@@ -101,18 +105,19 @@ class Camera:
 
 
 def read(folder: Path) -> Camera:
-    """Read and check the folder of a camera.
+    """Read and check the folder in which a user describes a ground camera.
 
     Parameters
     ----------
     folder : Path
-        Folder with the files that the docstring of this module lists.
+        Folder with parameters.csv, layout.csv, amplifiers.csv, bands.csv and optionally wavefront.csv. Its name is the
+        name of the camera.
 
     Returns
     -------
     Camera
-        The camera. Overrides in a request can still make its detectors overlap, which
-        `lake_schema.mission.checks.camera_faults` finds.
+        The camera. If a user later replaces parameters such as the size of a pixel, its detectors may overlap;
+        `lake_schema.mission.checks.camera_faults` finds that.
 
     Raises
     ------
@@ -127,7 +132,8 @@ def read(folder: Path) -> Camera:
     pixel = next(p for p in parameters if p.key == f"{prefix}fpa.pixel_size")
     layout = camera_tables.read_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
     tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.read_amplifiers(folder, layout)}
-    # The parameters describe the first amplifier; the table gives the ratios of the other amplifiers to it.
+    # Take gain, read noise and full well of the camera from its first amplifier. For the other amplifiers, their ratios
+    # to the first one are used, which follow from the table.
     first_amplifier = tables[AMPLIFIERS][0]
     parameters += [
         _make_parameter(
@@ -135,7 +141,7 @@ def read(folder: Path) -> Camera:
         )
         for key, unit in AMPLIFIER_UNITS.items()
     ]
-    # A dangling link counts as present, so it causes an error and does not select the default wavefront.
+    # Use `lexists`: a link to a missing file must cause an error, not select the default wavefront.
     if os.path.lexists(folder / WAVEFRONT):
         tables[WAVEFRONT] = camera_tables.read_wavefront(folder)
     models, contents = [], []
@@ -167,7 +173,11 @@ def _camera_name(folder: Path) -> str:
 
 
 def check_name(folder: Path) -> str:
-    """Return the camera's name, which is the folder's name; raise BadInput if no camera may have this name."""
+    """Return the name of a folder, which is the name of the camera that it describes.
+
+    Raise BadInput if it is not a letter a-z followed by at most 39 letters, digits and _, or truesky has a camera of
+    this name.
+    """
     with user_files.check_reachable(folder):
         name = folder.resolve().name
     if NAME_PATTERN.fullmatch(name) is None:
@@ -179,7 +189,10 @@ def check_name(folder: Path) -> str:
 
 
 def _make_parameter(location: str, key: str, value: float, unit: str, source: str) -> Parameter:
-    """Return a parameter after checking its bounds; the error message begins with `location`, its file and line."""
+    """Return a record of a parameter; raise BadInput if its value or unit is not allowed.
+
+    `location` is the file and line of the value, with which the error message begins.
+    """
     try:
         parameter = Parameter(key, _STATUS, value, unit, source=source)
         bounds.check_bounds(parameter, key)
@@ -189,7 +202,10 @@ def _make_parameter(location: str, key: str, value: float, unit: str, source: st
 
 
 def _read_parameters(folder: Path, prefix: str) -> list[Parameter]:
-    """Read parameters.csv."""
+    """Read the numbers of a user's camera from parameters.csv, and return them as records with `prefix` in their names.
+
+    Raise BadInput if a name is unknown, missing or given twice, or a unit or value is not allowed.
+    """
     rows, known_parameters = camera_tables.read_rows(folder, PARAMETERS), parameter_units()
     camera_tables.refuse_repeated(rows, lambda row: row.text("name"))
     parameters = []
@@ -235,14 +251,14 @@ def _read_curve(folder: Path, row: Row) -> Curve:
     return Curve(row.text("band"), user_files.check_file(folder / file, "curve", row.location), medium, row.location)
 
 
-# -------------------------------------------------------------------------------------------------- known parameters
+# ------------------------------------- parameters that a ground camera may or must have
 
 
 @cache
 def units_by_camera() -> Mapping[str, Mapping[str, str]]:
-    """Return the units of the parameters of each known ground camera.
+    """Return the units of the parameters of each ground camera in the mission database: {camera: {parameter: unit}}.
 
-    The names of parameters have no prefix of the camera. Parameters of bands and amplifiers are left out.
+    The names of the parameters have no prefix ``ext.<camera>.``. Parameters of bands and amplifiers are left out.
     """
     units: dict[str, dict[str, str]] = {camera: {} for camera in CAMERAS}
     bands = {
@@ -256,10 +272,13 @@ def units_by_camera() -> Mapping[str, Mapping[str, str]]:
 
 
 def parameter_units() -> dict[str, str]:
-    """Return the units of all parameters that a ground camera may have, by name."""
+    """Return the units of all parameters that a ground camera may have, by name without the prefix of the camera."""
     return {key: unit for units in units_by_camera().values() for key, unit in units.items()}
 
 
 def required_parameters() -> tuple[str, ...]:
-    """Return the sorted names of the parameters that every ground camera must have."""
+    """Return the sorted names of the parameters that every ground camera must have, without the prefix of the camera.
+
+    They are the parameters that all ground cameras of the mission database have.
+    """
     return tuple(sorted(set.intersection(*(set(units) for units in units_by_camera().values()))))

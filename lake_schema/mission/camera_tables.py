@@ -1,4 +1,4 @@
-"""Read the CSV tables of a camera's folder, and check layouts and amplifiers."""
+"""Read the CSV tables in which a user describes a ground camera, and check its detectors and amplifiers."""
 
 from __future__ import annotations
 
@@ -15,16 +15,21 @@ import numpy as np
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 
+# Names of the files in the folder of a camera.
 PARAMETERS, LAYOUT, AMPLIFIERS, BANDS, WAVEFRONT = (
     f"{name}.csv" for name in ("parameters", "layout", "amplifiers", "bands", "wavefront")
 )
+# Type of the CSV files of a camera, a key of `user_files.MAX_BYTES`, which limits their size.
 FILE_KIND = "table of a camera"
+# Pattern of the name of a camera or a band.
 NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
+# Pattern of the name of a detector or an amplifier.
 _DETECTOR_PATTERN = re.compile(r"\w[\w-]{0,39}", re.ASCII)
+# Largest number of columns or rows of a detector.
 _MAX_PIXELS = 65_536
-# Real amplifiers have at most about 100 prescan and overscan columns or rows.
+# Largest number of prescan or overscan columns or rows; real amplifiers have at most about 100.
 _MAX_SCAN = 512
-# Units of the parameters in the columns of bands.csv; optional parameters may be blank.
+# Units of the columns of numbers in bands.csv that must not be blank. Only the strength of fringes is optional.
 BAND_UNITS = {
     "zero_point": "mag",
     "sky_brightness": "mag / arcsec2",
@@ -32,7 +37,7 @@ BAND_UNITS = {
     "extinction": "mag",
 }
 OPTIONAL_BAND_UNITS = {"fringes": ""}
-# Units of the parameters in the columns of amplifiers.csv.
+# Units of the numbers of an amplifier in the columns of amplifiers.csv.
 AMPLIFIER_UNITS = {"gain": "electron / adu", "read_noise": "electron", "full_well": "electron"}
 COLUMNS = {
     PARAMETERS: ("name", "value", "unit", "source"),
@@ -44,7 +49,7 @@ COLUMNS = {
     BANDS: ("band", "curve", "medium", *BAND_UNITS, *OPTIONAL_BAND_UNITS),
     WAVEFRONT: ("noll", "x_power", "y_power", "coefficient_nm"),
 }  # fmt: skip
-# Lowest and highest value of each column of whole numbers.
+# Lowest and highest allowed value of each column of whole numbers, in any of the files.
 _INTEGER_BOUNDS = {
     "nx": (1, _MAX_PIXELS),
     "ny": (1, _MAX_PIXELS),
@@ -59,33 +64,37 @@ _INTEGER_BOUNDS = {
     "x_power": (0, 10),
     "y_power": (0, 10),
 }
-_MAX_TEXT_LENGTH, _MAX_ROWS = 1000, 10_000
+# Largest number of characters of an entry of a table.
+_MAX_TEXT_LENGTH = 1000
+# Largest number of rows of a table of a camera.
+_MAX_ROWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a table.
+    """A row of a CSV table in the folder of a camera.
 
     Attributes
     ----------
     location : str
-        File and line, for messages.
+        File and line number, for error messages.
     values : mapping of str to str
-        Texts by column, in the order of `COLUMNS`, without blanks around them. Whole numbers consist of digits only.
+        Entries by name of the column, in the order of `COLUMNS`, without blanks around them. Entries of columns of
+        whole numbers consist of digits only.
     """
 
     location: str
     values: Mapping[str, str]
 
     def text(self, column: str) -> str:
-        """Return the text of a column; raise BadInput if it is blank."""
+        """Return the entry of a column as text; raise BadInput if it is blank."""
         value = self.values[column]
         if not value:
             raise BadInput(f"{self.location}: {column} is missing")
         return value
 
     def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """Return the finite number of a column.
+        """Return the entry of a column as a finite number.
 
         Parameters
         ----------
@@ -116,7 +125,10 @@ class Row:
         return value
 
     def integer(self, column: str) -> int:
-        """Return the whole number of a column in `_INTEGER_BOUNDS`; raise BadInput for other texts or out of bounds."""
+        """Return the entry of a column of whole numbers, such as nx; 300.0 and 3e2 are accepted, too.
+
+        Raise BadInput if the entry is not a whole number, or outside the allowed range of this column.
+        """
         value = self.number(column, *_INTEGER_BOUNDS[column])
         if value % 1.0:
             raise BadInput(f"{self.location}: {column} = {value:g} is not a whole number")
@@ -124,14 +136,16 @@ class Row:
 
 
 def read_rows(folder: Path, file: str) -> list[Row]:
-    """Read a table that has exactly the expected columns, in any order.
+    """Read a CSV table of a camera, which must have exactly the expected columns, in any order.
+
+    Blank lines, and lines that begin with #, are ignored.
 
     Parameters
     ----------
     folder : Path
         Folder of the camera.
     file : str
-        Name of the table, a key of `COLUMNS`.
+        Name of the file, a key of `COLUMNS`, such as "layout.csv".
 
     Returns
     -------
@@ -141,7 +155,8 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     Raises
     ------
     BadInput
-        If the table cannot be read, a column is missing, unknown or given twice, or a whole number is wrong.
+        If the file cannot be read or has no rows or more than 10,000, a column is missing, unknown or given twice, or
+        an entry of a column of whole numbers is wrong. The message names the file, and the line if it is known.
     """
     path = folder / file
     path_text = user_files.format_path(path)
@@ -180,22 +195,28 @@ def read_rows(folder: Path, file: str) -> list[Row]:
 
 
 def _with_integers(row: Row) -> Row:
-    """Write 300.0 and 3e2 as 300, because readers of the mission database expect whole numbers in this form."""
+    """Return a row in which whole numbers such as 300.0 and 3e2 are written as 300.
+
+    The code that uses the tables later converts these entries with int(), which accepts only this form.
+    """
     integers = {column: str(row.integer(column)) for column in row.values if column in _INTEGER_BOUNDS}
     return Row(row.location, {**row.values, **integers})
 
 
 def csv_text(rows: Sequence[Row]) -> str:
-    """Return rows as a CSV text for the mission database: columns in their order, no comments, every text in quotes."""
+    """Return rows of a table as CSV text, with a line of column names; every entry is in quotes.
+
+    `rows` must contain at least one row.
+    """
     stream = io.StringIO()
-    # Without quotes, a text that begins with # would be a comment.
+    # Quote all entries: a line that begins with # would otherwise be read as a comment.
     writer = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
     writer.writerows([list(rows[0].values), *(list(row.values.values()) for row in rows)])
     return stream.getvalue()
 
 
 def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
-    """Raise BadInput if `name_of` returns the same name for two rows."""
+    """Raise BadInput if the function `name_of` returns the same name for two rows; the message names the second one."""
     used_names: set[str] = set()
     for row in rows:
         name = name_of(row)
@@ -205,7 +226,7 @@ def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
 
 
 def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
-    """Read and check layout.csv.
+    """Read and check layout.csv, the table of the positions of a camera's detectors in its focal plane.
 
     Parameters
     ----------
@@ -222,7 +243,8 @@ def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
     Raises
     ------
     BadInput
-        If a name or number is wrong, or a detector is given twice or overlaps another. The message names the line.
+        If the file cannot be read, a name or number is not allowed, or a detector is given twice or overlaps another
+        one. The message names the line.
     """
     rows = read_rows(folder, LAYOUT)
     refuse_repeated(rows, lambda row: row.text("detector"))
@@ -241,12 +263,14 @@ def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
 
 
 def find_overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tuple[int, int]]:
-    """Yield the pairs of detectors that overlap, as rectangles along the axes of the focal plane.
+    """Yield the pairs of detectors that overlap; each detector is taken as a rectangle along the focal plane's axes.
+
+    Rotations are rounded to multiples of 90 deg.
 
     Parameters
     ----------
     rows : sequence of mapping of str to str
-        Rows of a layout.
+        Rows of a table layout.csv, one per detector: x_mm and y_mm (centre), nx and ny (pixels), and rotation_deg.
     pixel_mm : float
         Size of a pixel in mm.
 
@@ -265,7 +289,11 @@ def find_overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterato
 
 
 def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
-    """Read amplifiers.csv; raise BadInput if amplifiers do not fit each other or the detectors (rows of layout.csv)."""
+    """Read and check amplifiers.csv, the table of the areas of a detector that different amplifiers read.
+
+    `detectors` are the rows of layout.csv. Raise BadInput if a type of detector has no amplifier or differs in size, if
+    amplifiers overlap or reach beyond the detector, or if a number is not allowed. The full well must be equal for all.
+    """
     rows = read_rows(folder, AMPLIFIERS)
     refuse_repeated(rows, lambda row: f"amplifier {row.text('amplifier')} of {row.text('type')}")
     sizes = {row.text("type"): (row.integer("nx"), row.integer("ny")) for row in detectors}
@@ -288,7 +316,11 @@ def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
 
 
 def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
-    """Raise BadInput if amplifiers of a type lie outside the detector, overlap, or differ in size or overscan."""
+    """Raise BadInput if the amplifiers of one type of detector are not possible.
+
+    They must not overlap or reach beyond the detector of `size` (columns, rows). Their areas, prescans and overscans
+    must have equal sizes, and their gain, read noise and full well must be within bounds.
+    """
     corners: list[tuple[int, int]] = []
     for row in rows:
         if _DETECTOR_PATTERN.fullmatch(row.text("amplifier")) is None:
@@ -312,7 +344,10 @@ def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
 
 
 def read_wavefront(folder: Path) -> list[Row]:
-    """Read wavefront.csv; raise BadInput if a number is wrong."""
+    """Read wavefront.csv, the table of the telescope's aberrations: Zernike coefficients in nm across the field.
+
+    Raise BadInput if the file cannot be read or a number is not allowed.
+    """
     rows = read_rows(folder, WAVEFRONT)
     for row in rows:
         row.number("coefficient_nm", -1e4, 1e4)

@@ -1,4 +1,4 @@
-"""Write the folder of a new camera with the numbers of a known one, to be edited."""
+"""Write the folder of a new ground camera with the numbers of a camera in the mission database, for a user to edit."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from lake_schema.mission.parameter import CAMERAS
 
 
 def write_like(camera: str, folder: Path) -> list[Path]:
-    """Write the folder of a camera with the numbers of a known ground camera.
+    """Create the folder of a new camera, with CSV files that contain the numbers of a known ground camera.
 
     Parameters
     ----------
     camera : str
-        Name of a ground camera of the mission database.
+        Name of a ground camera of the mission database, such as "decam".
     folder : Path
         Folder to create. Its name is the new camera's name.
 
     Returns
     -------
     list of Path
-        The files.
+        The files that were written.
 
     Raises
     ------
     BadInput
-        If there is no such camera, or the folder already exists.
+        If there is no such camera, the folder already exists or cannot be created, or its name is not allowed.
     """
     if camera not in CAMERAS:
         raise BadInput(f"--like {camera} is not one of {', '.join(CAMERAS)}")
@@ -71,9 +71,10 @@ def write_like(camera: str, folder: Path) -> list[Path]:
 
 
 def _amplifier_rows(prefix: str, mission: MissionConfiguration) -> list[tuple[str, ...]]:
-    """Return the rows of amplifiers.csv.
+    """Return the rows of amplifiers.csv for a camera of the mission database.
 
-    The database contains the mean value of the camera and the ratio of each amplifier to the first one.
+    Gain and read noise are the camera's values, times the ratio of the amplifier's value to that of the first amplifier
+    in the database. The full well is equal for all amplifiers. `prefix` is ``ext.<camera>.``
     """
     rows = mission.rows(f"{prefix}amplifiers")
     mean = {key: mission.value(prefix + key, unit) for key, unit in AMPLIFIER_UNITS.items()}
@@ -100,7 +101,7 @@ def _band_row(prefix: str, band: str, mission: MissionConfiguration) -> tuple[st
         name = f"{prefix}{band}.{key}"
         values[key] = repr(mission.value(name, unit)) if name in mission else ""
     if not values["sky_brightness"]:
-        # For these bands, the database gives the sky level in electrons.
+        # The mission database has no sky brightness of this band, but a rate in electrons per s and pixel: convert it.
         scale = mission.value(f"{prefix}fpa.pixel_scale", "arcsec / pix")
         rate = mission.value(f"{prefix}{band}.sky", "electron / (s pix)") / scale**2
         values["sky_brightness"] = f"{float(values['zero_point']) - 2.5 * math.log10(rate):.4f}"

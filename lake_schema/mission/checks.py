@@ -1,4 +1,4 @@
-"""Check that the records of a mission configuration are consistent."""
+"""Check that a mission configuration (one value per parameter of telescope, cameras and survey) is consistent."""
 
 from __future__ import annotations
 
@@ -14,22 +14,27 @@ from lake_schema.mission.detector_overrides import split_name
 from lake_schema.mission.parameter import convert, read_all_parameters
 from lake_schema.ramps import MAX_FRAMES, frame_count
 
-# Quantities whose chosen values must not be higher, or lower, than the required values.
+# Patterns of the names of parameters whose values must not be higher (_LOWER), or lower (_HIGHER), than required.
 _LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
           "*.bad_pixels", "*.readout_time", "*.ee50", "*.ee80")  # fmt: skip
 _HIGHER = ("*.full_well", "*.quantum_efficiency", "*.resolving_power", "*.depth")
-# Throughputs of Pan-STARRS are capture cross sections in m2 (Tonry et al. 2012), which can exceed 1.
+# Patterns of the names of throughput curves that may exceed 1: the curves of Pan-STARRS (camera gpc1) are capture cross
+# sections in m2 (Tonry et al. 2012).
 _CROSS_SECTIONS = ("ext.gpc1.*",)
 
 
 def check(configuration: MissionConfiguration) -> None:
-    """Raise BadInput with the first fault of a configuration."""
+    """Raise BadInput with the first fault that `faults` finds in a mission configuration, if there is one."""
     for fault in faults(configuration):
         raise BadInput(fault)
 
 
 def faults(configuration: MissionConfiguration) -> Iterator[str]:
-    """Yield one sentence per fault, which names a parameter or model."""
+    """Yield one sentence per fault of a mission configuration; the sentence names the parameter or model (file).
+
+    Values that are worse than required, overlapping detectors, impossible amplifiers, ramps (NISP exposures) with too
+    many frames, and throughputs outside 0 to 1 are faults, for example.
+    """
     yield from _worse_than_required(configuration)
     for camera in configuration.ground_cameras:
         yield from camera_faults(camera, configuration)
@@ -44,7 +49,10 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
 
 
 def camera_faults(camera: str, configuration: MissionConfiguration) -> Iterator[str]:
-    """Yield faults of a ground camera: overlapping detectors, and amplifiers with impossible values."""
+    """Yield one sentence per fault of a ground camera: detectors that overlap, and amplifiers with impossible values.
+
+    `camera` is the name of the camera in the mission database, such as "decam".
+    """
     yield from _layout_faults(f"ext.{camera}", configuration)
     yield from _amplifier_faults(f"ext.{camera}.amplifiers", configuration)
 
@@ -67,7 +75,11 @@ def _matches_any(key: str, patterns: tuple[str, ...]) -> bool:
 
 
 def _layout_faults(section: str, configuration: MissionConfiguration) -> Iterator[str]:
-    """Find detectors that overlap, as rectangles along the axes of the focal plane, or are given twice."""
+    """Yield a sentence for each pair of detectors of a camera that overlap, and one if a name occurs twice.
+
+    `section` is the beginning of the names of the camera's parameters, such as "ext.decam". Detectors are taken as
+    rectangles along the axes of the focal plane.
+    """
     key = f"{section}.layout"
     rows = configuration.rows(key)
     for first, second in find_overlaps(rows, configuration.value(f"{section}.fpa.pixel_size", "mm / pix")):
@@ -83,7 +95,11 @@ def _gap_faults(section: str, configuration: MissionConfiguration) -> Iterator[s
 
 
 def ramp_faults(configuration: MissionConfiguration) -> Iterator[str]:
-    """Yield faults of ramps: too many frames, or pixels that share more than half of their charge with neighbours."""
+    """Yield one sentence per fault of NISP's exposures, which are ramps (series of frames read during the exposure).
+
+    Faults are too many frames in a ramp, and a capacitive coupling (IPC) by which the eight neighbours of a pixel
+    receive more than half of its charge.
+    """
     for kind in ("photometric", "spectroscopic"):
         key = f"nisp.macc.{kind}"
         groups, reads, drops = (int(configuration.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
@@ -114,14 +130,15 @@ def _throughput_faults(key: str, configuration: MissionConfiguration) -> Iterato
 
 
 def _read_curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
-    """Return wavelengths and throughputs, shape (n, 2), from a file of this package or of speclite.
+    """Return wavelengths and throughputs, shape (n, 2), of a throughput curve (a model of the mission database).
 
-    speclite's files have columns separated by blanks, and a header line.
+    The wavelengths of truesky's files are in nm. Files of the library speclite have another format (columns separated
+    by blanks, after a header line), and their wavelengths keep their unit.
     """
     rows = configuration.rows(key)
     if next(iter(rows[0])) == "wavelength_nm":
         return np.array([[float(value) for value in row.values()] for row in rows])
-    # These files have tens of thousands of lines, which `loadtxt` parses three times as fast.
+    # A file of speclite has tens of thousands of lines. `loadtxt` parses them three times as fast as a loop.
     return np.loadtxt([next(iter(row.values())) for row in rows], usecols=(0, 1), ndmin=2)
 
 

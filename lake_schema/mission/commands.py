@@ -1,6 +1,8 @@
-"""Query the mission database: python -m lake_schema mission list [PATTERN] | diff A [B] | camera FOLDER.
+"""Command that queries the database of telescope and camera parameters, and writes the folder of a new camera.
 
-A configuration is named by a ladder (CBE,BLT,DES,REQ,SIM), a request file, or a table mission as LAKE or LAKE@KEY.
+It is python -m lake_schema mission list [PATTERN] | diff A [B] | camera FOLDER. A and B name a configuration (one value
+per parameter): by statuses in order of preference (CBE,BLT,DES,REQ,SIM), by a request file, or by a lake with a table
+`mission`, as LAKE or LAKE@KEY, where KEY selects a version of the table.
 """
 
 from __future__ import annotations
@@ -21,9 +23,10 @@ _CONFIGURATION_HELP = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE o
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command and return its exit status.
+    """Run the command `mission` with the arguments `argv`, and return its exit status.
 
-    The status is 0 for success and 2 for a wrong call. `diff` returns 1 if the configurations differ.
+    The status is 0 for success, 1 for a damaged lake, and 2 for wrong arguments. For `diff`, it is 1 if the
+    configurations differ.
     """
     parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Query the mission database.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff|camera")

@@ -1,4 +1,7 @@
-"""Compare two mission configurations: python -m lake_schema mission diff A B."""
+"""Compare two mission configurations (sets of the numbers of telescope, cameras and survey).
+
+The command is python -m lake_schema mission diff A B.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +19,30 @@ from lake_schema.tables.mission import LADDER
 
 
 def compare_configurations(first: str, second: str) -> list[str]:
-    """Return one line per name that differs between two configurations.
+    """Return one line per parameter or model (file) that differs between two mission configurations.
 
     Parameters
     ----------
     first, second : str
-        A ladder ("CBE,BLT,DES,REQ,SIM"), a request file, or a lake with a table mission as LAKE or LAKE@KEY.
+        Order of preference of statuses ("CBE,BLT,DES,REQ,SIM"), path of a request file, or a lake with a table
+        `mission`, as LAKE or LAKE@KEY, where KEY selects a version of the table.
 
     Returns
     -------
     list of str
-        Lines, empty if the configurations are equal.
+        Lines "NAME: FIRST -> SECOND", empty if the configurations are equal. BadInput is raised if `first` or `second`
+        is none of these.
     """
     return list(differences(load_configuration(first), load_configuration(second)))
 
 
 def load_configuration(name: str) -> MissionConfiguration:
-    """Return the configuration that a ladder (list of statuses such as REQ,DES), a request file or a lake names."""
+    """Return the mission configuration that a text names.
+
+    The text is a list of statuses in order of preference ("REQ,DES"), the path of a request file, or a lake with a
+    table `mission`, as LAKE or LAKE@KEY, where KEY selects a version of the table. BadInput is raised for any other
+    text.
+    """
     statuses = tuple(name.split(","))
     if all(status in STATUSES for status in statuses):
         return resolve(ladder=statuses)

@@ -1,4 +1,8 @@
-"""Mission configurations: exactly one value and one model for every name, chosen by a ladder of statuses."""
+"""Mission configurations: one record for each name in the mission database.
+
+The database has several records of a quantity, with different statuses (required, designed, built, current best
+estimate, simulated). A ladder, an order of preference of the statuses, determines which record is chosen.
+"""
 
 from __future__ import annotations
 
@@ -24,26 +28,28 @@ Chosen = TypeVar("Chosen", Parameter, Model)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MissionConfiguration:
-    """Chosen records of the mission database, sorted by name, with the overrides of a request.
+    """The numbers and model files of telescope, cameras and survey that a simulation uses.
 
-    A value for one detector or amplifier has a separate name (see `lake_schema.mission.detector_overrides`).
+    They are records of the mission database, sorted by name, some of which a user's request has replaced. A value for
+    one detector or amplifier has a separate name, such as vis.gain@3-4.
 
     Attributes
     ----------
     parameters : tuple of Parameter
         Chosen values, one per name.
     ladder : tuple of str
-        Statuses in order of preference.
+        Statuses in order of preference, such as CBE (current best estimate) before REQ (required).
     overridden : tuple of str
-        Names of values from the request.
+        Names of the parameters whose values come from a request.
     models : tuple of Model
-        Chosen models, one per name.
+        Chosen models (files such as layouts and throughput curves), one per name.
     folder : Path or None
-        Folder with the files of the models, or None if the package contains them.
+        Folder with copies of the models' files, which is searched if the installed files have changed; None without
+        such a folder.
     contents : tuple of (str, bytes)
-        sha256 and contents of models that are neither in `folder` nor in the package: models of a user's cameras.
+        sha256 and contents of the models of cameras that a user has described; the package does not contain them.
     ground_cameras : tuple of str
-        Names of the ground cameras with a layout.
+        Names of the ground cameras with a layout of detectors, sorted.
     """
 
     parameters: tuple[Parameter, ...]
@@ -77,21 +83,22 @@ class MissionConfiguration:
         object.__setattr__(self, "_digest", hashlib.sha256(everything.encode()).hexdigest())
 
     def __hash__(self) -> int:
-        # The folder is included, because comparing equal configurations of different lakes takes long.
+        # Include the folder: configurations of two lakes are not equal even if all numbers are, so their hashes should
+        # differ.
         return hash((self._fingerprint, self.folder))
 
     def __eq__(self, other: object) -> bool:
-        # Comparing digests is fast: caches compare equal configurations thousands of times in each exposure.
+        # Compare digests instead of all records, because caches compare configurations thousands of times per exposure.
         return self._digest == other._digest if isinstance(other, MissionConfiguration) else NotImplemented
 
     def parameter(self, key: str) -> Parameter:
-        """Return the chosen record of a parameter; raise BadInput if the name is unknown."""
+        """Return the record of a parameter (value, unit, status, source); raise BadInput if the name is unknown."""
         if key not in self._parameters_by_key:
             raise BadInput(f"the mission database has no parameter {key}")
         return self._parameters_by_key[key]
 
     def model(self, key: str) -> Model:
-        """Return the chosen record of a model; raise BadInput if the name is unknown."""
+        """Return the record of a model (file name, sha256, status, source); raise BadInput if the name is unknown."""
         if key not in self._models_by_key:
             raise BadInput(f"the mission database has no model {key}")
         return self._models_by_key[key]
@@ -100,20 +107,24 @@ class MissionConfiguration:
         return key in self._parameters_by_key or key in self._models_by_key
 
     def is_overridden_at(self, key: str, place: DetectorPlace) -> bool:
-        """Return True if a detector or an amplifier has a value that overrides the camera's value."""
+        """Return True if a parameter has a value for a detector or amplifier that replaces the value of the camera.
+
+        Values for all amplifiers of the detector, and for this amplifier of all detectors, count, too.
+        """
         return any(narrow in self for narrow in detector_overrides.names_at_place(key, place)[:-1])
 
     def value(self, key: str, unit: str | None = None, place: DetectorPlace | None = None) -> float:
-        """Return the value of a parameter.
+        """Return the value of a parameter of the telescope, a camera or the survey.
 
         Parameters
         ----------
         key : str
-            Name of the parameter.
+            Name of the parameter, such as vis.gain.
         unit : str, optional
-            Unit of the result; by default the unit of the record.
+            astropy unit string of the result; by default the unit of the record.
         place : DetectorPlace, optional
-            Detector or amplifier whose value is returned; by default the value of the camera.
+            Detector or amplifier whose value is returned. By default, and if there is no separate value for it, the
+            value of the whole camera is returned.
 
         Returns
         -------
@@ -123,7 +134,7 @@ class MissionConfiguration:
         Raises
         ------
         BadInput
-            If the name is unknown or the unit does not fit.
+            If the name is unknown or the unit cannot be converted to `unit`.
         """
         record = self.parameter(key)
         if place and key in self._places_by_key:
@@ -142,16 +153,17 @@ class MissionConfiguration:
         Parameters
         ----------
         key : str
-            Name of the parameter.
+            Name of the parameter of the camera, such as vis.gain.
         unit : str
-            Unit of the result.
+            astropy unit string of the result.
         detector : str
-            Name of the detector.
+            Name of the detector, such as "3-4".
 
         Returns
         -------
         tuple of float
-            Values in the order in which the amplifiers are read, or a single value if all are equal.
+            Values in the order in which the amplifiers are read, or a single value if all are equal. BadInput is raised
+            if the name is unknown or the unit does not fit.
         """
         if not any(place.amplifier and place.detector in ("", detector) for place in self._places_by_key.get(key, ())):
             return (self.value(key, unit, DetectorPlace(detector)),)
@@ -160,29 +172,39 @@ class MissionConfiguration:
         return values if len(set(values)) > 1 else values[:1]
 
     def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
-        """Return the rows of a model that is a table of numbers."""
+        """Return the rows of a model (file) that is a CSV table of numbers, without its line of column names.
+
+        A blank entry is NaN. BadInput is raised for an unknown name `key`, Damaged if the file has changed.
+        """
         return model.parse_numbers(self.content(self.model(key)))
 
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]:
-        """Return the rows of a model that is a table of texts, as mappings by column name."""
+        """Return the rows of a model (file) that is a CSV table, as mappings from column name to text.
+
+        BadInput is raised for an unknown name `key`, Damaged if the file has changed.
+        """
         return model.parse_rows(self.content(self.model(key)))
 
     def content(self, record: Model) -> bytes:
-        """Return the bytes of a model's file; raise Damaged if their sha256 differs from the record."""
+        """Return the bytes of the file of a model; raise Damaged if no file with the sha256 of the record is found."""
         user_contents = dict(self.contents)
         return (
             user_contents[record.sha256] if record.sha256 in user_contents else model.read_content(record, self.folder)
         )
 
     def with_overrides(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
-        """Return a copy in which some values are replaced by (value, unit).
+        """Return a copy of the configuration in which the values of some parameters are replaced.
+
+        `overrides` contains the new value and its unit by name of the parameter. A name may end in a detector or an
+        amplifier, such as vis.gain@3-4. The new records have the status SIM (simulated) and the source "request".
 
         Raises
         ------
         BadInput
-            If a name is unknown, or a value or unit is not allowed. The message names the parameter.
+            If a parameter, detector or amplifier is unknown, a value is not finite or must be a whole number, or a unit
+            cannot be converted. The message names the parameter.
         OutOfRange
-            If a value is outside its bounds.
+            If a value is outside its allowed range.
         """
         chosen = dict(self._parameters_by_key)
         for name, (value, unit) in overrides.items():
@@ -197,7 +219,10 @@ class MissionConfiguration:
 
     @property
     def fingerprint(self) -> str:
-        """sha256 (hexadecimal) of all names, values, units and files; equal for equivalent configurations."""
+        """sha256 (hexadecimal) of all names, values and units of parameters, and of the sha256 of all models.
+
+        It does not depend on statuses and sources.
+        """
         return self._fingerprint
 
 
@@ -209,34 +234,36 @@ def resolve(
     models: Iterable[Model] | None = None,
     cameras: Iterable[Camera] = (),
 ) -> MissionConfiguration:
-    """Choose one value and one model per name.
+    """Choose one record of the mission database for each name, by an order of preference of their statuses.
 
     Parameters
     ----------
     records : iterable of Parameter, optional
-        Parameters in any order; by default those of the package.
+        Records of parameters in any order; by default those of the package.
     ladder : sequence of str, optional
-        Statuses, the preferred one first. Other statuses are never chosen.
+        Statuses in order of preference, by default CBE, BLT, DES, REQ, SIM. Records with other statuses are not chosen.
     overrides : mapping of str to (float, str), optional
-        Value and unit by name. They replace the choice of the ladder.
+        Value and unit by name of the parameter, which replace the chosen records.
     mjd : float, optional
-        Date (MJD) at which the records must be valid; by default the latest records are chosen.
+        Date (MJD) at which the records must be valid; by default all records are valid. If several valid records have
+        the preferred status, the one with the latest date `valid_from` is chosen.
     models : iterable of Model, optional
-        Models in any order; by default those of the package if `records` is None, else none.
+        Records of models (files) in any order; by default those of the package if `records` is None, else none.
     cameras : iterable of Camera, optional
-        Cameras of a user, in addition to the cameras of the records.
+        Ground cameras that a user has described, in addition to the cameras in `records`.
 
     Returns
     -------
     MissionConfiguration
-        The configuration.
+        The configuration, with one record per name.
 
     Raises
     ------
     BadInput
-        If the ladder is wrong, a record is given twice, or a name has no record of a suitable status and date.
+        If the ladder is empty or has an unknown or repeated status, a record is given twice, units of one quantity
+        cannot be converted into each other, or a name has no record of a suitable status and date.
     OutOfRange
-        If a value is outside its bounds.
+        If a value is outside its allowed range.
     """
     unknown = [status for status in ladder if status not in STATUSES]
     if unknown or not ladder or len(set(ladder)) != len(ladder):
@@ -248,7 +275,7 @@ def resolve(
     parameters = _group_by_key([*(read_all_parameters() if records is None else records), *camera_parameters])
     for key, group in parameters.items():
         for record in group[1:]:
-            # The units of the records of one quantity must be convertible into each other.
+            # Check that the units of all records of a quantity can be converted into each other.
             convert(1.0, record.unit, group[0].unit, f"mission parameter {key} ({record.status})")
     chosen = {key: _choose_record(key, group, ladder, mjd) for key, group in parameters.items()}
     chosen_models = {
@@ -308,7 +335,10 @@ def _override_record(parameters: Mapping[str, Parameter], name: str, value: floa
 
 
 def differences(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:
-    """Yield a line for each name whose value, unit or file differs, or that only one of the configurations has."""
+    """Yield a line "NAME: FIRST -> SECOND" for each parameter or model (file) that differs in two configurations.
+
+    They differ if the value, the unit or the sha256 of the file differs, or if only one configuration has the name.
+    """
     first_records, second_records = _records_by_key(first), _records_by_key(second)
     for key in sorted(set(first_records) | set(second_records)):
         first_record, second_record = first_records.get(key), second_records.get(key)
@@ -322,7 +352,10 @@ def _records_by_key(configuration: MissionConfiguration) -> dict[str, Parameter 
 
 @dataclass(frozen=True, slots=True)
 class _RecordText:
-    """A record in two forms: the content that is compared, and the text that is shown."""
+    """Two descriptions of a record of the mission database.
+
+    `content` is compared with other records; `text` is shown to the user and also contains the status.
+    """
 
     content: str
     text: str

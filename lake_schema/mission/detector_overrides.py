@@ -1,4 +1,4 @@
-"""Handle values that apply to one detector or one amplifier.
+"""Handle values of mission parameters that apply to one detector or amplifier instead of a whole camera.
 
 Names of such values are::
 
@@ -23,14 +23,18 @@ from typing import Protocol
 
 from lake_schema.errors import BadInput
 
-# Names of detectors of cameras with a regular grid, by row and column from 1 (Euclid Data Product Description
-# Document, LE1 VIS and NISP).
+# Format of the names of the detectors of each Euclid camera. Rows and columns of the grid of detectors are counted from
+# 1 (Euclid Data Product Description Document, LE1 VIS and NISP).
 GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
+# Levels at which the value of a parameter may differ, as in places.csv: one value per camera, detector or amplifier.
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
 
 
 class MissionValues(Protocol):
-    """Methods of a mission configuration that this module uses."""
+    """Methods of MissionConfiguration that this module uses; importing the class itself would be circular.
+
+    `value` returns the number of a parameter, `rows` the rows of a table, and `in` tests whether a name exists.
+    """
 
     def value(self, key: str) -> float: ...
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]: ...
@@ -39,7 +43,10 @@ class MissionValues(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DetectorPlace:
-    """A detector, an amplifier, or both; "" stands for all."""
+    """Part of a camera to which a value applies: the names of a detector and of an amplifier.
+
+    "" stands for all detectors or all amplifiers. An instance is False if both are "": the whole camera.
+    """
 
     detector: str = ""
     amplifier: str = ""
@@ -49,12 +56,17 @@ class DetectorPlace:
 
 
 def split_name(name: str, parameter_names: Container[str]) -> tuple[str, DetectorPlace]:
-    """Return the name of the parameter and the place that a name contains, for a container of known parameter names."""
+    """Split a name such as vis.gain@3-4.E into the name of the parameter and the detector and amplifier.
+
+    `parameter_names` contains the known names of parameters, by which the ending of vis.gain.E is recognised as an
+    amplifier. A name without a detector or amplifier is returned unchanged, and so is an unknown name without "@".
+    """
     key, at, place = name.partition("@")
     if at:
         detector, _, amplifier = place.partition(".")
         return key, DetectorPlace(detector, amplifier)
-    # No parameter has a name that is another parameter's name plus a suffix.
+    # If the name without its last part is a parameter, the last part is an amplifier: no name of a parameter is another
+    # one's name with a further part.
     parent, _, last = name.rpartition(".")
     if parent in parameter_names:
         return parent, DetectorPlace(amplifier=last)
@@ -62,7 +74,10 @@ def split_name(name: str, parameter_names: Container[str]) -> tuple[str, Detecto
 
 
 def names_at_place(key: str, place: DetectorPlace) -> tuple[str, str, str, str]:
-    """Return the names under which a parameter's value at a place can be given, the most specific first."""
+    """Return the four names under which a value of a parameter for an amplifier of a detector can be given.
+
+    The order is: this amplifier of this detector, this detector, this amplifier of all detectors, the whole camera.
+    """
     detector, amplifier = f"@{place.detector}", f".{place.amplifier}"
     return f"{key}{detector}{amplifier}", f"{key}{detector}", f"{key}{amplifier}", key
 
@@ -75,12 +90,19 @@ def _read_scopes() -> tuple[tuple[re.Pattern[str], str], ...]:
 
 @cache
 def variation_scope(key: str) -> str:
-    """Return how finely the values of a parameter may vary: CAMERA, DETECTOR or AMPLIFIER."""
+    """Return the smallest part of a camera that may have a separate value of a parameter.
+
+    It is `AMPLIFIER`, `DETECTOR`, or `CAMERA` if the whole camera must have one value.
+    """
     return next((by for pattern, by in _read_scopes() if pattern.fullmatch(key)), CAMERA)
 
 
 def check_override(name: str, configuration: MissionValues) -> None:
-    """Raise BadInput if a parameter cannot be overridden at the place that the name contains."""
+    """Raise BadInput if a user cannot give a value for the detector or amplifier in a name such as vis.gain@3-4.E.
+
+    Reasons are a parameter that must have one value per camera or detector, and an unknown detector or amplifier. A
+    name without a detector or amplifier is accepted only if the parameter may differ between them.
+    """
     key, place = split_name(name, configuration)
     where, scope = f"mission override {name}", variation_scope(key)
     if ("@" in name and not place.detector) or name.endswith("."):
@@ -103,13 +125,17 @@ def _format_names(existing: tuple[str, ...]) -> str:
 
 
 def camera_prefix(key: str) -> str:
-    """Return the camera's prefix of a parameter's name, such as vis, nisp or ext.lsstcam."""
+    """Return the part of a parameter's name that identifies the camera, such as vis, nisp or ext.lsstcam."""
     parts = key.split(".")
     return ".".join(parts[:2] if parts[0] == "ext" else parts[:1])
 
 
 def detectors(section: str, configuration: MissionValues) -> tuple[str, ...]:
-    """Return the names of a camera's detectors in their order, () for a section that is not a camera."""
+    """Return the names of a camera's detectors: row by row for Euclid, else in the order of the camera's layout.
+
+    `section` is the beginning of the names of the camera's parameters, such as "vis" or "ext.lsstcam". The result is ()
+    if no camera has this name.
+    """
     if section in GRID_NAMES:
         rows, columns = (int(configuration.value(f"{section}.fpa.{key}")) for key in ("rows", "columns"))
         name = GRID_NAMES[section]
@@ -121,9 +147,13 @@ def detectors(section: str, configuration: MissionValues) -> tuple[str, ...]:
 
 
 def amplifiers(section: str, configuration: MissionValues) -> tuple[str, ...]:
-    """Return the names of a detector's amplifiers in the order of reading, () if it is read as one frame."""
+    """Return the names of the amplifiers of a camera's detectors, in the order in which they are read.
+
+    `section` is the beginning of the names of the camera's parameters, such as "vis". The result is () for a camera
+    without a table of amplifiers.
+    """
     key = f"{section}.amplifiers"
     if key not in configuration:
         return ()
-    # Detectors of different types may have amplifiers with the same names.
+    # Remove repeated names: the table has rows for each type of detector, and types may share names of amplifiers.
     return tuple(dict.fromkeys(row["amplifier"] for row in configuration.rows(key)))

@@ -1,4 +1,7 @@
-"""List the parameters of the mission database: python -m lake_schema mission list [PATTERN]."""
+"""List the parameters (numbers) and models (files) of the mission database.
+
+The command is python -m lake_schema mission list [PATTERN].
+"""
 
 from __future__ import annotations
 
@@ -18,26 +21,26 @@ _HEAD = ("name", "value", "unit", "bounds", "may differ by", "status", "source")
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A parameter or a model in a list.
+    """A parameter (number) or a model (file) of the mission database, as it is listed.
 
     Attributes
     ----------
     name : str
-        Name.
+        Name, such as vis.gain.
     value : float or str
-        Value of a parameter, or file of a model.
+        Value of a parameter, or name of the file of a model.
     unit : str
-        Unit of the value.
+        Unit of the value, "" for a pure number or a model.
     bounds : tuple of (float, float) or None
-        Lowest and highest value in this unit, or None if no bounds are declared.
+        Lowest and highest allowed value in this unit, or None if no bounds are declared.
     by : str
-        "detector" or "amplifier" if a request may give each a different value, else "".
+        "detector" or "amplifier" if a user may give each detector or amplifier a different value, else "".
     status : str
-        Status of the record.
+        REQ (required), DES (designed), BLT (built), CBE (current best estimate) or SIM (simulated).
     confidence : str
-        Confidence of the record.
+        How far the record can be trusted: published, quoted, derived or assumed.
     source : str
-        Source of the record.
+        Reference for the record.
     """
 
     name: str
@@ -51,19 +54,20 @@ class Entry:
 
 
 def list_entries(configuration: MissionConfiguration, pattern: str = "*") -> list[Entry]:
-    r"""Return the entries whose names match a pattern, sorted by name.
+    r"""Return the parameters and models of a configuration whose names match a pattern, sorted by name.
 
     Parameters
     ----------
     configuration : MissionConfiguration
-        The configuration.
+        One record per name of the mission database.
     pattern : str, optional
-        Pattern with \*, ? and [..] for the whole name; a text without them matches names that contain it.
+        Shell pattern for the whole name, with \*, ? and [..]. A text without these characters matches all names that
+        contain it. Upper and lower case are equal. By default, all names match.
 
     Returns
     -------
     list of Entry
-        At least one entry.
+        At least one parameter or model.
 
     Raises
     ------
@@ -94,7 +98,10 @@ def _entry(record: Parameter | Model, configuration: MissionConfiguration) -> En
 
 
 def _bounds_in_unit(key: str, unit: str) -> tuple[float, float] | None:
-    """Return the range that all bounds of a parameter allow, in a given unit."""
+    """Return the lowest and highest value of a parameter that all its declared bounds allow, in a given unit.
+
+    Return None if no bounds are declared for the name `key`.
+    """
     where = f"mission parameter {key}"
     ends = [
         (convert(lo, bound_unit, unit, where), convert(hi, bound_unit, unit, where))
@@ -104,7 +111,7 @@ def _bounds_in_unit(key: str, unit: str) -> tuple[float, float] | None:
 
 
 def align_columns(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield a line of headings and one line per entry, in aligned columns; the source comes last and is not padded."""
+    """Yield a line of headings and one line per parameter or model, in aligned columns; no line ends in blanks."""
     table = [_HEAD, *map(_format_fields, entries)]
     widths = [max(len(row[i]) for row in table) for i in range(len(_HEAD))]
     for row in table:

@@ -1,4 +1,7 @@
-"""Models of the mission database that are files, identified by their sha256."""
+"""Models of the mission database: parts of an instrument's description that are files (tables), not numbers.
+
+Examples are the layout of the detectors, a throughput curve or a wavefront. A model is identified by its sha256.
+"""
 
 from __future__ import annotations
 
@@ -25,26 +28,28 @@ _FILE = re.compile(r"\w[\w.-]*|[a-z_]+(\.[a-z_]+)*:\w[\w./-]*", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A record of a model that is a file.
+    """A record of the mission database for a model that is a file, such as a throughput curve.
+
+    BadInput is raised if an attribute has a value that is not allowed.
 
     Attributes
     ----------
     key : str
-        Name of the model.
+        Name of the model, such as vis.throughput.
     status : str
-        Status of the record, one of `parameter.STATUSES`.
+        REQ (required), DES (designed), BLT (built), CBE (current best estimate) or SIM (simulated).
     file : str
         Name in the package's folder of models, or `package:path` for a data file of another library.
     sha256 : str
-        Checksum of the file, hexadecimal.
+        Checksum of the file, 64 hexadecimal digits.
     version : int
-        Version of the record.
+        Version number of the record. If several records have the same status and date, the highest version is chosen.
     valid_from : float or None
-        MJD from which the record is valid, None for always.
+        Date (MJD) from which the record is valid, None for always.
     confidence : str
-        Confidence of the record, one of `parameter.CONFIDENCES`.
+        How far the record can be trusted: published, quoted, derived or assumed.
     source : str
-        Source of the record.
+        Reference for the file, not empty.
     """
 
     key: str
@@ -66,12 +71,16 @@ class Model:
 
     @property
     def identity(self) -> Identity:
-        """Key, status, version and date, which no two records may share."""
+        """Name, status, version and date of the record; no two records may have the same four values."""
         return record_identity(self)
 
 
 def read(file: Traversable) -> tuple[Model, ...]:
-    """Read the records of a CSV file that has exactly the columns `_COLUMNS`."""
+    """Read the records of models in a CSV file.
+
+    Its columns must be key, status, file, sha256, version, valid_from, confidence and source, in this order. BadInput
+    is raised for other columns or a wrong line.
+    """
 
     def make_model(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
         file, sha256, confidence = row["file"], row["sha256"], row["confidence"]
@@ -82,7 +91,7 @@ def read(file: Traversable) -> tuple[Model, ...]:
 
 @cache
 def read_models() -> tuple[Model, ...]:
-    """Return all models of the package."""
+    """Return the records of all models (files) in the mission database of the package, with every status and date."""
     return read(files("lake_schema.mission") / "models.csv")
 
 
@@ -92,20 +101,20 @@ def read_content(model: Model, folder: Path | None = None) -> bytes:
     Parameters
     ----------
     model : Model
-        Record of the model.
+        Record of the model: name and sha256 of the file.
     folder : Path, optional
-        Folder of a published configuration, whose files are named by their sha256. It is searched if the installed
-        file differs from the record.
+        Folder with copies of model files that an earlier run used, named by their sha256. It is searched if the
+        installed file is missing or has another sha256.
 
     Returns
     -------
     bytes
-        Contents with the sha256 of the record.
+        Contents of the file, with the sha256 of the record.
 
     Raises
     ------
     Damaged
-        If no such file exists. The message names the model and the sha256 of the installed file.
+        If neither place has a file with this sha256. The message names the model and the sha256 of the installed file.
     """
     data = _read_installed(model.file)
     if data is not None and hashlib.sha256(data).hexdigest() == model.sha256:
@@ -131,14 +140,20 @@ def _read_installed(file: str) -> bytes | None:
 
 @lru_cache(maxsize=256)
 def parse_numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
-    """Parse a CSV table of numbers without its header; lines that begin with '#' are comments, a blank entry is NaN."""
+    """Parse a CSV table of numbers in UTF-8, and return its rows without the line of column names.
+
+    Lines that begin with '#' are comments, and a blank entry is NaN. ValueError is raised for any other text.
+    """
     table = list(csv.reader(_lines(data)))
     return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in table[1:])
 
 
 @lru_cache(maxsize=256)
 def parse_rows(data: bytes) -> tuple[Mapping[str, str], ...]:
-    """Parse a CSV table of texts into mappings by column name; lines that begin with '#' are comments."""
+    """Parse a CSV table in UTF-8, and return one mapping from column name to text per row.
+
+    Lines that begin with '#' are comments. The mappings cannot be changed, because they are cached.
+    """
     return tuple(MappingProxyType(row) for row in csv.DictReader(_lines(data)))
 
 

@@ -1,4 +1,4 @@
-"""Records of the mission database, and the reader of its CSV files."""
+"""Parameters of the mission database (numbers with unit, status and source), and the reader of its CSV files."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ import astropy.units as u
 from lake_schema.errors import BadInput
 from lake_schema.tables import mission as table
 
-# Required, designed, built, current best estimate, simulated (Serrano et al. 2024, the Mission Database).
+# Allowed statuses of a record: REQ (required), DES (designed), BLT (built), CBE (current best estimate) and SIM
+# (simulated) (Serrano et al. 2024, the Mission Database).
 STATUSES = tuple(code for code, _ in table.STATUSES)
-# Origin of a value: read in its source, quoted without the source at hand, computed from published values, or chosen
-# for truesky.
+# Allowed confidences of a record: "published" (read in its source), "quoted" (the source was not at hand), "derived"
+# (computed from published values) and "assumed" (chosen for truesky).
 CONFIDENCES = tuple(code for code, _ in table.CONFIDENCES)
-# Ground cameras of the database; a user's folder can add others.
+# Names of the ground cameras in the database. A user can describe another camera in a folder of files.
 CAMERAS = ("decam", "lsstcam", "megacam", "jpcam", "gpc1", "hsc")
-# Cameras of Euclid; all other cameras are on the ground.
+# Names of Euclid's cameras; all other cameras are on the ground.
 SPACE_CAMERAS = ("vis", "nisp")
 SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for camera in CAMERAS), "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
 
-# Maximum length of a text in a record, in characters.
+# Largest number of characters of an entry in a CSV file of the database.
 _MAX_LENGTH = 1000
 
 Identity = tuple[str, str, int, float]
@@ -37,7 +38,7 @@ Record = TypeVar("Record")
 
 
 class MissionRecord(Protocol):
-    """Attributes that records of values and records of files have in common."""
+    """Attributes that both types of records in the mission database have: Parameter (a number) and Model (a file)."""
 
     @property
     def key(self) -> str: ...
@@ -55,26 +56,29 @@ class MissionRecord(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One value of one quantity.
+    """A record of the mission database for one value of a quantity, such as the gain of a camera.
+
+    A quantity can have several records with different statuses, versions and dates. BadInput is raised if an attribute
+    has a value that is not allowed.
 
     Attributes
     ----------
     key : str
-        Name of the quantity.
+        Name of the quantity, such as vis.gain.
     status : str
-        Status of the record, one of `STATUSES`.
+        REQ (required), DES (designed), BLT (built), CBE (current best estimate) or SIM (simulated).
     value : float
-        Finite value.
+        Finite value in the unit `unit`.
     unit : str
         astropy unit string, "" for a pure number.
     version : int
-        Version of the record.
+        Version number of the record. If several records have the same status and date, the highest version is chosen.
     valid_from : float or None
-        MJD from which the record is valid, None for always.
+        Date (MJD) from which the record is valid, None for always.
     confidence : str
-        Confidence of the record, one of `CONFIDENCES`.
+        How far the value can be trusted: published, quoted, derived or assumed.
     source : str
-        Source of the value.
+        Reference for the value, not empty.
     """
 
     key: str
@@ -95,12 +99,15 @@ class Parameter:
 
     @property
     def identity(self) -> Identity:
-        """Key, status, version and date, which no two records may share."""
+        """Name, status, version and date of the record; no two records may have the same four values."""
         return record_identity(self)
 
 
 def check_record(record: MissionRecord, where: str) -> None:
-    """Raise BadInput, with `where` at the start, if status, confidence, date or source of a record are not allowed."""
+    """Raise BadInput if a record has an unknown status or confidence, a date that is not finite, or no source.
+
+    `where` is the name of the record, with which the message begins.
+    """
     if record.status not in STATUSES:
         raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
     if record.confidence not in CONFIDENCES:
@@ -112,26 +119,30 @@ def check_record(record: MissionRecord, where: str) -> None:
 
 
 def record_identity(record: MissionRecord) -> Identity:
-    """Return key, status, version and date of a record; the date is -inf if the record is always valid."""
+    """Return name, status, version and date (MJD) of a record; the date is -inf if the record is always valid."""
     return record.key, record.status, record.version, -math.inf if record.valid_from is None else record.valid_from
 
 
 @cache
 def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
-    """Return the astropy unit of a unit string; raise BadInput, which begins with `where`, for any other string."""
+    """Return the astropy unit for a unit string.
+
+    Raise BadInput if the string is not a unit, or is a logarithmic unit such as mag(um). `where` is the name of the
+    quantity, with which the message begins.
+    """
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):
         raise BadInput(f"{where}: {text!r} is not a unit") from None
     if not isinstance(unit, u.UnitBase):
-        # astropy converts mag(um) to um without taking the power.
+        # Refuse logarithmic units: astropy would convert a value in mag(um) to um without computing the power of ten.
         raise BadInput(f"{where}: {text!r} is a logarithmic or structured unit: use a linear unit, or mag")
     return unit
 
 
 @cache
 def _conversion_factor(unit: str, to: str) -> float | None:
-    """Return the factor from `unit` to `to`, None if they are not convertible."""
+    """Return the factor that converts a value from `unit` to the unit `to`, or None if they cannot be converted."""
     try:
         factor = float(parse_unit(unit).to(parse_unit(to)))
     except u.UnitsError:
@@ -147,11 +158,11 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     value : float
         The value.
     unit : str
-        Unit of `value`.
+        astropy unit string of `value`, "" for a pure number.
     to : str
-        Unit of the result.
+        astropy unit string of the result.
     where : str
-        Name of the quantity, which begins the error message.
+        Name of the quantity, with which the error message begins.
 
     Returns
     -------
@@ -172,7 +183,11 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
 
 
 def read(file: Traversable) -> tuple[Parameter, ...]:
-    """Read the records of a CSV file that has exactly the columns `_COLUMNS`."""
+    """Read the parameters in a CSV file of the mission database.
+
+    Its columns must be key, status, value, unit, version, valid_from, confidence and source, in this order. BadInput is
+    raised for other columns or a wrong line.
+    """
 
     def make_parameter(row: Mapping[str, str], version: int, valid_from: float | None) -> Parameter:
         value = float(row["value"])
@@ -188,16 +203,17 @@ def read_records(
     columns: Sequence[str],
     make_record: Callable[[Mapping[str, str], int, float | None], Record],
 ) -> Iterator[Record]:
-    """Yield the records of a CSV file that has exactly the given columns.
+    """Yield the records of a CSV file of the mission database, which must have exactly the given columns.
 
     Parameters
     ----------
     file : Traversable
         The file.
     columns : sequence of str
-        Expected columns in their order.
+        Names of the columns in their order. They must include version and valid_from.
     make_record : callable
-        Function of (row, version, valid_from) that returns a record; `row` maps column names to texts.
+        Function of (row, version, valid_from) that returns a record. `row` maps column names to texts; the other two
+        arguments are the values of these columns as int, and as float or None.
 
     Yields
     ------
@@ -207,7 +223,8 @@ def read_records(
     Raises
     ------
     BadInput
-        If the columns differ, or a line is wrong. The message names the file and the line.
+        If the columns differ, or a line is wrong. The message names the file and the line, or the record if
+        `make_record` raises the error.
     """
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
@@ -230,6 +247,6 @@ def _is_short_line(value: object) -> bool:
 
 @cache
 def read_all_parameters() -> tuple[Parameter, ...]:
-    """Return all parameters of the package."""
+    """Return the records of all parameters in the mission database of the package, with every status and date."""
     folder = files("lake_schema.mission")
     return tuple(record for section in SECTIONS for record in read(folder / f"{section}.csv"))

@@ -1,4 +1,8 @@
-"""Convert mission configurations to the table `mission` with the files of its models, and back."""
+"""Convert a mission configuration to the table `mission` of a lake, and back.
+
+A configuration consists of the numbers and model files (tables of layouts, curves ...) of telescope, cameras and
+survey. The files are stored with the table.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,16 @@ from lake_schema.store.plan import Output
 from lake_schema.store.read import Version
 from lake_schema.tables.mission import MISSION
 
-# Folder of the models' files in a version of the table, named by sha256: old products can be rendered again with them.
+# Folder, in a version of the table `mission`, with copies of all model files, named by their sha256. With them, images
+# can be rendered again after the files of the package have changed.
 _FOLDER = "models"
 
 
 def to_output(configuration: MissionConfiguration) -> Output:
-    """Return the table `mission` of a configuration, with the files of its models."""
+    """Return the rows of the table `mission` for a mission configuration, and functions that write its model files.
+
+    A mission configuration is the set of chosen numbers and model files (tables) of telescope, cameras and survey.
+    """
     contents = {m.sha256: configuration.content(m) for m in configuration.models}
     return Output(
         to_table(configuration),
@@ -36,11 +44,16 @@ def _write(data: bytes, path: Path) -> None:
 
 
 def to_table(configuration: MissionConfiguration) -> pa.Table:
-    """Return the rows of the table `mission`: all records of the database, and separate rows for overridden records."""
+    """Return the rows of the table `mission` for a mission configuration (the chosen numbers of telescope and cameras).
+
+    There is one row per record of the mission database, with the column `chosen` True if the configuration contains the
+    record. Values that the settings of a simulation have replaced have additional rows, with `overridden` True.
+    """
     records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
     overridden = [record for record in records if record.key in configuration.overridden]
     package_records: list[Parameter | Model] = [*read_all_parameters(), *read_models()]
-    # A configuration from an older lake may contain records that the package no longer has.
+    # Add records that the installed package does not contain: the configuration may come from an older version, or
+    # contain a camera that a user has described.
     listed = {*package_records, *overridden}
     removed_records = [record for record in records if record not in listed]
     all_records = [*package_records, *removed_records, *overridden]
@@ -66,26 +79,29 @@ def to_table(configuration: MissionConfiguration) -> pa.Table:
 
 
 def read_back(version: Version) -> MissionConfiguration:
-    """Return the configuration that a published version of the table `mission` contains.
+    """Return the mission configuration (numbers and model files) that a published version of `mission` contains.
 
     Raises
     ------
     Damaged
-        If it is not the configuration that the manifest names.
+        If a file differs from the manifest of the version, or the configuration does not have the recorded sha256.
     """
     try:
         files = [version.folder / f"dataset/{part}" for part in version.partitions]
         states = [manifest.file_state(path) for path in files if isinstance(path, Path)]
     except OSError:
-        # Reading the version raises a suitable error.
+        # Ignore the error of a missing file: reading the version below raises Damaged with a suitable message.
         return _read_configuration(version)
-    # Copies of files on object storage are cached by their store.
+    # Cache the configuration only if all files are on disc; `states` then shows whether they have changed.
     return _read_cached(version, *states) if len(states) == len(files) else _read_configuration(version)
 
 
 @lru_cache(maxsize=8)
 def _read_cached(version: Version, *states: tuple[int, ...]) -> MissionConfiguration:
-    """Return a cached configuration while its files are unchanged, so that tasks of a process share it."""
+    """Read the mission configuration of a version, or return it from the cache if its files have not changed.
+
+    `states` are the results of `file_state` for the files of the version; with other states, they are read again.
+    """
     return _read_configuration(version)
 
 

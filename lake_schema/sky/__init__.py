@@ -1,7 +1,7 @@
 """Geometry of the sky: nested HEALPix cells, cones, boxes and polygons, separations, Galactic coordinates.
 
-Angles are in degrees and positions in ICRS unless stated otherwise. Functions that select cells of a region never miss
-a cell.
+Angles are in degrees and positions in ICRS unless stated otherwise. Functions that return the HEALPix cells that a
+region touches never miss a cell, but may return a few cells just outside.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput, OutOfRange
 
 MAX_ORDER = 29
-# Smallest triple product of three neighbouring vertices (unit vectors) that healpy accepts as a corner.
+# Smallest triple product of the unit vectors to three consecutive vertices of a polygon that healpy accepts. A smaller
+# value means that the vertices lie on one great circle.
 _MIN_TRIPLE_PRODUCT = 1e-10
-# Ratio of a circle's radius to the width of the cells that cover it; finer cells would skip only a few rows more.
+# Smallest ratio of the radius of a circle to the width of the cells that cover it. With finer cells, hardly fewer rows
+# outside the circle would be read.
 _CELLS_PER_RADIUS = 4
 # Safety margin of distances (deg), larger than any rounding error.
 _ROUNDING_DEG = 1e-9
@@ -26,19 +28,19 @@ _ROUNDING_DEG = 1e-9
 
 @cache
 def _healpy() -> Any:
-    # Importing healpy takes longer than most operations on a lake.
+    # Import healpy at the first use only, because the import takes longer than reading a small table.
     import healpy
 
     return healpy
 
 
 def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """Return ra, dec (deg, any shape) with ra wrapped to [0, 360).
+    """Check positions ra, dec (deg, any shape), and return them as float arrays with ra wrapped to [0, 360).
 
     Raises
     ------
     OutOfRange
-        If a coordinate is NaN or infinite, or |dec| > 90.
+        If a coordinate is NaN or infinite, or |dec| > 90. The message gives the first such value.
     """
     ra_deg, dec_deg = np.asarray(ra, float), np.asarray(dec, float)
     if not np.isfinite(ra_deg).all():
@@ -50,17 +52,17 @@ def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float
 
 
 def wrap_angle(angle: npt.ArrayLike) -> Float:
-    """Wrap angles (deg, any shape) to [0, 360)."""
+    """Wrap angles (deg, any shape) to the range from 0 (included) to 360 (excluded); NaN stays NaN."""
     remainder = np.mod(np.asarray(angle, float), 360.0)
-    # A tiny negative angle rounds up to exactly 360.
+    # For a tiny negative angle, the remainder is rounded up to exactly 360.
     angle_deg: Float = np.where(remainder >= 360.0, 0.0, remainder)[()]
     return angle_deg
 
 
 def wrap_position_angle(angle: npt.ArrayLike) -> Float32:
-    """Wrap position angles of axes (deg, any shape) to [0, 180), as float32."""
+    """Wrap position angles of axes (deg, any shape) to the range from 0 (included) to 180 (excluded), as float32."""
     remainder = np.mod(np.asarray(angle), 180.0).astype(np.float32)
-    # Angles just below 180, such as tiny negative angles, can round up to exactly 180 in float32.
+    # Replace 180 by 0: a remainder just below 180 (of a tiny negative angle, for example) may round up in float32.
     return np.where(remainder >= 180.0, np.float32(0.0), remainder)
 
 
@@ -69,57 +71,61 @@ def _first(values: Float) -> float:
 
 
 def healpix_29(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """Return the nested HEALPix index of order 29 (0.4 mas) of positions ra, dec (deg), int64 array of shape (n,)."""
+    """Return the nested HEALPix index of order 29 (cells of 0.4 mas) of positions ra, dec (deg, shape (n,)), as int64.
+
+    Raise OutOfRange if a coordinate is not finite, or |dec| > 90.
+    """
     return cell_at(ra, dec, MAX_ORDER)
 
 
 def cell_at(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
-    """Return the nested cell that contains each position.
+    """Return the nested HEALPix cell that contains each position.
 
     Parameters
     ----------
     ra, dec : float array, shape (n,)
-        Positions in deg.
+        Positions in deg; any ra, |dec| <= 90.
     order : int
         HEALPix order of the cells, 0 to 29.
 
     Returns
     -------
     int64 array, shape (n,)
-        Nested cell numbers.
+        Nested cell numbers. OutOfRange is raised if a coordinate is not finite, or |dec| > 90.
     """
     ra_deg, dec_deg = check_positions(ra, dec)
     return np.asarray(_healpy().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
 
 
 def cell_area(order: int) -> float:
-    """Return the area of a cell of `order` in deg2."""
+    """Return the area in deg2 of a HEALPix cell of an order; all cells of an order have the same area."""
     return float(np.degrees(np.sqrt(np.pi / 3)) ** 2 / 4**order)
 
 
 def cell_centre(order: int, cell: int) -> tuple[float, float]:
-    """Return ra, dec (deg) of the centre of a nested cell."""
+    """Return ra, dec (deg) of the centre of a nested HEALPix cell."""
     ra, dec = _healpy().pix2ang(1 << order, cell, nest=True, lonlat=True)
     return float(ra), float(dec)
 
 
 def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
-    """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested cells."""
+    """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested HEALPix cells of one order."""
     ra, dec = _healpy().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
 def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
-    """Return the corners of nested cells.
+    """Return the corners of nested HEALPix cells of one order.
 
     Returns
     -------
     float array, shape (n, 4, 2)
-        ra, dec in deg of the north, west, south and east corner of each cell.
+        ra, dec in deg of the north, west, south and east corner of each cell. The result for cells that do not exist is
+        undefined.
 
     Notes
     -----
-    The formulas are written out here so that a page with the sky need not wait for the import of healpy.
+    The formulas are written out here to avoid healpy, whose import would delay the first sky map on a web page.
 
     References
     ----------
@@ -127,19 +133,20 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
     """
     nested = np.atleast_1d(np.asarray(cells, np.int64))
     face, within = nested >> (2 * order), nested & ((1 << 2 * order) - 1)
-    # Coordinates of the corners in their base cell, 0 to 1; they increase to the north-east and to the north-west.
+    # Coordinates x, y of the corners in their base cell (one of the 12 cells of order 0), 0 to 1. They increase to the
+    # north-east (x) and to the north-west (y).
     x, y = ((_even_bits(within >> bit)[:, None] + np.array(step)) / (1 << order)
             for bit, step in ((0, (1, 0, 0, 1)), (1, (1, 1, 0, 0))))  # fmt: skip
-    # Row of the base cell, 2 (north) to 4, and right ascension of its centre in units of 45 deg.
+    # `row` is the row of the base cell, 2 (north) to 4 (south); `column` is the right ascension of its centre / 45 deg.
     row, column = face // 4 + 2, 2 * (face % 4) + (face // 4 != 1)
     height = row[:, None] - x - y
     polar = (height < 1.0) | (height > 3.0)
-    # Distance from the nearer pole in the polar caps, 1 elsewhere.
+    # Distance of a corner from the nearer pole in units of the height of a polar cap; 1 outside the polar caps.
     depth = np.where(height < 1.0, height, np.where(height > 3.0, 4.0 - height, 1.0))
     z = np.where(polar, np.sign(2.0 - height) * (1.0 - depth**2 / 3.0), (2.0 - height) * 2.0 / 3.0)
     dec = np.where(
         polar & (depth < 0.5),
-        # Near the poles, arcsin(z) loses digits because z is close to 1.
+        # Near the poles, use a formula without arcsin(z), which loses digits because |z| is close to 1.
         np.sign(2.0 - height) * (90.0 - 2.0 * np.degrees(np.arcsin(depth / np.sqrt(6.0)))),
         np.degrees(np.arcsin(z)),
     )
@@ -148,7 +155,7 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
 
 
 def _even_bits(bits: Int) -> Int:
-    """Return the number that consists of every second bit of a number, from bit 0."""
+    """Return integers whose bits 0, 1, 2 and so on are the even-numbered bits (0, 2, 4 and so on) of `bits`."""
     packed = bits & 0x5555555555555555
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF), (8, 0x0000FFFF0000FFFF),
@@ -159,22 +166,22 @@ def _even_bits(bits: Int) -> Int:
 
 
 def cell_range(order: int, cell: int) -> tuple[int, int]:
-    """Return the half-open range of order-29 indices inside a cell."""
+    """Return the first nested index of order 29 inside a HEALPix cell, and the first index after the cell."""
     shift = 2 * (MAX_ORDER - order)
     return int(cell) << shift, (int(cell) + 1) << shift
 
 
 def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
-    """Return the coarser cells that contain nested cells.
+    """Return the cells of a lower HEALPix order that contain the given nested cells.
 
     Parameters
     ----------
     cells : int array, shape (n,)
-        Nested cells of `order`.
+        Nested HEALPix cells.
     order : int
         HEALPix order of `cells`.
     coarser : int
-        HEALPix order of the result, at most `order`.
+        HEALPix order of the result, at most `order`; not checked.
 
     Returns
     -------
@@ -185,12 +192,12 @@ def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
 
 
 def cell_radius(order: int) -> float:
-    """Return the largest distance (deg) of any point of a cell of `order` from the cell's centre."""
+    """Return the largest distance (deg) between the centre and a corner of any HEALPix cell of an order."""
     return float(np.degrees(_healpy().max_pixrad(1 << order)))
 
 
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
-    """Return the cells that a circle touches, sorted.
+    """Return the HEALPix cells that a circle on the sky touches, sorted.
 
     Parameters
     ----------
@@ -209,7 +216,7 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     Raises
     ------
     OutOfRange
-        If `radius` is outside its limits.
+        If the radius is outside its limits, a coordinate is not finite, or |dec| > 90.
     """
     (ra_deg,), (dec_deg,) = check_positions([ra], [dec])
     if not 0.0 <= radius <= 180.0:
@@ -222,14 +229,18 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
 
 
 def cover_order(radius: float) -> int:
-    """Return the order of cells that suit the cover of a circle of `radius` deg."""
+    """Return the HEALPix order of cells whose width is between an eighth and a quarter of a circle's radius (deg).
+
+    Such cells cover the circle without much area outside. The order is at least 0 and at most 26, so the cells are
+    wider than that for circles with a radius below 13 mas.
+    """
     cell_width = max(radius / _CELLS_PER_RADIUS, 1e-7)
     order = int(np.ceil(np.log2(np.sqrt(cell_area(0)) / cell_width)))
     return min(max(order, 0), MAX_ORDER - 3)
 
 
 def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike, order: int) -> list[Int]:
-    """Return the cells that each of many circles touches, sorted, as `cells_in_cone` does for one circle.
+    """Return the HEALPix cells that each of many circles on the sky touches, sorted for each circle.
 
     Parameters
     ----------
@@ -243,16 +254,18 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
     Returns
     -------
     list of int64 array, length n
-        Nested cells of each circle.
+        Nested cells that each circle touches, and possibly neighbours just outside; equal to the results of
+        `cells_in_cone`.
 
     Raises
     ------
     OutOfRange
-        If a radius is outside its limits.
+        If a radius is outside its limits, a coordinate is not finite, or |dec| > 90.
 
     Notes
     -----
-    The function is fast if the circles lie close together, such as the circles around the detectors of a camera.
+    The function is fast if the circles lie close together, such as the circles around the detectors of a camera. Time
+    and memory are proportional to n times the number of cells near any circle.
     """
     lon, lat = check_positions(ra, dec)
     radii, fine = np.asarray(radius, float), min(order + 3, MAX_ORDER)
@@ -265,7 +278,8 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
     size = cell_radius(order) + _ROUNDING_DEG
     widest = float((separation(lon, lat, lon[0], lat[0]) + radii).max()) + size
     candidates = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
-    # The distance of the centre decides for most cells. For the others, the centres of the finer cells inside decide.
+    # For most cells, the distance of the centre from the circle decides whether the circle touches the cell. For cells
+    # on its edge, the distances of the centres of finer cells decide.
     cell_centres_xyz = _healpy().pix2vec(1 << order, candidates, nest=True)
     cos_distance = sum(centres[:, i, None] * cell_centres_xyz[i] for i in range(3))
     inside_limit = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
@@ -281,19 +295,22 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
 
 
 def _finer_centres(cells: Int, order: int, finer: int) -> Float:
-    """Return unit vectors, shape (3, n, m), to the centres of the m finer cells in each of n cells."""
+    """Return unit vectors, shape (3, n, m), to the centres of the m cells of order `finer` in each of n nested cells.
+
+    `order` is the order of the n cells.
+    """
     finer_count = 1 << 2 * (finer - order)
     inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(finer_count)
     return np.array(_healpy().pix2vec(1 << finer, inside, nest=True))
 
 
 def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
-    """Return the cells that a convex spherical polygon touches, sorted.
+    """Return the HEALPix cells that a convex spherical polygon touches, sorted; its sides are great circles.
 
     Parameters
     ----------
     vertices : float array, shape (n, 2)
-        ra, dec of the vertices in deg, in order around the polygon, n >= 3.
+        ra, dec of the vertices in deg, clockwise or counterclockwise, n >= 3.
     order : int
         HEALPix order of the cells.
 
@@ -305,7 +322,10 @@ def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
     Raises
     ------
     BadInput
-        If the vertices have another shape or the polygon is not convex.
+        If the vertices have another shape, two of them are equal, three consecutive ones lie on a great circle, or the
+        polygon is not convex.
+    OutOfRange
+        If a coordinate is not finite, or |dec| > 90.
     """
     corners = np.asarray(vertices, float)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -326,7 +346,8 @@ def _refuse_not_convex(vectors: Float) -> None:
         raise BadInput(
             f"a polygon must be convex: vertex {corner} lies on the great circle of its neighbours, or on one of them"
         )
-    # All vertices must lie on the same side of each edge. A check of the turns alone would accept a pentagram.
+    # Check that all vertices lie on the same side of each edge. A check that all turns have the same direction would
+    # accept a pentagram.
     heights = np.einsum("ij,kj->ik", sides, vectors)
     ends = np.arange(len(vectors))
     heights[ends, ends] = heights[ends, (ends + 1) % len(vectors)] = np.sign(heights[0, 2])
@@ -335,31 +356,34 @@ def _refuse_not_convex(vectors: Float) -> None:
 
 
 def cells_in_box(west: float, east: float, south: float, north: float, order: int) -> Int:
-    """Return the cells that a box between two meridians and two parallels touches, sorted.
+    """Return the HEALPix cells that a box between two meridians and two parallels touches, sorted.
 
     Parameters
     ----------
     west, east : float
-        Meridians in deg. The box runs eastward from `west` to `east`, across RA 0 if east < west.
+        Right ascension of the edges in deg, wrapped to [0, 360). The box extends from `west` eastward to `east`, across
+        ra = 0 if east < west. If both are equal, it has no width.
     south, north : float
-        Parallels in deg.
+        Declination of the edges in deg, -90 to 90, south <= north.
     order : int
         HEALPix order of the cells.
 
     Returns
     -------
     int64 array, shape (m,)
-        All nested cells that the box touches, and possibly neighbours whose edges are just outside.
+        All nested cells that the box touches, and possibly neighbours whose edges are just outside. OutOfRange is
+        raised if an edge is not finite or |dec| > 90.
     """
     ra, dec = check_positions([west, east], [south, north])
     fine = min(order + 3, MAX_ORDER)
     reach = cell_radius(fine)
     low, high = max(dec[0] - reach, -90.0), min(dec[1] + reach, 90.0)
-    # The southernmost cells of the strip have the largest colatitude.
+    # `query_strip` takes colatitudes, which increase to the south, so the northern limit comes first.
     strip = _healpy().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
     fine_cells = _healpy().ring2nest(1 << fine, strip)
     lon, lat = _healpy().pix2ang(1 << fine, fine_cells, nest=True, lonlat=True)
-    # Half-width of a cell in right ascension; a cell near a pole can reach any meridian.
+    # Largest extent of a cell in right ascension from its centre (deg). It is 360 for cells near a pole, which may
+    # contain all meridians.
     widest = np.cos(np.radians(np.minimum(np.abs(lat) + reach, 90.0)))
     margin = np.where(widest > np.radians(reach), reach / np.maximum(widest, 1e-9), 360.0)
     eastward = (lon - ra[0] + margin) % 360.0
@@ -376,17 +400,18 @@ def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2
     ra1, dec1 : float array
         First positions in deg.
     ra2, dec2 : float array
-        Second positions in deg; all shapes are broadcast.
+        Second positions in deg. The shapes of all four arrays are broadcast.
 
     Returns
     -------
     float array
-        Distances in deg.
+        Distances in deg, of the broadcast shape; NaN if a coordinate is NaN.
     """
     lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
     dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
     haversine = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
-    # Near the antipode, 1 - haversine would lose digits; this form of the complement does not.
+    # `complement` equals 1 - haversine. This formula has no rounding error near a separation of 180 deg, where the
+    # difference would lose digits.
     complement = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
     return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(haversine), np.sqrt(complement))))
 
@@ -399,7 +424,7 @@ def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[
     ra, dec : float array, shape (n,)
         Positions in deg.
     east, north : float array, shape (n,)
-        Components of the shift in rad.
+        Components of the shift in rad, towards increasing ra and dec at the position.
 
     Returns
     -------
@@ -407,7 +432,7 @@ def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[
         Moved positions in deg.
     """
     angle = np.hypot(east, north)
-    # sin(angle) / angle, without a division by zero.
+    # sin(angle) / angle; np.sinc returns 1 for angle = 0.
     ratio = np.sinc(angle / np.pi)
     lat, lon = np.radians(dec), np.radians(ra)
     forward = np.cos(angle) * np.cos(lat) - ratio * north * np.sin(lat)
@@ -418,7 +443,7 @@ def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[
 
 
 def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:
-    """Draw positions uniformly in a cell.
+    """Draw random positions that are uniformly distributed in a HEALPix cell.
 
     Parameters
     ----------
@@ -434,9 +459,9 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
     Returns
     -------
     index : int64 array, shape (n,)
-        HEALPix indices of order 29, ascending.
+        Nested HEALPix indices of order 29, ascending.
     ra, dec : float array, shape (n,)
-        Positions in deg.
+        Positions in deg: the centres of these order-29 cells, which are 0.4 mas wide.
     """
     first, _ = cell_range(order, cell)
     index = np.sort(rng.integers(0, 1 << (2 * (MAX_ORDER - order)), n, dtype=np.int64)) | np.int64(first)
@@ -445,25 +470,27 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
 
 
 def positions_of_indices(index: npt.ArrayLike) -> tuple[Float, Float]:
-    """Return ra, dec (deg) of the centres of order-29 HEALPix indices, arrays of shape (n,)."""
+    """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested HEALPix cells of order 29."""
     ra, dec = _healpy().pix2ang(1 << MAX_ORDER, np.asarray(index, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
 def unit_vectors(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
-    """Return unit vectors, shape (..., 3), towards positions ra, dec (deg, shape (...))."""
+    """Return Cartesian unit vectors, shape (..., 3), towards positions ra, dec (deg, any shape)."""
     return np.moveaxis(
         _unit_vector_components(np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))), 0, -1
     )
 
 
 def _unit_vector_components(lon: Float, lat: Float) -> Float:
-    """Return unit vectors, shape (3, ...), towards lon, lat (rad, shape (...))."""
+    """Return the components x, y, z, shape (3, ...), of unit vectors towards lon, lat (rad, any shape)."""
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 
 
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """Convert ICRS ra, dec (deg) to Galactic l, b (deg).
+    """Convert ICRS ra, dec (deg, any shape) to Galactic longitude l in [0, 360) and latitude b (deg).
+
+    Positions are not checked; NaN gives NaN.
 
     References
     ----------
@@ -475,16 +502,19 @@ def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
-    """Convert Galactic l, b (deg) to ICRS ra, dec (deg); the inverse of `galactic`."""
+    """Convert Galactic longitude and latitude (deg, any shape) to ICRS ra in [0, 360) and dec (deg).
+
+    Positions are not checked; NaN gives NaN.
+    """
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
     x, y, z = _rotate(TO_GALACTIC.T, _unit_vector_components(l_rad, b_rad))
     return wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def _rotate(matrix: Float, vector: Float) -> Float:
-    """Multiply a matrix (3, 3) by vectors (3, ...), with a fixed order of sums.
+    """Multiply a matrix, shape (3, 3), by vectors, shape (3, ...), with equal results on all processors.
 
-    A library's matrix product can give different last bits on different processors.
+    The sums are written out, because the order of sums in numpy's matrix product depends on the processor.
     """
     return np.stack([row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in matrix])
 
@@ -499,19 +529,19 @@ TO_GALACTIC = np.array(
 
 
 def ring_index(order: int, cell: int) -> int:
-    """Return the number in the RING ordering of a nested cell."""
+    """Return the number in HEALPix RING ordering of the cell with a number in NESTED ordering."""
     return int(_healpy().nest2ring(1 << order, cell))
 
 
 def border_cells(order: int, cell: int, fine: int) -> Int:
-    """Return the finer cells inside a cell that touch its border.
+    """Return the cells of a higher HEALPix order inside a cell that touch its border.
 
     Parameters
     ----------
     order : int
         HEALPix order of the cell.
     cell : int
-        Nested cell number.
+        Nested number of the cell.
     fine : int
         HEALPix order of the result, at least `order`.
 
@@ -528,14 +558,14 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
 
 
 def margin_cells(order: int, cell: int, fine: int) -> Int:
-    """Return the finer cells outside a cell that touch its border, including its corners.
+    """Return the cells of a higher HEALPix order outside a cell that touch its border or one of its corners.
 
     Parameters
     ----------
     order : int
         HEALPix order of the cell.
     cell : int
-        Nested cell number.
+        Nested number of the cell.
     fine : int
         HEALPix order of the result, at least `order`.
 

@@ -1,1 +1,1 @@
-"""Storage of the lake's tables: staging, publishing, verifying and reading versions."""
+"""Storage of the tables of a lake (a folder of versioned tables): making, publishing, verifying and reading them."""

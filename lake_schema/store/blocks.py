@@ -1,9 +1,11 @@
-"""Read files with checksums: every byte is compared with the file's manifest entry before it is returned.
+"""Read files block by block, and compare each block with a recorded checksum before its bytes are returned.
 
-The manifest entry of a file contains its size, its sha256, and its blocks, each with a checksum. The checksum of a
-block is its CRC-32. It detects every single flipped bit and every burst of up to 32 bits, and misses one in 4e9 other
-changes. It takes less time than the checksums of Parquet's pages. Unlike them, it covers page headers and detects
-exchanged blocks. `verify --deep` compares the sha256 of whole files.
+The manifest (list of files) of a table's version records the size and the sha256 of each file. For a Parquet file it
+also records the sizes and the CRC-32 checksums of its blocks (consecutive ranges of bytes). A CRC-32 detects every
+single flipped bit and every burst of up to 32 bits, and misses one in 4e9 other changes. It takes less time than the
+checksums that Parquet can store per page. Unlike the page checksums, it covers page headers and detects exchanged
+blocks. The sha256 is compared only when a whole file is read, such as an image or a file that is reused or copied. The
+command `truesky verify --deep` compares it for every file.
 """
 
 from __future__ import annotations
@@ -24,21 +26,24 @@ from lake_schema.errors import Damaged
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.plan import Json
 
-# Pieces below the minimum share a block; pieces above the maximum are divided.
-_MIN_BYTES, _MAX_BYTES = 16 << 10, 8 << 20
+# Smallest size in bytes of a block, a range of a file with one checksum. A smaller range is joined with the next one.
+# Only the last part of a divided range, the last block before the footer, and the footer may be smaller.
+_MIN_BYTES = 16 << 10
+# Largest size in bytes of a block, a range of a file with one checksum. A larger range is divided.
+_MAX_BYTES = 8 << 20
 _RECORD = np.dtype([("bytes", "<u4"), ("crc", "<u4")])
 
 
 def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
-    """Return the size and the checksums that the manifest records for a file of which parts are read.
+    """Return the size and the checksums that the manifest records for a file that is later read in parts.
 
     Parameters
     ----------
     path : Path
         The file.
     cuts : sequence of int
-        Offsets in bytes, ascending, at which reading may start. The last one is the start of the footer, which every
-        reader needs.
+        Offsets in bytes, ascending, at which reading may start, at least one. The last one is the start of the footer,
+        which always begins a new block, because every reader needs it.
 
     Returns
     -------
@@ -58,7 +63,7 @@ def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
 
 
 def crc32(path: Path) -> int:
-    """Return the CRC-32 of a file's contents, which are read in pieces."""
+    """Return the CRC-32 of a file's contents, 0 for an empty file. The file is read in pieces to save memory."""
     checksum = 0
     with path.open("rb") as stream:
         while data := stream.read(_MAX_BYTES):
@@ -76,12 +81,13 @@ def _block_ends(cuts: Sequence[int], size: int) -> list[int]:
 
 
 def decode_blocks(entry: Json) -> list[tuple[int, int]]:
-    """Return (end offset, CRC-32) of each block of a manifest entry.
+    """Decode the list of blocks in a file's manifest entry, and return the end offset in bytes and CRC-32 of each.
 
     Raises
     ------
     KeyError, TypeError, ValueError
-        If the entry has no valid blocks for its size.
+        If the entry has no key "blocks", its value is not valid base64, it lists no blocks, or their sizes do not add
+        up to the size of the file.
     """
     blocks = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
     ends = np.cumsum(blocks["bytes"], dtype=np.int64)
@@ -91,19 +97,20 @@ def decode_blocks(entry: Json) -> list[tuple[int, int]]:
 
 
 class VerifiedFile(io.RawIOBase):
-    """A file of a lake that is open for reading; each block is verified when it is first read.
+    """A file of a lake that is open for reading; each block of its bytes is verified when it is first read.
 
     Parameters
     ----------
     path : Path or ObjectPath
-        The file.
+        The file. It is opened at the first read.
     entry : mapping
-        Its entry in the manifest.
+        Entry of the file in the manifest: its size, and the sizes and CRC-32 checksums of its blocks.
 
     Attributes
     ----------
     fault : str
-        Reason why the file was refused, "" if it was not. Use it if another library hides the exception.
+        Message of the last Damaged that a method raised, "" before the first one. Libraries that read the file may
+        replace the exception by another one without this message.
 
     Raises
     ------
@@ -120,7 +127,8 @@ class VerifiedFile(io.RawIOBase):
         self._ends, self._checksums = [end for end, _ in blocks], [crc for _, crc in blocks]
         self._verified: set[int] = set()
         self._position = 0
-        # The opened object on object storage; files on disc are opened for each read.
+        # Opened object, or None before the first read. It is used on object storage only; a file on disc is opened
+        # again for each read.
         self._object: Any = None
 
     def readable(self) -> bool:
@@ -138,14 +146,19 @@ class VerifiedFile(io.RawIOBase):
         return self._position
 
     def read(self, size: int | None = -1) -> bytes:
-        """Return up to `size` bytes from the current position, after verifying their blocks."""
+        """Return up to `size` bytes from the current position, after verifying the blocks that contain them.
+
+        All remaining bytes are returned if `size` is None or negative, b"" at the end of the file. Damaged is raised
+        if a block differs from its checksum or the file is missing.
+        """
         first, length = self._position, int(self._entry["bytes"])
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:
             return b""
         numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1)
         unverified = [number for number in numbers if number not in self._verified]
-        # Whole blocks are read once, so that the verified bytes are the bytes that are returned.
+        # Read unverified blocks completely and return bytes of this copy. A second read of the file after the check
+        # could return bytes that have changed meanwhile.
         start, end = (
             (min(first, self._block_start(unverified[0])), max(last, self._ends[unverified[-1]]))
             if unverified
@@ -158,7 +171,10 @@ class VerifiedFile(io.RawIOBase):
         return data[first - start : last - start]
 
     def forget(self) -> None:
-        """Verify every block again when it is next read; call this if a file stays open between queries."""
+        """Mark all blocks as unverified, so that the next read compares them with their checksums again.
+
+        Call this between queries if the file stays open for a long time, because it may change on disc meanwhile.
+        """
         self._verified.clear()
         self._object = None
 
@@ -176,7 +192,10 @@ class VerifiedFile(io.RawIOBase):
         return Damaged(self.fault)
 
     def _read_range(self, first: int, last: int) -> bytes:
-        """Read a range of bytes. The file is opened for each call, because a process can only keep some files open."""
+        """Return the bytes from offset `first` up to but not including `last`; raise Damaged if they cannot be read.
+
+        The file is opened and closed in each call, because the number of open files of a process is limited.
+        """
         if isinstance(self.path, ObjectPath):
             return self._read_object_range(self.path, first, last)
         try:
@@ -189,7 +208,7 @@ class VerifiedFile(io.RawIOBase):
             finally:
                 os.close(descriptor)
         except FileNotFoundError:
-            # The whole version has been removed since.
+            # The version to which the file belongs may have been removed after it was opened for reading.
             raise self._damage_error("is missing") from None
         except OSError as error:
             raise self._damage_error(f"cannot be read: {error.strerror}") from None
@@ -198,7 +217,10 @@ class VerifiedFile(io.RawIOBase):
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def _read_object_range(self, place: ObjectPath, first: int, last: int) -> bytes:
-        """Read a range of bytes of an object; the object is opened once, and again after `forget`."""
+        """Return bytes `first` to `last` (exclusive) of an object on object storage; raise Damaged if that fails.
+
+        The object is opened in the first call, and again in the first call after `forget`.
+        """
         try:
             if self._object is None:
                 self._object = place.open()

@@ -1,8 +1,8 @@
-"""Find and remove versions and stages that are no longer needed.
+"""Find and remove versions of tables that are no longer needed, and folders of versions that were never finished.
 
-A version is kept if it is current, if a request links to it, or if a kept version was made from it, directly or
-indirectly. All other versions, and the stages of runs that have ended, can be removed. A folder is renamed before it is
-emptied, so that an interrupted removal leaves no incomplete version that looks complete.
+A version is kept if it is the current version of its table, if a request (named set of settings) links to it, or if
+another kept version was made from it, directly or indirectly. Unfinished versions of runs that have ended are removed,
+too. A folder is renamed before it is emptied, so that an interrupted removal leaves no version that looks complete.
 """
 
 from __future__ import annotations
@@ -20,35 +20,38 @@ from lake_schema.store import layout, locks, manifest, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.stage import receipts_folder
 
-# Names with a version's key in a table's folder, and names of folders that are marked for removal.
+# Names in the folder of a table that end in the key of a version: the version, an unfinished version (stage), its
+# receipts (records of finished files), and its lock file.
 _KEY_PATTERN = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
+# Names of folders that have been renamed because they will be removed.
 _MARKED_PATTERN = ".gone*"
 
 
 def table_names(root: Folder) -> list[str]:
-    """Return the sorted names of the tables that have been published or begun in a lake."""
+    """Return the sorted names of the tables of a lake, including tables of which no version has been finished."""
     return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.table_names(root)))
 
 
 def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
-    """Return the keys of the versions that are kept, by table.
+    """Return the keys of the versions that must be kept, because a link leads to them or a kept version used them.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     previous : mapping of str to set of str, optional
-        Earlier result of this function. These versions are kept, and their manifests are not read again.
+        Earlier result of this function. Its versions are kept, too, and their manifests are not read again.
 
     Returns
     -------
     dict of str to set of str
-        Keys by table.
+        Keys (16 hexadecimal digits that name a version's folder) by name of the table.
 
     Raises
     ------
     Damaged
-        If a kept version is missing or its manifest is broken, because its inputs are then unknown.
+        If a link leads to a version that is missing, or the manifest of a kept version is broken. The versions from
+        which it was made are then unknown.
     """
     links = [
         (name, layout.current_key(root, name), layout.current_link(root, name)) for name in layout.table_names(root)
@@ -79,7 +82,10 @@ def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) ->
 
 
 def collect(root: Path, name: str | None = None, delete: bool = False) -> list[Path]:
-    """Return the paths that are not needed, and remove them if requested.
+    """Return the folders of versions that are not needed, and remove them if requested.
+
+    A version is needed if a link leads to it, or if a needed version was made from it. The folders of unfinished
+    versions are not needed after their runs have ended.
 
     Parameters
     ----------
@@ -88,19 +94,19 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     name : str, optional
         Name of a table; by default all tables.
     delete : bool, optional
-        True to remove the paths.
+        True to remove the folders. By default they are only listed.
 
     Returns
     -------
     list of Path
-        Folders that can be removed, or that were removed.
+        Folders that can be removed, or that were removed. Folders on which a run is working are left out.
 
     Raises
     ------
     BadInput
         If there is no such table.
     Damaged
-        If it is unknown which versions are needed. Nothing is removed then.
+        If a link or a manifest is broken, so that it is unknown which versions are needed. Nothing is removed then.
     """
     existing_tables = table_names(root)
     selected = existing_tables if name is None else [layout.table_folder(root, name).name]
@@ -109,10 +115,12 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     kept_keys = kept_versions(root)
     if not delete:
         return [path for table in selected for path in _removable_paths(root, table, kept_keys[table])]
-    # Remains of an interrupted removal must not block a version that has been made again since.
+    # First delete folders that an interrupted removal has renamed. Otherwise a new folder could not be renamed to the
+    # same name below.
     removed = _delete_marked(root, selected)
     with contextlib.ExitStack() as stack:
-        # Nothing can be published while the locks are held. Only links that are new since the first pass are followed.
+        # Lock all tables, so that nothing is published during the removal. Then follow the links again, because a
+        # version may have been published since the first pass.
         for table in existing_tables:
             stack.enter_context(locks.hold_table(layout.table_folder(root, table)))
         kept_keys = kept_versions(root, kept_keys)
@@ -122,7 +130,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
 
 
 def _delete_marked(root: Path, selected: Iterable[str]) -> list[Path]:
-    """Delete the folders of some tables that are marked for removal, and return their paths."""
+    """Delete the folders of the selected tables whose names mark them for removal (.gone*), and return their paths."""
     marked = [path for table in selected for path in sorted(layout.table_folder(root, table).glob(_MARKED_PATTERN))]
     for path in marked:
         shutil.rmtree(path, ignore_errors=True)
@@ -138,7 +146,11 @@ def _removable_paths(root: Path, name: str, kept_keys: set[str]) -> list[Path]:
 
 
 def _mark_for_removal(root: Path, name: str, kept_keys: set[str]) -> Iterator[Path]:
-    """Rename folders that can be removed; stages on which a run is working stay."""
+    """Rename the folders of a table that can be removed to .gone*, and yield their old paths.
+
+    They are the folders of unfinished versions, and of versions whose keys are not in `kept_keys`. Folders of a version
+    whose lock another process holds are left, because a run is working on them.
+    """
     folder = layout.table_folder(root, name)
     for key in _version_keys(folder):
         lock = folder / f".lock-{key}"

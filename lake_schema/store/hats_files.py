@@ -1,12 +1,12 @@
-"""Write the files that turn a folder of cells into a HATS collection: metadata, margin and properties.
+"""Write the files that turn a folder of Parquet files, one per HEALPix cell, into a HATS collection.
 
-The files of a version are::
+HATS is the format of partitioned catalogues that lsdb reads. The files of a version of a table are::
 
     <version>/collection.properties
     <version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
-    <version>/<table>_margin/   the same for the rows within 10 arcsec outside each cell
+    <version>/<table>_margin/   the same without skymap.fits, for copies of the rows just outside each cell
 
-With the margin, a cross-match loses no pairs at the edges of cells.
+The margin contains all rows within 10 arcsec of a cell, so that a cross-match loses no pairs at the edges of cells.
 """
 
 from __future__ import annotations
@@ -25,21 +25,24 @@ from lake_schema.store import layout, parquet
 from lake_schema.store.plan import Json
 
 MARGIN_ARCSEC = 10.0
-# Cells of order 13 are 26" wide, so a ring of them around a cell contains all positions within 10" of the cell.
+# HEALPix order of the cells that form the margin. They are 26 arcsec wide, so one ring of them around a cell contains
+# all positions within 10 arcsec of the cell.
 _MARGIN_ORDER = 13
+# HEALPix order of the map of source counts in skymap.fits.
 _SKYMAP_ORDER = 8
-# With more files, the merged footers in `_metadata` would be too large to be useful.
+# Largest number of files whose footers are merged into the file `_metadata`; beyond it, the file would be too large.
 _MAX_FILES_IN_METADATA = 1000
-# The properties require a date; the current date would make equal lakes differ.
+# Date in the properties files, which must contain one. It is fixed, so that equal tables give equal files.
 _DATE = "2000-01-01T00:00UTC"
 
-Cell = tuple[int, int]  # order, nested cell
+Cell = tuple[int, int]  # HEALPix order, and number of the nested cell.
 
 
 def border_rows(rows: pa.Table, partition: str) -> pa.Table:
-    """Return the rows of a cell that the margins of other cells may need.
+    """Return the rows of a partition near the edge of its HEALPix cell, which the margins of other cells may contain.
 
-    They are stored with the receipts of the tasks until the margins are written.
+    They lie in the order-13 cells (26 arcsec wide) along the inner edge. `partition` is the path of the file, which
+    contains the order and number of the cell.
     """
     order, cell = layout.cell_of_file(partition)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, _MARGIN_ORDER)
@@ -47,18 +50,18 @@ def border_rows(rows: pa.Table, partition: str) -> pa.Table:
 
 
 def write_metadata(version: Path, table: Table, receipts: Sequence[Json], borders: Path) -> None:
-    """Write the metadata of a catalogue whose cells are in `version`/<table>/dataset.
+    """Write the margin and the HATS metadata of a catalogue whose Parquet files are in `version`/<table>/dataset.
 
     Parameters
     ----------
     version : Path
-        Folder of the version, or of its stage.
+        Folder of the version, which need not be published yet.
     table : Table
         Declaration of the table.
     receipts : sequence of mapping
-        Receipts of the cells.
+        Receipts (JSON records of files and rows) of all partitions, one per HEALPix cell.
     borders : Path
-        Folder with the border rows of the cells.
+        Folder with the files of rows near the edges of the cells, see `border_rows`.
     """
     cells = [layout.cell_of_file(receipt["part"]) for receipt in receipts]
     root, margin = version / table.name, version / f"{table.name}_margin"
@@ -119,7 +122,8 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, cou
         facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
     provenance = TableProperties.new_provenance_dict(root, builder="truesky")
     provenance["hats_creation_date"] = _DATE
-    # The estimated size depends on the length of the path, so equal lakes would differ.
+    # Remove the estimated size of the catalogue, which depends on the length of its path: equal tables must give equal
+    # files.
     provenance.pop("hats_estsize", None)
     TableProperties(**facts, **provenance).to_properties_file(root)
 

@@ -1,6 +1,7 @@
-"""Paths of a lake's files, and checks of names; names that lead out of the lake are refused here.
+"""Paths of the files in a lake (a folder of versioned tables), and checks of names in these paths.
 
-The layout of a lake is::
+A name from a user cannot lead to a file outside the lake. A request is a named set of settings for a simulation; it has
+one version of each table. The layout of a lake is::
 
     LAKE/<table>/current -> v-<key>               the version that was published last, of any request
     LAKE/names/<name>/<table> -> ../../<table>/v-<key>    the version of a request
@@ -9,7 +10,7 @@ The layout of a lake is::
     LAKE/<table>/v-<key>/dataset/<part>.parquet   any other table
     LAKE/<table>/v-<key>/images/...               files that belong to rows
     LAKE/<table>/.stage-<key>/                    a version that is being made
-    LAKE/<table>/.receipts-<key>/                 receipts of its finished tasks, and the border rows of its cells
+    LAKE/<table>/.receipts-<key>/                 JSON records of its finished files, and rows near the edges of cells
     LAKE/<table>/.lock, .lock-<key>               locks for publishing, and for making a version
     LAKE/<table>/.gone*                           folders that are being removed
     LAKE/runs/<id>.jsonl                          log of a run
@@ -36,22 +37,64 @@ _FILE_URL = re.compile(r"file:(?://(?:localhost)?)?(/(?!/).*)", re.IGNORECASE | 
 
 
 def check_name(text: str) -> str:
-    """Return `text` if it is a valid name of a table, request or file stem, else raise BadInput."""
+    """Return `text` if it is a valid name of a table, of a request (named settings) or of a file.
+
+    Parameters
+    ----------
+    text : str
+        The name. A valid name has 1 to 64 characters: lower-case letters, digits, _ and -, beginning with a letter or
+        digit.
+
+    Returns
+    -------
+    str
+        The unchanged text.
+
+    Raises
+    ------
+    BadInput
+        If the name is not valid.
+    """
     if not is_name(text):
         raise BadInput(f"name {str(text)[:100]!r} is not of the form [a-z0-9][a-z0-9_-]* with at most 64 characters")
     return text
 
 
 def is_name(text: object) -> bool:
-    """Return True if `text` is a valid name."""
+    """Return True if `text` is a valid name of a table, of a request (named settings) or of a file.
+
+    Parameters
+    ----------
+    text : object
+        The name. A valid name has 1 to 64 characters: lower-case letters, digits, _ and -, beginning with a letter or
+        digit.
+
+    Returns
+    -------
+    bool
+        True if the name is valid; False if it is not a str.
+    """
     return isinstance(text, str) and _NAME.fullmatch(text) is not None
 
 
 def resolve_lake(text: str | Path) -> Path:
-    """Return the absolute path of a lake's folder, which need not exist yet.
+    """Return the absolute path of a lake's folder, which need not exist yet; links are followed.
 
-    file:///a/b is accepted for /a/b, as Spark's users write it. Addresses of object storage are refused, because
-    publishing requires renames.
+    Parameters
+    ----------
+    text : str or Path
+        Path of the folder. Users of Spark may write file:///a/b for /a/b. Addresses of object storage, such as
+        s3://bucket, are refused, because tables are published by renames of folders.
+
+    Returns
+    -------
+    Path
+        The absolute path.
+
+    Raises
+    ------
+    BadInput
+        If the path is empty, an address of object storage, an existing file, or not allowed by the file system.
     """
     if local := _FILE_URL.fullmatch(str(text)):
         text = unquote(local[1])
@@ -65,14 +108,14 @@ def resolve_lake(text: str | Path) -> Path:
         )
     try:
         root = user_files.expand_path(text).resolve()
-        # The path must be missing or a folder; the file system may refuse the name.
+        # Check that the file system accepts the path: `os.lstat` raises an error if it is too long, for example.
         os.lstat(root)
         if not root.is_dir():
             raise BadInput(f"lake {user_files.format_path(text)} is not a folder")
     except FileNotFoundError:
         pass
     except (OSError, RuntimeError, ValueError) as error:
-        # Reasons are a loop of links, a path that is too long, or a NUL character.
+        # Possible reasons: a loop of symbolic links, a path that is too long, or a NUL character in the path.
         raise BadInput(f"lake {user_files.format_path(text)}: {getattr(error, 'strerror', None) or error}") from None
     return root
 
@@ -83,19 +126,20 @@ def open_lake(text: str | Folder, endpoint: str | None = None) -> Folder:
     Parameters
     ----------
     text : str, Path or ObjectPath
-        Path or address of the lake.
+        Path of the lake, or its address on object storage, s3://BUCKET/PREFIX.
     endpoint : str, optional
-        URL of the object storage; by default that of the address or of $AWS_ENDPOINT_URL.
+        URL of the object storage, for an address only. By default it is taken from the address, else from
+        $AWS_ENDPOINT_URL_S3 or $AWS_ENDPOINT_URL, else it is Amazon S3. It is ignored if `text` is an ObjectPath.
 
     Returns
     -------
     Path or ObjectPath
-        The root. It is not checked that a lake exists there.
+        The root. Whether a lake exists there is not checked.
 
     Raises
     ------
     BadInput
-        If the path or address is wrong.
+        If the path or address is not valid, or if a path is given with an endpoint.
     """
     if isinstance(text, ObjectPath):
         return text.reopen()
@@ -107,12 +151,30 @@ def open_lake(text: str | Folder, endpoint: str | None = None) -> Folder:
 
 
 def table_folder(root: Below, table_name: str) -> Below:
-    """Return the folder of a table."""
+    """Return the folder of a table in a lake.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    table_name : str
+        Name of the table.
+
+    Returns
+    -------
+    Path or ObjectPath
+        The folder, which need not exist.
+
+    Raises
+    ------
+    BadInput
+        If the name is not valid or leads out of the lake.
+    """
     return check_inside(root, root / check_name(table_name))
 
 
 def stage_folder(root: Path, table_name: str, key: str) -> Path:
-    """Return the folder of a version that is being made.
+    """Return the hidden folder (stage) in which a version of a table is made before it is published.
 
     Parameters
     ----------
@@ -121,7 +183,7 @@ def stage_folder(root: Path, table_name: str, key: str) -> Path:
     table_name : str
         Name of the table.
     key : str
-        Key of the version.
+        Key of the version (hash of everything that determines its contents).
 
     Returns
     -------
@@ -132,7 +194,7 @@ def stage_folder(root: Path, table_name: str, key: str) -> Path:
 
 
 def version_folder(root: Below, table_name: str, key: str) -> Below:
-    """Return the folder of a published version.
+    """Return the folder of a published version of a table.
 
     Parameters
     ----------
@@ -141,7 +203,7 @@ def version_folder(root: Below, table_name: str, key: str) -> Below:
     table_name : str
         Name of the table.
     key : str
-        Key of the version.
+        Key of the version (hash of everything that determines its contents).
 
     Returns
     -------
@@ -152,24 +214,50 @@ def version_folder(root: Below, table_name: str, key: str) -> Below:
 
 
 def current_link(root: Below, table_name: str) -> Below:
-    """Return the link to the version that was published last."""
+    """Return the path of the symbolic link to the version of a table that was published last.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    table_name : str
+        Name of the table.
+
+    Returns
+    -------
+    Path or ObjectPath
+        The link, which need not exist.
+    """
     return table_folder(root, table_name) / "current"
 
 
 def requests_folder(root: Below) -> Below:
-    """Return the folder with one folder per request, which contains the links to the request's tables."""
+    """Return the folder that contains one folder per request (named set of settings of a simulation).
+
+    The folder of a request contains one symbolic link per table, to the version that belongs to the request.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+
+    Returns
+    -------
+    Path or ObjectPath
+        The folder, which need not exist.
+    """
     return check_inside(root, root / _NAMES)
 
 
 def request_link(root: Below, request: str, table_name: str) -> Below:
-    """Return the link of a request to its version of a table.
+    """Return the path of the symbolic link from a request to its version of a table.
 
     Parameters
     ----------
     root : Path or ObjectPath
         Root of the lake.
     request : str
-        Name of the request.
+        Name of the request (named set of settings of a simulation).
     table_name : str
         Name of the table.
 
@@ -182,7 +270,19 @@ def request_link(root: Below, request: str, table_name: str) -> Below:
 
 
 def table_names(root: Folder) -> list[str]:
-    """Return the sorted names of all tables that have been published, even if the version has been removed since."""
+    """Return the names of the tables in a lake that have a link `current`.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+
+    Returns
+    -------
+    list of str
+        Sorted names. A name is also returned if the link leads to a version that has been removed. The list is empty
+        without a lake.
+    """
     reserved = {_NAMES, _RUNS}
     folders = [p for p in root.iterdir() if is_name(p.name) and p.name not in reserved] if root.is_dir() else []
     return sorted(
@@ -191,9 +291,20 @@ def table_names(root: Folder) -> list[str]:
 
 
 def current_key(root: Folder, table_name: str) -> str | None:
-    """Return the key of the version that was published last, or None if nothing has been published.
+    """Return the key of the version of a table that was published last.
 
-    The version itself may be missing.
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    table_name : str
+        Name of the table.
+
+    Returns
+    -------
+    str or None
+        Key of the version, or None if the link `current` does not exist. Whether the folder of the version still exists
+        is not checked.
 
     Raises
     ------
@@ -204,19 +315,20 @@ def current_key(root: Folder, table_name: str) -> str | None:
 
 
 def linked_key(link: Folder, table_name: str) -> str | None:
-    """Return the key of the version to which a link leads, or None if the link does not exist.
+    """Return the key of the version to which a symbolic link leads, or None if the link does not exist.
 
     Parameters
     ----------
     link : Path or ObjectPath
         The link.
     table_name : str
-        Table in the link's target, or "" if the version is in the folder of the link.
+        Name of the table that the target of the link must contain (../../<table>/v-<key>), or "" if the target must be
+        a version in the folder of the link (v-<key>).
 
     Returns
     -------
     str or None
-        Key of the version.
+        Key of the version, 16 hexadecimal digits. Whether the version exists is not checked.
 
     Raises
     ------
@@ -235,17 +347,57 @@ def linked_key(link: Folder, table_name: str) -> str | None:
 
 
 def runs_folder(root: Below) -> Below:
-    """Return the folder of the run logs."""
+    """Return the folder of a lake in which every run of a job writes its log.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+
+    Returns
+    -------
+    Path or ObjectPath
+        The folder, which need not exist.
+    """
     return check_inside(root, root / _RUNS)
 
 
 def cell_file(order: int, cell: int) -> str:
-    """Return the path of a cell's file below dataset/, as HATS requires."""
+    """Return the path of the file of a nested HEALPix cell below dataset/, in the form that HATS requires.
+
+    Parameters
+    ----------
+    order : int
+        HEALPix order.
+    cell : int
+        Nested index of the cell.
+
+    Returns
+    -------
+    str
+        Path such as "Norder=5/Dir=0/Npix=8983.parquet".
+    """
     return f"Norder={order}/Dir={cell // 10_000 * 10_000}/Npix={cell}.parquet"
 
 
 def cell_of_file(partition: str) -> tuple[int, int]:
-    """Return the order and the cell of a path from `cell_file`."""
+    """Return the HEALPix order and the nested cell of the path of a file.
+
+    Parameters
+    ----------
+    partition : str
+        A path from `cell_file`.
+
+    Returns
+    -------
+    tuple of int
+        Order and nested index of the cell.
+
+    Raises
+    ------
+    BadInput
+        If the path does not have the form of `cell_file`.
+    """
     match = _CELL_PATH.fullmatch(partition)
     if match is None or cell_file(int(match[1]), int(match[2])) != partition:
         raise BadInput(f"{partition} is not the path of a cell")
@@ -253,9 +405,27 @@ def cell_of_file(partition: str) -> tuple[int, int]:
 
 
 def check_inside(root: Below, path: Below) -> Below:
-    """Return `path` if it is in `root` after links are followed, else raise BadInput."""
+    """Return a path if it is inside a folder after symbolic links are followed.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        The folder.
+    path : Path or ObjectPath
+        The path, which may be the folder itself. Paths on object storage are not checked.
+
+    Returns
+    -------
+    Path or ObjectPath
+        The unchanged path.
+
+    Raises
+    ------
+    BadInput
+        If the path leads out of the folder.
+    """
     if isinstance(path, ObjectPath) or isinstance(root, ObjectPath):
-        # Paths on object storage consist of checked names, and there are no links.
+        # Object storage has no symbolic links, and all names in these paths were checked before.
         return path
     try:
         inside = path.resolve().is_relative_to(root.resolve())

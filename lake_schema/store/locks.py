@@ -1,4 +1,4 @@
-"""Lock files: held by one process at a time, and released by the kernel when the process ends in any way."""
+"""Lock files: one process at a time can hold a lock file; the kernel releases it when the process ends or is killed."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ from pathlib import Path
 
 from lake_schema.errors import Superseded
 
-# Time to wait for a table's lock, which is held during a few renames, and interval between attempts, in s.
-TABLE_TIMEOUT, _POLL_INTERVAL = 10.0, 0.02
-# `is_held` holds the lock for a moment. Time to wait for that, in s.
+# Time to wait for the lock of a table, in s. Other processes hold it only while they rename a few folders or links.
+TABLE_TIMEOUT = 10.0
+# Time between two attempts to get a lock, in s.
+_POLL_INTERVAL = 0.02
+# Time to wait for the lock of a version, in s. A call of `is_held` in another process holds it for a moment.
 SHORT_TIMEOUT = 1.0
 
 
 @contextlib.contextmanager
 def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
-    """Hold a lock file while the context is active.
+    """Hold a lock file in the body of a `with` statement.
 
     Parameters
     ----------
     path : Path
         The lock file; it is created if it does not exist.
     message : str
-        Message of the exception.
+        Message of the exception if another process holds the lock.
     timeout : float, optional
-        Time to wait for another holder, in s.
+        Time to wait until another process releases the lock, in s. By default there is one attempt.
 
     Yields
     ------
@@ -52,12 +54,19 @@ def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
 
 
 def hold_table(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """Hold the lock of a table's folder, which protects renames of its versions and links."""
+    """Return a context manager that holds the lock of a table's folder.
+
+    Hold it to rename versions or replace links of the table. Superseded is raised if another process still holds the
+    lock after 10 s.
+    """
     return hold(folder / ".lock", f"table {folder.name}: another run is publishing", TABLE_TIMEOUT)
 
 
 def is_held(path: Path) -> bool:
-    """Return True if a process holds the lock now; nothing is written."""
+    """Return True if a process holds the lock file now, False if none does or the file does not exist.
+
+    Nothing is written.
+    """
     try:
         with path.open() as stream:
             return not _try_lock(path, stream.fileno())
@@ -66,7 +75,11 @@ def is_held(path: Path) -> bool:
 
 
 def _try_lock(path: Path, descriptor: int) -> bool:
-    """Lock the open file; return True if that succeeds and the file still has this name (holders remove lock files)."""
+    """Try to lock an open file, and return True on success.
+
+    Return False if another process holds the lock, or if `path` is no longer a name of the open file: the last holder
+    may have removed it, and another process may have created a new file of this name.
+    """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino

@@ -1,4 +1,8 @@
-"""Manifests of versions: their files with sizes and sha256, their inputs, and a digest of the manifest itself."""
+"""Write, read and check the manifest of a version of a table.
+
+A manifest is a JSON file in the folder of the version. It lists all files with their sizes and sha256, the facts from
+which the version was made (settings, inputs, code), and a digest of the manifest itself.
+"""
 
 from __future__ import annotations
 
@@ -21,25 +25,30 @@ from lake_schema.store.object_storage.s3 import MANIFEST, Folder, ObjectPath
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 
-# Types of the entries of every manifest, and of its entry of each file.
+# Keys that every manifest must have, and the types of their values.
 _FACT_TYPES = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+# Keys that the entry of each file in a manifest must have, and the types of their values.
 _ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
 def write(folder: Path, facts: Json) -> None:
-    """Write the facts of a version and their digest as its manifest, and sync it to disc."""
+    """Write the manifest of a version into its folder, and sync it to disc.
+
+    It contains `facts` (JSON values: files, rows, inputs) and their sha256 as "digest". An existing manifest is
+    replaced in one rename. ValueError is raised for NaN or an infinity in `facts`.
+    """
     plain = json.loads(canonical(facts))
     write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
 
 
 def load(folder: Folder, table: str) -> Manifest:
-    """Return the manifest of a version's folder.
+    """Return the manifest in the folder of a version of a table: list of files, and facts from which it was made.
 
     Raises
     ------
     Damaged
-        If the manifest is missing, incomplete, changed, or belongs to another version or table.
+        If the manifest is missing, incomplete, or changed since it was written, or belongs to another version or table.
     """
     path = folder / MANIFEST
     try:
@@ -52,23 +61,30 @@ def load(folder: Folder, table: str) -> Manifest:
 
 
 class Manifest(dict[str, Any]):
-    """Contents of a manifest; they must not be changed."""
+    """Contents of the manifest of a version: its files with checksums, and the facts from which it was made.
+
+    Callers must not change the values, because instances are cached and shared.
+    """
 
     @cached_property
     def by_path(self) -> dict[str, dict[str, Any]]:
-        """Entries of the files by path."""
+        """Entries of all files (size, sha256, rows), by path relative to the folder of the version."""
         return {entry["path"]: entry for entry in self["files"]}
 
     @cached_property
     def schemas(self) -> dict[tuple[int, ...], pa.Schema]:
-        """Cache of the schema of the first partition by `file_state` of its file, filled by readers."""
+        """Cache of the Arrow schema of the version's first file, empty until a reader fills it.
+
+        The keys are results of `file_state` for this file, so a changed file is read again. On object storage, where
+        files of versions never change, the key is ().
+        """
         return {}
 
 
 def file_state(path: Path) -> tuple[int, int, int, int]:
-    """Return inode, size in bytes, and times of modification and change in ns of a file.
+    """Return inode, size in bytes, and times of modification and of status change in ns of a file.
 
-    While they are equal, the file is unchanged and need not be read again.
+    If two calls return equal values, the file has not changed between them. OSError is raised if it does not exist.
     """
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
@@ -76,7 +92,10 @@ def file_state(path: Path) -> tuple[int, int, int, int]:
 
 @lru_cache(maxsize=16)
 def _read_once(path: Path, *state: int) -> Manifest:
-    """Return a cached manifest while its file is unchanged; manifests may be large, and tasks share them."""
+    """Read a manifest, or return it from the cache if the file has not changed.
+
+    `state` is the result of `file_state` for the file; with another state, the file is read again.
+    """
     return _read_manifest(path)
 
 
@@ -116,9 +135,10 @@ def _has_types(value: Any, types: dict[str, type]) -> bool:
 
 
 def file_entry(path: Path, relative: str) -> dict[str, Any]:
-    """Return a file's entry in the manifest: path, size, sha256, and for a Parquet file the checksums of its blocks.
+    """Return the entry of a file for the manifest: path, size in bytes, and sha256.
 
-    The blocks cover the whole file, so that any part of it can be verified when it is read.
+    The entry of a Parquet file also has the sizes and CRC-32 of its blocks (ranges of bytes). The blocks cover the
+    whole file, so that a reader can verify each part that it reads. `relative` is the path that the entry contains.
     """
     if relative.endswith(".parquet"):
         return {"path": relative, **parquet.file_checksums(path)}
@@ -126,14 +146,15 @@ def file_entry(path: Path, relative: str) -> dict[str, Any]:
 
 
 def check_size(folder: Folder, entry: Json) -> Folder:
-    """Return the path of a listed file after comparing its size with the manifest; the contents are not read.
+    """Return the path of a file of a version after comparing its size with its manifest entry.
 
-    The size of an object on object storage is compared when it is opened.
+    `folder` is the folder of the version. The contents are not read. An object on object storage is not checked here
+    but when it is read.
 
     Raises
     ------
     Damaged
-        If the file is missing or its size differs.
+        If the file is on disc, and is missing or has another size.
     """
     path: Folder = folder / entry["path"]
     if isinstance(path, ObjectPath):
@@ -144,7 +165,10 @@ def check_size(folder: Folder, entry: Json) -> Folder:
 
 
 def check_contents(folder: Folder, entry: Json) -> Path:
-    """Return the path of a listed file after comparing its sha256; an object on object storage is copied first.
+    """Return the path of a file of a version after comparing its size and sha256 with its manifest entry.
+
+    `folder` is the folder of the version. An object on object storage is copied to a temporary file first; the path of
+    this file is returned.
 
     Raises
     ------
@@ -159,7 +183,7 @@ def check_contents(folder: Folder, entry: Json) -> Path:
 
 
 def _check_sha256(path: Folder, entry: Json) -> None:
-    """Read a whole file, and raise Damaged if its sha256 differs from the manifest."""
+    """Read a whole file, and raise Damaged if it cannot be read or its sha256 differs from its manifest entry."""
     try:
         if file_sha256(path) == entry["sha256"]:
             return
@@ -172,7 +196,7 @@ def _size_fault(path: Path, entry: Json) -> str:
     try:
         return _size_difference(path, entry)
     except FileNotFoundError:
-        # The whole version has been removed since.
+        # `_size_difference` has found the file, but another process has removed it before reading its size.
         return f"{path} is missing"
     except OSError as error:
         return f"{path} cannot be read: {error.strerror}"
@@ -188,21 +212,22 @@ def _size_difference(path: Path, entry: Json) -> str:
 
 
 def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
-    """Return the faults of a version.
+    """Compare the files of a version with its manifest, and return a description of every fault.
 
     Parameters
     ----------
     folder : Path or ObjectPath
         Folder of the version.
     facts : mapping
-        Its manifest.
+        Manifest of the version: the list of its files with sizes, checksums and numbers of rows.
     deep : bool, optional
-        True to compare the sha256 of every file, and to check that each cell contains only its own rows, sorted.
+        True to compare the sha256 of every file, and to check that the file of each HEALPix cell contains only rows in
+        this cell, sorted by position. By default, only sizes, and the footers of Parquet files, are compared.
 
     Returns
     -------
     list of str
-        One sentence per fault, empty for a sound version.
+        One sentence per fault; an empty list for a version without faults.
     """
     entries = facts["files"]
     names = {entry["path"] for entry in entries}
@@ -211,7 +236,7 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
     except OSError as error:
         return [f"{folder} cannot be read: {error}"]
     messages = [f"{folder / extra} is not in the manifest" for extra in sorted(sizes.keys() - names - {MANIFEST})]
-    # Hashing releases Python's global lock, so threads use all cores.
+    # Threads can use all cores here, because the hash functions release Python's global interpreter lock.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for file_messages in pool.map(
             lambda entry: _file_faults(folder, entry, sizes.get(entry["path"], 0), deep), entries
@@ -224,17 +249,23 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
 
 
 def _file_sizes(folder: Folder) -> Mapping[str, int]:
-    """Return the size in bytes of each file below a folder, by relative path (0 for a symbolic link)."""
+    """Return the size in bytes of each file in a folder and its subfolders, by relative path (0 for a symbolic link).
+
+    Temporary files are left out.
+    """
     if isinstance(folder, ObjectPath):
         return folder.sizes()
-    # Ignore temporary files of a duplicate task that was still writing when the version was published.
+    # Ignore temporary files: a second process may have been writing a finished file again at the publication.
     permanent = (path for path in folder.rglob("*") if not is_temporary(path))
     files = [path for path in permanent if path.is_symlink() or not path.is_dir()]
     return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in files}
 
 
 def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str]:
-    """Return the faults of a file; `size` is its size according to a listing of the folder."""
+    """Return the faults of one file of a version as sentences, [] for a file without faults.
+
+    `size` is its size in bytes in a listing of the folder, 0 if the file is missing. If `deep`, the whole file is read.
+    """
     path = folder / entry["path"]
     if isinstance(path, ObjectPath) and size != entry["bytes"]:
         return [f"{path} has {size} bytes, the manifest says {entry['bytes']}" if size else f"{path} is missing"]
@@ -244,7 +275,7 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
             return _row_faults(folder, entry) if "rows" in entry else []
         check_size(folder, entry)
         if PurePosixPath(entry["path"]).suffix == ".parquet":
-            # This verifies the footer.
+            # Read the schema only to verify the checksum of the footer; it raises Damaged.
             parquet.read_schema(folder, entry)
     except Damaged as error:
         return [str(error)]
@@ -255,7 +286,7 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
 
 def _row_faults(folder: Folder, entry: Json) -> list[str]:
     path, schema = folder / entry["path"], parquet.read_schema(folder, entry)
-    # This refuses a wrong number of rows.
+    # `open_dataset` raises Damaged if the number of rows differs from the manifest.
     rows = parquet.open_dataset(folder, [entry], schema)
     if "_healpix_29" not in schema.names or "Npix=" not in path.name:
         return []
@@ -266,11 +297,14 @@ def _row_faults(folder: Folder, entry: Json) -> list[str]:
     return [f"{path} is not sorted by _healpix_29"] if (index[1:] < index[:-1]).any() else []
 
 
-# ------------------------------------------------------------------------------------------------ files that last
+# ------------------------------------- writing files so that they survive a crash or a loss of power
 
 
 def write_json(path: Path, value: Json) -> None:
-    """Replace a JSON file in one rename, and sync it to disc."""
+    """Write a JSON object to a file, which is replaced in one rename and synced to disc.
+
+    Missing folders are created. ValueError is raised for NaN or an infinity in `value`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     staged = temporary_path(path)
     try:
@@ -285,22 +319,23 @@ def write_json(path: Path, value: Json) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary path in the folder of `path`.
+    """Return a path with a random name in the folder of `path`, for a file that is later renamed to `path`.
 
-    Its name is random, because processes on two machines may have the same number.
+    The name does not contain the process number, because processes on two machines may have the same one.
     """
     return path.with_name(f".{uuid4().hex[:12]}.tmp.{path.name}")
 
 
 def is_temporary(path: Path) -> bool:
-    """Return True if a path has a name from `temporary_path`."""
+    """Return True if a path has a name as `temporary_path` makes them, for files that are still being written."""
     return _TEMPORARY.match(path.name) is not None
 
 
 def _json_text(value: Json) -> str:
-    """Return JSON with one line per value of the outermost object and per entry of its lists.
+    """Return the JSON text of an object, with sorted keys and short lines.
 
-    Further indentation would require Python's slow encoder, which takes a minute for 100,000 partitions.
+    Each value is on a separate line, and so is each element if the value is a list. Deeper levels are not indented,
+    because `json.dumps` with `indent` is slow: it takes a minute for a manifest of 100,000 partitions.
     """
     lines = []
     for key in sorted(value):
@@ -318,7 +353,7 @@ def _line(value: Any) -> str:
 
 
 def sync(path: Path) -> None:
-    """Sync a file, or the names in a folder, to disc, so that they survive a loss of power."""
+    """Sync the contents of a file, or the list of names in a folder, to disc, so that it survives a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,8 +1,8 @@
-"""Write and read the Parquet files of a lake, with declared encodings and with checksums of every byte.
+"""Write and read the Parquet files of a lake's tables, with checksums of every byte.
 
 Other readers (pyarrow, Spark, pandas, DuckDB, lsdb) return a changed byte as a wrong number. Here a file is read
-through `blocks.VerifiedFile` with its entry in a manifest or receipt. The decoder sees only verified bytes, including
-page headers and the footer.
+through `blocks.VerifiedFile`, which compares it with checksums that were recorded when the file was written. The
+decoder gets only verified bytes, including page headers and the footer.
 """
 
 from __future__ import annotations
@@ -22,23 +22,24 @@ from lake_schema.store import blocks
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
 
-# With this number of rows per group, small cone searches are fast and the footer is small (tried: 4k to 262k).
+# Number of rows per Parquet row group. Compared with other values (4,000 to 262,000), it gives fast searches in small
+# circles on the sky and a small footer.
 ROWS_PER_GROUP = 65_536
 
 _FORMAT = ds.ParquetFileFormat()
 
 
 def write(path: Path, rows: pa.Table, table: Table) -> None:
-    """Write a Parquet file with the table's encodings and a VOTable header; equal rows give equal bytes.
+    """Write rows to a Parquet file, with a VOTable header in its footer; equal rows give equal bytes.
 
     Parameters
     ----------
     path : Path
-        File to write.
+        File to write. An existing file is overwritten.
     rows : pyarrow.Table
-        Rows.
+        Rows. They are not compared with the declaration.
     table : Table
-        Declaration of the table.
+        Declaration of the table, which sets the compression and encoding of each column.
     """
     with pq.ParquetWriter(path, rows.schema, **table.parquet_options()) as file:
         file.write_table(rows, row_group_size=ROWS_PER_GROUP)
@@ -46,14 +47,14 @@ def write(path: Path, rows: pa.Table, table: Table) -> None:
 
 
 def file_checksums(path: Path) -> dict[str, Any]:
-    """Return size, sha256 and blocks of a Parquet file that was just written.
+    """Return size, sha256 and checksums of the blocks of a Parquet file that was just written.
 
-    A block contains the pages of one column of a row group with their headers. Small pieces share a block with the
-    next piece, and large pieces are divided into several blocks. The page index and the footer come last. The entry
-    `blocks` contains sizes and CRC-32 of the blocks as base64 text, see `blocks.file_checksums`.
+    A block is a range of bytes that is verified as a whole: the pages of one column of a row group with their headers.
+    A small column shares its block with the next column, and a large column is divided into several blocks. The last
+    blocks contain the page index and the footer. The result is that of `blocks.file_checksums`.
     """
     metadata = pq.read_metadata(path)
-    starts, end = [], 4  # the magic number
+    starts, end = [], 4  # A Parquet file begins with a magic number of 4 bytes.
     for group in range(metadata.num_row_groups):
         for column in range(metadata.num_columns):
             chunk = metadata.row_group(group).column(column)
@@ -63,38 +64,39 @@ def file_checksums(path: Path) -> dict[str, Any]:
 
 
 class Dataset(ds.FileSystemDataset):  # type: ignore[misc]
-    """Files of a lake as an Arrow dataset.
+    """Parquet files of a lake as one Arrow dataset, which verifies the checksums of all bytes that it reads.
 
     Attributes
     ----------
     verified_files : sequence of VerifiedFile
-        Its files, in the order of its fragments.
+        The opened files, one per Arrow fragment of the dataset, in the same order.
     """
 
     verified_files: Sequence[blocks.VerifiedFile] = ()
 
     @property
     def fault(self) -> str:
-        """Reason why one of the files was refused, "" if none was."""
+        """Message about the first file that differs from its checksums or cannot be read, "" without such a file."""
         return next((file.fault for file in self.verified_files if file.fault), "")
 
 
 def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
-    """Open files in a folder as one Arrow dataset, in the given order.
+    """Open Parquet files of a version of a table as one Arrow dataset, in the given order.
 
     Parameters
     ----------
     folder : Path or ObjectPath
         Folder of the version.
     entries : sequence of mapping
-        Entries of the files in the manifest.
+        Entries of the files in the manifest (the list of the version's files with their sizes and checksums).
     schema : pyarrow.Schema
         Schema of the dataset.
 
     Returns
     -------
     Dataset
-        The dataset. Reading it raises an error if other parts of a file than its footer are damaged.
+        The dataset. Only the footers of the files have been verified. The other bytes are verified when rows are read,
+        which raises an error if they have changed.
 
     Raises
     ------
@@ -106,7 +108,7 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
     merged = Dataset(fragments, schema, _FORMAT)
     merged.verified_files = files
     if len(fragments) > 1:
-        # This reads several footers at a time.
+        # Count the rows only because Arrow then reads all footers in parallel; the loop below would read one by one.
         merged.count_rows()
     for file, fragment, entry in zip(files, fragments, entries, strict=True):
         rows = fragment.metadata.num_rows
@@ -116,16 +118,16 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
 
 
 def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read the rows of one file, with the types with which they were written.
+    """Read the rows of one Parquet file of a version, with the types with which they were written.
 
     Parameters
     ----------
     folder : Path or ObjectPath
         Folder of the version.
     entry : mapping
-        Entry of the file in the manifest.
+        Entry of the file in the manifest (path, size and checksums).
     columns : sequence of str, optional
-        Names of columns; by default all.
+        Names of the columns to read; by default all. pyarrow.ArrowInvalid is raised for an unknown name.
 
     Returns
     -------
@@ -135,19 +137,21 @@ def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> p
     Raises
     ------
     Damaged
-        If the file differs from the manifest. The message names the file.
+        If the file is missing or its bytes differ from the manifest. The message names the file.
     """
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_table(file, columns=None if columns is None else list(columns))
 
 
 def read_schema(folder: Folder, entry: Json) -> pa.Schema:
-    """Return the schema of a file.
+    """Return the Arrow schema of a Parquet file in the folder of a version.
+
+    `entry` is the file's entry in the manifest: path, size and checksums. Only the footer is read.
 
     Raises
     ------
     Damaged
-        If the file differs from the manifest. The message names the file.
+        If the file is missing or its footer differs from the manifest. The message names the file.
     """
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_schema(file)

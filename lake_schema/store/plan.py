@@ -1,4 +1,8 @@
-"""Plans of versions: a table, the facts that determine its contents, and its tasks. A plan's hash names the version."""
+"""Plans: descriptions of versions of tables that are to be made.
+
+A plan consists of the declaration of a table, the facts that determine its contents (settings, inputs, code), and one
+task per partition (file). A hash of the plan is the key of the version, which names its folder in the lake.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,15 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One partition (file) of a table, and the facts that the task function needs to make it.
+    """One partition (Parquet file) of a table, and the facts that determine its contents.
 
     Attributes
     ----------
     name : str
-        Path of the file below dataset/: a plain name, or the HATS path of a catalogue's cell.
+        Path of the file below dataset/: a file name, or for a catalogue the HATS path of a HEALPix cell, such as
+        Norder=5/Dir=0/Npix=17.parquet.
     facts : mapping
-        JSON values, which are part of the plan's key.
+        Names and JSON values of the inputs from which the partition is made. They are part of the version's key.
     rows : int or None
         Number of rows that the partition must have, or None if any number is allowed.
     """
@@ -44,9 +49,15 @@ class Plan:
     table : Table
         Declaration of the table.
     facts : mapping
-        JSON values of everything that determines the contents: seed, request, keys of inputs, mission, code version.
+        JSON values of everything that determines the contents: seed, settings of the user's request, keys of the
+        versions of other tables that are read, numbers of the telescope, fingerprint of the code.
     tasks : tuple of Task
-        One task per partition.
+        One task per partition (file). A catalogue must have at least one; other tables may have none.
+
+    Raises
+    ------
+    BadInput
+        If two tasks have the same name, or a catalogue has no task.
     """
 
     table: Table
@@ -61,7 +72,11 @@ class Plan:
 
     @property
     def key(self) -> str:
-        """Key of the version: 16 hexadecimal digits of a hash of the declaration, the facts and the tasks."""
+        """Key of the version, which names its folder: 16 hexadecimal digits.
+
+        They are the first digits of a sha256 of the declaration, the facts and the tasks, so equal plans have equal
+        keys.
+        """
         table = self.table
         schema = [[f.name, str(f.type), f.nullable, _text(f.metadata)] for f in table.arrow_schema()]
         tasks = [[task.name, dict(task.facts), task.rows] for task in self.tasks]
@@ -71,14 +86,15 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Result of a task function.
+    """Result of a task function, which computes one partition (file) of a table.
 
     Attributes
     ----------
     rows : pyarrow.Table
         Rows of the partition.
     files : mapping of str to callable
-        Further files: functions that write a file to a path, by relative name.
+        Further files, such as images: functions that write the file to a given path. The keys are the paths of the
+        files relative to the folder of the version.
     """
 
     rows: pa.Table
@@ -89,7 +105,7 @@ TaskFunction = Callable[[Path, Json], Output]
 
 
 def data_path(table: Table, partition: str) -> str:
-    """Return the path of a partition's Parquet file in a version."""
+    """Return the path of a partition's Parquet file, relative to the folder of a version of the table."""
     return f"{table.name}/dataset/{partition}" if table.is_catalogue else f"dataset/{partition}"
 
 

@@ -1,4 +1,4 @@
-"""Fingerprints of the code and of the environment that made a product, and hashes of JSON values."""
+"""Describe the code, libraries and machine with which tables and images are made, and hash JSON values and files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("lake_schema", "truesky")
-# Examples, which are in the package in a wheel but not in a clone.
+# Folders of examples, which are left out of the fingerprint of the code. An installed package contains them, but in a
+# clone of the repository they are elsewhere.
 _EXCLUDED_FOLDERS = {"requests", "notebooks"}
 _SUFFIXES = {".py", ".csv", ".toml"}
-# Libraries whose version can change the bytes of products.
+# Libraries whose version can change the bytes of tables and images.
 _LIBRARIES = (
     "astropy",
     "colossus",
@@ -36,23 +37,30 @@ _LIBRARIES = (
 
 
 def canonical(value: Any) -> bytes:
-    """Return JSON with sorted keys and no spaces: equal values give equal bytes, and NaN and infinities are refused."""
+    """Return a value as JSON with sorted keys and without spaces, so that equal values give equal bytes.
+
+    ValueError is raised for NaN and infinities, TypeError for a value that JSON cannot represent.
+    """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
 
 
 def digest(value: Any) -> str:
-    """Return the sha256 (hexadecimal) of the canonical JSON of a value."""
+    """Return the sha256 (64 hexadecimal digits) of the JSON text of a value with sorted keys, see `canonical`."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def file_sha256(path: Folder) -> str:
-    """Return the sha256 (hexadecimal) of a file's contents."""
+    """Return the sha256 (64 hexadecimal digits) of the contents of a file; raise OSError if it cannot be read."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def code_version(root: Path = _ROOT) -> str:
-    """Return a fingerprint of all source and data files of lake_schema and truesky, and of the libraries' versions."""
+    """Return a sha256 of all source and data files of lake_schema and truesky, and of the versions of libraries.
+
+    The files are the .py, .csv and .toml files of both packages in the folder `root`. Python counts as a library, and
+    only libraries that can change results are included.
+    """
     files = sorted(
         path
         for package in _PACKAGES
@@ -66,20 +74,21 @@ def code_version(root: Path = _ROOT) -> str:
 
 
 def libraries() -> Mapping[str, str]:
-    """Return the versions of Python and of the libraries that affect the bytes of products."""
+    """Return the versions of Python and of the libraries that can change the bytes of tables and images, by name."""
     return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
 
 
 def machine() -> str:
-    """Return the kind of this machine: instruction set and C library, such as "x86-64-v3 glibc 2.36".
+    """Return the instruction set and C library that this process uses, such as "x86-64-v3 glibc 2.36".
 
-    Receipts of tasks and manifests of versions record it. It is not part of the key of a version.
+    The records of all files that are made contain this text, because the last bits of results depend on it. It is not
+    part of the hash that names a version of a table.
     """
     return instruction_set.kind()
 
 
 def git_commit(root: Path = _ROOT) -> str:
-    """Return the git commit of the checkout, or "unknown" outside one; it is recorded, but never part of a key."""
+    """Return the hash of the git commit that is checked out in `root`, or "unknown" if git does not find one."""
     try:
         process = subprocess.run(
             ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True

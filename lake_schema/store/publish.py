@@ -1,21 +1,23 @@
 """Make and publish versions of tables, so that readers never see an incomplete version.
 
-A plan describes a table, everything that determines its contents, and its tasks; its hash names the version.
+A plan describes a table, everything that determines its contents, and its tasks, one per partition (file). A hash of
+the plan is the key of the version.
 
-1. Each partition is written to LAKE/<table>/.stage-<key> under a temporary name, synced, hashed and renamed. Its
-   receipt is written last, in the same way.
-2. When all partitions exist, HATS metadata and the manifest are written, and one rename of the folder publishes the
-   version. Then the request's link and the link `current` are replaced, each by one rename.
+1. Each partition is written to LAKE/<table>/.stage-<key> under a temporary name, synced to disc, hashed and renamed.
+   Its receipt, a JSON record of its files, is written last, in the same way.
+2. When all partitions exist, HATS metadata and the manifest (list of all files) are written, and one rename of the
+   folder publishes the version. Then two symbolic links to the version are replaced, each by one rename: the link of
+   the request (named set of settings) for which it was made, and the link `current` of the table.
 
 If a run is killed::
 
-    at this point                                readers see               the next run makes
-    before the first receipt                     the last version          everything
-    between receipts                             the last version          what lacks a receipt or differs from it
-    after the last receipt, before the rename    the last version          the metadata and the rename
-    after the rename, before the request's link  the last version          both links
-    between the two links                        the new one by request    `current`
-    after both                                   the new version           nothing
+    at this point                                readers see                       the next run makes
+    before the first receipt                     the last version                  everything
+    between receipts                             the last version                  partitions without a valid receipt
+    after the last receipt, before the rename    the last version                  the metadata and the rename
+    after the rename, before the request's link  the last version                  both links
+    between the two links                        new one if they name the request  the link `current`
+    after both links                             the new version                   nothing
 """
 
 from __future__ import annotations
@@ -71,39 +73,40 @@ def make_version(
     base: str | None = "",
     name: str | None = None,
 ) -> Path:
-    """Make the missing partitions of a plan's version and publish it as the current version of its table.
+    """Make the missing partitions of a version of a table, and publish it as the current version.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     plan : Plan
-        Table, facts and tasks.
+        Declaration of the table, facts that determine its contents, and tasks (one per partition).
     task_function : callable
-        Function of (lake, facts of plan and task) that returns the Output of a task. `mapper` decides where it runs.
+        Function of (folder of the lake, facts of the plan and of the task in one dict) that returns the Output of a
+        task. `mapper` decides in which process it runs.
     mapper : callable, optional
-        Function like map: takes (function, tasks) and returns results in any order. Results are only used to report
-        failures; receipts decide which tasks are done.
+        Function like map: takes (function, tasks) and returns results in any order. The results are only used to report
+        failures. A task is done if its receipt (JSON record of its files) exists in the lake.
     base : str or None, optional
-        Key of the version that this one replaces. By default ("") it is the version that exists at the call: the
-        version of the request if `name` is given, else the current one.
+        Key of the version that the new version may replace; None if there must not be any. By default ("") it is the
+        version that exists at the call: the version of the request if `name` is given, else the current one.
     name : str, optional
-        Name of the request for which the version is made. The request is then linked to the version, and to the inputs
-        of the plan for which it has no link yet.
+        Name of the request (named set of settings) for which the version is made. The request is then linked to the
+        version, and to the versions of other tables that are its inputs, unless the request has a link for that table.
 
     Returns
     -------
     Path
-        Folder of the version.
+        Folder of the version. If the version exists and is current, nothing is made or written.
 
     Raises
     ------
     TasksFailed
-        If tasks failed. The output of the other tasks is kept.
+        If tasks failed. The output of the other tasks is kept for the next run.
     Superseded
-        If another run is making the same version, or has published another one since this run began.
+        If another run is making the same version, or has replaced the version `base` by a third one.
     Damaged
-        If the version exists and is damaged.
+        If the version exists and its files differ from its manifest, or a finished file has disappeared.
     """
     table, key = plan.table.name, plan.key
     replaced_key = _replaced_key(root, table, name)
@@ -112,7 +115,8 @@ def make_version(
     folder = layout.table_folder(root, table)
     lock = folder / f".lock-{key}"
     if replaced_key == current_key(root, table) == key and target.exists() and not lock.exists():
-        # Nothing is left to do. This needs no lock, so it works in a lake that is not writable.
+        # The version is complete and both links lead to it. Return before locking, because a lock file cannot be
+        # created in a lake that is not writable.
         _refuse_damaged(target, table)
         return target
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,12 +134,19 @@ def make_version(
 
 
 def _replaced_key(root: Path, table: str, name: str | None) -> str | None:
-    """Return the key of the version that a new version for a request, or for none, would replace."""
+    """Return the key of the version of a table that a new version would replace, or None without such a version.
+
+    It is the version of the request (named set of settings) `name`. If `name` is None, it is the current version.
+    """
     return current_key(root, table) if name is None else request_links.linked_key(root, name, table)
 
 
 def _pin_inputs(root: Path, plan: Plan, name: str) -> None:
-    """Link the request to the inputs of its table before they are used, so that they are not removed meanwhile."""
+    """Link a request (named set of settings) to the versions of other tables from which the new version is made.
+
+    A table to which the request has a link is left out. The links keep the garbage collection from removing the
+    versions while tasks read them.
+    """
     keys = set(request_links.version_keys_in(plan.facts))
     for table in set(layout.table_names(root)) - {plan.table.name}:
         for key in sorted(keys):
@@ -152,7 +163,11 @@ def _refuse_damaged(target: Path, name: str) -> None:
 
 
 def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapper, name: str | None) -> list[Json]:
-    """Run the missing tasks, and return the receipts of all tasks in the plan's order."""
+    """Make the missing partitions (files) of a version, and return the receipts of all partitions.
+
+    A receipt is the JSON record of a finished partition; the order is that of the tasks in the plan. Partitions of
+    older versions are reused if possible. Raise TasksFailed if a partition has no receipt at the end.
+    """
     table, stage = plan.table, layout.stage_folder(root, plan.table.name, plan.key)
     discard_damaged(stage, plan)
     for version in _candidate_versions(root, table.name, name):
@@ -173,7 +188,11 @@ def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapp
 
 
 def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
-    """Return versions that may contain reusable partitions: the request's, the current one, and other requests'."""
+    """Return the folders of published versions of a table that may contain reusable partitions.
+
+    They are the version of the request (named set of settings) `name`, the current version, and the versions of other
+    requests. A reusable partition is a file that need not be made again, because its inputs are the same as before.
+    """
     keys = [
         _replaced_key(root, table, name),
         current_key(root, table),
@@ -184,7 +203,11 @@ def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
 
 
 def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> None:
-    """Write metadata and manifest into a stage, given the receipts of its tasks; then only the rename is left."""
+    """Complete the folder of a new version with HATS metadata and the manifest, so that a rename can publish it.
+
+    `task_receipts` are the records of the finished partitions, in the order of the tasks in `plan`. BadInput is raised
+    if a primary key occurs in two partitions, Damaged if a file is missing.
+    """
     refuse_duplicates(stage, plan, task_receipts)
     entries = {f["path"]: f for receipt in task_receipts for f in receipt["files"]}
     _remove_unlisted(stage, set(entries))
@@ -195,12 +218,12 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
     for path in sorted(stage.rglob("*")):
         relative = path.relative_to(stage).as_posix()
         if manifest.is_temporary(path):
-            # Another copy of a task is still running and writes this file.
+            # Skip files with temporary names: a second process may still be writing a partition that is finished.
             continue
         if path.is_file():
             entry = entries.pop(relative, None)
             if entry is None:
-                # Files of receipts were synced before, other files were not.
+                # The file is not in the record of a partition, so it has not been synced to disc.
                 entry = manifest.file_entry(path, relative)
                 sync(path)
             files.append({**entry, **({"rows": rows[relative]} if relative in rows else {})})
@@ -226,7 +249,7 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
                 for task, receipt in zip(plan.tasks, task_receipts, strict=True)
             ],
             "rows": sum(rows.values()),
-            # Readers can see from this if last bits may differ when the version is made again elsewhere.
+            # Types of the machines that made the partitions. On another type, the last bits of numbers may differ.
             "machines": sorted({str(r["machine"]) for r in task_receipts}),
             "files": files,
             **deflections,
@@ -235,7 +258,10 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
 
 
 def _remove_unlisted(stage: Path, listed: set[str]) -> None:
-    """Remove files that no receipt lists: temporary files of killed tasks, and metadata of an interrupted run."""
+    """Remove the files in the folder of an unfinished version (`stage`) whose relative paths are not in `listed`.
+
+    They are temporary files of killed tasks, and metadata of an interrupted run.
+    """
     for path in sorted(stage.rglob("*"), reverse=True):
         if path.is_file() and path.relative_to(stage).as_posix() not in listed:
             path.unlink(missing_ok=True)

@@ -1,6 +1,7 @@
-"""Read published tables through their manifests; every byte is verified before it is decoded.
+"""Read published tables of a lake; every byte is compared with the checksums in the manifest before it is decoded.
 
-A version is resolved once, so a later publication does not change what is read.
+Each publication of a table is a new version, an immutable folder with a manifest (list of its files). A reader selects
+a version once. If another version is published later, the reader still gets the rows of the selected one.
 """
 
 from __future__ import annotations
@@ -26,26 +27,27 @@ from lake_schema.store import layout, manifest, parquet, request_links
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.provenance import digest
 
-# Positions of a catalogue's sources by which rows can be selected.
+# Positions of a catalogue's sources by which rows can be selected: with and without the deflection by lensing.
 POSITION_KINDS = ("observed", "true")
-# Largest number of ranges of _healpix_29 in the filter of one file; other rows outside the region are removed later.
+# Largest number of ranges of the column _healpix_29 in the filter with which a file is read. Rows in the ranges but
+# outside the requested cells are removed after reading.
 _MAX_RANGES = 16
-# Safety margin of a padded radius (deg), larger than the rounding error of the largest deflection.
+# Safety margin (deg) added to the radius of a search around true positions, above the rounding error of deflections.
 _ROUNDING_DEG = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """One published version of a table.
+    """One published version of a table, opened for reading.
 
-    Attributes
+    Parameters
     ----------
     folder : Path or ObjectPath
         Folder of the version.
     manifest : Manifest
-        Contents of its manifest.
+        Manifest of the version: its files with checksums, and the facts from which it was made.
     schema : pyarrow.Schema
-        Schema of its rows; the metadata of its fields contain units and descriptions.
+        Schema of the rows; the metadata of its fields contain units and descriptions.
     """
 
     folder: Folder
@@ -57,43 +59,99 @@ class Version:
 
     @property
     def table(self) -> str:
-        """Name of the table."""
+        """Name of the table, such as "galaxies"."""
         return str(self.manifest["table"])
 
     @property
     def key(self) -> str:
-        """Key of the version; plans of tables made from this version contain it."""
+        """Key of the version: 16 hexadecimal digits of a hash of everything from which it was made.
+
+        Tables that are made from this version record the key as one of their inputs.
+        """
         return str(self.manifest["key"])
 
     @property
     def fingerprint(self) -> str:
-        """sha256 (hexadecimal) of the sha256 of all files: it depends on the version's contents, not on its inputs."""
+        """Hexadecimal sha256 of the list of all files, each with its path and its own sha256.
+
+        Unlike the key, it is equal for two versions that have equal files but were made from different inputs.
+        """
         return digest({entry["path"]: entry["sha256"] for entry in self.manifest["files"]})
 
     @property
     def num_rows(self) -> int:
-        """Number of rows."""
+        """Number of rows in all partitions."""
         return int(self.manifest["rows"])
 
     @property
     def partitions(self) -> list[str]:
-        """Names of the partitions in the order of the plan."""
+        """Names of the partitions (Parquet files), in the order in which the manifest lists them."""
         return [str(entry["name"]) for entry in self.manifest["parts"]]
 
     def partition_path(self, partition: str) -> Path:
-        """Return the path of a partition's Parquet file for other readers; only its size is compared.
+        """Return the path of a partition's Parquet file, for programs other than truesky.
 
-        On object storage, the file is copied and its sha256 is compared.
+        Only its size is compared with the manifest. On object storage, the file is copied to a temporary folder, and
+        its sha256 is compared.
+
+        Parameters
+        ----------
+        partition : str
+            Name of the partition.
+
+        Returns
+        -------
+        Path
+            Path of a file on this machine.
+
+        Raises
+        ------
+        BadInput
+            If the version has no such partition.
+        Damaged
+            If the file differs from the manifest.
         """
         path = manifest.check_size(self.folder, self._partition_entry(partition))
         return path.download(self.partition_sha256(partition)) if isinstance(path, ObjectPath) else path
 
     def partition_sha256(self, partition: str) -> str:
-        """Return the sha256 of a partition's Parquet file when it was published."""
+        """Return the sha256 of a partition's Parquet file according to the manifest; the file is not read.
+
+        Parameters
+        ----------
+        partition : str
+            Name of the partition.
+
+        Returns
+        -------
+        str
+            The sha256, 64 hexadecimal digits.
+
+        Raises
+        ------
+        BadInput
+            If the version has no such partition.
+        """
         return str(self._partition_entry(partition)["sha256"])
 
     def partition_rows(self, partition: str) -> int:
-        """Return the number of rows of a partition."""
+        """Return the number of rows of a partition according to the manifest.
+
+        Parameters
+        ----------
+        partition : str
+            Name of the partition.
+
+        Returns
+        -------
+        int
+            Number of rows.
+
+        Raises
+        ------
+        BadInput
+            If the version has no such partition.
+        """
         return int(self._partition_entry(partition)["rows"])
 
     def _partition_entry(self, partition: str) -> dict[str, Any]:
@@ -104,19 +162,45 @@ class Version:
         raise BadInput(f"table {self.table}: version {self.key} has no partition {partition}")
 
     def sidecar_path(self, relative: str) -> Path:
-        """Return the path of another file of the version, such as an image, after comparing its sha256.
+        """Return the path of a file of the version that is not a partition, such as an image.
 
-        On object storage, it is copied to a temporary folder that is removed when the process ends.
+        The sha256 of the file is first compared with the manifest. On object storage, the file is copied to a temporary
+        folder, which is removed when no object in memory refers to the opened lake any more.
+
+        Parameters
+        ----------
+        relative : str
+            Path of the file in the folder of the version.
+
+        Returns
+        -------
+        Path
+            Path of a file on this machine.
 
         Raises
         ------
+        BadInput
+            If the manifest does not list the file.
         Damaged
-            If the file differs from the manifest.
+            If the file is missing or differs from the manifest.
         """
         return manifest.check_contents(self.folder, self._file_entry(relative))
 
     def sidecar_folder(self, relative: str) -> Path:
-        """Return a folder with further files of the version; on object storage, they are copied to a temporary folder.
+        """Return the path of a folder of the version, such as its folder of images.
+
+        A folder on disc is returned without any check. On object storage, all files in it are copied to a temporary
+        folder after their sha256 have been compared.
+
+        Parameters
+        ----------
+        relative : str
+            Path of the folder in the folder of the version.
+
+        Returns
+        -------
+        Path
+            Path of a folder on this machine.
 
         Raises
         ------
@@ -130,11 +214,38 @@ class Version:
         return folder.gather_copies(copies)
 
     def has_file(self, relative: str) -> bool:
-        """Return True if the version contains a file of this relative path."""
+        """Return True if the manifest lists a file.
+
+        Parameters
+        ----------
+        relative : str
+            Path of the file in the folder of the version.
+
+        Returns
+        -------
+        bool
+            True if the manifest lists the path; whether the file exists is not checked.
+        """
         return relative in self._entries_by_path()
 
     def file_sha256(self, relative: str) -> str:
-        """Return the sha256 of a file when it was published."""
+        """Return the sha256 of a file according to the manifest; the file is not read.
+
+        Parameters
+        ----------
+        relative : str
+            Path of the file in the folder of the version.
+
+        Returns
+        -------
+        str
+            The sha256, 64 hexadecimal digits.
+
+        Raises
+        ------
+        BadInput
+            If the manifest does not list the file.
+        """
         return str(self._file_entry(relative)["sha256"])
 
     def _file_entry(self, relative: str) -> dict[str, Any]:
@@ -147,7 +258,25 @@ class Version:
         return self.manifest.by_path
 
     def dataset(self, partitions: Iterable[str] | None = None) -> parquet.Dataset:
-        """Return the files of all or some partitions as an Arrow dataset that verifies what it reads."""
+        """Return the files of all or some partitions as an Arrow dataset, which verifies all bytes that it reads.
+
+        Parameters
+        ----------
+        partitions : iterable of str, optional
+            Names of partitions; by default all.
+
+        Returns
+        -------
+        Dataset
+            The dataset, with the partitions in the given order.
+
+        Raises
+        ------
+        BadInput
+            If the version has no such partition.
+        Damaged
+            If a file is missing, or its size or footer differs from the manifest.
+        """
         entries = [
             self._partition_entry(partition) for partition in (self.partitions if partitions is None else partitions)
         ]
@@ -161,7 +290,10 @@ class Version:
 
     @contextmanager
     def _errors_as_damaged(self) -> Iterator[None]:
-        """Turn errors of Arrow into Damaged; they occur if it cannot decode a file that matches the manifest."""
+        """Raise Damaged in place of an error of Arrow or of the operating system in the body of the `with` statement.
+
+        Arrow raises such an error if it cannot decode a file, or if a checksum differs.
+        """
         try:
             yield
         except (OSError, pa.ArrowInvalid) as error:
@@ -173,16 +305,16 @@ class Version:
         partitions: Iterable[str] | None = None,
         where: ds.Expression | None = None,
     ) -> pa.Table:
-        """Return rows in the order of the files.
+        """Return the rows of all or some partitions, in the order of the partitions and of their rows.
 
         Parameters
         ----------
         columns : sequence of str, optional
             Names of columns; by default all.
         partitions : iterable of str, optional
-            Names of partitions; by default all.
+            Names of partitions (Parquet files); by default all.
         where : pyarrow.dataset.Expression, optional
-            Filter of the rows.
+            Condition that the rows must satisfy; by default all rows are returned.
 
         Returns
         -------
@@ -192,41 +324,82 @@ class Version:
         Raises
         ------
         BadInput
-            If a column or partition does not exist.
+            If a column of `columns` or a partition does not exist.
         Damaged
-            If a file differs from the manifest.
+            If a file differs from the manifest, or Arrow cannot apply `where`, for example because it names a column
+            that does not exist.
         """
         self._check_columns(columns or ())
         with self._errors_as_damaged():
             return self.dataset(partitions).to_table(columns=None if columns is None else list(columns), filter=where)
 
     def read_margin(self, partition: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of a catalogue outside a partition's cell, up to 10" or slightly more from its edge."""
+        """Return the margin of a partition of a catalogue: the rows of other partitions close to its HEALPix cell.
+
+        All rows up to 10 arcsec from the edge of the cell are returned, and some rows farther out.
+
+        Parameters
+        ----------
+        partition : str
+            Name of the partition.
+        columns : sequence of str, optional
+            Names of columns; by default all.
+
+        Returns
+        -------
+        pyarrow.Table
+            The rows, which may be an empty table.
+
+        Raises
+        ------
+        BadInput
+            If the partition or a column does not exist.
+        Damaged
+            If the file of the margin differs from the manifest.
+        """
         self._check_columns(columns or ())
         entry = self._file_entry(f"{self.table}_margin/dataset/{partition}")
         with self._errors_as_damaged():
             return self._open_dataset([entry], self.schema).to_table(columns=None if columns is None else list(columns))
 
     def read_sidecar(self, relative: str) -> pa.Table:
-        """Return the rows of a Parquet file of the version that does not belong to its table."""
+        """Return the rows of a Parquet file in the folder of the version that is not a partition of the table.
+
+        Parameters
+        ----------
+        relative : str
+            Path of the file in the folder of the version.
+
+        Returns
+        -------
+        pyarrow.Table
+            All rows and columns of the file.
+
+        Raises
+        ------
+        BadInput
+            If the manifest does not list the file.
+        Damaged
+            If the file differs from the manifest.
+        """
         entry = self._file_entry(relative)
         manifest.check_size(self.folder, entry)
         with self._errors_as_damaged():
             return parquet.read(self.folder, entry)
 
     def _check_columns(self, columns: Sequence[str]) -> None:
-        """Raise BadInput if the table lacks one of the columns."""
+        """Raise BadInput if the table does not have one of the columns; the message names the first missing one."""
         for name in columns:
             if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
 
     def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of a catalogue in HEALPix cells; only matching files and row groups are read.
+        """Return the rows of a catalogue in some HEALPix cells; only files and row groups that may match are read.
 
         Parameters
         ----------
         cells : sequence of int
-            Nested cells.
+            Nested cells in any order; duplicates are ignored. Without cells, the result is empty.
         order : int
             HEALPix order of the cells.
         columns : sequence of str, optional
@@ -235,7 +408,8 @@ class Version:
         Returns
         -------
         pyarrow.Table
-            The rows.
+            The rows, in the order of the partitions. BadInput is raised for an unknown column or a table without
+            positions, Damaged for a changed file.
         """
         unique_cells = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
@@ -254,7 +428,7 @@ class Version:
     def cone(
         self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "observed"
     ) -> pa.Table:
-        """Return the rows of a catalogue within a circle, including its edge.
+        """Return the rows of a catalogue inside or on the edge of a circle on the sky.
 
         Parameters
         ----------
@@ -265,23 +439,27 @@ class Version:
         columns : sequence of str, optional
             Names of columns; by default all.
         on : str, optional
-            Positions that are compared: "observed" or "true".
+            Positions that are compared with the circle: "observed" (with the deflection by lensing) or "true".
 
         Returns
         -------
         pyarrow.Table
-            The rows.
+            The rows; an empty table if no row is in the circle.
 
         Raises
         ------
         BadInput
-            If a coordinate or the radius is outside its bounds, or a column does not exist.
+            If a coordinate or the radius is not a number within its bounds, a column does not exist, the table has no
+            positions, or `on` has another value.
+        Damaged
+            If a file differs from the manifest.
         """
         radius = arguments.check_number("radius", radius, 0.0, 180.0)
         sky.check_positions(arguments.check_number("ra", ra), arguments.check_number("dec", dec))
         position_names = self.position_columns(on)
         self._check_columns([*position_names, "_healpix_29"])
-        # Files are sorted by observed positions, so a source can be this far from the cells of its true position.
+        # Files are sorted by observed positions. Enlarge the circle by the largest deflection, so that it contains the
+        # observed position of every source whose true position is inside.
         padded = radius if position_names == ("ra", "dec") else radius + self.max_deflection() + _ROUNDING_DEG
         order = sky.cover_order(padded)
         names = None if columns is None else list(dict.fromkeys([*columns, *position_names]))
@@ -291,7 +469,18 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def position_columns(self, on: str = "observed") -> tuple[str, str]:
-        """Return the columns of ra and dec of observed or true positions; both are equal in a table without lensing.
+        """Return the names of the columns with the observed or true positions.
+
+        Parameters
+        ----------
+        on : str, optional
+            "observed" (with the deflection by lensing) or "true".
+
+        Returns
+        -------
+        tuple of str
+            Names of the columns of right ascension and declination. For "true" they are ra_true and dec_true, or ra and
+            dec if the table has no such columns, because its sources are not lensed.
 
         Raises
         ------
@@ -303,14 +492,28 @@ class Version:
         return ("ra_true", "dec_true") if on == "true" and "ra_true" in self.schema.names else ("ra", "dec")
 
     def max_deflection(self) -> float:
-        """Return the largest distance (deg) between observed and true positions when the version was published."""
+        """Return the largest distance between the observed and the true position of a source.
+
+        Returns
+        -------
+        float
+            Distance from the manifest, deg.
+
+        Raises
+        ------
+        BadInput
+            If the manifest does not contain it, as for tables without true positions.
+        """
         if "deflection_deg" not in self.manifest:
             raise BadInput(f"table {self.table}: the manifest of version {self.key} has no largest deflection")
         return float(self.manifest["deflection_deg"])
 
 
 def _cells_in_partition(partition: str, cells: Int, order: int) -> Int:
-    """Return the cells that overlap a partition's cell."""
+    """Return the nested cells of the given order that overlap the HEALPix cell of a partition.
+
+    `partition` is the path of its file, which contains the order and number of its cell.
+    """
     file_order, cell = layout.cell_of_file(partition)
     if file_order <= order:
         inside: Int = cells[sky.parent(cells, order, file_order) == cell]
@@ -320,9 +523,9 @@ def _cells_in_partition(partition: str, cells: Int, order: int) -> Int:
 
 
 def _ranges(cells: Int, order: int) -> list[tuple[int, int]]:
-    """Return half-open ranges of order-29 indices that cover sorted cells.
+    """Return half-open ranges of order-29 HEALPix indices that cover the given nested cells, which must be sorted.
 
-    At most `_MAX_RANGES` ranges are returned, so only the widest gaps between the cells are left out.
+    At most `_MAX_RANGES` ranges are returned. If the cells have more gaps, the narrower gaps are covered, too.
     """
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
@@ -340,11 +543,14 @@ def _range_filter(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
     return reduce(lambda a, b: a | b, [(index >= first) & (index < last) for first, last in ranges])
 
 
-# ------------------------------------------------------------------------------------------------ versions
+# ------------------------------------- selecting and opening a version of a table
 
 
 def version(root: Folder, name: str, key: str | None = None, request: str | None = None) -> Version:
-    """Return a published version of a table: by key or by request, else the one published last.
+    """Open a published version of a table for reading.
+
+    It is selected by its key, else by a request (named set of settings for which tables are made), else it is the
+    version that was published last.
 
     Parameters
     ----------
@@ -353,7 +559,7 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
     name : str
         Name of the table.
     key : str, optional
-        Key of the version. It takes precedence over `request`.
+        Key of the version, 16 hexadecimal digits. It takes precedence over `request`.
     request : str, optional
         Name of the request whose version is returned.
 
@@ -368,9 +574,9 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
         If the lake has no such table, version or request, or if requests have different versions and neither a key nor
         a request is given.
     Damaged
-        If the manifest is missing, broken or belongs to another version.
+        If a link leads to a version that is missing, or the manifest is missing, broken or belongs to another version.
     VersionMismatch
-        If this code cannot read the declaration with which the version was written.
+        If the columns with which the version was written differ from the table's declaration in this code.
     """
     selected_key = key or _select_key(root, name, request)
     if selected_key is None:
@@ -379,9 +585,10 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
 
 
 def input_version(root: Folder, name: str, request: str) -> Version:
-    """Return the version of a table from which a request's next table is made.
+    """Open the version of a table that is the input when another table of a request is made.
 
-    This is the request's version, else the version that was published last (for requests that share a catalogue).
+    It is the version that belongs to the request (named set of settings). If the request has none or does not exist, it
+    is the version that was published last, so that requests can share a catalogue.
 
     Parameters
     ----------
@@ -399,15 +606,41 @@ def input_version(root: Folder, name: str, request: str) -> Version:
 
     Raises
     ------
-    BadInput, Damaged, VersionMismatch
-        As in `version`.
+    BadInput
+        If the lake has no such table, or a name is not valid.
+    Damaged
+        If a link leads to a version that is missing, or the manifest is missing, broken or belongs to another version.
+    VersionMismatch
+        If the columns of the version differ from the table's declaration in this code.
     """
     request_key = request_links.linked_key(root, request, name)
     return latest_version(root, name) if request_key is None else version(root, name, request=request)
 
 
 def latest_version(root: Folder, name: str) -> Version:
-    """Return the version that was published last, of any request; it raises the errors of `version`."""
+    """Open the version of a table that was published last, whatever the settings for which it was made.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    name : str
+        Name of the table.
+
+    Returns
+    -------
+    Version
+        The version.
+
+    Raises
+    ------
+    BadInput
+        If the table has never been published.
+    Damaged
+        If the version is missing, or its manifest is broken.
+    VersionMismatch
+        If the columns of the version differ from the table's declaration in this code.
+    """
     current_key = layout.current_key(root, name)
     if current_key is None:
         raise BadInput(f"lake {root} has no table {name}")
@@ -447,14 +680,27 @@ def _open_version(root: Folder, name: str, key: str, is_requested: bool, link: F
 
 
 def with_declared_schema(published: Version, table: Table) -> Version:
-    """Return the version with the schema that `table` declares.
+    """Return a copy of a version with the schema that its table declares, including units and descriptions.
+
+    Parameters
+    ----------
+    published : Version
+        The version.
+    table : Table
+        Declaration of its table.
+
+    Returns
+    -------
+    Version
+        The version with the schema of the declaration.
 
     Raises
     ------
     VersionMismatch
-        If the declarations differ. The message names both versions or the first column that differs.
+        If the stored columns differ from the declaration in name, type or unit, or if the version was written with
+        another version number of the declaration. The message names the first differing column, or both numbers.
     """
-    # Arrow ignores units when it compares schemas, so they are compared separately.
+    # Units are part of the cache key of `_declared_schema`, because Arrow ignores metadata when it compares schemas.
     units = tuple((column.metadata or {}).get(b"unit", b"") for column in published.schema)
     return replace(
         published, schema=_declared_schema(published.schema, units, int(published.manifest["version"]), table)
@@ -464,7 +710,7 @@ def with_declared_schema(published: Version, table: Table) -> Version:
 @lru_cache(maxsize=64)
 def _declared_schema(stored: pa.Schema, units: tuple[bytes, ...], stored_version: int, table: Table) -> pa.Schema:
     if stored_version != table.version:
-        # Version numbers during development do not show which one is later.
+        # Do not say which of the two declarations is newer: their version numbers need not increase during development.
         raise VersionMismatch(
             f"table {table.name}: written by another version of truesky: "
             f"it has version {stored_version} of the declaration, but this truesky reads version {table.version}"
@@ -491,13 +737,36 @@ def _difference(stored: pa.Schema, table: Table) -> str:
 
 
 def table_names(root: Folder) -> list[str]:
-    """Return the names of the published tables, including damaged ones."""
+    """Return the names of the tables that have been published in a lake.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+
+    Returns
+    -------
+    list of str
+        Sorted names, [] for a lake that does not exist. A table is also listed if its files are damaged or have been
+        removed.
+    """
     return layout.table_names(root)
 
 
 def find_faults(published: Version, deep: bool = False) -> list[str]:
-    """Return the faults of a version as sentences, empty for a sound version.
+    """Compare the files of a version with its manifest (list of files).
 
-    If `deep`, the sha256 of every file is compared, and each cell is checked to contain only its own rows, sorted.
+    Parameters
+    ----------
+    published : Version
+        The version.
+    deep : bool, optional
+        Compare the sha256 of every file, and check that the rows of each file of a catalogue lie in the HEALPix cell of
+        the file, sorted by position. By default, only sizes and the footers of Parquet files are compared.
+
+    Returns
+    -------
+    list of str
+        One sentence per fault; [] for a version without faults.
     """
     return manifest.faults(published.folder, published.manifest, deep)

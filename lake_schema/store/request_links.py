@@ -1,7 +1,8 @@
-"""Links from requests to their versions of tables, so that several requests can share a lake.
+"""Symbolic links from requests to their versions of tables, so that several requests can share a lake.
 
-The links are LAKE/names/<name>/<table> -> ../../<table>/v-<key>. A link is replaced in one rename. Linked versions and
-the versions from which they were made are never removed.
+A request is a named set of settings of a simulation. Its links are LAKE/names/<name>/<table> ->
+../../<table>/v-<key>. A link is replaced in one rename. The garbage collection keeps linked versions and the versions
+from which they were made.
 """
 
 from __future__ import annotations
@@ -21,26 +22,34 @@ _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 
 
 def request_names(root: Folder) -> list[str]:
-    """Return the sorted names of the requests that have a table in the lake."""
+    """Return the sorted names of the requests (named sets of settings) that have a table in the lake."""
     folder = layout.requests_folder(root)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
 def check_request(root: Folder, name: str) -> str:
-    """Return the name if the lake has such a request, else raise BadInput, which lists the requests of the lake."""
+    """Return `name` if the lake has a request (named set of settings) of this name, else raise BadInput.
+
+    The message lists the names that the lake has.
+    """
     if layout.check_name(name) not in (existing := request_names(root)):
         raise BadInput(f"lake {root} has no request {name}" + (f"; it has {', '.join(existing)}" if existing else ""))
     return name
 
 
 def tables_of_request(root: Folder, name: str) -> list[str]:
-    """Return the sorted names of the tables of which a request has a version."""
+    """Return the sorted names of the tables of which a request (named set of settings) has a version.
+
+    The result is [] if there is no such request.
+    """
     folder = layout.requests_folder(root) / layout.check_name(name)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
 def linked_key(root: Folder, name: str, table: str) -> str | None:
-    """Return the key of a request's version of a table, or None if it has none; the version may be missing.
+    """Return the key of the version of a table that belongs to a request, or None if the request has no such table.
+
+    A request is a named set of settings; a symbolic link in the lake leads from it to each of its versions.
 
     Parameters
     ----------
@@ -54,24 +63,29 @@ def linked_key(root: Folder, name: str, table: str) -> str | None:
     Returns
     -------
     str or None
-        Key of the version.
+        Key of the version, 16 hexadecimal digits. Whether the version exists is not checked.
 
     Raises
     ------
     Damaged
-        If the file is not a link to a version of the table.
+        If the link leads elsewhere than to a version of the table, or is not a link.
     """
     return layout.linked_key(layout.request_link(root, name, table), table)
 
 
 def keys_by_request(root: Folder, table: str) -> dict[str, str]:
-    """Return the key of each request's version of a table, by name of the request."""
+    """Return the key of the version of a table that belongs to each request (named set of settings), by its name.
+
+    Requests that have no version of the table are left out.
+    """
     keys = {name: linked_key(root, name, table) for name in request_names(root)}
     return {name: key for name, key in keys.items() if key is not None}
 
 
 def link_version(root: Path, name: str, table: str, key: str) -> None:
-    """Link a request to a version of a table; the caller must hold the table's lock.
+    """Create or replace the symbolic link from a request (named set of settings) to its version of a table.
+
+    The caller must hold the lock of the table.
 
     Parameters
     ----------
@@ -82,7 +96,7 @@ def link_version(root: Path, name: str, table: str, key: str) -> None:
     table : str
         Name of the table.
     key : str
-        Key of the version.
+        Key of the version. Whether the version exists is not checked.
     """
     link = layout.request_link(root, name, table)
     if not link.parent.is_dir():
@@ -93,7 +107,7 @@ def link_version(root: Path, name: str, table: str, key: str) -> None:
 
 
 def replace_link(link: Path, target: str) -> None:
-    """Replace a link in one rename, and sync it to disc."""
+    """Create or replace a symbolic link to `target` in one rename, and sync it to disc."""
     temporary = link.with_name(f".{link.name}.{os.getpid()}.tmp")
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)
@@ -102,7 +116,11 @@ def replace_link(link: Path, target: str) -> None:
 
 
 def version_keys_in(facts: Any) -> Iterator[str]:
-    """Yield every text in the facts of a plan that has the form of a version's key, under any name."""
+    """Yield every string of 16 hexadecimal digits, the form of a version's key, in nested JSON values.
+
+    `facts` are the values from which a version of a table is made. They include the keys of the versions of other
+    tables that are read, which are found by their form.
+    """
     pending = [facts]
     while pending:
         value = pending.pop()

@@ -1,7 +1,9 @@
-"""Reuse partitions of older versions instead of making them again.
+"""Reuse partitions (files) of published versions of a table in a new version, instead of making them again.
 
-If the facts of a task contain `PRODUCT`, the digest of everything that determines its bytes, the partition is taken
-from a version with the same task and digest. Its files are linked after their sha256 has been compared.
+A partition is reusable if its facts (JSON values in the plan, from which it is made) contain the key "product": a
+digest of everything that determines its bytes. If an older version has a partition with the same name and facts, its
+files are hard-linked into the new version. Before that, their sha256 are compared with the manifest of the older
+version.
 """
 
 from __future__ import annotations
@@ -21,7 +23,11 @@ PRODUCT = "product"
 
 
 def manifest_facts(task: Task, receipt: Json) -> Json:
-    """Return the entries of the manifest for a reusable partition: rows, files, machine."""
+    """Return the entries that the manifest of a version needs so that later versions can reuse a partition.
+
+    They are its number of rows, files, machine type, and range of primary keys if it is in `receipt`, the record of the
+    finished partition. The result is {} if the facts of the task do not contain "product", which reuse requires.
+    """
     if PRODUCT not in task.facts:
         return {}
     span = {"span": receipt["span"]} if "span" in receipt else {}
@@ -30,7 +36,7 @@ def manifest_facts(task: Task, receipt: Json) -> Json:
 
 
 def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
-    """Return the digests (`PRODUCT`) of the reusable partitions of a request's version, by name.
+    """Return the digests of the partitions in a request's version of a table that a later version may reuse.
 
     Parameters
     ----------
@@ -39,12 +45,13 @@ def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
     table : str
         Name of the table.
     request : str
-        Name of the request.
+        Name of the request (named set of settings).
 
     Returns
     -------
     mapping of str to str
-        Digests by name; empty if the request has no version or an unreadable one.
+        Digest of everything that determines the bytes of a partition, by name of the partition. It is empty if the
+        request has no version of the table, or if the manifest of the version is damaged.
     """
     key = request_links.linked_key(root, request, table)
     if key is None:
@@ -59,18 +66,21 @@ def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
 
 
 def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task]) -> None:
-    """Link the reusable partitions of a version into a stage; missing and damaged ones are left out and made again.
+    """Link the files of reusable partitions of an old version into the folder of a new version.
+
+    Each linked partition also gets a receipt (JSON record), which marks its task as done. Partitions that the old
+    version does not have, or whose files have changed, are left out, so that their tasks make them.
 
     Parameters
     ----------
     stage : Path
-        Folder of the version that is being made.
+        Folder in which the new version is being made.
     version : Path
-        Folder of the version that may contain reusable partitions.
+        Folder of the old version, which is published.
     table : str
         Name of the table.
     tasks : sequence of Task
-        Tasks that are not done yet.
+        Tasks (one per partition) of the new version that are not done yet.
     """
     if not any(PRODUCT in task.facts for task in tasks):
         return
@@ -93,7 +103,7 @@ def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task])
 
 
 def _intact_entry(folder: Path, entry: Json) -> Json | None:
-    """Return the entry of a file that is unchanged since it was published, else None."""
+    """Return the manifest entry of a file without its key "rows", or None if the file is missing or has changed."""
     path = str(entry["path"])
     try:
         if file_sha256(folder / path) != str(entry["sha256"]):
@@ -109,9 +119,10 @@ def _link_file(source: Path, target: Path) -> None:
     try:
         os.link(source, temporary)
     except OSError:
-        # The file system does not support hard links.
+        # Copy the file if the file system does not support hard links.
         shutil.copyfile(source, temporary)
     os.replace(temporary, target)
-    # If both names already refer to the same file, os.replace does nothing and the temporary name remains.
+    # Remove the temporary name, which still exists if `target` was a link to the same file: os.replace does nothing
+    # then.
     temporary.unlink(missing_ok=True)
     manifest.sync(target.parent)

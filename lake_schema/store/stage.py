@@ -1,8 +1,10 @@
-"""Make one partition of a version: run its task, check and write its files, and write its receipt last.
+"""Make single partitions (Parquet files) of a version of a table, with a receipt for each.
 
-A task is done if its receipt exists and its files have the recorded sizes; at the start of a run, their sha256 are
-compared, too. Two copies of a task may run at the same time, on machines of the same kind, and one of them may outlive
-the run. The functions for one task run on the workers.
+A partition is made in the stage, the hidden folder of a version that is not published yet. Its rows are checked, its
+files are written, and its receipt is written last. A receipt is a JSON record of the files with their sizes and
+checksums. A task (the work for one partition) is done if its receipt exists and its files have the recorded sizes; at
+the start of a run, the sha256 of the files are compared, too. Spark may run two copies of a task at the same time, and
+one of them may end after the run.
 """
 
 from __future__ import annotations
@@ -28,40 +30,42 @@ from lake_schema.store.plan import Json, Output, Plan, Task, TaskFunction, data_
 from lake_schema.store.provenance import file_sha256, machine
 from lake_schema.store.validate import check_rows
 
-# Largest number of identifier blocks that a receipt lists (a cell of order 3 has 1024 blocks of each kind).
+# Largest number of blocks of identifiers (order-8 HEALPix cells, each for one type of source) that the receipt (record)
+# of a partition lists. An order-3 cell, the largest partition, has 1024 blocks per type of source.
 _MAX_BLOCKS = 4096
-# Number of receipts that are read at the same time, because a network file system has long waiting times.
+# Number of receipts (records of finished partitions) that are read in parallel, because each read on a network file
+# system has a long delay.
 _READ_THREADS = 16
 
 
 def run_task(root: Path, key: str, table: Table, facts: Json, task_function: TaskFunction, task: Task) -> Json:
-    """Make and write one partition, unless it is done.
+    """Make and write one partition (Parquet file) of a version, unless it exists already.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     key : str
-        Key of the version.
+        Key of the version that is being made.
     table : Table
         Declaration of the table.
     facts : mapping
-        Facts of the plan.
+        Everything that determines the contents of all partitions: settings, inputs, code.
     task_function : callable
-        Function of (lake, facts of plan and task) that returns an Output.
+        Function of (folder of the lake, facts of the plan and of the task in one dict) that returns an Output.
     task : Task
-        The task.
+        Name and facts of the partition.
 
     Returns
     -------
     mapping
-        The receipt, or after a failure {"part", "error", "traceback", "final"}, in which "final" is True if the same
-        input will fail again.
+        The receipt (JSON record of the files and rows that were written). After a failure instead the entries "part"
+        (name of the partition), "error" (message), "traceback", and "final": True if the same input will fail again.
 
     Raises
     ------
     Superseded
-        Only internally: all exceptions are returned as failures.
+        Only inside the function, which catches every Exception and returns it as a failure.
     """
     stage = layout.stage_folder(root, table.name, key)
     if is_done(stage, task):
@@ -70,7 +74,7 @@ def run_task(root: Path, key: str, table: Table, facts: Json, task_function: Tas
         instruction_set.require_limit()
         output = task_function(root, {**facts, **task.facts})
         if is_done(stage, task):
-            # Another copy of this task has finished first.
+            # Spark may have started a second copy of this task, which finished while the function above ran.
             return read_receipt(stage, task.name) or {}
         if not stage.is_dir():
             raise Superseded(f"table {table.name}: version {key} was published before this copy of {task.name} ended")
@@ -82,7 +86,7 @@ def run_task(root: Path, key: str, table: Table, facts: Json, task_function: Tas
 
 
 def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Json:
-    """Write one partition into the stage, with its receipt last.
+    """Check the rows of one partition, and write its files and then its receipt (JSON record of these files).
 
     Parameters
     ----------
@@ -91,19 +95,20 @@ def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Js
     table : Table
         Declaration of the table.
     task : Task
-        The task.
+        Name of the partition, and the number of rows that it must have.
     output : Output
-        Rows and further files.
+        Rows and further files of the partition.
 
     Returns
     -------
     mapping
-        The receipt.
+        The receipt: name, number of rows, machine type, and path, size and checksums of each file.
 
     Raises
     ------
     BadInput
-        If the rows do not fit the declaration or the plan.
+        If `output` is not an Output, the number of rows is wrong, the rows do not agree with the declaration, or rows
+        of a catalogue are not sorted or are outside the HEALPix cell of the partition.
     OSError
         If a file cannot be written.
     """
@@ -131,7 +136,10 @@ def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Js
 
 
 def write_receipt(stage: Path, receipt: Json) -> None:
-    """Write the receipt of a task."""
+    """Write the receipt of a partition, a JSON record of its files with sizes and checksums.
+
+    It is written into a folder next to `stage`, the folder in which the version is made.
+    """
     manifest.write_json(_receipt_path(stage, receipt["part"]), receipt)
 
 
@@ -155,7 +163,12 @@ def _check_positions(rows: pa.Table, table: Table, task: Task) -> None:
 
 
 def _summarize_rows(rows: pa.Table, table: Table) -> dict[str, Any]:
-    """Return facts for the receipt: blocks of identifiers or span of keys, and the largest deflection."""
+    """Return values about the rows of a partition, for the JSON record of the finished partition.
+
+    "blocks" lists the high bits of the identifiers that occur, or is None if there are too many. If the primary key is
+    not one integer column, "span" is the range of primary keys instead. For a table with observed and true positions,
+    "deflection_deg" is the largest distance between them (deg).
+    """
     facts: dict[str, Any] = {}
     if is_numbered(table):
         blocks = np.unique(rows[table.key[0]].to_numpy() >> BLOCK_BITS)
@@ -169,7 +182,10 @@ def _summarize_rows(rows: pa.Table, table: Table) -> dict[str, Any]:
 
 
 def _key_span(rows: pa.Table, table: Table) -> list[list[Any]]:
-    """Return the lowest and highest key of the rows, as the leading columns up to the first one that varies."""
+    """Return the lowest and highest primary key of the rows, shortened, or [] without rows.
+
+    Each is a list of values of the key's columns, up to and including the first column that is not constant.
+    """
     lowest: list[Any] = []
     highest: list[Any] = []
     for name in table.key if rows.num_rows else ():
@@ -182,7 +198,7 @@ def _key_span(rows: pa.Table, table: Table) -> list[list[Any]]:
 
 
 def is_numbered(table: Table) -> bool:
-    """Return True if the key of a table is one int64 column."""
+    """Return True if the primary key of a table is one int64 column, such as the identifiers of sources."""
     return len(table.key) == 1 and table.column(table.key[0]).type == "int64"
 
 
@@ -201,11 +217,14 @@ def _write_file(folder: Path, relative: str, writer: Callable[[Path], None]) -> 
     return facts
 
 
-# ------------------------------------------------------------------------------------------------ receipts
+# ------------------------------------- receipts: JSON records of finished partitions
 
 
 def receipts_folder(stage: Path) -> Path:
-    """Return the folder of a stage's receipts, with one JSON file per finished task."""
+    """Return the folder with one receipt (JSON file) per finished partition of a version that is being made.
+
+    `stage` is the folder in which the version is made; the folder of receipts is next to it.
+    """
     return stage.with_name(stage.name.replace(".stage-", ".receipts-"))
 
 
@@ -218,7 +237,7 @@ def _flat_name(partition: str) -> str:
 
 
 def read_receipt(stage: Path, partition: str) -> dict[str, Any] | None:
-    """Return the receipt of a partition, or None if there is no readable one."""
+    """Return the receipt (record of the written files) of a partition, or None if it is missing or not valid JSON."""
     try:
         receipt: dict[str, Any] = json.loads(_receipt_path(stage, partition).read_bytes())
     except (FileNotFoundError, ValueError):
@@ -227,7 +246,7 @@ def read_receipt(stage: Path, partition: str) -> dict[str, Any] | None:
 
 
 def is_done(stage: Path, task: Task) -> bool:
-    """Return True if the task's receipt exists and its files have the recorded sizes."""
+    """Return True if a partition is finished: its receipt exists, and all files in it have the recorded sizes."""
     receipt = read_receipt(stage, task.name)
     if receipt is None:
         return False
@@ -238,7 +257,10 @@ def is_done(stage: Path, task: Task) -> bool:
 
 
 def completed_receipts(stage: Path, plan: Plan) -> dict[str, Json]:
-    """Return the receipts of all finished tasks of a plan, by name."""
+    """Return the receipts (records of the written files) of all finished partitions, by name of the partition.
+
+    `plan` describes the version of a table that is being made, with one task per partition.
+    """
     folder = receipts_folder(stage)
     receipt_names = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
     candidates = [task for task in plan.tasks if f"{_flat_name(task.name)}.json" in receipt_names]
@@ -248,13 +270,16 @@ def completed_receipts(stage: Path, plan: Plan) -> dict[str, Json]:
 
 
 def missing_tasks(stage: Path, plan: Plan) -> list[Task]:
-    """Return the tasks of a plan that are not done."""
+    """Return the tasks of a plan whose partitions are not finished, in the order of the plan.
+
+    `plan` describes the version of a table that is being made in the folder `stage`, with one task per partition.
+    """
     completed = completed_receipts(stage, plan)
     return [task for task in plan.tasks if task.name not in completed]
 
 
 def discard_damaged(stage: Path, plan: Plan) -> None:
-    """Remove the receipts of tasks whose files do not have the recorded sha256."""
+    """Remove the receipts of partitions whose files differ from the recorded sha256, so that they are made again."""
     completed = completed_receipts(stage, plan)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for name, is_intact in zip(completed, pool.map(lambda name: _is_intact(stage, name), completed), strict=True):

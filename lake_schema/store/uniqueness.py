@@ -1,4 +1,4 @@
-"""Check that no identifier occurs in two partitions of a table."""
+"""Check that no primary key, such as the identifier of a source, occurs in two partitions (files) of a table."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from lake_schema.store.stage import is_numbered
 
 
 def refuse_duplicates(stage: Path, plan: Plan, receipts: Sequence[Json]) -> None:
-    """Raise BadInput if a key occurs in two partitions; each partition was checked before it was written.
+    """Raise BadInput if a primary key occurs in two partitions (files) of a version of a table.
 
     Parameters
     ----------
     stage : Path
         Folder of the version that is being made.
     plan : Plan
-        Its plan.
+        Plan of the version, which contains the declaration of the table.
     receipts : sequence of mapping
-        Receipts of all tasks.
+        Receipts (JSON records of files and ranges of keys) of all partitions.
 
     Raises
     ------
     BadInput
-        If a key occurs twice.
+        If a key occurs in two partitions. The message names the key and both files.
 
     Notes
     -----
-    Only partitions that share a block of identifiers, or whose spans of keys overlap, are read.
+    Duplicates within a partition are not found here; `stage.write_partition` refuses them. To save time, only
+    partitions with identifiers in the same block (the high bits of an identifier), or with overlapping ranges of keys,
+    are read.
     """
     table = plan.table
-    # The first file of a receipt is the partition's Parquet file.
+    # The first file in a receipt (record of a partition) is the Parquet file; the others are images, for example.
     entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in receipts}
     if not is_numbered(table):
         for group in _overlapping_groups(receipts):
@@ -57,9 +59,10 @@ def refuse_duplicates(stage: Path, plan: Plan, receipts: Sequence[Json]) -> None
 
 
 def _shared_blocks(receipts: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
-    """Return the files that contain identifiers of a block, by block, for blocks with two or more files.
+    """Return the paths of the files that contain identifiers of the same block, by block number.
 
-    If a receipt lists no blocks, the key None stands for all files.
+    A block is the range of identifiers with the same high bits. Blocks that occur in one file only are left out. If the
+    receipt (record) of any file does not list its blocks, the result is {None: all paths}.
     """
     if any(receipt["blocks"] is None for receipt in receipts):
         return {None: list(paths)}
@@ -87,7 +90,10 @@ def _refuse_shared_ids(
 
 
 def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
-    """Yield groups of two or more receipts whose rows have overlapping ranges of identifiers."""
+    """Yield groups of two or more receipts (records of partitions) whose ranges of primary keys overlap.
+
+    Receipts of partitions without rows have no range and are ignored.
+    """
     group: list[Json] = []
     highest: list[Any] = []
     for receipt in sorted(
@@ -98,7 +104,8 @@ def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
             if len(group) > 1:
                 yield group
             group = []
-        # If one bound is the beginning of the other, the shorter one covers more keys.
+        # A bound is a list of values of the leading key columns. If one bound is the beginning of another one, the
+        # shorter bound covers more keys and is kept.
         if not group or _is_below(highest, high) or (not _is_below(high, highest) and len(high) < len(highest)):
             highest = high
         group.append(receipt)

@@ -1,6 +1,6 @@
-"""Check that rows agree with the declaration of their table.
+"""Check that rows agree with the declaration of their table: columns, types, units, ranges, codes and unique keys.
 
-Every task checks its rows before it writes them, and readers can check them again.
+Rows are checked before they are written. Readers can check them again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from lake_schema.errors import BadInput
 
 
 def find_violations(rows: pa.Table, table: Table) -> list[str]:
-    """Return the violations of a declaration as sentences; the contents are checked only if the schema is right."""
+    """Return one sentence for each way in which rows differ from the declaration of their table, [] if they agree.
+
+    If names, order, types, nullability or units of the columns differ, the values are not checked.
+    """
     messages = _schema_violations(rows.schema, table)
     if messages:
         return messages
@@ -26,7 +29,10 @@ def find_violations(rows: pa.Table, table: Table) -> list[str]:
 
 
 def check_rows(rows: pa.Table, table: Table) -> None:
-    """Raise BadInput with the first violation if `rows` do not agree with the declaration of `table`."""
+    """Raise BadInput if `rows` do not agree with the declaration of `table`.
+
+    The message describes the first difference that `find_violations` finds, and gives the number of the others.
+    """
     messages = find_violations(rows, table)
     if messages:
         suffix = f" (and {len(messages) - 1} more)" if len(messages) > 1 else ""
@@ -83,7 +89,8 @@ def _number_violations(values: pa.ChunkedArray, column: Column, where: str, row_
     for bound, compare in ((column.lo, pc.less), (column.hi, pc.greater)):
         if bound is None or len(values) == 0:
             continue
-        # The bound is rounded to the column's type: 0.02 in float32 is slightly less than 0.02.
+        # Round the bound to the type of the column before comparing: 0.02 as a float32 is slightly less than 0.02, so
+        # a value that equals the bound would be refused.
         scalar = pa.scalar(np.dtype(values.type.to_pandas_dtype()).type(bound), values.type)
         out_of_range = compare(values, scalar)
         if pc.any(out_of_range).as_py():

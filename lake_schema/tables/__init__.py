@@ -1,4 +1,4 @@
-"""Declarations of the tables of a lake."""
+"""Declarations of the tables of a lake: their columns with types, units, ranges and meanings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from lake_schema.columns import Table
 
 
 def all_tables(bands: Sequence[str]) -> list[Table]:
-    """Return all tables of a lake; the flux tables have these bands."""
+    """Return the declarations of all tables of a lake.
+
+    `bands` are the names of the passbands for which the tables of fluxes have a column.
+    """
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.gaia import GAIA
@@ -32,7 +35,7 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
 
 
 def to_markdown() -> str:
-    """Return the reference page of all tables in Markdown."""
+    """Return a page in Markdown that documents all tables and columns; "<band>" stands for the name of a passband."""
     head = "# Tables of the lake\n\nWritten by `python -m lake_schema tables`; do not edit.\n"
     return "\n".join([head, *(table.to_markdown() for table in all_tables(["<band>"]))])
 
@@ -45,11 +48,13 @@ def find_table(name: str, columns: Sequence[str] = ()) -> Table | None:
     name : str
         Name of the table.
     columns : sequence of str, optional
-        Names of the columns of the table. The bands of a flux table are taken from them.
+        Names of the columns that the table has in a lake. They are needed for a table of fluxes only, whose columns
+        f_nu_<band> differ between lakes.
 
     Returns
     -------
     Table or None
+        The declaration.
     """
     bands = [column.removeprefix("f_nu_") for column in columns if column.startswith("f_nu_")]
     return next((table for table in all_tables(bands) if table.name == name), None)

@@ -1,4 +1,7 @@
-"""Columns and types that several tables share: identifiers, positions, sources of files."""
+"""Declarations that several tables share: columns of identifiers and positions, codes of the types of sources.
+
+The class Origin describes the file from which a spectrum or curve was made.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +39,14 @@ SKY = (ID, RA, DEC, HEALPIX_29)
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Origin of a spectrum or a curve.
+    """Files from which a spectrum or a curve was made.
 
     Attributes
     ----------
     source : str
-        Names of its files, with their reference.
+        Names of the files, with a reference to the literature.
     sha256 : str
-        Checksum of these files, hexadecimal.
+        sha256 of the concatenated files, hexadecimal.
     """
 
     source: str
@@ -51,9 +54,10 @@ class Origin:
 
 
 def id_of_kinds(first: int, last: int) -> Column:
-    """Return the column `id` of a table that contains only kinds `first` to `last`.
+    """Return the column `id` of a table that contains only sources of the kinds `first` to `last`.
 
-    Its bounds ensure that tables of different kinds share no identifiers.
+    A kind is a code for the type of source, such as 5 for a star, and the highest bits of an identifier. The bounds of
+    the column exclude identifiers of other kinds.
     """
     return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
 
@@ -61,8 +65,8 @@ def id_of_kinds(first: int, last: int) -> Column:
 def density_boost_column(sources: str) -> Column:
     """Return the column `density_boost`.
 
-    The column contains the factor by which a kind of source was drawn denser than in nature. `sources` is the subject
-    and verb in the description of the column, such as "this kind was".
+    The column contains the factor by which the simulation multiplied the density of a type of source on the sky.
+    `sources` is the subject and verb in the description of the column, such as "this kind was" or "strong lenses were".
     """
     doc = f"factor by which {sources} drawn denser than in nature; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

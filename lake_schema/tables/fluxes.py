@@ -1,4 +1,7 @@
-"""Declaration of the tables `galaxy_fluxes` and `star_fluxes`: band fluxes in the row order of their catalogues."""
+"""Declaration of the tables `galaxy_fluxes` and `star_fluxes`: fluxes of all galaxies and stars in each passband.
+
+Their rows are in the same order as the rows of the tables `galaxies` and `stars`.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ INTEGRATED = Column(
 
 
 def fluxes(kind: str, bands: Sequence[str]) -> Table:
-    """Return the flux table of `kind` ("galaxy" or "star"), with one column f_nu_<band> in microjansky per band."""
+    """Return the declaration of the table of fluxes of galaxies or stars, with a column f_nu_<band> (uJy) per passband.
+
+    `kind` is "galaxy" or "star"; KeyError is raised for another text if `bands` is not empty.
+    """
     columns = [
         Column(
             f"f_nu_{band}",

@@ -1,7 +1,7 @@
-"""Declaration of the table `gaia`: the stars as Gaia DR2 would list them, a reference catalogue for calibration.
+"""Declaration of the table `gaia`: simulated stars with the errors and columns that Gaia DR2 would give them.
 
-`EXPORT` and `EXPORT_DR3` declare the same rows under the names of Gaia's archive, for export to files. `EXPORT_DR3`
-also has the column order of DR3.
+The table serves as a reference catalogue for calibrations. `EXPORT` and `EXPORT_DR3` declare the same rows with the
+column names of Gaia's archive, for export to files. `EXPORT_DR3` also has the column order of DR3.
 """
 
 from __future__ import annotations
@@ -165,10 +165,10 @@ EXPORT = Table(
 
 
 def _make_dr3_table() -> Table:
-    """Return the available columns of DR3's gaia_source, in its order."""
+    """Return the declaration of a table with the columns of Gaia DR3's gaia_source that truesky has, in DR3's order."""
     columns_by_name = {column.name: column for column in EXPORT.columns}
     parameter_names = [name for parameter in PARAMETERS for name in (parameter, f"{parameter}_error")]
-    # In DR3, parallax_over_error and pm follow the parallax.
+    # Begin with the columns up to the parallax error, after which DR3 has parallax_over_error and pm.
     order: list[str | Column] = ["source_id", "ref_epoch", *parameter_names[:6]]
     order += [
         Column(

@@ -1,8 +1,8 @@
 """Declaration of the tables `galaxies` and `emission_lines` (wavelengths and widths of the galaxies' lines).
 
-The columns of `galaxies` come in the ten groups of Serrano et al. 2024, section 4.1. The SED has two components, as in
-Flagship 2. Flagship 1 has one mixed template with one extinction law and one E(B-V): the case of two components with
-equal laws and E(B-V).
+The columns of `galaxies` are in the ten groups of Serrano et al. 2024, section 4.1. The spectrum (SED) of a galaxy is
+the sum of two template spectra, each with its extinction law and E(B-V), as in the Flagship 2 catalogue. Flagship 1 has
+one law and one E(B-V) per galaxy, which are then equal for both templates.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from lake_schema.tables.common import (
 
 LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump"), (4, "Calzetti + double bump"))
 
-# Scale height of every disc in scale lengths. It relates `inclination` to the axis ratio, and discs are drawn with it
-# (Serrano et al. 2024, "Bulge and disc model").
+# Scale height of the disc of every galaxy, in units of its radial scale length. It relates the column `inclination` to
+# the axis ratio, and discs are drawn with it (Serrano et al. 2024, "Bulge and disc model").
 DISK_SCALE_HEIGHT = 0.1
 
 _LINE_DOC = (
@@ -60,7 +60,7 @@ def _component(k: int) -> tuple[Column, ...]:
     )
 
 
-# 1 identity
+# Columns of group 1 (groups of Serrano et al. 2024, section 4.1): identity.
 _IDENTITY = (
     id_of_kinds(0, 4),
     Column(
@@ -71,15 +71,16 @@ _IDENTITY = (
         lo=0,
     ),
 )
-# The position columns (group 2) stand between _IDENTITY and these.
+# Columns of groups 3 to 10 (groups of Serrano et al. 2024, section 4.1). In the table, the columns of group 2, the
+# position, are between the columns of _IDENTITY and _OTHER_COLUMNS.
 _OTHER_COLUMNS = (
-    # 3 kind
+    # Columns of group 3: type of source.
     Column("kind", "int8", ucd="src.class", doc="kind of source", codes=SOURCE_KINDS[:5], lo=0, hi=4),
     density_boost_column("this kind was"),
-    # 4 redshift
+    # Columns of group 4: redshift.
     Column("z_true", "float32", "", "src.redshift", "cosmological redshift", 0.0, 15.0),
     Column("z_obs", "float32", "", "src.redshift", "observed redshift, with the peculiar velocity", -0.02, 15.0),
-    # 5 reference magnitude
+    # Columns of group 5: reference magnitude, colour and masses.
     Column(
         "abs_mag_r01",
         "float32",
@@ -131,10 +132,10 @@ _OTHER_COLUMNS = (
         5.0,
         True,
     ),
-    # 6 SED
+    # Columns of group 6: spectrum of the galaxy, the sum of two templates with their dust.
     *_component(1),
     *_component(2),
-    # 7 emission lines
+    # Columns of group 7: fluxes of emission lines.
     _line_column("halpha", "H alpha 6564.6"),
     _line_column("hbeta", "H beta 4862.7"),
     _line_column("oii", "[O II] 3727.1 (the doublet's other line has the same flux)"),
@@ -150,7 +151,7 @@ _OTHER_COLUMNS = (
     _line_column("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)"),
     _line_column("hei", "He I 10833"),
     _line_column("hei_5877", "He I 5877.2"),
-    # 8 morphology
+    # Columns of group 8: morphology.
     Column(
         "bulge_half_light_radius",
         "float32",
@@ -216,7 +217,7 @@ _OTHER_COLUMNS = (
         0.0,
         180.0,
     ),
-    # 9 lensing
+    # Columns of group 9: weak lensing.
     Column("kappa", "float32", ucd="arith.factor", doc="convergence", lo=-1.0, hi=2.0),
     Column(
         "gamma1",
@@ -234,7 +235,7 @@ _OTHER_COLUMNS = (
         lo=-1.0,
         hi=1.0,
     ),
-    # 10 Milky Way
+    # Columns of group 10: dust of the Milky Way.
     Column(
         "a_v",
         "float32",
@@ -244,7 +245,7 @@ _OTHER_COLUMNS = (
         0.0,
         40.0,
     ),
-    # Origin in another catalogue or library
+    # Columns of galaxies from a user's catalogue, or with an image from a user's library.
     Column(
         "origin_id",
         "int64",
@@ -301,16 +302,16 @@ EMISSION_LINES = Table(
 
 
 class Line(Protocol):
-    """An emission line.
+    """Attributes of an emission line that `line_rows` needs.
 
     Attributes
     ----------
     name : str
         Name of the line.
     column : str
-        Column of the table `galaxies` with the flux of its primary line.
+        Name of the column of the table `galaxies` that determines the flux of the line.
     ratio : float
-        Flux of the line relative to that column.
+        Flux of the line divided by the value of that column; 1 if the column contains the flux of this line.
     vacuum, air : float
         Rest wavelengths in vacuum and in air, in angstrom.
     """
@@ -328,16 +329,17 @@ class Line(Protocol):
 
 
 def line_rows(lines: Sequence[Line], width: Mapping[str, float], origins: Sequence[Origin]) -> pa.Table:
-    """Build the table `emission_lines`.
+    """Build the rows of the table `emission_lines`.
 
     Parameters
     ----------
     lines : sequence of Line, length n
         Lines, one per row.
     width : mapping of str to float
-        Coefficients of the law of line widths, by column name.
+        Coefficients of the formula for the widths of lines, the same for all lines, by name of the column: width_slope,
+        width_slope_z, width_magnitude, width_z, width_least and width_most.
     origins : sequence of Origin, length n
-        Origin of each line.
+        File and reference of each line.
 
     Returns
     -------

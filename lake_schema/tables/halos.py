@@ -1,4 +1,7 @@
-"""Declaration of the tables `halos` (dark-matter halos that host galaxies) and `halo_limits` (their completeness)."""
+"""Declaration of the tables `halos` (dark-matter halos that host galaxies) and `halo_limits`.
+
+`halo_limits` contains the mass, for each redshift, above which `halos` lists all halos.
+"""
 
 from __future__ import annotations
 

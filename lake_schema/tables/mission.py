@@ -1,4 +1,7 @@
-"""Declaration of the table `mission`: all records of the mission database, with a flag for those that a run used."""
+"""Declaration of the table `mission`: all parameters of telescope, cameras and survey in the mission database.
+
+A flag marks the values that a run used.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ STATUSES = (
     ("CBE", "current best estimate"),
     ("SIM", "as simulated"),
 )
-# Default order of preference: best knowledge first; SIM is used only if nothing better exists.
+# Statuses of a parameter's values in the default order of preference: current best estimate, built, designed, required,
+# simulated. A value with a later status is used only if there is none with an earlier one.
 LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
 CONFIDENCES = (
     ("published", "read in its source"),

@@ -1,4 +1,4 @@
-"""Declaration of the table `passbands`: photon responses with which fluxes were computed, one row per band."""
+"""Declaration of the table `passbands`: the response curves with which fluxes were computed, one row per passband."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ PASSBANDS = Table(
 
 
 class Passband(Protocol):
-    """Photon response on a wavelength grid with equal steps.
+    """Attributes of a passband that `rows` needs: the response to photons on a wavelength grid with equal steps.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def rows(
     origins: Sequence[Origin],
     ab_minus_vega: Sequence[float | None],
 ) -> pa.Table:
-    """Build the table `passbands`.
+    """Build the rows of the table `passbands`.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def rows(
     log_widths : float array, shape (n,)
         Integrals of the responses over ln(wavelength).
     origins : sequence of Origin, length n
-        Origin of each passband.
+        File and reference from which each passband was made.
     ab_minus_vega : sequence of float or None, length n
         AB magnitude of Vega in each band, None if Vega's spectrum does not cover the band.
 

@@ -1,4 +1,4 @@
-"""Declaration of the image archive: tables `products` (files of detectors) and `exposure_files` (whole exposures)."""
+"""Declaration of the tables of image files: `products` (one detector per file) and `exposure_files` (one exposure)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Declaration of the table `quarantine`: galaxies that weak lensing cannot describe, separate from `galaxies`."""
+"""Declaration of the table `quarantine`: galaxies whose lensing is too strong to be described by shear and convergence.
+
+They are not in the table `galaxies`, and neither fluxes nor images of them are made.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ from dataclasses import replace
 from lake_schema.columns import Column, Table
 from lake_schema.tables.galaxies import GALAXIES
 
-# A galaxy behind the centre of a massive halo has a convergence of several.
+# Bounds of columns that are wider than in the table `galaxies`: behind the centre of a massive halo, the convergence
+# kappa is well above 1.
 _BOUNDS = {"kappa": (-1.0, 100.0), "gamma1": (-10.0, 10.0), "gamma2": (-10.0, 10.0)}
 
 

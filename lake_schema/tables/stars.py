@@ -1,4 +1,4 @@
-"""Declaration of the table `stars`: stars of the Milky Way (Serrano et al. 2024, section 4.2)."""
+"""Declaration of the table `stars`: simulated and catalogued Milky Way stars (Serrano et al. 2024, section 4.2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMPONENTS = (
 )
 STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwarf"), (4, "subgiant"))
 
-# Epoch of the positions, Julian year.
+# Epoch of the positions of stars, as a Julian year.
 EPOCH = 2015.5
 
 

@@ -1,4 +1,4 @@
-"""Declaration of the table `strong_lenses`: galaxies that lens another galaxy, each with an image of its arcs."""
+"""Declaration of the table `strong_lenses`: galaxies that lens a background galaxy, with images of its arcs."""
 
 from __future__ import annotations
 

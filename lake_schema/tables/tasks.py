@@ -1,4 +1,7 @@
-"""Declaration of the table `tasks`: detectors to render, one row per detector of an exposure."""
+"""Declaration of the table `tasks`: the images to simulate, one row per detector of an exposure.
+
+A row contains the position of the detector on the sky, and the predicted CPU time, memory and file size.
+"""
 
 from __future__ import annotations
 

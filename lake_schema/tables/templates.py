@@ -1,4 +1,4 @@
-"""Declaration of the tables `templates` (spectra of sources) and `extinction_laws` (dust inside galaxies)."""
+"""Declaration of the tables `templates` (template spectra) and `extinction_laws` (laws of the dust inside galaxies)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ TEMPLATES = Table(
 
 
 class Types(Protocol):
-    """Parameters of the first n stars of a library.
+    """Stellar parameters of the first n spectra of a library of star spectra.
 
     Attributes
     ----------
@@ -75,18 +75,18 @@ class Types(Protocol):
 
 
 class Library(Protocol):
-    """Spectra on a wavelength grid with equal steps.
+    """Attributes of a library of n template spectra that `rows` needs.
 
     Attributes
     ----------
     wavelength : float array, shape (m,)
-        Wavelengths in angstrom.
+        Vacuum wavelengths in angstrom, in equal steps.
     flux : float32 array, shape (n, m)
-        Flux densities f_lambda, normalised.
+        Flux densities f_lambda, normalised as the description of the column `flux` says.
     names : sequence of str, length n
         Labels of the spectra.
     types : Types or None
-        Parameters of its first stars, None for a library without stellar parameters.
+        Temperatures and gravities of the first spectra, None for a library without stellar parameters.
     """
 
     @property
@@ -100,7 +100,11 @@ class Library(Protocol):
 
 
 def rows(libraries: Mapping[str, Library], origins: Mapping[str, Sequence[Origin]]) -> pa.Table:
-    """Build the table `templates` from libraries by name ("galaxy", "star" ...) and the origins of their spectra."""
+    """Build the rows of the table `templates` from libraries of spectra, by name ("galaxy", "star" ...).
+
+    `origins` contains the file and reference of each spectrum, by name of the library; KeyError is raised if a library
+    is missing from it.
+    """
     library_tables = (_rows(name, library, origins[name]) for name, library in libraries.items())
     return pa.concat_tables([TEMPLATES.empty(), *library_tables])
 
@@ -126,7 +130,7 @@ def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
 
 
 def _pad_missing(values: Float, n: int) -> Any:
-    """Return `n` values, masked beyond the given values."""
+    """Return a masked array of length `n` that begins with `values`; the elements after them are masked."""
     missing = np.arange(n) >= len(values)
     return np.ma.masked_array(np.concatenate([values[:n], np.zeros(max(n - len(values), 0))]), missing)
 
@@ -156,16 +160,16 @@ EXTINCTION_LAWS = Table(
 
 
 def law_rows(wavelength: Float, k: Float32, origins: Sequence[Origin]) -> pa.Table:
-    """Build the table `extinction_laws`.
+    """Build the rows of the table `extinction_laws`.
 
     Parameters
     ----------
     wavelength : float array, shape (m,)
         Wavelengths in angstrom, with equal steps.
     k : float32 array, shape (n, m)
-        A(lambda) / E(B-V) of each law, in the order of the law codes.
+        A(lambda) / E(B-V) of each law, in mag / mag, in the order of the codes of the laws (column ext_law_k).
     origins : sequence of Origin, length n
-        Origin of each law.
+        File and reference of each law.
 
     Returns
     -------

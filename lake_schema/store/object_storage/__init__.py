@@ -1,1 +1,1 @@
-"""Lakes on S3-compatible object storage: pushing and reading."""
+"""Copying a lake (a folder of versioned tables) to S3-compatible object storage, and reading it there."""
