@@ -23,24 +23,25 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Plan the table `gaia` with one task per partition of the stars.
+    """Plan the making of table `gaia`, with one task per partition (file) of the stars.
 
     Parameters
     ----------
     lake : Path
         Folder of the lake.
     request : Request
-        The request; its catalogues of stars and star fluxes must be in the lake.
+        The request; its tables `stars` and `star_fluxes` must be in the lake.
 
     Returns
     -------
     list of Step
-        One step, which observes the stars.
+        One step, which simulates the measurements.
 
     Raises
     ------
     BadInput
-        If the Gaia bands are missing in the table `star_fluxes`, or if it was computed from another version of `stars`.
+        If the Gaia bands are missing in the table `star_fluxes`, or if this table was computed from other rows of
+        `stars`.
     """
     stars, fluxes = (read.input_version(lake, name, request.name) for name in ("stars", "star_fluxes"))
     universe.check_catalogues([stars], request)
@@ -64,16 +65,17 @@ def observe_stars(lake: Path, facts: Json) -> Output:
     lake : Path
         Folder of the lake.
     facts : dict
-        Facts of the plan and of the task; `part` is the partition.
+        Parameters of the job and of the task; `part` is the name of the partition.
 
     Returns
     -------
     Output
-        Rows of table `gaia` in the cell of the partition.
+        Rows of table `gaia` whose measured positions are in the sky cell of the partition.
 
     Notes
     -----
-    Stars in the margin around the cell are included, because their measured positions may lie inside it.
+    Stars in the margin (a strip around the cell) are also observed, because their measured positions may be inside the
+    cell.
     """
     partition = facts["part"]
     stars = _rows(read.version(lake, "stars", facts["stars"]), partition, gaia.STAR_COLUMNS)

@@ -1,6 +1,9 @@
-"""Build tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
+"""Build the tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
 
-spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST
+`halo_limits` contains the masses above which `halos` is complete. `quarantine` contains galaxies that are too close to
+a lensing caustic for weak lensing.
+
+Command: spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST.
 """
 
 from collections.abc import Sequence
@@ -38,7 +41,9 @@ _GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "alignment", *_LENS_FACTS, "high
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Plan the tables with one task per order-5 cell, which draws the generation cells that the request's area touches.
+    """Plan the making of the tables, with one task per HEALPix cell of order 5.
+
+    A task draws all order-8 cells inside this cell that the area of the request touches.
 
     Parameters
     ----------
@@ -50,20 +55,22 @@ def steps(lake: Path, request: Request) -> list[Step]:
     Returns
     -------
     list of Step
-        Steps of `halos` and `halo_limits` (only if galaxies are drawn in halos), of `galaxies` and of `quarantine`.
+        Steps that make `halos` and `halo_limits` (only if galaxies are drawn in halos), then `galaxies`, then
+        `quarantine`.
 
     Raises
     ------
     BadInput
-        If a file of the user is missing or wrong.
+        If a file of the user is missing or wrong, or a passband is unknown.
 
     Notes
     -----
-    The halos of galaxies from a user's catalogue are not known. Galaxies that weak lensing cannot describe are stored
-    in sidecar files of `galaxies` and are collected in the table `quarantine`.
+    If the galaxies are from a catalogue of the user, their halos are not known, and there are no tables of halos.
+    Galaxies too close to a caustic are first stored in additional files next to the partitions of `galaxies`. The last
+    step collects them in the table `quarantine`.
     """
     check_rendered(request)
-    # Report problems with the user's files before any table is published.
+    # Read the user's files now, so that an error in them is reported before any table is made.
     dust_map.map_for_request(request.seed, request.ingest.dust)
     if request.sources is not None:
         table_steps = [_given_step(request, request.sources)]
@@ -81,7 +88,8 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
-    # The limit of a halo's galaxies depends on the spectra of the training table.
+    # The user's training galaxies also change the table `halos`: their dust determines how faint galaxies must be
+    # drawn, and therefore how light halos must be.
     external_facts = (
         {"halos": _input_facts(user_inputs.halos, mapping.halo_columns(dict(user_inputs.halos.columns)))}
         if user_inputs.halos
@@ -102,11 +110,12 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     tasks = cells.tasks_of_area(request.area)
     halo_facts = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, "code")}
     halos, limits = Plan(HALOS, halo_facts, tasks), Plan(HALO_LIMITS, halo_facts, (Task("all.parquet", {}),))
-    # The power of the lensing agrees with linear theory within 10 % up to this multipole.
+    # Store, with the table `galaxies`, the multipole up to which the power of the lensing agrees with linear theory
+    # within 10 %.
     multipole_limit = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
     plan = Plan(GALAXIES, {**facts, **multipole_limit}, tasks)
     if not layout.version_folder(lake, GALAXIES.name, plan.key).exists():
-        # Make the box and its lensing once on the driver; the workers map them from the cache.
+        # Make the simulated matter and its lensing maps once on the Spark driver; workers read them from the cache.
         _universe(facts, user_inputs)
     return [
         Step(halos, partial(draw_halos, user_inputs=user_inputs)),
@@ -116,16 +125,16 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
 
 
 def draw_halos(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """Draw the halos of one order-5 cell.
+    """Draw the halos of one task, that is in the requested order-8 cells inside one order-5 cell.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to draw.
     user_inputs : Ingest, optional
-        Section `ingest` of the request.
+        Section `ingest` of the request, with the user's files of halos and training galaxies.
 
     Returns
     -------
@@ -139,16 +148,16 @@ def draw_halos(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Ou
 
 
 def list_halo_limits(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """List the mass above which the halos are complete, by redshift.
+    """Return the halo masses above which the table `halos` is complete, by redshift.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan.
+        Parameters of the job.
     user_inputs : Ingest, optional
-        Section `ingest` of the request.
+        Section `ingest` of the request, with the user's files of halos and training galaxies.
 
     Returns
     -------
@@ -161,21 +170,21 @@ def list_halo_limits(lake: Path, facts: Json, user_inputs: Ingest | None = None)
 
 
 def draw_galaxies(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """Draw the galaxies whose lensed positions are in one order-5 cell.
+    """Draw the galaxies whose observed (lensed) positions are in the requested order-8 cells inside one order-5 cell.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to draw.
     user_inputs : Ingest, optional
-        Section `ingest` of the request.
+        Section `ingest` of the request, with the user's files of halos, training galaxies and dust.
 
     Returns
     -------
     Output
-        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
+        Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
     universe = _universe(facts, user_inputs)
     dust = dust_map.map_for_request(facts["seed"], user_inputs.dust if user_inputs else None)
@@ -184,19 +193,19 @@ def draw_galaxies(lake: Path, facts: Json, user_inputs: Ingest | None = None) ->
 
 
 def collect_quarantine(lake: Path, facts: Json) -> Output:
-    """Collect the quarantined galaxies from the sidecar files of all cells.
+    """Collect the galaxies too close to a caustic from the additional files of all partitions of table `galaxies`.
 
     Parameters
     ----------
     lake : Path
         Folder of the lake.
     facts : dict
-        Facts of the plan; `galaxies` is the key of the version.
+        Parameters of the job; `galaxies` is the key (hash) that identifies the version of table `galaxies`.
 
     Returns
     -------
     Output
-        Rows of table `quarantine`.
+        Rows of table `quarantine`; no rows if there are no such galaxies.
     """
     version = read.version(lake, GALAXIES.name, facts["galaxies"])
     existing = {entry["path"] for entry in version.manifest["files"]}
@@ -206,7 +215,11 @@ def collect_quarantine(lake: Path, facts: Json) -> Output:
 
 
 def quarantine_file(generation_cells: Sequence[int]) -> str:
-    """Return the relative path of the sidecar file with quarantined galaxies, which exists only if there are any."""
+    """Return the path of the additional file with the galaxies of order-8 cells, as far as they are near a caustic.
+
+    All cells must be in the same order-5 cell. The path is relative to the folder of table `galaxies`. The file exists
+    only if galaxies are too close to a caustic for weak lensing.
+    """
     return f"quarantine/{layout.cell_file(FILE_ORDER, generation_cells[0] >> 2 * (GENERATION_ORDER - FILE_ORDER))}"
 
 
@@ -235,7 +248,7 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
 
 
 def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone | None, Training | None]:
-    """Return the user's halos and training galaxies, each None if the request does not name them."""
+    """Return the user's halos and the user's training galaxies; each is None if the request names no files of them."""
     light_cone = training = None
     if user_inputs is not None and user_inputs.halos is not None:
         columns = mapping.halo_columns(dict(user_inputs.halos.columns))
@@ -273,7 +286,10 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
 
 
 def _columns(catalogue: Catalogue, replaces_lensing: bool) -> mapping.Columns:
-    """Return the column mapping of a catalogue, without lensed positions if the request replaces the lensing."""
+    """Return which columns of a user's catalogue give which properties of galaxies.
+
+    Columns with lensed positions are left out if the request replaces the lensing of the catalogue.
+    """
     columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
     return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
@@ -292,23 +308,23 @@ def _given_step(request: Request, source_tables: UserSources) -> Step:
 
 
 def draw_given_galaxies(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
-    """Draw the galaxies of one order-5 cell for a request that lists all sources.
+    """Make the galaxies in one order-5 cell for a request whose sources are all listed in tables of the user.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to draw.
     source_tables : UserSources
-        The user's tables of sources.
+        The user's tables of stars and galaxies.
     area : Area
         Area of the request.
 
     Returns
     -------
     Output
-        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
+        Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
     source_columns = given_sources.load(source_tables, area, facts["sources"])
     model = given_sources.model(facts["seed"], source_tables, source_columns, _shear(facts), facts["rotation"])
@@ -322,23 +338,23 @@ def _shear(facts: Json) -> Shear | None:
 
 
 def ingest_galaxies(lake: Path, facts: Json, catalogue: Catalogue, dust: DustMap | None) -> Output:
-    """Convert the galaxies of a user's catalogue in one order-5 cell.
+    """Convert the galaxies of a user's catalogue in the requested order-8 cells inside one order-5 cell.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task; `generation_cells` are the cells to draw.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to convert.
     catalogue : Catalogue
         Files and columns of the user's catalogue.
     dust : DustMap or None
-        The user's dust map; None for the embedded map.
+        The user's dust map; None for the simulated map.
 
     Returns
     -------
     Output
-        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
+        Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
     columns = _columns(catalogue, facts["lensing"] is not None)
     files, _ = ingest.list_files(catalogue.files, columns)

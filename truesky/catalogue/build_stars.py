@@ -1,4 +1,7 @@
-"""Build the table `stars` of a request: spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUEST."""
+"""Build the table `stars` of a request.
+
+Command: spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUEST.
+"""
 
 import math
 from functools import partial
@@ -17,19 +20,20 @@ from truesky.request.files import DustMap, UserSources
 from truesky.request.schema import Request, Stars
 from truesky.running.submitted_job import Job, Step
 
-# Lowest order of a file's cell (54 deg2). With a bright limit, such a cell has few stars and is drawn quickly.
+# HEALPix order of the largest cell (54 deg2) that a file may cover. With a bright magnitude limit, even such a cell has
+# few stars and is drawn quickly.
 _MIN_FILE_ORDER = 3
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Plan the table `stars` in files with similar numbers of rows.
+    """Plan the making of table `stars`, in files with similar numbers of rows.
 
     Parameters
     ----------
     lake : Path
         Folder of the lake.
     request : Request
-        The request; the generation cells that its area touches are drawn.
+        The request; all generation cells (HEALPix cells of order 8) that its area touches are drawn completely.
 
     Returns
     -------
@@ -72,16 +76,16 @@ def _given_step(request: Request, source_tables: UserSources) -> Step:
 
 
 def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
-    """Draw the stars of one file for a request that lists all sources.
+    """Make the stars of one file for a request whose stars and galaxies are all listed in tables of the user.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to draw.
     source_tables : UserSources
-        The user's tables of sources.
+        The user's tables of stars and galaxies.
     area : Area
         Area of the request.
 
@@ -95,24 +99,27 @@ def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: 
 
 
 def _given_model(source_tables: UserSources, area: Area, planned: Json | None = None) -> stars.StarModel:
-    """Return a model that contains exactly the listed stars, without any magnitude limit."""
+    """Return a model that contains exactly the stars in the user's table, without any magnitude limit.
+
+    `planned` are the checksums of the tables when the job began; None to skip this check.
+    """
     catalogue = given_sources.stars(given_sources.load(source_tables, area, planned), source_tables.band)
     return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 
 def draw_stars(lake: Path, facts: Json, choice: Stars, user_dust_map: DustMap | None = None) -> Output:
-    """Draw the stars of one file.
+    """Draw the stars of one file, which contains the stars in one order-8 cell or more.
 
     Parameters
     ----------
     lake : Path
         Not used.
     facts : dict
-        Facts of the plan and of the task; `generation_cells` are the cells to draw.
+        Parameters of the job and of the task; `generation_cells` are the order-8 cells to draw.
     choice : Stars
         Section `stars` of the request.
     user_dust_map : DustMap, optional
-        The user's dust map; None for the embedded map.
+        The user's dust map; None for the simulated map.
 
     Returns
     -------

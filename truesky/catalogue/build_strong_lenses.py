@@ -1,6 +1,6 @@
-"""Build the table `strong_lenses` of a lake's galaxies, with images of the arcs.
+"""Build the table `strong_lenses`: which galaxies of a lake are strong lenses, with images of the lensed sources.
 
-spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST
+Command: spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Plan the table `strong_lenses` with one task per partition of the galaxies."""
+    """Plan the making of table `strong_lenses`, with one task per partition (file) of the request's galaxies."""
     galaxies = read.input_version(lake, "galaxies", request.name)
     universe.check_catalogues([galaxies], request)
     facts = {"seed": request.seed, "galaxies": galaxies.key, "boost": request.strong_lens_boost, "code": code_version()}
@@ -35,9 +35,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def draw_lenses(lake: Path, facts: Json) -> Output:
-    """Draw the strong lenses of one partition.
+    """Draw the strong lenses among the galaxies of one partition (`facts["part"]`).
 
-    The sources are galaxies whose lensed positions are in the same generation cell as the lens.
+    Lens and source are galaxies whose observed positions are in the same generation cell (HEALPix cell of order 8).
     """
     rows = read.version(lake, "galaxies", facts["galaxies"]).rows(strong_lenses.COLUMNS, [facts["part"]])
     index = rows["_healpix_29"].to_numpy()

@@ -1,7 +1,7 @@
-"""Generation cells, and the files in which their rows are stored.
+"""Divide the sky into cells in which rows are drawn (generation cells), and into the files that store the rows.
 
-Rows are drawn for whole order-8 cells (generation cells) and stored in files of larger cells. A generation cell is
-always drawn completely, so that its rows are identical in every request that touches it and in files of any size.
+A generation cell is a HEALPix cell of order 8. Each file contains the generation cells of one larger cell. A generation
+cell is always drawn completely, so its rows are identical in every request that touches it and in files of any size.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ from truesky.request.area import Area
 
 
 def tasks_of_area(area: Area) -> tuple[Task, ...]:
-    """Return one task per order-5 cell, with the generation cells inside it that the area touches."""
+    """Return the files of a table in an area, with the generation cells (HEALPix cells of order 8) that each contains.
+
+    There is one task (the name and the contents of a file) per order-5 cell. It lists the order-8 cells inside the
+    order-5 cell that the area touches.
+    """
     cells_by_file: dict[int, list[int]] = defaultdict(list)
     for cell in area.cells(GENERATION_ORDER):
         cells_by_file[cell >> 2 * (GENERATION_ORDER - FILE_ORDER)].append(cell)
@@ -35,7 +39,7 @@ def tasks_of_area(area: Area) -> tuple[Task, ...]:
 def tasks_by_row_count(
     generation_cells: Sequence[int], row_counts: npt.ArrayLike, max_rows: float, min_order: int
 ) -> tuple[Task, ...]:
-    """Divide generation cells into files that contain at most `max_rows` rows, in the order of _healpix_29.
+    """Divide generation cells (HEALPix cells of order 8) into files that contain at most `max_rows` rows.
 
     Parameters
     ----------
@@ -44,14 +48,16 @@ def tasks_by_row_count(
     row_counts : float array, shape (n,)
         Expected number of rows of each cell.
     max_rows : float
-        Largest number of rows per file. A generation cell with more rows is not split.
+        Largest expected number of rows per file. A generation cell with more rows is not divided: it gets a separate
+        file.
     min_order : int
-        Lowest order of a file's cell.
+        HEALPix order of the largest cell that a file may cover, at most 8.
 
     Returns
     -------
     tuple of Task
-        One task per file. Each file is the largest cell that keeps the limit.
+        One task (name of the file and list of its generation cells) per file, in the order of position (nested index).
+        Each file covers the largest HEALPix cell that has at most `max_rows` rows.
     """
     remaining = np.sort(np.asarray(generation_cells, np.int64))
     expected = np.asarray(row_counts, float)[np.argsort(generation_cells)]
@@ -71,25 +77,26 @@ def tasks_by_row_count(
 
 
 def draw_rows(facts: Json, table: Table, draw: Callable[[int], pa.Table]) -> pa.Table:
-    """Draw the rows of a file, one generation cell after another.
+    """Draw the rows of a file, one generation cell (HEALPix cell of order 8) after another.
 
     Parameters
     ----------
     facts : dict
-        Facts of the task; `generation_cells` are the cells to draw.
+        Parameters from which the file is made. Only `generation_cells` is used, the list of nested indices of the cells
+        to draw.
     table : Table
         Schema of the rows.
     draw : callable
-        Function that returns the rows of a generation cell, sorted as `sort_rows` does.
+        Function that returns the rows of the generation cell with a nested index, sorted as by `sort_rows`.
 
     Returns
     -------
     Table
-        Rows in the order of _healpix_29.
+        Rows of all cells, sorted as by `sort_rows`.
     """
     return pa.concat_tables([table.empty(), *(draw(cell) for cell in sorted(facts["generation_cells"]))])
 
 
 def sort_rows(rows: pa.Table) -> pa.Table:
-    """Sort rows by _healpix_29, and by identifier if these are equal."""
+    """Sort rows by `_healpix_29` (HEALPix cell of order 29), and rows in the same cell by `id`."""
     return rows.take(np.lexsort((rows["id"].to_numpy(), rows["_healpix_29"].to_numpy())))

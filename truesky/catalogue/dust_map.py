@@ -1,8 +1,8 @@
-"""Extinction A(V) by the dust of the Milky Way, to infinity from a full-sky map and to a distance.
+"""Extinction A(V) by the Milky Way's dust: a full-sky map of the total extinction, and the extinction to a distance.
 
-The embedded map is a cosecant law times a log-normal field that depends on the seed of the universe. A request can
-replace it by a file. Maps are in HEALPix RING ordering and Galactic coordinates. The parameters and their sources are
-in dust_map.toml.
+By default the map is simulated: a cosecant law of Galactic latitude times a log-normal random field. A file of the user
+can replace the simulated map. Maps are in HEALPix RING ordering and Galactic coordinates. The file dust_map.toml
+contains the parameters and their sources.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from truesky.request.files import DustMap
 
 # Largest A(V) that table `galaxies` can store, mag.
 _MAX_A_V = 40.0
-# A map is refused if the steps between neighbouring pixels are smaller than this fraction in the other ordering.
+# A map is refused if the mean difference between neighbouring pixels in the other HEALPix ordering (RING or NESTED) is
+# below this fraction of the difference in its declared ordering.
 _SMOOTHNESS_RATIO = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Cosecant:
-    """Parameters of the embedded map (dust_map.toml, [map])."""
+    """Parameters of the simulated dust map; explained in dust_map.toml, [map]."""
 
     nside: int
     ebv_pole: float
@@ -57,17 +58,17 @@ class Layer:
 
 
 def cosecant() -> Cosecant:
-    """Return the parameters of the embedded map."""
+    """Return the built-in parameters of the simulated dust map."""
     return Cosecant(**parameters.section("dust_map.toml", "map"))
 
 
 def layer() -> Layer:
-    """Return the dust layer of the embedded universe."""
+    """Return the built-in scale height of the dust layer."""
     return Layer(**parameters.section("dust_map.toml", "layer"))
 
 
 def make_map(seed: int, model: Cosecant) -> Float32:
-    """Make the embedded map of a seed: A(V) in mag, float32, shape (12 nside^2,)."""
+    """Simulate a dust map from a seed: A(V) in mag, float32, shape (12 nside^2,), RING ordering, Galactic frame."""
     _, b = hp.pix2ang(model.nside, np.arange(hp.nside2npix(model.nside)), lonlat=True)
     field = _gaussian_field(seed, model)
     sin_b = np.maximum(np.abs(np.sin(np.radians(b))), model.sin_b_min)
@@ -81,14 +82,14 @@ def a_v(sky_map: Float32, ra: Float, dec: Float) -> Float:
     Parameters
     ----------
     sky_map : float32 array, shape (pixels,)
-        A(V) in mag, RING ordering, Galactic coordinates.
+        A(V) in mag, HEALPix RING ordering, Galactic coordinates.
     ra, dec : float array, shape (n,)
         ICRS positions, deg.
 
     Returns
     -------
     float array, shape (n,)
-        A(V) in mag.
+        A(V) in mag, through the whole Milky Way.
     """
     lon, lat = galactic(ra, dec)
     return np.asarray(hp.get_interp_val(sky_map, lon, lat, lonlat=True), float)
@@ -100,15 +101,15 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
     Parameters
     ----------
     to_infinity : float array, shape (n,)
-        A(V) to infinity in mag.
+        A(V) through the whole Milky Way towards each star, mag.
     distance : float array, shape (n,)
-        Distance of each star in pc.
+        Distance of each star in pc; infinity is allowed.
     b : float array, shape (n,)
         Galactic latitude in deg.
     dust : Layer
-        The dust layer.
+        Scale height of the dust layer.
     sin_b_min : float
-        Lower limit of |sin b|, the same as in the map.
+        Lower limit of |sin b|; smaller values are replaced by it.
 
     Returns
     -------
@@ -126,9 +127,9 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
 
 
 def load(seed: int) -> Float32:
-    """Return the embedded map of a seed, from the cache or made now (1 s).
+    """Return the simulated dust map of a seed, from the disc cache or made now (1 s).
 
-    The map is A(V) in mag, float32, RING ordering, Galactic coordinates.
+    The map is A(V) in mag, float32, shape (12 nside^2,), RING ordering, Galactic coordinates.
     """
     model = cosecant()
     key = content_key(code_key(__name__), version("healpy"), seed, *astuple(model))
@@ -136,9 +137,10 @@ def load(seed: int) -> Float32:
 
 
 def facts(user_map: DustMap | None) -> dict[str, Any]:
-    """Return the facts that identify the user's dust map in a plan, {} without a map.
+    """Return the SHA-256 and the settings of the user's dust map, by which changes of the input are recognised.
 
-    Raises BadInput if the file does not exist.
+    They are in a dict under the key "dust"; without a user's map, return an empty dict. Raises BadInput if the file
+    does not exist.
     """
     if user_map is None:
         return {}
@@ -148,19 +150,19 @@ def facts(user_map: DustMap | None) -> dict[str, Any]:
 
 
 def map_for_request(seed: int, user_map: DustMap | None) -> Float32:
-    """Return the map of A(V) for a request: the user's map (from the cache or read now), or the embedded one.
+    """Return the dust map of a request: the user's map, or else the simulated map.
 
     Parameters
     ----------
     seed : int
-        Seed of the request.
+        Seed of the simulated map.
     user_map : DustMap or None
-        The user's dust map; None for the embedded map.
+        File and settings of the user's dust map; None for the simulated map.
 
     Returns
     -------
     float32 array, shape (pixels,)
-        A(V) in mag, RING ordering, Galactic coordinates.
+        A(V) in mag, RING ordering, Galactic coordinates. It is read from the disc cache if it has been made before.
     """
     if user_map is None:
         return load(seed)
@@ -174,17 +176,18 @@ def read(user_map: DustMap) -> Float32:
     Parameters
     ----------
     user_map : DustMap
-        The user's dust map.
+        File, column and settings of the user's dust map, in E(B-V) or A(V).
 
     Returns
     -------
     float32 array, shape (pixels,)
-        A(V) in mag. The resolution is at most that of the embedded map.
+        A(V) in mag. A map with a higher resolution than the simulated map (nside 512) is degraded to it.
 
     Raises
     ------
     BadInput
-        If the size, the ordering, the coordinates or the value of a pixel is missing or wrong.
+        If the number of pixels is not that of a full-sky HEALPix map or of NSIDE in the header, if the ordering or the
+        coordinates are missing or wrong, or if a value is negative, NaN or above A(V) = 40 mag.
     """
     values, cards = read_map(user_map.file, user_map.column)
     where = f"{user_map.file}: column {user_map.column}"
@@ -221,7 +224,10 @@ def read(user_map: DustMap) -> Float32:
 def _header_or_request(
     user_map: DustMap, card: str, key: str, cards: Mapping[str, Any], names: Mapping[str, str]
 ) -> str:
-    """Return the value in the header or in the request; at least one must be present, and both must agree."""
+    """Return the value of a setting from the FITS header card `card` or from the request's key `key`.
+
+    Raises BadInput if both are missing or disagree, or if the header has a value that is not in `names`.
+    """
     header_value, requested = str(cards.get(card, "")).strip().upper(), getattr(user_map, key)
     if header_value and header_value not in names:
         raise BadInput(f"{user_map.file}: {card} is {header_value!r}, not one of {', '.join(names)}")
@@ -233,7 +239,10 @@ def _header_or_request(
 
 
 def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
-    """Raise BadInput if neighbouring pixels differ much less in the other ordering, because dust maps are smooth."""
+    """Raise BadInput if the HEALPix ordering (RING or NESTED) of a map is probably wrong.
+
+    Dust maps are smooth. The ordering is refused if neighbouring pixels differ much less in the other one.
+    """
     nside = hp.npix2nside(values.size)
     pixel = np.unique(np.linspace(0, values.size - 1, 20_000).astype(np.int64))
     step = {}
@@ -249,7 +258,7 @@ def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
 
 def _gaussian_field(seed: int, model: Cosecant) -> Float:
     ell, m = hp.Alm.getlm(model.l_max)
-    # Draw here, because healpy's synalm uses numpy's global generator.
+    # Draw the coefficients here, because healpy's function synalm uses numpy's global random generator.
     normal = stream(seed, "dust_map").standard_normal((2, ell.size))
     used = ell >= model.l_min
     amplitude = np.where(used, np.where(used, ell, 1.0) ** (-0.5 * model.slope), 0.0)

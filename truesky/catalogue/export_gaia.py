@@ -65,22 +65,23 @@ def export(
     lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None,
     request: str | None = None,
 ) -> int:  # fmt: skip
-    """Write the published table `gaia` to a file, which is replaced atomically.
+    """Write the table `gaia` of a lake to a file; an existing file is replaced atomically.
 
     Parameters
     ----------
     lake : Path
         Folder of the lake.
     path : Path
-        File to write; the ending must be one of its form in FORMS.
+        File to write. It must end in .csv or .fits for the form "table", and in .fits, .cat or .ldac for "ldac".
     declared : Table
-        Columns of the form "table".
+        Columns to write with the form "table".
     form : str
-        "table" or "ldac".
+        "table" or "ldac" (FITS_LDAC for SCAMP).
     epoch : float, optional
-        Year from 1900 to 2100 to which the proper motions move the positions; None for the epoch of the catalogue.
+        Year from 1900 to 2100 to which positions are moved with the measured proper motions; None for the epoch of the
+        catalogue.
     request : str, optional
-        Name of the request to export, if the lake contains several.
+        Name of the request to export; None if the lake contains only one.
 
     Returns
     -------
@@ -117,7 +118,10 @@ def _select_columns(rows: pa.Table, declared: Table) -> pa.Table:
 
 
 def _release_columns(version: read.Version, partition: str, epoch: float | None) -> pa.Table:
-    """Return the rows of a partition with all columns of all releases."""
+    """Return the rows of a partition with the columns of all Gaia releases that can be exported.
+
+    Raises BadInput if the table has no proper motions.
+    """
     rows = version.rows(partitions=[partition])
     if rows.num_rows and rows["ruwe"].null_count:
         raise BadInput("table gaia has no proper motions: it was built by an older version; run build_gaia again")
@@ -144,7 +148,11 @@ def _release_columns(version: read.Version, partition: str, epoch: float | None)
 
 
 def _correlations(has_motion: pa.ChunkedArray) -> dict[str, Any]:
-    """Return the correlations of the parameters: 0, because errors are drawn independently, or null if unknown."""
+    """Return the columns with the correlations of the astrometric parameters.
+
+    They are 0, because the errors are drawn independently. For stars without proper motions they are null, except for
+    the correlation of ra and dec.
+    """
     zero = pc.if_else(has_motion, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
     pairs = [(first, second) for i, first in enumerate(PARAMETERS) for second in PARAMETERS[i + 1 :]]
     position = pa.array(np.zeros(len(has_motion), np.float32))
@@ -152,7 +160,7 @@ def _correlations(has_motion: pa.ChunkedArray) -> dict[str, Any]:
 
 
 def _advance_positions(rows: pa.Table, years: float) -> tuple[Any, Any]:
-    """Return positions after `years` of proper motion."""
+    """Return ra and dec (deg) after `years` of the measured proper motion; unknown proper motions count as 0."""
     east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
     return sky.offset_positions(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 

@@ -48,7 +48,7 @@ def _run_export(options: argparse.Namespace) -> int:
 
 
 def export(lake: Path, folder: Path, form: str, request: str | None = None) -> list[Path]:
-    """Write the published galaxies, one file per partition; each file is replaced atomically.
+    """Write the table `galaxies` of a lake to files of another format; existing files are replaced atomically.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
     folder : Path
         Folder to write to; it is created if it does not exist.
     form : str
-        Format, one of FORMS.
+        "fits" (one FITS table per partition) or "skycatalogs" (files for skyCatalogs, also of the stars).
     request : str, optional
-        Name of the request to export, if the lake contains several.
+        Name of the request to export; None if the lake contains only one.
 
     Returns
     -------

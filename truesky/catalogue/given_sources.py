@@ -1,8 +1,8 @@
-"""Sources of a request that lists every source: small tables, with positions in the table or on a grid.
+"""Read the user's tables of stars and galaxies for a request that draws no sources, but lists every one.
 
-A table is a CSV file with a line of column names. A column that is absent has its default in GALAXIES or STARS. `mag`
-is an AB magnitude in the band of the request, before magnification and before the Milky Way's extinction `a_v`.
-Emission lines are not added.
+A table is a CSV file with a line of column names. Sources have positions in the table, or are placed on a grid. A
+column that is absent has its default value in GALAXIES or STARS. `mag` is an AB magnitude in the band of the request,
+without magnification and without the Milky Way's extinction `a_v`. Galaxies have no emission lines.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MAX_SHEAR
 
 _POSITION = ("ra", "dec")
-# Default of each column if it is absent; None if it is required. Units and frames are the same as in table `galaxies`.
+# Columns of the table of galaxies, and the default value of each column if it is absent; None if it is required. Units
+# and frames are the same as in table `galaxies`.
 GALAXIES: Mapping[str, float | None] = {
     "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
     "bulge_half_light_radius": 0.3, "disk_half_light_radius": 0.3, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 1.0,
@@ -44,23 +45,25 @@ GALAXIES: Mapping[str, float | None] = {
 }  # fmt: skip
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
 _GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
-# Columns with integers.
+# Columns whose values must be whole numbers.
 _INTEGER_COLUMNS = ("ext_law", "stamp")
 _STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
 # Largest number of grid positions in the square around the area.
 _MAX_GRID_POSITIONS = 4_000_000
-# The dust map adds nothing, because each galaxy has its own extinction `a_v`.
+# Dust map with A(V) = 0, for the function that makes the rows and requires a map. The map has no effect, because the
+# user's table contains the extinction `a_v` of each galaxy.
 _NO_DUST: Float32 = np.zeros(12, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceColumns:
-    """Columns of the sources, sorted by `index`.
+    """All galaxies and all stars of the user's tables, sorted by position.
 
     Attributes
     ----------
     galaxies, stars : mapping of str to array, shape (n,)
-        Columns by name; `index` is the order-29 cell and `origin_id` the row number of the user's table, from 1.
+        Columns by name. `index` is the order-29 cell of the position, and `origin_id` the number of the row in the
+        user's table, from 1. On a grid, a row can occur several times.
     """
 
     galaxies: Mapping[str, Array]
@@ -68,26 +71,28 @@ class SourceColumns:
 
 
 def load(source_tables: UserSources, area: Area, planned: Json | None = None) -> SourceColumns:
-    """Read and check the user's tables of sources.
+    """Read and check the user's tables of stars and galaxies.
 
     Parameters
     ----------
     source_tables : UserSources
-        The user's tables of sources.
+        Files of the tables, band of the magnitudes, and spacing of the grid if sources are placed on one.
     area : Area
-        Area of the request, which must contain all sources.
+        Area of the request. The order-8 cells that it touches must contain all sources.
     planned : dict, optional
-        Facts of the plan, with which the files must still agree.
+        Checksums and settings of the tables when the job began, with which the files must still agree; None to skip
+        this check.
 
     Returns
     -------
     SourceColumns
-        The sources.
+        The galaxies and stars.
 
     Raises
     ------
     BadInput
-        If a file has changed or is wrong; the message names the file, the column and the row.
+        If a file has changed since the job began, the band is unknown, a value is missing or out of range, a galaxy is
+        near a caustic, or a source is outside the area. For values, the message names the file, the column and the row.
     """
     if planned is not None and canonical(source_tables.facts(area.bounding_circle())) != canonical(planned):
         raise BadInput("sources: a table has changed since the job began")
@@ -115,20 +120,20 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
 def model(
     seed: int, source_tables: UserSources, sources: SourceColumns, lens: lensing.Shear | None, rotation: float
 ) -> IngestModel:
-    """Return the model with which `galaxies` draws.
+    """Return the model from which properties that the table of galaxies does not contain are drawn.
 
     Parameters
     ----------
     seed : int
-        Seed of the request.
+        Seed of the random numbers.
     source_tables : UserSources
-        The user's tables of sources.
+        Settings of the user's tables, of which the band of the magnitudes is used.
     sources : SourceColumns
-        The sources, from `load`.
+        The galaxies and stars, from `load`.
     lens : lensing.Shear or None
-        Uniform lensing that replaces that of the rows; None to use the rows.
+        Uniform shear that replaces the lensing of the rows; None to use the lensing of the rows.
     rotation : float
-        Angle that is added to the position angles, deg.
+        Angle that is added to the position angle of each galaxy before lensing, deg.
 
     Returns
     -------
@@ -141,21 +146,21 @@ def model(
 
 
 def galaxies(cell: int, sources: SourceColumns, universe: IngestModel) -> pa.Table:
-    """Return the rows of table `galaxies` in one generation cell.
+    """Return the rows of table `galaxies` in one generation cell (HEALPix cell of order 8).
 
     Parameters
     ----------
     cell : int
-        Nested index of an order-8 cell.
+        Nested index of the order-8 cell.
     sources : SourceColumns
-        The sources, from `load`.
+        The galaxies and stars, from `load`.
     universe : IngestModel
         The model, from `model`.
 
     Returns
     -------
     Table
-        Rows of table `galaxies`.
+        Rows of table `galaxies`, sorted by position; empty if the cell has no galaxies.
     """
     first, last = np.searchsorted(sources.galaxies["index"], sky.cell_range(GENERATION_ORDER, cell))
     rows = {name: values[first:last] for name, values in sources.galaxies.items()}
@@ -163,7 +168,10 @@ def galaxies(cell: int, sources: SourceColumns, universe: IngestModel) -> pa.Tab
 
 
 def stars(sources: SourceColumns, band: str) -> StarCatalogue:
-    """Return the stars with their H magnitudes, computed with the template of the nearest temperature."""
+    """Return the stars of the user's table as a catalogue with H magnitudes (Vega).
+
+    H follows from the magnitude in `band` (AB) and the template spectrum with the nearest temperature.
+    """
     library, values = templates.stellar_library(), dict(sources.stars)
     temperatures = stellar.types().teff
     zeros = np.zeros(temperatures.size)
@@ -176,7 +184,11 @@ def stars(sources: SourceColumns, band: str) -> StarCatalogue:
 def _read(
     file: Path | None, defaults: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
 ) -> dict[str, Array]:
-    """Return the columns of a table with defaults for absent ones; all columns are empty without a file."""
+    """Read a CSV table, and return its columns by name, with default values for absent columns.
+
+    If `file` is None, all columns are empty. Raises BadInput if a column is unknown or a required one is missing, if
+    there are no rows, or if a value is out of `bounds` or not a whole number where it must be one.
+    """
     if file is None:
         return {name: np.zeros(0) for name in defaults} | {"origin_id": np.zeros(0, np.int64)}
     titles = external_rows.csv_column_names(file, SOURCES_KIND)
@@ -206,7 +218,10 @@ def _read(
 
 
 def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
-    """Raise BadInput for galaxies near a caustic: the images could not show the requested shear."""
+    """Raise BadInput if a galaxy is near a lensing caustic, because its image would not be an ellipse there.
+
+    BadInput is also raised if a reduced shear |gamma / (1 - kappa)| is larger than `MAX_SHEAR`.
+    """
     kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
     bad = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
     bad |= np.hypot(gamma1, gamma2) > MAX_SHEAR * np.abs(1.0 - kappa)
@@ -218,7 +233,11 @@ def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
 
 
 def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:
-    """Place the rows of all tables in turn on the positions of a grid."""
+    """Place the rows of all tables, one after another, on the positions of a grid.
+
+    The rows are repeated until every position has a source. Each returned table has the additional columns ra and dec
+    (deg).
+    """
     ra, dec = _grid(area, spacing)
     first_rows = np.cumsum([0, *(len(values["mag"]) for values in tables.values())])
     row_number = np.arange(ra.size) % first_rows[-1]
@@ -231,7 +250,11 @@ def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float)
 
 
 def _grid(area: Area, spacing: float) -> tuple[Float, Float]:
-    """Return grid positions in an area, `spacing` arcsec apart, from south to north and from west to east."""
+    """Return the positions (ra, dec, deg) of a square grid in an area, with `spacing` arcsec between neighbours.
+
+    The positions are sorted from south to north, then from west to east. Raises BadInput if the square around the area
+    has more than `_MAX_GRID_POSITIONS` positions, or if no position is in the area.
+    """
     ra, dec, radius = area.bounding_circle()
     half = int(radius * 3600.0 / spacing)
     if (2 * half + 1) ** 2 > _MAX_GRID_POSITIONS:

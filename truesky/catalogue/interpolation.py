@@ -1,4 +1,4 @@
-"""Indices and weights for linear interpolation between the nodes of a table."""
+"""Find the indices and weights for linear interpolation between the nodes of a table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from lake_schema.arrays import Float, Int
 
 
 def bracket(nodes: Float, values: Float, extrapolated: bool = False) -> tuple[Int, Float]:
-    """Find the nodes around each value, and the weight of the upper one.
+    """Return the nodes around each value for linear interpolation, and the weight of the upper node.
 
     Parameters
     ----------
@@ -17,7 +17,8 @@ def bracket(nodes: Float, values: Float, extrapolated: bool = False) -> tuple[In
     values : float array
         Values, of any shape.
     extrapolated : bool
-        If True, weights are below 0 and above 1 beyond the nodes; otherwise they are limited to 0 to 1.
+        What to do with values beyond the first or last node: True to extrapolate (weights below 0 or above 1), False to
+        use the value at that node (weights 0 or 1).
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Parameters of the models, read from the TOML files in this folder; each table in them has a source."""
+"""Read the parameters of the catalogue models from the TOML files in this folder; each TOML table names its source."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _FOLDER = Path(__file__).resolve().parent
 
 
 def section(file: str, name: str) -> dict[str, Any]:
-    """Return a table of a TOML file in this folder without its `source`, as arguments of a dataclass.
+    """Return a table of a TOML file in this folder without its key `source`.
 
     Parameters
     ----------
@@ -25,12 +25,12 @@ def section(file: str, name: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        Values by key; arrays become tuples.
+        Values of the table by key, which can be passed to a dataclass as arguments; arrays become tuples.
 
     Raises
     ------
     BadInput
-        If the table does not exist or has no `source`.
+        If the table does not exist, or if its `source` is missing or empty.
     """
     tables = _tables((_FOLDER / file).read_text(encoding="utf-8"))
     if name not in tables:
@@ -43,5 +43,5 @@ def section(file: str, name: str) -> dict[str, Any]:
 
 @cache
 def _tables(text: str) -> dict[str, Any]:
-    """Parse a file's text; cached, because a model reads dozens of tables from a few files."""
+    """Parse the text of a TOML file; the result is cached, because a model reads dozens of tables from a few files."""
     return user_files.parse_toml(text)

@@ -1,4 +1,4 @@
-"""Checks of a request's catalogue inputs before a job computes anything."""
+"""Check the galaxies and stars of a request, and the user's files that it names, before a job computes anything."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from truesky.request.schema import Request, Stars
 
 
 def check_request(request: Request) -> None:
-    """Check the files, bands and positions of the galaxies and stars of a request.
+    """Check the settings of the galaxies and stars of a request, and the user's files that it names.
 
-    Raises BadInput with the key, or with the file and its column or row. Only the first rows of a large catalogue are
-    read here; the job that splits the catalogue into cells reads all rows.
+    Raises BadInput if a passband is unknown, a file is missing or has wrong columns or values, or an area has too many
+    stars. The message names the key of the request, or the file and its column or row. A catalogue of
+    galaxies, halos or training galaxies is checked here only by the first rows of its first file; the job that uses it
+    reads all rows.
     """
     user_inputs = request.ingest
     if user_inputs.dust is not None:
@@ -45,7 +47,7 @@ def check_request(request: Request) -> None:
 
 
 def check_band(request: Request) -> None:
-    """Raise BadInput if the band of the galaxy limit is not an embedded passband."""
+    """Raise BadInput if galaxies are drawn and the band of their magnitude limit is not a built-in passband."""
     if request.ingest.galaxies is None and request.universe.galaxy_band not in passbands.names():
         band_names = ", ".join(passbands.names())
         raise BadInput(f"universe.galaxy_band = {request.universe.galaxy_band!r} is not one of {band_names}")
@@ -53,12 +55,17 @@ def check_band(request: Request) -> None:
 
 def _check_first_rows(files: Sequence[Path], columns: mapping.Columns) -> None:
     listed_files, _ = ingest.list_files(files, columns)
-    # Check the columns, the units and the values of the first rows.
+    # Reading the first rows checks the columns, the units and the values of these rows.
     next(mapping.read(listed_files[:1], columns), None)
 
 
 def star_files(choice: Stars) -> dict[str, Any]:
-    """Return the facts that identify the user's files of stars by content, independent of their paths."""
+    """Return checksums and settings that identify the contents of the user's star files, independent of their paths.
+
+    The dict has the keys "tycho2" and "catalogue" for the files that the request names. Raises BadInput if a file does
+    not exist, if a file of Tycho-2 has wrong values, or if the mapping to the catalogue's columns is incomplete. The
+    contents of the catalogue are not checked here.
+    """
     facts: dict[str, Any] = {}
     if choice.tycho2:
         checksums = bright_stars.sha256(choice.tycho2)
@@ -83,11 +90,11 @@ def star_model(limit: float, choice: Stars, files: Json) -> stars.StarModel:
     Parameters
     ----------
     limit : float
-        Faintest H magnitude (Vega).
+        Faintest observed H magnitude (Vega).
     choice : Stars
         Section `stars` of the request.
     files : dict
-        Facts from `star_files`, with which the files must still agree.
+        Checksums and settings of the user's files, from `star_files`.
 
     Returns
     -------

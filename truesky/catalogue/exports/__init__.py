@@ -1,1 +1,1 @@
-"""Exports of the catalogues in formats of other programs."""
+"""Write the catalogues of galaxies and stars in formats of other programs (SCAMP, skyCatalogs)."""

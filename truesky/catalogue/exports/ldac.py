@@ -1,8 +1,8 @@
-"""Reference catalogue for SCAMP in FITS_LDAC format, with the default column names of SCAMP's ASTREF*_KEYS.
+"""Write an astrometric reference catalogue for SCAMP in FITS_LDAC format.
 
-A star without a measured proper motion gets a proper motion of 0 with an error of 100 mas/yr. Hardly any star that
-faint moves faster, and the error keeps a program from trusting the position at another epoch. An error of 0 would mean
-that the star is known not to move.
+The column names are the defaults of SCAMP's parameters ASTREF*_KEYS. A star without a measured proper motion gets a
+proper motion of 0 with an error of 100 mas/yr. Hardly any star without a measurement moves faster. With an error of 0,
+programs would assume that the star does not move.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from lake_schema.fits import ldac
 
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
 _DEG = 1.0 / 3.6e6
-# Error of an unknown proper motion, mas/yr.
+# Error that is written for an unknown proper motion, mas/yr.
 _UNKNOWN_MOTION = 100.0
 
 
 def write(path: Path, rows: pa.Table) -> None:
-    """Write a reference catalogue, which replaces the file atomically.
+    """Write an astrometric reference catalogue to a file; an existing file is replaced atomically.
 
     Parameters
     ----------
     path : Path
         File to write.
     rows : Table
-        Columns source_id, ref_epoch, ra and dec (deg) with errors (mas), pmra and pmdec with errors (mas/yr),
-        phot_g_mean_mag (Vega) and phot_g_mean_flux_over_error.
+        Columns source_id, ref_epoch (yr), ra and dec (deg), ra_error and dec_error (mas), pmra, pmdec, pmra_error and
+        pmdec_error (mas/yr, null if unknown), phot_g_mean_mag (Vega) and phot_g_mean_flux_over_error.
     """
     ldac.write(path, _columns(rows))
 
@@ -47,7 +47,7 @@ def _columns(rows: pa.Table) -> list[ldac.ColumnData]:
         ("Y_WORLD", "D", "deg", values("dec")),
         ("ERRA_WORLD", "E", "deg", np.maximum(east, north)),
         ("ERRB_WORLD", "E", "deg", np.minimum(east, north)),
-        # Angle from the axis of right ascension.
+        # ERRTHETA is the angle of the larger error (ERRA) from the axis of right ascension.
         ("ERRTHETA_WORLD", "E", "deg", np.where(east >= north, 0.0, 90.0)),
         ("PMALPHA_J2000", "E", "mas/yr", values("pmra")),
         ("PMDELTA_J2000", "E", "mas/yr", values("pmdec")),

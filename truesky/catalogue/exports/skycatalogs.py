@@ -1,7 +1,8 @@
-"""Galaxies and stars of a lake in the format of LSST DESC skyCatalogs 2 (schema 1.3.0).
+"""Write the galaxies and stars of a lake in the format of LSST DESC skyCatalogs 2 (schema 1.3.0).
 
-`write` makes galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet and pointsource_flux_N.parquet for each
-Nside-32 pixel N (ring) of the observed positions, the folder seds/ with the spectra of the stars, and skyCatalog.yaml.
+`write` makes the files galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet and pointsource_flux_N.parquet
+for each HEALPix pixel N (Nside 32, RING ordering) that contains observed positions. It also makes the folder seds/ with
+the spectra of the stars, and skyCatalog.yaml.
 
 The components of a galaxy are a bulge and a disk, whose spectra add up to the galaxy's spectrum; there are no knots.
 skyCatalogs computes fluxes from the spectra, except in the LSST bands that the flux files contain.
@@ -28,9 +29,9 @@ from truesky.catalogue.exports import stellar_spectra, tophat
 from truesky.fluxes import bulges, cosmology, inputs, passbands
 from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
 
-# HEALPix order of the pixels: Nside 32.
+# HEALPix order of the pixels into which the files are divided (Nside 32).
 ORDER = 5
-# Rows per row group; skyCatalogs reads one row group at a time.
+# Number of rows per row group of the Parquet files; skyCatalogs reads one row group at a time.
 _ROW_GROUP_SIZE = 20_000
 # Smallest half-light radius, arcsec, because GalSim cannot draw a size of 0.
 _MIN_SIZE = 1e-3
@@ -39,14 +40,27 @@ _Maker = Callable[[pa.Table], pa.Table]
 
 @dataclass(frozen=True, slots=True)
 class _Catalogue:
-    """A table of the lake and the table of its fluxes, which has the same rows."""
+    """A table of sources in the lake, and the table of their fluxes, which has the same rows in the same order.
+
+    Attributes
+    ----------
+    rows : read.Version
+        Table `galaxies` or `stars`.
+    fluxes : read.Version
+        Table `galaxy_fluxes` or `star_fluxes`.
+    bands : list of str
+        LSST bands of the fluxes, such as "lsst_r".
+    """
 
     rows: read.Version
     fluxes: read.Version
     bands: list[str] = field(default_factory=list)
 
     def read_partition(self, name: str) -> pa.Table:
-        """Return the rows of a partition, with the columns f_nu_<band> appended."""
+        """Return the rows of a partition (file) of the sources, with the columns f_nu_<band> of all bands appended.
+
+        Raises BadInput if the table of fluxes has other rows.
+        """
         rows = self.rows.rows(partitions=[name])
         flux_rows = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
         if not flux_rows["id"].equals(rows["id"]):
@@ -57,7 +71,7 @@ class _Catalogue:
 
 
 def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
-    """Write the set of files; each file is replaced atomically, skyCatalog.yaml last.
+    """Write all files for skyCatalogs; existing files are replaced atomically, and skyCatalog.yaml is written last.
 
     Parameters
     ----------
@@ -66,7 +80,7 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     folder : Path
         Folder to write to; it is created if it does not exist.
     request : str, optional
-        Name of the request to export, if the lake contains several.
+        Name of the request to export; None if the lake contains only one.
 
     Returns
     -------
@@ -76,7 +90,8 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     Raises
     ------
     BadInput
-        If the lake has no galaxies, or if fluxes are missing or belong to other rows.
+        If the lake has no table `galaxies`, or if the tables of fluxes are missing, have no LSST band or belong to
+        other rows.
     """
     catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
     if "galaxy" not in catalogues:
@@ -100,9 +115,6 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     text = f"# Written by truesky {__version__}\n" + yaml.safe_dump(_document(object_types), sort_keys=False)
     written.append(_write_staged(document, lambda path: path.write_text(text, encoding="utf-8")))
     return written
-
-
-# ------------------------------------------------------------------------------------------------ rows by pixel
 
 
 def _has(lake: Path, kind: str, request: str | None) -> bool:
@@ -129,7 +141,7 @@ def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
 
 
 def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
-    """Yield (nested pixel, its rows) for every pixel that has rows."""
+    """Yield the nested index and the rows of every HEALPix pixel (Nside 32) that contains sources."""
     for partitions in _group_by_pixel(catalogue.rows.partitions):
         rows = pa.concat_tables([catalogue.read_partition(partition) for partition in partitions])
         pixels = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, ORDER)
@@ -138,16 +150,16 @@ def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
 
 
 def _group_by_pixel(partitions: Iterable[str]) -> list[list[str]]:
-    """Group the partitions that are in the same pixel; a partition larger than a pixel is a separate group."""
+    """Group the names of partitions (files of sky cells) that are in the same HEALPix pixel with Nside 32.
+
+    A partition that is larger than a pixel is a separate group.
+    """
     groups: dict[tuple[int, int], list[str]] = {}
     for partition in partitions:
         order, cell = layout.cell_of_file(partition)
         coarse = min(order, ORDER)
         groups.setdefault((coarse, cell >> 2 * (order - coarse)), []).append(partition)
     return list(groups.values())
-
-
-# ------------------------------------------------------------------------------------------------ columns
 
 
 def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
@@ -163,7 +175,7 @@ def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
 
 
 def _shapes(galaxies: pa.Table) -> dict[str, Any]:
-    """Return the columns of galaxies except for their spectra.
+    """Return the columns of skyCatalogs for galaxies, except for their spectra.
 
     Notes
     -----
@@ -222,7 +234,11 @@ def _star_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
 
 
 def _fluxes(identifier: str, bands: list[str]) -> _Maker:
-    """Photons per second and cm2 through the whole system, with magnification and extinction."""
+    """Return a function that makes the table of fluxes from rows with the columns f_nu_<band>.
+
+    Fluxes are in photons per second and cm2 through the whole system (atmosphere, telescope and camera), and include
+    magnification and extinction. `identifier` is the name of the column with the identifiers.
+    """
     width = {band: passbands.log_width(passbands.load(band)) for band in bands}
 
     def rows(sources: pa.Table) -> pa.Table:
@@ -238,9 +254,6 @@ def _fluxes(identifier: str, bands: list[str]) -> _Maker:
 def _list_column(values: Float) -> pa.Array:
     offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
     return pa.ListArray.from_arrays(offsets, values.astype(np.float32).ravel())
-
-
-# ------------------------------------------------------------------------------------------------ files
 
 
 def _document(object_types: dict[str, Any]) -> dict[str, Any]:
@@ -282,7 +295,11 @@ def _object_type(kind: str, stem: str) -> dict[str, Any]:
 
 
 def _parquet(path: Path, rows: pa.Table, maker: _Maker) -> Path:
-    """Write a file with the same row groups as its companion file, one row group at a time."""
+    """Write the rows that `maker` makes to a Parquet file, one row group at a time.
+
+    Files with the same number of rows have the same row groups, which skyCatalogs requires of each file of sources and
+    its file of fluxes.
+    """
 
     def fill(temporary: Path) -> None:
         first = maker(rows.slice(0, _ROW_GROUP_SIZE))

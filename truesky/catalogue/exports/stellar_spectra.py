@@ -1,7 +1,7 @@
-"""Spectra of stars for skyCatalogs: one text file per template, and the magnitude that scales it to each star.
+"""Write template spectra of stars for skyCatalogs, and compute the magnitude that scales a template to each star.
 
-The files are seds/star_K.txt below the folder in the environment variable SIMS_SED_LIBRARY_DIR. Each line contains a
-wavelength in nm (in steps of 1 nm) and f_lambda.
+There is one text file seds/star_K.txt per template K. skyCatalogs searches for it in the folder that the environment
+variable SIMS_SED_LIBRARY_DIR names. Each line contains a wavelength in nm (in steps of 1 nm) and f_lambda.
 """
 
 from __future__ import annotations
@@ -19,26 +19,28 @@ from truesky.fluxes.calibration import star_scale
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.sources import stars_from_table
 
-# Samples of a template (1 A apart) per sample of the file, and the wavelength at which templates are normalised, A.
-_SAMPLES_PER_BIN, _LEVEL_WAVELENGTH = 10, 5000.0
-# Lower limit of all samples, relative to the highest sample of the template.
+# Number of samples of a template (steps of 1 A) per sample of the written file (steps of 10 A).
+_SAMPLES_PER_BIN = 10
+# Wavelength at which skyCatalogs normalises spectra, A.
+_LEVEL_WAVELENGTH = 5000.0
+# Lower limit of all written samples, relative to the highest sample of the template.
 _MIN_RELATIVE_FLUX = 1e-12
 
 
 def relative_path(sed: int) -> str:
-    """Return the path of a template's file, relative to the library folder."""
+    """Return the path of the file with the template number `sed`, relative to the folder of the spectra."""
     return f"seds/star_{sed:03d}.txt"
 
 
 def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path]:
-    """Write templates of a library; each file is replaced atomically.
+    """Write template spectra of stars, one text file per template; existing files are replaced atomically.
 
     Parameters
     ----------
     folder : Path
-        Library folder; seds/ is created in it.
+        Folder in which the folder seds/ with the files is created.
     library : Library
-        Templates.
+        Template spectra of stars.
     templates : sequence of int
         Indices of the templates to write.
 
@@ -60,7 +62,7 @@ def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path
 
 
 def magnorm(stars: pa.Table, library: Library) -> Float:
-    """Return the AB magnitude at 500 nm, before extinction, of each row of table `stars`."""
+    """Return the AB magnitude of stars at 500 nm, without extinction; `stars` are rows of table `stars`."""
     rows = stars_from_table(stars, library)
     wavelength, flux = _rebin(library)
     level = flux[:, int(np.searchsorted(wavelength, _LEVEL_WAVELENGTH))]
@@ -69,16 +71,16 @@ def magnorm(stars: pa.Table, library: Library) -> Float:
 
 
 def _rebin(library: Library) -> tuple[Float, Float]:
-    """Return (A; f_lambda[template]) every 10 A, averaged over the samples around each wavelength."""
+    """Return wavelengths in steps of 10 A, and f_lambda of each template averaged around them, shape (templates, n)."""
     half = _SAMPLES_PER_BIN // 2
     start = int((_LEVEL_WAVELENGTH - library.wavelength[0] - half) % _SAMPLES_PER_BIN)
     count = (library.flux.shape[1] - start - 1) // _SAMPLES_PER_BIN
-    # The samples at both ends of a bin count half, because they also belong to the next bin.
+    # A bin has 11 samples. The samples at both ends count half, because they also belong to the neighbouring bins.
     weights = np.full(_SAMPLES_PER_BIN + 1, 1.0 / _SAMPLES_PER_BIN)
     weights[[0, -1]] *= 0.5
     flux = np.zeros((len(library), count))
     for k, weight in enumerate(weights):
         flux += weight * library.flux[:, start + k : start + k + _SAMPLES_PER_BIN * count : _SAMPLES_PER_BIN]
-    # A template without flux at the reference wavelength still needs a positive level there.
+    # `magnorm` takes the logarithm of the flux at 500 nm, so it must be positive also for templates without flux there.
     flux = np.maximum(flux, _MIN_RELATIVE_FLUX * flux.max(axis=1, keepdims=True))
     return library.wavelength[start + half :: _SAMPLES_PER_BIN][:count], flux

@@ -1,9 +1,9 @@
-"""Spectra of galaxies for skyCatalogs: luminosities in rest-frame wavelength bins.
+"""Compute the spectra of galaxies for skyCatalogs: luminosities in rest-frame wavelength bins.
 
-Bins are equal in the logarithm of wavelength between spectral breaks and windows around the emission lines.
-skyCatalogs makes f_lambda constant in each bin, dims it by the luminosity distance, redshifts it, and applies the
-Milky Way's dust. A bin contains the photons of the spectrum inside it. A band whose response is smooth over a bin
-therefore gets the same flux as from the full spectrum.
+Between spectral breaks and narrow windows around the emission lines, bins have equal widths in the logarithm of
+wavelength. skyCatalogs makes f_lambda constant in each bin, dims it by the luminosity distance, redshifts it, and
+applies the Milky Way's dust. Each bin has the same number of photons as the spectrum inside it. A band whose response
+is smooth over a bin therefore gets the same flux as from the full spectrum.
 """
 
 from __future__ import annotations
@@ -30,32 +30,40 @@ from truesky.fluxes.spectra.continuum import (
 )
 from truesky.numerics import matrices
 
-# Limits of the first and last bin, A: ultraviolet of galaxies at z = 6 to infrared of nearby galaxies.
+# Lower limit of the first and upper limit of the last bin (rest frame, A). They cover the ultraviolet of galaxies at
+# z = 6 and the infrared of nearby galaxies.
 FIRST_EDGE, LAST_EDGE = 450.5, 24499.5
-# Width of a bin in ln(wavelength), and half the width of a line window relative to its wavelength (4 sigma of 300
-# km/s).
-_STEP, _WINDOW = 0.02, 0.004
-# Wavelengths of spectral breaks, A: the Lyman limit; the lines of the Lyman series, because intergalactic hydrogen
-# absorbs less redward of each of them; Lyman alpha with its red wing, narrow or wide; the Balmer limit.
+# Largest width of a bin in ln(wavelength), before the edges are rounded to half an angstrom.
+_STEP = 0.02
+# Half the width of the window around an emission line relative to its wavelength (4 sigma of a line with 300 km/s).
+_WINDOW = 0.004
+# Wavelengths (A) of the lines of the Lyman series except Lyman alpha, which are edges of bins, because intergalactic
+# hydrogen absorbs less redward of each line.
 _LYMAN_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
+# Edges of bins (A) in the red wing of Lyman alpha, narrow near the line and wider farther from it.
 _RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
+# Windows (lower limit, upper limit) without width, in A, so that the wavelengths of spectral breaks are edges of bins:
+# Lyman limit, Lyman series, Lyman alpha and its wing, and Balmer limit.
 _BREAKS = tuple((at, at) for at in (912.0, *_LYMAN_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
-# Unit of L_nu, W/Hz. Source: GCR Catalogs, SCHEMA.md.
+# Unit of luminosities per frequency in skyCatalogs, W/Hz. Source: GCR Catalogs, SCHEMA.md.
 TOPHAT_W_HZ = 4.4659e13
 _MPC_CM = 3.085677581491367e24
 _ERG_W = 1e7
-# Smallest redshift at which a luminosity distance is meaningful.
+# Smaller redshifts are replaced by this value, because the luminosity distance must not be 0.
 MIN_REDSHIFT = 1e-5
-# Number of rows per block; each array of a block has 25 MB.
+# Number of galaxies that are computed together; each of their arrays has 25 MB.
 _BLOCK = 128
-# Range and step of the law of Fitzpatrick et al. 2019, A.
+# Wavelength range and step (A) in which the extinction law of Fitzpatrick et al. 2019 is tabulated.
 _F19_RANGE, _F19_STEP = (1150.0, 33333.0), 5.0
 _LYMAN_ALPHA = 1215.67
 
 
 @lru_cache(maxsize=1)
 def edges() -> Float:
-    """Return the edges of the n bins, float64, shape (n + 1,), in A, halfway between the samples of the templates."""
+    """Return the edges of the n rest-frame wavelength bins in A, float64, shape (n + 1,).
+
+    The edges end in .5, because the templates have samples at integer wavelengths.
+    """
     lowest, highest = (1.0 + sign * _WINDOW for sign in (-1.0, 1.0))
     line_windows = [(line.vacuum * lowest, line.vacuum * highest) for line in lines.line_list()]
     windows: list[list[float]] = []
@@ -73,14 +81,14 @@ def edges() -> Float:
 
 
 def luminosities(galaxies: pa.Table, library: Library) -> Float:
-    """Return L_nu of galaxies in each bin, before magnification.
+    """Return the luminosities L_nu of galaxies in each wavelength bin, without magnification.
 
     Parameters
     ----------
     galaxies : Table
-        Rows of table `galaxies`, of any kind.
+        Rows of table `galaxies`, which may also contain quasars and galaxies beyond z = 6.
     library : Library
-        Templates of the kinds central, satellite and strong lens.
+        Template spectra of the galaxies in halos.
 
     Returns
     -------
@@ -89,8 +97,9 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
 
     Notes
     -----
-    skyCatalogs applies the extinction law of Fitzpatrick et al. 2019. The result includes the difference between our
-    law and this law at the wavelength of each bin.
+    skyCatalogs applies the Milky Way's dust with the extinction law of Fitzpatrick et al. 2019, but truesky uses
+    another law (O'Donnell 1994). The result therefore includes the difference between both laws at the observed
+    wavelength of each bin.
     """
     out = np.empty((galaxies.num_rows, len(edges()) - 1))
     for start in range(0, galaxies.num_rows, _BLOCK):
@@ -108,10 +117,13 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
 
 
 def _galaxies(rows: Galaxies, library: Library) -> Float:
-    """Observed f_lambda in each bin before magnification and the Milky Way, shape (n, bins), erg s-1 cm-2 A-1."""
+    """Return the observed f_lambda (erg s-1 cm-2 A-1) of galaxies in halos in each bin, shape (n, bins).
+
+    Emission lines and intergalactic absorption are included; magnification and the Milky Way's dust are not.
+    """
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     amplitude = amplitudes(rows.mix, reference, library, dust)
-    # Normalise to order 1, so that single precision does not underflow.
+    # Normalise the amplitudes of each galaxy's templates to a sum of 1, so that single precision does not underflow.
     amplitude /= amplitude.sum(0)
     spectra, dust_in_bins = _bin_library(library)
     total = np.zeros((len(rows), len(edges()) - 1))
@@ -129,18 +141,26 @@ def _galaxies(rows: Galaxies, library: Library) -> Float:
 
 
 def templates_in_bins(library: Library) -> Float:
-    """Return f_lambda of each template in each bin, float64, shape (templates, bins)."""
+    """Return the mean f_lambda of each template in each rest-frame wavelength bin, shape (templates, bins).
+
+    The unit is that of `library.flux`. The array is cached and must not be changed."""
     return _bin_library(library)[0]
 
 
 @lru_cache(maxsize=2)
 def _bin_library(library: Library) -> tuple[Float, Float]:
-    """Templates and extinction curves in bins; a curve is smooth over a bin, so its mean is sufficient."""
+    """Return the spectra of all templates and the curves of all extinction laws, averaged over each wavelength bin.
+
+    The arrays have the shapes (templates, bins) and (laws, bins).
+    """
     return bin_spectra(library.flux, library.wavelength), bin_spectra(dust_curves(library), library.wavelength)
 
 
 def _high_redshift(galaxies: pa.Table) -> Float:
-    """Observed f_lambda in each bin of quasars and of galaxies beyond z = 6, otherwise as in `_galaxies`."""
+    """Return the observed f_lambda (erg s-1 cm-2 A-1) of quasars and galaxies beyond z = 6 in each bin, (n, bins).
+
+    Magnification and the Milky Way's dust are not included.
+    """
     kind, z, mag, sed = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "sed_1"))
     out = np.empty((len(z), len(edges()) - 1))
     for code in high_redshift.MAGNITUDE_WAVELENGTH:
@@ -159,26 +179,29 @@ def _high_redshift(galaxies: pa.Table) -> Float:
 
 @lru_cache(maxsize=2)
 def _templates(kind: int) -> tuple[Library, Float]:
-    """Library of quasars or of galaxies beyond z = 6, and its spectra in bins."""
+    """Return the template library of quasars or of galaxies beyond z = 6, and its spectra in wavelength bins.
+
+    `kind` is high_redshift.QUASAR or high_redshift.HIGH_REDSHIFT.
+    """
     make_library = high_redshift.quasar_library if kind == high_redshift.QUASAR else high_redshift.high_redshift_library
     library = make_library()
     return library, bin_spectra(library.flux, library.wavelength)
 
 
 def bin_spectra(spectra: Float32, wavelength: Float) -> Float:
-    """Average spectra over the bins so that the number of photons in each bin is kept.
+    """Average spectra over the wavelength bins so that the number of photons in each bin is kept.
 
     Parameters
     ----------
     spectra : float32 array, shape (n, m)
-        f_lambda.
+        f_lambda, in any unit.
     wavelength : float array, shape (m,)
-        Integer wavelengths in steps of 1 A.
+        Integer wavelengths in steps of 1 A, which must cover all bins.
 
     Returns
     -------
     float array, shape (n, bins)
-        f_lambda.
+        Mean f_lambda of each bin, weighted with the wavelength, in the same unit.
     """
     starts = np.floor(edges() + 0.5 - wavelength[0]).astype(np.int64)
     inside, at = slice(starts[0], starts[-1]), starts[:-1] - starts[0]
@@ -187,7 +210,7 @@ def bin_spectra(spectra: Float32, wavelength: Float) -> Float:
 
 
 def _line_light(fluxes: Float) -> Float:
-    """f_lambda of the lines, all of whose photons are in the bin of their rest-frame wavelength.
+    """Return the f_lambda that emission lines add to each bin; a line is completely in the bin of its wavelength.
 
     Parameters
     ----------
@@ -197,7 +220,7 @@ def _line_light(fluxes: Float) -> Float:
     Returns
     -------
     float array, shape (n, bins)
-        f_lambda.
+        f_lambda per rest-frame A, erg s-1 cm-2 A-1.
     """
     vacuum = np.array([line.vacuum for line in lines.line_list()])
     bins = np.searchsorted(edges(), vacuum) - 1
@@ -209,12 +232,12 @@ def _line_light(fluxes: Float) -> Float:
 
 
 def _intergalactic_transmission(z: Float) -> Float:
-    """Mean transmission of the intergalactic medium in each bin, shape (n, bins)."""
+    """Return the mean transmission of the intergalactic medium in each bin for galaxies at redshifts z, (n, bins)."""
     wavelength = np.arange(1.0, np.ceil(_LYMAN_ALPHA * (1.0 + z.max())) + 2.0)
     transmissions = intergalactic.transmission(wavelength, z)
     out = np.empty((len(z), len(edges()) - 1))
     for i, transmission in enumerate(transmissions):
-        # There is no absorption redward of the Lyman series.
+        # Redward of Lyman alpha, where `wavelength` ends, the transmission is 1.
         cumulative = np.append(0.0, np.cumsum(transmission))
         observed_edges = edges() * (1.0 + z[i])
         integral = np.interp(observed_edges, np.append(wavelength, wavelength[-1] + 1.0) - 0.5, cumulative)
@@ -224,7 +247,7 @@ def _intergalactic_transmission(z: Float) -> Float:
 
 
 def _extinction_excess(z: Float) -> Float:
-    """Our A(lambda) / A(V) minus the value of skyCatalogs at the observed wavelength of each bin, shape (n, bins)."""
+    """Return A(lambda) / A(V) of truesky minus that of skyCatalogs at the observed wavelengths of bins, (n, bins)."""
     wavelength = _bin_centres() * (1.0 + z)[:, None]
     grid, difference = _law_difference()
     return np.interp(wavelength, grid, difference)
@@ -232,7 +255,10 @@ def _extinction_excess(z: Float) -> Float:
 
 @lru_cache(maxsize=1)
 def _law_difference() -> tuple[Float, Float]:
-    """Return wavelengths (A), and our A(lambda) / A(V) minus Fitzpatrick et al. 2019 with R_V = 3.1, in its range."""
+    """Return wavelengths (A), and A(lambda) / A(V) of truesky's law minus that of Fitzpatrick et al. 2019.
+
+    Both laws are for R_V = 3.1. The wavelengths are the range of the latter law.
+    """
     # Import here, because these packages are slow to import.
     import astropy.units as u
     from dust_extinction.parameter_averages import F19
@@ -243,7 +269,7 @@ def _law_difference() -> tuple[Float, Float]:
 
 
 def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
-    """Factors that convert observed f_lambda (erg s-1 cm-2 A-1) into L_nu of a bin, shape (n, bins)."""
+    """Return the factors from observed f_lambda (erg s-1 cm-2 A-1) to L_nu (TOPHAT_W_HZ) in each bin, (n, bins)."""
     low, high = edges()[:-1], edges()[1:]
     width = (high - low) / (LIGHT_ANGSTROM_S * (1.0 / low - 1.0 / high))
     distance = cosmology.luminosity_distance(np.maximum(z_true, MIN_REDSHIFT)) / cosmology.HUBBLE * _MPC_CM
@@ -252,6 +278,6 @@ def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
 
 
 def _bin_centres() -> Float:
-    """Mean wavelength of the photons in each bin of constant f_lambda, A."""
+    """Return the mean wavelength (A) of the photons in each bin, for a constant f_lambda."""
     low, high = edges()[:-1], edges()[1:]
     return 2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2)

@@ -1,6 +1,7 @@
-"""Read and check the galaxies of a user's catalogue once, and store them by order-5 cell for the workers.
+"""Read and check the galaxies of a user's catalogue once, and store them by sky cell in the disc cache.
 
-One pass over all files checks every value, and that no identifier occurs twice. The rows are stored in the cache.
+One pass over all files checks every value, and that no identifier occurs twice. The rows are stored in one Arrow file
+or more per HEALPix cell of order 5. Each worker process then reads only the rows of its cells.
 """
 
 from __future__ import annotations
@@ -31,30 +32,31 @@ from truesky.numerics import cache
 from truesky.numerics.cache import cache_dir, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Number of rows in memory before they are written to the files of their cells.
+# Number of rows that are collected in memory before they are written to the files of their cells.
 _MAX_BUFFERED_ROWS = 2_000_000
-# Number of groups in which identifiers are compared; each group fits into memory.
+# Number of groups into which identifiers are divided to find duplicates; each group must fit into memory.
 _LOT_COUNT = 64
 _ID_ENTRY = np.dtype([("id", np.int64), ("file", np.int32), ("row", np.int64)])
 _SUMMARY_FILE = "about.json"
-# Columns of positions; the observed positions are last.
+# Columns (ra, dec) of true and of observed positions. The observed positions must be last, because `_write_cells` uses
+# the last pair that a catalogue has.
 _POSITION_COLUMNS = (("ra", "dec"), ("ra_lensed", "dec_lensed"))
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """A catalogue that is stored by cell.
+    """A user's catalogue of galaxies that is stored by HEALPix cell of order 5.
 
     Attributes
     ----------
     folder : Path
-        Folder of the pieces.
+        Folder of the stored files, in the disc cache.
     checksums : mapping of str to int
-        CRC-32 of each piece by name.
+        CRC-32 of each stored file by its path in the folder, such as "4711/000000.arrow" for the cell 4711.
     rows : int
-        Number of rows of all files.
+        Number of rows of the whole catalogue.
     z_max, ebv_max : float
-        Largest redshift, and largest E(B-V) in mag.
+        Largest redshift, and largest E(B-V) in mag, of the whole catalogue; 0 without values.
     """
 
     folder: Path
@@ -65,16 +67,23 @@ class Split:
 
 
 def files_with_checksums(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], list[str]]:
-    """Return the catalogue files in the order of the request, and the SHA-256 of each file and companion file."""
+    """Return the files of a user's catalogue, and the SHA-256 of each file, then of each companion file.
+
+    A companion file contains further columns of the same rows. The files are in the order of `list_files`.
+    """
     files, all_files = list_files(paths, columns)
     return files, [file_sha256(file) for file in all_files]
 
 
 def list_files(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], list[Path]]:
-    """Return the catalogue files in the order of the request, and the same list followed by the companion files."""
+    """Return the files of a user's catalogue, and the same list followed by their companion files.
+
+    A companion file contains further columns of the same rows. The files are in the order of `paths`; a folder stands
+    for the files in it. Raises BadInput if there are no files or a file has a format that cannot be read.
+    """
     files = [file for path in paths for file in external_rows.find_files(path)]
     if columns.companion_prefixes:
-        # The folder also contains the companion files and unrelated tables.
+        # The folder also contains the companion files and unrelated tables: select by the beginning of the name.
         other_prefix = columns.companion_prefixes[1]
         files = [
             f for f in files if f.name.startswith(columns.companion_prefixes[0]) and not f.name.startswith(other_prefix)
@@ -90,16 +99,16 @@ def list_files(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], lis
 
 
 def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Split:
-    """Return a catalogue stored by cell, from the cache or made now.
+    """Read and check a user's catalogue, and store its rows by sky cell, unless the disc cache already contains them.
 
     Parameters
     ----------
     files : sequence of Path
-        Files of the catalogue.
+        Files of the catalogue, without companion files.
     sha256 : sequence of str
-        SHA-256 of all files, which identify the cached copy.
+        SHA-256 of all files and companion files, by which the cache recognises the catalogue.
     columns : Columns
-        Mapping of the columns.
+        Mapping from the columns of the files to the properties of galaxies.
 
     Returns
     -------
@@ -109,7 +118,8 @@ def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns
     Raises
     ------
     BadInput, Damaged
-        If a value cannot be used; the message names the file, the column and the row.
+        If a file cannot be read, or has a missing, wrong or repeated value; the message names the file, the column and
+        the row. Also if the stored files cannot be read back.
     """
     columns_json = json.dumps(
         [sorted((key, repr(field)) for key, field in columns.fields.items()), columns.companion_prefixes]
@@ -144,25 +154,27 @@ def _read_checksums(folder: Path) -> dict[str, int] | None:
 
 
 def rows_of_cell(split: Split, cell: int) -> dict[str, Array]:
-    """Return the galaxies of a generation cell.
+    """Return the galaxies of a stored catalogue whose positions are in a HEALPix cell of order 8.
 
     Parameters
     ----------
     split : Split
         The stored catalogue.
     cell : int
-        Nested index of an order-8 cell.
+        Nested index of the order-8 cell.
 
     Returns
     -------
     dict of str to array, shape (n,)
-        Values by name of the column, with `index` (the order-29 cell), sorted by index, then by origin_id.
+        Values by name of the property, with `index` (the order-29 cell of the position), sorted by index, then by
+        origin_id (the identifier in the user's catalogue). An empty dict if the catalogue has no galaxies in the
+        order-5 cell around the cell.
 
     Raises
     ------
     Damaged
-        If the stored file of this cell has changed on disk. The cached copy is deleted, and the next call of
-        `split_by_cell` makes it again.
+        If a stored file of this part of the sky has changed on disk. The stored catalogue is then deleted, and the next
+        call of `split_by_cell` makes it again.
     """
     prefix = f"{cell >> 2 * (GENERATION_ORDER - FILE_ORDER)}/"
     pieces = [split.folder / name for name in sorted(split.checksums) if name.startswith(prefix)]
@@ -172,7 +184,7 @@ def rows_of_cell(split: Split, cell: int) -> dict[str, Array]:
         if not cache.is_intact(piece, split.checksums[piece.relative_to(split.folder).as_posix()]):
             cache.discard(split.folder, f"{piece.name} is not what was written")
             raise Damaged(f"{piece} has changed on disk and was deleted; run again to rebuild it")
-        # Pieces are sorted by index, so only the rows of the cell are copied.
+        # The rows of a stored file are sorted by index, so the rows of the cell are one slice of the memory map.
         table = feather.read_table(piece, memory_map=True)
         index = table["index"].to_numpy()
         tables.append(table.slice(*_offset_and_length(np.searchsorted(index, [first, last]))))
@@ -202,7 +214,8 @@ def _publish(temporary: Path, folder: Path) -> None:
         except OSError as error:
             if error.errno != errno.ENOTEMPTY:
                 raise
-        # Another process has published the folder, or has left an incomplete one, which _read_checksums deletes.
+        # The folder exists: another process has just made it, or has left a damaged one. `_read_checksums` deletes a
+        # damaged folder, and the loop then tries to rename again.
         if _read_checksums(folder) is not None:
             return None
 
@@ -230,14 +243,17 @@ def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict
 
 
 def _write_cells(folder: Path, pieces: Sequence[Rows], piece_number: int) -> None:
-    """Write the rows of every cell to a new piece, sorted by index."""
+    """Write the rows of each order-5 cell to a new Arrow file in the folder of the cell, sorted by position.
+
+    The position is `index`, the nested index of the order-29 cell. `piece_number` is the name of the new files.
+    """
     if not sum(len(piece.values["ra"]) for piece in pieces):
         return
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
     for ra, dec in _POSITION_COLUMNS:
         if ra in values:
             values[ra], values[dec] = sky.check_positions(values[ra], values[dec])
-            # If the catalogue has observed positions, they determine the cell.
+            # The observed positions, which come last, determine the cell if the catalogue has them.
             values["index"] = sky.healpix_29(values[ra], values[dec])
     order = np.argsort(values["index"], kind="stable")
     cells = values["index"][order] >> 2 * (sky.MAX_ORDER - FILE_ORDER)
@@ -249,14 +265,17 @@ def _write_cells(folder: Path, pieces: Sequence[Rows], piece_number: int) -> Non
 
 
 class _IdentifierStore:
-    """Identifiers with their file and row, in groups on disk, because they may not fit into memory."""
+    """Store of all identifiers of a catalogue with their file and row, in order to find duplicates.
+
+    They are stored in groups in a folder, because together they may not fit into memory.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
 
     def add(self, file: int, piece: Rows) -> None:
-        """Store the identifiers of rows."""
+        """Store the identifiers of rows; `file` is the number of the file that contains the rows."""
         identifiers = piece.values["origin_id"]
         entries = np.empty(identifiers.size, _ID_ENTRY)
         entries["id"], entries["file"], entries["row"] = identifiers, file, piece.first + np.arange(identifiers.size)
@@ -266,7 +285,7 @@ class _IdentifierStore:
                 stream.write(entries[lot == lot_number].tobytes())
 
     def refuse_duplicates(self, files: Sequence[Path], column: str) -> None:
-        """Raise BadInput if an identifier occurs twice; then delete the groups."""
+        """Raise BadInput if an identifier occurs twice in the catalogue; otherwise delete the folder of the groups."""
         for path in sorted(self.folder.iterdir()):
             entries = np.sort(np.fromfile(path, _ID_ENTRY), order=("id", "file", "row"))
             duplicates = np.flatnonzero(entries["id"][1:] == entries["id"][:-1])

@@ -1,7 +1,9 @@
-"""Map the columns of a user's table to keys of this package, with mappings from a TOML file and from the request.
+"""Map the columns of a user's table to properties of galaxies or halos, and check the values.
 
-The mappings in ingest_formats.toml are the shipped formats. Entries of the request override them. Halos and training
-tables have no shipped format. Each value is checked; an error names the file, the column and the row.
+A mapping says for each property (key), such as "z_true", from which column of the table it is computed and how. The
+mappings of known catalogue formats are in ingest_formats.toml, and a request can override their entries. For tables of
+halos and of training galaxies, the whole mapping is in the request. Each value is checked; an error names the file, the
+column and the row.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ _FIELD_KEYS = (
 )  # fmt: skip
 _FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
 _SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
-# Keys that are computed, or that other keys determine.
+# Properties of table `galaxies` that cannot be mapped, because they are computed or follow from other properties.
 _NOT_MAPPED = ("id", "halo_id", "_healpix_29", "ra_true", "dec_true")
 GALAXY_BOUNDS: Bounds = {
     **{c.name: (c.lo, c.hi) for c in GALAXIES.columns if c.lo is not None and c.hi is not None},
@@ -74,7 +76,13 @@ _INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "sta
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Entry of a mapping; ingest_formats.toml explains the keys."""
+    """Entry of a mapping: how one property is computed from columns of the user's table.
+
+    The value is scale * f((column + plus - minus) / over) + offset, where f is 10^x, log10 or no function. The columns
+    `plus`, `minus` and `over` are optional. With the column `kpc_at` (redshift), the argument of f is a length in kpc,
+    which is first converted to arcsec. With `value`, the property has this constant value. ingest_formats.toml explains
+    all attributes.
+    """
 
     column: str = ""
     plus: str = ""
@@ -90,30 +98,32 @@ class Field:
     beside: bool = False
 
     def titles(self) -> list[str]:
-        """Return the columns of the file from which the field is computed."""
+        """Return the names of the file's columns from which the property is computed; none for a constant value."""
         return [title for title in (self.column, self.plus, self.minus, self.over, self.kpc_at) if title]
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """A complete mapping.
+    """Mapping from the columns of a user's table to properties of galaxies or halos.
 
     Attributes
     ----------
     fields : mapping of str to Field
-        Fields by key.
+        How each property is computed, by name of the property.
     bounds : mapping of str to (float, float)
-        Lowest and highest valid value by key.
+        Lowest and highest valid value of each property.
     nullable : tuple of str
-        Keys whose values may be missing.
+        Properties whose values may be missing (NaN).
     band : str
-        Passband of `mag`; "" without one.
+        Passband of the property `mag`; "" without it.
     companion_prefixes : tuple of str
-        Prefix of the names of the files, and of their companion files; empty without companion files.
+        Beginning of the names of the table's files, and of their companion files, which have further columns of the
+        same rows. Empty without companion files.
     seen_over_v : float or None
-        A(band) / A(V), if `mag` is an observed magnitude with magnification and extinction; None otherwise.
+        Extinction ratio A(band) / A(V), if `mag` is an observed magnitude, which includes magnification and the Milky
+        Way's extinction. None if `mag` includes neither.
     lines_magnified : bool
-        True if line fluxes include magnification.
+        True if the fluxes of emission lines include magnification.
     """
 
     fields: Mapping[str, Field]
@@ -125,14 +135,27 @@ class Columns:
     lines_magnified: bool = False
 
     def titles(self, in_companion: bool) -> list[str]:
-        """Return the columns to read from a file, or from its companion file."""
+        """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).
+
+        Each name occurs once.
+        """
         titles = [title for field in self.fields.values() if field.beside is in_companion for title in field.titles()]
         return list(dict.fromkeys(titles))
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Checked rows of one file by key; `first` is the number of the first row in the file."""
+    """Checked rows of one file of a user's table.
+
+    Attributes
+    ----------
+    file : Path
+        The file.
+    first : int
+        Number of the first of these rows in the file, from which error messages count.
+    values : mapping of str to array
+        Values by name of the property.
+    """
 
     file: Path
     first: int
@@ -140,35 +163,37 @@ class Rows:
 
 
 def formats() -> dict[str, dict[str, Any]]:
-    """Return the content of ingest_formats.toml by name of the format."""
+    """Return the known catalogue formats from ingest_formats.toml, by name of the format."""
     return _formats(_FILE.read_text(encoding="utf-8"))
 
 
 @cache
 def _formats(text: str) -> dict[str, dict[str, Any]]:
-    """Parse the text of ingest_formats.toml."""
+    """Parse the text of ingest_formats.toml; the result is cached."""
     return user_files.parse_toml(text)
 
 
 def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
-    """Return the mapping of a catalogue of galaxies.
+    """Return which columns of a user's catalogue give which properties of galaxies, and with which conversion.
 
     Parameters
     ----------
     name : str
-        Shipped format, "" for none.
+        Name of a format in ingest_formats.toml; "" for none.
     overrides : mapping of str to str
-        Entries of the request as JSON, which override the format.
+        For each property or setting that the request gives: its column or value as JSON text. They override the
+        format.
 
     Returns
     -------
     Columns
-        The mapping.
+        The column, unit and conversion of each property.
 
     Raises
     ------
     BadInput
-        If an entry is wrong or missing; the message names the key.
+        If the format is unknown, a text in `overrides` is wrong, or a required property is missing. Required are ra,
+        dec, a redshift and a magnitude. Some properties are only allowed together, such as kappa, gamma1 and gamma2.
     """
     all_formats = formats()
     if name and name not in all_formats:
@@ -193,20 +218,28 @@ def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
 
 
 def drop_lensed_positions(columns: Columns) -> Columns:
-    """Return the mapping without the observed positions."""
+    """Return `columns` without the observed (lensed) positions; galaxies are then observed at their true positions."""
     fields = {key: field for key, field in columns.fields.items() if not key.endswith("_lensed")}
     return replace(columns, fields=fields)
 
 
 def halo_columns(entries: Mapping[str, str]) -> Columns:
-    """Return the mapping of a request's catalogue of halos, with entries as JSON."""
+    """Return which columns of a user's table of halos give which properties of halos, and with which conversion.
+
+    `entries` contains for each property that the request gives its column or value, as JSON text. Raises BadInput if
+    such a text is wrong, or if ra, dec, z_true or log_mass is missing.
+    """
     fields = _fields({key: json.loads(text) for key, text in entries.items()}, HALO_BOUNDS, "ingest.halos.columns")
     _require(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
     return Columns(fields, HALO_BOUNDS)
 
 
 def training_columns(entries: Mapping[str, str]) -> Columns:
-    """Return the mapping of a request's training table, with entries as JSON; all its keys are required."""
+    """Return which columns of a user's training table give which properties of galaxies, and with which conversion.
+
+    `entries` contains for each property that the request gives its column or value, as JSON text. Raises BadInput if
+    such a text is wrong, or if one of the properties in TRAINING_BOUNDS is missing.
+    """
     parsed = {key: json.loads(text) for key, text in entries.items()}
     fields = _fields(parsed, TRAINING_BOUNDS, "ingest.training.columns")
     _require(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
@@ -214,7 +247,11 @@ def training_columns(entries: Mapping[str, str]) -> Columns:
 
 
 def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
-    """Read and check the rows of files; integers become int64, other values float64."""
+    """Yield the rows of files in batches, as checked values by property.
+
+    Codes, template indices and stamp numbers become int64, most other values float64. Raises BadInput for a value that
+    is missing or out of range, a wrong unit, or a companion file with other rows.
+    """
     identifier_columns = [columns.fields[key].column for key in IDENTIFIER_KEYS if key in columns.fields]
     for file in files:
         pieces = external_rows.read_batches(file, columns.titles(in_companion=False), identifier_columns)
@@ -224,13 +261,13 @@ def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
 
 
 def companion_file(file: Path, prefixes: Sequence[str]) -> Path:
-    """Return the path of the file with the other columns of the same rows."""
+    """Return the path of the companion file, which has further columns of the same rows as `file`.
+
+    `prefixes` are the beginnings of the names of both files. Raises BadInput if the name of `file` begins otherwise.
+    """
     if not file.name.startswith(prefixes[0]):
         raise BadInput(f"{file}: the name must begin with {prefixes[0]}")
     return file.with_name(prefixes[1] + file.name.removeprefix(prefixes[0]))
-
-
-# ------------------------------------------------------------------------------------------------ fields
 
 
 def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Field]:
@@ -240,7 +277,7 @@ def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Fi
         if key not in legal:
             raise BadInput(f"{path}.{key} is not one of {', '.join(dict.fromkeys(legal))}")
         if entry in ("", {}):
-            # An empty entry removes a column of the format that this catalogue does not have.
+            # With an empty text or table, the request says that the catalogue lacks the column that the format names.
             continue
         fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
     return fields
@@ -278,7 +315,7 @@ def _unit(text: str, where: str) -> Any:
     from astropy.cosmology.units import littleh
 
     try:
-        # Enable h as a unit only here.
+        # Enable the unit littleh only for this call, because it changes the units of the whole process.
         with units.add_enabled_units([littleh]):
             return units.Unit(text.replace("Msun", "solMass").replace("/h", " / littleh"))
     except ValueError:
@@ -295,14 +332,11 @@ def _check_units(piece: RowBatch, columns: Columns) -> None:
             raise BadInput(f"{where} ({key}) has unit {file_unit!r}, but the mapping has {field.unit!r}")
 
 
-# ------------------------------------------------------------------------------------------------ values
-
-
 def _checked_values(piece: RowBatch, columns: Columns) -> dict[str, Array]:
     rows = len(next(iter(piece.columns.values())))
     by_key = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
     for k in "12":
-        # The spectrum of a component without light has no meaning and may be invalid.
+        # If a template has the flux fraction 0, set its index and its dust to 0, because they may have invalid values.
         if f"frac_{k}" in by_key:
             dark = by_key[f"frac_{k}"] == 0.0
             for name in (f"sed_{k}", f"ext_law_{k}", f"ebv_{k}"):
@@ -336,7 +370,10 @@ def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> A
 
 
 def _kpc_per_arcsec(z: Array) -> Array:
-    """Scale in kpc per arcsec; NaN, which is refused later, at redshifts without a valid scale."""
+    """Return the proper length per angle (kpc/arcsec) at redshifts.
+
+    It is NaN at redshifts of 0 or less or beyond the largest redshift of the cosmology. Later checks refuse NaN.
+    """
     valid = (z > 0.0) & (z <= cosmology.Z_MAX)
     return np.where(valid, cosmology.kpc_per_arcsec(np.where(valid, z, 1.0)), np.nan)
 
@@ -360,7 +397,10 @@ def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array) ->
 
 
 def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:
-    """Yield batches with the columns of the companion file; the identifiers of both files must agree row by row."""
+    """Yield the batches of a file with the columns of its companion file added.
+
+    Raises BadInput if the companion file has fewer rows, or if the identifiers of both files differ in a row.
+    """
     companion = companion_file(file, columns.companion_prefixes)
     name = columns.fields["origin_id"].column
     titles = [name, *columns.titles(in_companion=True)]

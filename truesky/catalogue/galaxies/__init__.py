@@ -1,1 +1,1 @@
-"""Properties of galaxies: colours, spectra, masses, emission lines, shapes and lensing."""
+"""Draw the properties of galaxies: colours, spectra, masses, emission lines, shapes and lensing."""

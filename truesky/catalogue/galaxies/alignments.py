@@ -1,13 +1,13 @@
-"""Intrinsic alignments: orientations of galaxies before lensing.
+"""Intrinsic alignments: draw the position angles of galaxies before lensing.
 
-Position angles are drawn around a mean ellipticity that depends on the place of a galaxy; axis ratios do not change.
-Ellipticities are complex, e_1 + i e_2 = |e| exp(2 i phi), where |e| = (a - b) / (a + b) and phi is measured from east
-to north.
+Alignments change only the distribution of position angles, not the axis ratios. Each galaxy has a mean ellipticity,
+which depends on its place; larger means give a narrower distribution of position angles. Ellipticities are complex,
+e_1 + i e_2 = |e| exp(2 i phi), where |e| = (a - b) / (a + b) and phi is measured from east to north.
 
 Notes
 -----
-Central galaxies follow the linear alignment model with the tide of the matter in the cells of the box. Satellites point
-to their central galaxy, with a mean ellipticity without scatter.
+Central galaxies follow the linear alignment model with the tidal field on the grid of simulated matter. Satellites
+point to their central galaxy; their mean ellipticity depends on their distance from it, and on whether they are red.
 
 References
 ----------
@@ -28,13 +28,13 @@ from truesky.catalogue.matter.density_box import Box
 from truesky.catalogue.matter.lightcone import Replicas
 from truesky.fluxes import cosmology
 
-# Newton steps that solve y + a sin 2y = x to floating-point precision for a < 1/2.
+# Number of Newton steps that solve y + a sin(2 y) = x to floating-point precision for a < 1/2.
 _STEPS = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Parameters of the alignments (alignments.toml)."""
+    """Parameters of the alignments of central and satellite galaxies; explained in alignments.toml."""
 
     amplitude: float
     slope: float
@@ -57,15 +57,15 @@ class Alignments:
     Attributes
     ----------
     numbers : Constants
-        Parameters of the file.
+        Parameters from alignments.toml.
     strength : float
         Factor by which each mean ellipticity is multiplied.
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     replicas : Replicas
-        Rotation of each replica of the box.
+        Rotations of the copies of the box that fill space.
     tides : tuple of float32 array
-        Tidal field, same as `density_box.tides`.
+        Components xx, yy, xy, xz and yz of the tidal field on the grid of the box, from `density_box.tides`.
     """
 
     numbers: Constants
@@ -76,16 +76,16 @@ class Alignments:
 
 
 def model(box: Box, replicas: Replicas, strength: float) -> Alignments | None:
-    """Return the alignments of the embedded universe.
+    """Return the alignment model with the built-in parameters.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     replicas : Replicas
-        Rotation of each replica of the box.
+        Rotations of the copies of the box that fill space.
     strength : float
-        Factor of the request by which each mean ellipticity is multiplied.
+        Factor by which each mean ellipticity is multiplied.
 
     Returns
     -------
@@ -99,12 +99,12 @@ def model(box: Box, replicas: Replicas, strength: float) -> Alignments | None:
 
 
 def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
-    """Return the tidal field of the linear density today at positions in the light-cone.
+    """Return the projected tidal field of the linear density at z = 0 at positions in the light-cone.
 
     Parameters
     ----------
     alignments : Alignments
-        The model.
+        Alignment model.
     ra, dec : float array, shape (n,)
         True positions, deg.
     chi : float array, shape (n,)
@@ -113,7 +113,8 @@ def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
     Returns
     -------
     complex array, shape (n,)
-        T_11 - T_22 + 2 i T_12; axis 1 points east, axis 2 north.
+        T_11 - T_22 + 2 i T_12, where T is the tidal tensor in the grid cell that contains the position; axis 1 points
+        east, axis 2 north.
     """
     lon, lat = np.radians(ra), np.radians(dec)
     zeros = np.zeros_like(lon)
@@ -121,7 +122,7 @@ def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
     east = np.stack([-np.sin(lon), np.cos(lon), zeros], 1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], 1)
     cell, _ = lightcone.box_cells(alignments.box, alignments.replicas, direction, chi)
-    # Rotate the axes of each position into the frame of its replica.
+    # Rotate the east and north axes at each position into the frame of the copy of the box that contains the position.
     (e_x, e_y, e_z), (n_x, n_y, n_z) = (
         lightcone.box_cells(alignments.box, alignments.replicas, axis, chi)[1].T for axis in (east, north)
     )
@@ -145,20 +146,21 @@ def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Floa
     Parameters
     ----------
     alignments : Alignments
-        The model.
+        Alignment model.
     ra, dec : float array, shape (n,)
         True positions, deg.
     chi : float array, shape (n,)
         Comoving distance, Mpc/h.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
 
     Returns
     -------
     complex array, shape (n,)
-        Mean ellipticity. It does not change with time in linear theory.
+        Mean ellipticity e_1 + i e_2. It does not depend on the epoch, because the factor 1 / D of the linear alignment
+        model cancels the linear growth D of the tidal field.
     """
     numbers = alignments.numbers
     amplitude = numbers.amplitude * 10.0 ** (-0.4 * numbers.slope * (m_r - numbers.magnitude))
@@ -167,23 +169,23 @@ def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Floa
 
 
 def satellite_ellipticity(alignments: Alignments, direction: Float, distance: Float, red: Bool) -> Complex:
-    """Return the mean ellipticity of satellites, along the line to their central galaxy.
+    """Return the mean ellipticity of satellites; the major axis points to their central galaxy.
 
     Parameters
     ----------
     alignments : Alignments
-        The model.
+        Alignment model.
     direction : float array, shape (n,)
-        Direction of the central galaxy, rad, from east to north.
+        Direction of the central galaxy as seen from the satellite, rad from east to north.
     distance : float array, shape (n,)
-        Projected distance from the central galaxy in units of R_200m.
+        Projected distance from the central galaxy in units of the halo radius R_200m.
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
 
     Returns
     -------
     complex array, shape (n,)
-        Mean ellipticity.
+        Mean ellipticity e_1 + i e_2; it decreases with distance, to 0 in the outer parts of the halo.
     """
     numbers = alignments.numbers
     size = np.maximum(numbers.inner - numbers.outer * distance, 0.0)
@@ -197,11 +199,11 @@ def position_angles(alignments: Alignments | None, uniform: Float, mean: Complex
     Parameters
     ----------
     alignments : Alignments or None
-        The model; None for isotropic directions.
+        Alignment model; None for isotropic directions.
     uniform : float array, shape (n,)
         Uniform random numbers in (0, 1).
     mean : complex array, shape (n,)
-        Mean ellipticities.
+        Mean ellipticities e_1 + i e_2; galaxies with 0 get a uniform position angle.
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
 
@@ -216,8 +218,9 @@ def position_angles(alignments: Alignments | None, uniform: Float, mean: Complex
 
         p(phi) ~ 1 + 2 a cos 2(phi - phi_0)
 
-    with a = |mean| / (mean ellipticity of galaxies, red or blue), limited to `max_modulation`. It is sampled by
-    inversion.
+    where phi_0 is the direction of `mean`. The modulation a is |mean| / m, but at most `max_modulation` of
+    alignments.toml; m is the average of |e| over galaxies of the same colour (red or blue). The cumulative distribution
+    is inverted to draw phi.
     """
     if alignments is None:
         return 180.0 * uniform
@@ -229,26 +232,26 @@ def position_angles(alignments: Alignments | None, uniform: Float, mean: Complex
     for _ in range(_STEPS):
         y -= (y + a * np.sin(2.0 * y) - phase) / (1.0 + 2.0 * a * np.cos(2.0 * y))
     phi = 0.5 * np.angle(mean) + y
-    # Convert to an angle from north through east. Galaxies without alignment get the same angle as without a model.
+    # Convert to an angle from north through east. Galaxies with a = 0 get the same angle as without an alignment model.
     return np.where(a > 0.0, np.mod(90.0 - np.degrees(phi), 180.0), 180.0 * uniform)
 
 
 def direction_to_cells(ra: Float, dec: Float, target: Int) -> tuple[Float, Float]:
-    """Return direction and separation of order-29 cells as seen from positions.
+    """Return the direction and the separation of target positions, given as HEALPix cells, from other positions.
 
     Parameters
     ----------
     ra, dec : float array, shape (n,)
-        Positions, deg.
+        Positions from which direction and separation are measured, deg.
     target : int array, shape (n,)
-        Nested indices of order-29 cells.
+        Nested indices of the order-29 cells that contain the targets.
 
     Returns
     -------
     direction : float array, shape (n,)
-        Direction from east to north, rad.
+        Direction from the position to the target, rad from east to north.
     separation : float array, shape (n,)
-        Separation, rad.
+        Separation, rad. It is the length of the projection on the tangent plane, which is correct for small angles.
     """
     lon, lat = (np.radians(angle) for angle in sky.positions_of_indices(target))
     origin_lon, origin_lat = np.radians(ra), np.radians(dec)

@@ -1,11 +1,12 @@
-"""Brightness of a dusty template in a passband at redshift z, relative to its rest-frame 0.1r flux.
+"""Flux of a template spectrum with dust in a passband at redshift z, relative to its rest-frame flux in 0.1r.
 
-The apparent magnitude in band b follows from the ratio of the two fluxes::
+0.1r is the SDSS r band blueshifted to z = 0.1. The apparent magnitude in band b follows from the ratio of the two
+fluxes::
 
     m_b = M_r + DM(z) - 2.5 log10(ratio)        (M_r = M(0.1r) - 5 log10 h, DM for H0 = 100)
 
-A small table of ln(ratio) by redshift, extinction law, template and E(B-V) serves only the selection of galaxies in one
-band and the reference magnitude. Fluxes are not computed from it.
+A small table of ln(ratio) by redshift, extinction law, template and E(B-V) is used only for the magnitude limit of the
+catalogue, for colours and for the column mag_r01. The fluxes of the catalogue are computed without it.
 
 References
 ----------
@@ -27,17 +28,33 @@ from truesky.numerics import matrices
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
+# Passband 0.1r: SDSS r blueshifted to z = 0.1.
 REFERENCE_BAND = "sdss_r01"
-# Uniform step of ln(1 + z).
+# Step of ln(1 + z) between two redshifts of the table.
 _STEP = 0.005
-# Possible numbers of Chebyshev-Lobatto nodes of E(B-V). The smallest one is used whose error halfway between the nodes
-# is below _EBV_ERROR (mag) at _REDSHIFTS redshifts. The errors stated below hold for these values.
-_EBV_NODES, _EBV_ERROR, _REDSHIFTS = (5, 9, 17, 33), 2e-4, 8
+# Possible numbers of Chebyshev-Lobatto nodes of E(B-V). `_nodes` takes the smallest number that is accurate enough.
+_EBV_NODES = (5, 9, 17, 33)
+# Largest interpolation error halfway between two nodes of E(B-V), mag.
+_EBV_ERROR = 2e-4
+# Number of redshifts at which the interpolation error in E(B-V) is measured.
+_REDSHIFTS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Sed:
-    """Two-component spectra of n galaxies: columns sed_k, frac_k, ext_law_k and ebv_k of table `galaxies`."""
+    """Spectra of n galaxies; each is a mixture of two template spectra behind the same dust.
+
+    Attributes
+    ----------
+    template_1, template_2 : int array, shape (n,)
+        Indices of the two templates in the library.
+    frac_1, frac_2 : float array, shape (n,)
+        Fractions of the two templates in the rest-frame flux after the dust in 0.1r (SDSS r blueshifted to z = 0.1).
+    law : int array, shape (n,)
+        Extinction law, 0 (no dust) to 4.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+    """
 
     template_1: Int
     frac_1: Float
@@ -47,7 +64,7 @@ class Sed:
     ebv: Float
 
     def select(self, keep: npt.NDArray[np.generic]) -> Sed:
-        """Return the galaxies of a bool mask or of row numbers."""
+        """Return the spectra of some galaxies, given as a bool mask of shape (n,) or as row numbers."""
         return Sed(
             self.template_1[keep],
             self.frac_1[keep],
@@ -60,16 +77,19 @@ class Sed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandRatios:
-    """Table of ln(f_nu in the band at z / f_nu in 0.1r at rest) of dusty templates.
+    """Table of ln(observed f_nu in a passband / rest-frame f_nu in 0.1r) of template spectra with dust.
+
+    0.1r is the SDSS r band blueshifted to z = 0.1. This logarithm is called ln(ratio) below.
 
     Attributes
     ----------
     band : str
         Name of the passband.
     ebv : float array, shape (e,)
-        Nodes of E(B-V), mag.
+        E(B-V) of the last axis of `values`, mag.
     values : float32 array, shape (z, 4, templates, e)
-        ln(ratio) of the extinction laws 1 to 4. The redshift nodes are uniform in ln(1 + z) and start at 0.
+        ln(ratio) by redshift, extinction law (1 to 4), template and E(B-V). The redshifts start at 0 and have a
+        constant step of ln(1 + z).
     """
 
     band: str
@@ -78,12 +98,12 @@ class BandRatios:
 
 
 def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
-    """Compute the table of one passband (0.5 s for z_max = 2.3).
+    """Compute the brightness of template spectra with dust in one passband by redshift (0.5 s for z_max = 2.3).
 
     Parameters
     ----------
     library : Library
-        Templates.
+        Template spectra.
     band : str
         Name of the passband.
     z_max : float
@@ -108,7 +128,10 @@ def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRati
 
 
 def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
-    """Nodes of E(B-V): more in blue bands and for large E(B-V), because dust absorbs more."""
+    """Return the values of E(B-V) (mag) from 0 to `ebv_max` between which brightnesses are interpolated (nodes).
+
+    Their number is the smallest of `_EBV_NODES` with an interpolation error below `_EBV_ERROR`, or else the largest.
+    """
     z = np.expm1(np.linspace(0.0, np.log1p(z_max), _REDSHIFTS))
     for count in _EBV_NODES:
         finer = 0.5 * ebv_max * (1.0 - np.cos(np.pi * np.arange(2 * count - 1) / (2 * count - 2)))
@@ -122,7 +145,10 @@ def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
 
 
 def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Float:
-    """ln(ratio), shape (z, 4, templates, e)."""
+    """Return ln(observed f_nu in the band / rest-frame f_nu in 0.1r), shape (z, 4 extinction laws, templates, e).
+
+    A template without flux in the band gets the logarithm of the smallest float32 number.
+    """
     dust = dust_transmission(library, ebv)
     spectra = library.flux.astype(np.float64).T
     reference = _band_flux(dust, spectra, band_weights(library, REFERENCE_BAND, 0.0))
@@ -135,23 +161,23 @@ def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Flo
 
 
 def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
-    """Return the same table as `build`, from the cache or made now.
+    """Return the same table as `build`, from the disc cache if it has been computed before.
 
     Parameters
     ----------
     library : Library
-        Templates.
+        Template spectra.
     band : str
         Name of the passband.
     z_max : float
-        Largest redshift.
+        Largest redshift; the table starts at 0.
     ebv_max : float
-        Largest E(B-V), mag.
+        Largest E(B-V), mag; the table starts at 0.
 
     Returns
     -------
     BandRatios
-        The table; the cache key contains everything that it depends on.
+        The table. It is computed again if the code, the library, a passband curve or an extinction law has changed.
     """
     curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
     responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
@@ -167,18 +193,21 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
 
 
 def dust_transmission(library: Library, ebv: Float) -> Float:
-    """Return the transmission of laws 1 to 4 at each E(B-V) (mag), shape (4, e, wavelengths of the library)."""
+    """Return the fraction of light that passes the dust, shape (4, e, wavelengths of the library).
+
+    The first axis are the extinction laws 1 to 4, the second the values of `ebv` (E(B-V), mag).
+    """
     k = extinction.laws(library.wavelength)[1:]
     return np.asarray(extinction.transmission(k[:, None, :], ebv[None, :, None]), float)
 
 
 def band_weights(library: Library, band: str, z: float) -> Float:
-    """Return the weights with which rest-frame f_lambda sums to the observed, band-averaged f_nu.
+    """Return weights whose scalar product with a rest-frame spectrum f_lambda is the observed mean f_nu in a band.
 
     Parameters
     ----------
     library : Library
-        Templates.
+        Template spectra, whose wavelengths have steps of 1 A.
     band : str
         Name of the passband.
     z : float
@@ -187,7 +216,7 @@ def band_weights(library: Library, band: str, z: float) -> Float:
     Returns
     -------
     float array, shape (wavelengths,)
-        Weights on the wavelengths of the library.
+        Weight of each wavelength of the library. Parts of the band outside the library get no weight.
 
     Notes
     -----
@@ -205,32 +234,32 @@ def band_weights(library: Library, band: str, z: float) -> Float:
 
 
 def _band_flux(dust: Float, spectra: Float, weights: Float) -> Float:
-    """Flux in a band, shape (4, e, templates)."""
+    """Return the flux of each template behind dust in a band, shape (4 extinction laws, e, templates)."""
     used = np.flatnonzero(weights)
     cut = slice(used[0], used[-1] + 1)
     return np.asarray(matrices.matmul(dust[:, :, cut] * weights[cut], spectra[cut]))
 
 
 def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -> Float:
-    """Interpolate ln(ratio) linearly in ln(1 + z) and by a polynomial in E(B-V).
+    """Interpolate ln(ratio) of single template spectra, linearly in ln(1 + z) and by a polynomial in E(B-V).
 
     Parameters
     ----------
     table : BandRatios
-        The table.
+        Table of ln(observed f_nu in a passband / rest-frame f_nu in 0.1r).
     z : float array, shape (n,)
         Redshift.
     template : int array, shape (n,)
         Index of the template.
     law : int array, shape (n,)
-        Extinction law, 0 to 4; 0 means no dust.
+        Extinction law, 0 to 4; 0 means no dust, and E(B-V) is then ignored.
     ebv : float array, shape (n,)
         E(B-V), mag.
 
     Returns
     -------
     float array, shape (n,)
-        ln(ratio).
+        ln(ratio). Values beyond the table are extrapolated; nothing is checked.
     """
     # Import here, because compiled code is slow to import.
     from truesky.catalogue.galaxies import ratio_sums
@@ -243,7 +272,7 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
 
 
 def ebv_weights(nodes: Float, ebv: Float) -> Float:
-    """Return the Lagrange weights of the nodes (mag) at each E(B-V) (mag), shape (n, e)."""
+    """Return the weights of Lagrange interpolation from e nodes (mag) to n values of E(B-V) (mag), shape (n, e)."""
     weights = np.ones((ebv.size, nodes.size))
     for i, node in enumerate(nodes):
         for j, other in enumerate(nodes):
@@ -253,12 +282,12 @@ def ebv_weights(nodes: Float, ebv: Float) -> Float:
 
 
 def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
-    """Return m_b - M_r - DM(z) of two-component spectra.
+    """Return apparent minus absolute magnitude minus distance modulus, m_b - M_r - DM(z), of galaxy spectra.
 
     Parameters
     ----------
     table : BandRatios
-        The table of band b.
+        Table of the passband b of the apparent magnitude. M_r is in 0.1r at rest, for h = 1, and so is DM.
     z : float array, shape (n,)
         Redshift.
     sed : Sed
@@ -275,30 +304,33 @@ def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
 
 
 def brightest_offset(table: BandRatios) -> tuple[Float, Float]:
-    """Return redshifts, and the smallest m_b - M_r - DM of any template, law and E(B-V) at each of them, mag."""
+    """Return the redshifts of a table, and at each the smallest m_b - M_r - DM(z) (mag) of any spectrum.
+
+    The minimum is over all templates, extinction laws and values of E(B-V); see `offset` for the magnitudes.
+    """
     z = np.expm1(_STEP * np.arange(table.values.shape[0]))
     highest = table.values.astype(np.float64).max(axis=(1, 2, 3))
     return z, -2.5 / np.log(10.0) * highest
 
 
 def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
-    """Return spectra that have the given colours.
+    """Return mixtures of two neighbouring templates that have the given colours behind the given dust.
 
     Parameters
     ----------
     table : BandRatios
-        The table of 0.1g at z = 0.
+        Table of the passband 0.1g, of which only z = 0 is used.
     colour : float array, shape (n,)
-        0.1(g - r), mag.
+        Rest-frame colour 0.1(g - r), mag.
     law : int array, shape (n,)
-        Extinction law.
+        Extinction law, 0 (no dust) to 4.
     ebv : float array, shape (n,)
         E(B-V), mag.
 
     Returns
     -------
     Sed
-        Spectra. If no spectrum behind this dust has the colour, the end of the library.
+        Spectra. If all spectra behind this dust are bluer or redder than the colour, the first or last template.
 
     Notes
     -----
@@ -318,14 +350,14 @@ def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed
 
 
 def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
-    """Return the spectra of real template indices.
+    """Return mixtures of two neighbouring templates from a template index that is a real number.
 
     Parameters
     ----------
     index : float array, shape (n,)
-        Index t >= 0.
+        Index t >= 0, which is not checked.
     law : int array, shape (n,)
-        Extinction law.
+        Extinction law, 0 (no dust) to 4.
     ebv : float array, shape (n,)
         E(B-V), mag.
 
@@ -344,7 +376,7 @@ def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
 
 
 def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
-    """Return spectra as columns of the table `galaxies`; both templates of a galaxy have the same dust."""
+    """Return spectra as columns of table `galaxies`, by name; both templates of a galaxy have the same dust."""
     return {
         "sed_1": sed.template_1,
         "frac_1": sed.frac_1,
@@ -358,5 +390,5 @@ def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def colours(table: BandRatios, sed: Sed) -> Float:
-    """Return 0.1(g - r) of two-component spectra in mag, from the table of 0.1g at z = 0."""
+    """Return the rest-frame colour 0.1(g - r) of galaxy spectra in mag; `table` is the table of the passband 0.1g."""
     return offset(table, np.zeros(sed.ebv.size), sed)

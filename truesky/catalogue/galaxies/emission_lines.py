@@ -1,8 +1,10 @@
-"""Emission lines: H alpha from the star formation rate, matched to observed counts; other lines from line ratios.
+"""Emission lines of galaxies.
 
-The matching table (halpha_matching.csv) is made by scripts/match_halpha.py from a sample without clustering. All ratios
-use one metallicity scale, because mixing two scales changes [O III] / H beta by an order of magnitude. The parameters
-are in emission_lines.toml.
+H alpha follows from the star formation rate, and is then shifted so that the number of galaxies by H alpha luminosity
+agrees with observed counts. The other lines follow from H alpha by line ratios. The table of shifts
+(halpha_matching.csv) is made by scripts/match_halpha.py from galaxies without clustering. All ratios use one
+metallicity scale, because mixing two scales changes [O III] / H beta by an order of magnitude. The file
+emission_lines.toml contains the parameters.
 
 References
 ----------
@@ -28,16 +30,20 @@ from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "emission_lines.toml"
 MATCHING = Path(__file__).with_name("halpha_matching.csv")
-# Normal deviates per galaxy: dust, H alpha, metallicity, N2, R3, R2, S2, [S III], He I.
+# Number of normal deviates per galaxy: one each for the scatter of dust, H alpha, metallicity, [N II], [O III], [O II],
+# [S II], [S III] and He I, in this order.
 _DEVIATES = 9
 _CM_PER_MPC = 3.0856775814913673e24
+# log10 of the H alpha luminosities (erg/s) at which the observed luminosity function is integrated if L* = 1e42 erg/s.
+# They are shifted to the L* of each redshift.
 _L_NODES = np.linspace(38.0, 45.0, 1401)
+# Number of redshifts at which the volume integral of `expected_counts` is evaluated.
 _Z_NODES = 400
 
 
 @dataclass(frozen=True, slots=True)
 class Halpha:
-    """Parameters of H alpha (emission_lines.toml, [halpha])."""
+    """Parameters of the H alpha luminosity by star formation rate; explained in emission_lines.toml, [halpha]."""
 
     per_sfr: float
     scatter: float
@@ -46,7 +52,7 @@ class Halpha:
 
 @dataclass(frozen=True, slots=True)
 class Gas:
-    """Parameters of the gas dust (emission_lines.toml, [gas])."""
+    """Parameters of the dust attenuation of emission lines by stellar mass; explained in emission_lines.toml, [gas]."""
 
     pivot: float
     limits: tuple[float, float]
@@ -57,7 +63,7 @@ class Gas:
 
 @dataclass(frozen=True, slots=True)
 class Metals:
-    """Parameters of the metallicity (emission_lines.toml, [metals])."""
+    """Parameters of the gas metallicity by mass and star formation rate; explained in emission_lines.toml, [metals]."""
 
     highest: float
     turn: float
@@ -71,7 +77,7 @@ class Metals:
 
 @dataclass(frozen=True, slots=True)
 class Ratios:
-    """Parameters of the line ratios (emission_lines.toml, [ratios])."""
+    """Parameters of the line ratios by metallicity; explained in emission_lines.toml, [ratios]."""
 
     n2: tuple[float, ...]
     n2_scatter: float
@@ -88,7 +94,7 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True)
 class OtherLines:
-    """Parameters of [S III] and He I (emission_lines.toml, [others])."""
+    """Parameters of the [S III] and He I lines; explained in emission_lines.toml, [others]."""
 
     siii: float
     siii_scatter: float
@@ -100,7 +106,7 @@ class OtherLines:
 
 @dataclass(frozen=True, slots=True)
 class Pozzetti:
-    """Parameters of the observed luminosity function (emission_lines.toml, [pozzetti])."""
+    """Parameters of the observed H alpha luminosity function; explained in emission_lines.toml, [pozzetti]."""
 
     alpha: float
     delta: float
@@ -120,19 +126,19 @@ class LineModel:
     Attributes
     ----------
     halpha, gas, metals, ratios : Halpha, Gas, Metals, Ratios
-        Parameters of the file.
+        Parameters of H alpha, dust, metallicity and line ratios, from emission_lines.toml.
     hydrogen : dict of str to float
-        Ratio of each hydrogen line to H beta, without dust.
+        Ratio of each hydrogen line to H beta without dust, by name such as "halpha".
     other_lines : OtherLines
         Parameters of [S III] and He I.
     dust : dict of str to float
-        Extinction coefficient k of each column relative to H alpha.
+        Extinction coefficient k at the wavelength of each line relative to H alpha, by column such as "flux_oiii".
     z : float array, shape (r,)
-        Redshift nodes of the matching.
+        Redshifts of the rows of `shift`.
     log_l : float array, shape (c,)
-        Nodes of log10 L, erg/s.
+        log10 of the H alpha luminosities (erg/s) of the columns of `shift`.
     shift : float array, shape (r, c)
-        Shift that the matching adds to log10 L, dex.
+        Number that is added to log10 of the H alpha luminosity to match the observed counts, dex.
     """
 
     halpha: Halpha
@@ -148,22 +154,26 @@ class LineModel:
 
 
 def model(matching: Path = MATCHING) -> LineModel:
-    """Return the emission lines of the embedded universe."""
+    """Return the emission line model with the built-in parameters and a CSV table of the shifts of H alpha.
+
+    The first row of the file contains log10 L (erg/s), its first column the redshift, and the rest the shifts (dex).
+    """
     table = np.loadtxt(matching, delimiter=",")
     return model_from_table(table[1:, 0], table[0, 1:], table[1:, 1:])
 
 
 def model_from_table(z: Float, log_l: Float, shift: Float) -> LineModel:
-    """Return emission lines with a given matching table; shifts of 0 leave H alpha as drawn.
+    """Return the emission line model with given shifts of the H alpha luminosity.
 
     Parameters
     ----------
     z : float array, shape (r,)
-        Redshift nodes.
+        Redshifts of the rows of `shift`, ascending.
     log_l : float array, shape (c,)
-        Nodes of log10 L, erg/s.
+        log10 of the H alpha luminosities (erg/s) of the columns of `shift`, ascending.
     shift : float array, shape (r, c)
-        Shift of log10 L, dex.
+        Number that is added to log10 of the H alpha luminosity, dex; 0 for the luminosity that follows from the star
+        formation rate.
 
     Returns
     -------
@@ -188,16 +198,16 @@ def model_from_table(z: Float, log_l: Float, shift: Float) -> LineModel:
 
 
 def halpha_attenuation(gas: Gas, log_mass: Float, normal: Float) -> Float:
-    """Return the attenuation A(H alpha) of the gas.
+    """Return the attenuation of H alpha by the dust of the galaxy's gas.
 
     Parameters
     ----------
     gas : Gas
-        Parameters.
+        Parameters of the attenuation.
     log_mass : float array, shape (n,)
         log10 of the stellar mass, Msun.
     normal : float array, shape (n,)
-        Normal deviates.
+        Standard normal deviates, which give the scatter.
 
     Returns
     -------
@@ -213,23 +223,25 @@ def halpha_attenuation(gas: Gas, log_mass: Float, normal: Float) -> Float:
 
 
 def raw_halpha(law: Halpha, log_sfr: Float, a_halpha: Float, normal: Float) -> Float:
-    """Return the observed H alpha luminosity that follows from the star formation rate, before matching.
+    """Return the attenuated H alpha luminosity that follows from the star formation rate.
+
+    The shift to observed counts (`match_abundance`) is not applied here.
 
     Parameters
     ----------
     law : Halpha
-        Parameters.
+        Parameters of the relation.
     log_sfr : float array, shape (n,)
         log10 of the star formation rate, Msun/yr (Kroupa).
     a_halpha : float array, shape (n,)
-        A(H alpha), mag.
+        Attenuation of H alpha by the galaxy's dust, mag.
     normal : float array, shape (n,)
-        Normal deviates.
+        Standard normal deviates, which give the scatter.
 
     Returns
     -------
     float array, shape (n,)
-        log10 L, erg/s, behind the dust of the gas.
+        log10 of the luminosity after attenuation, erg/s.
 
     References
     ----------
@@ -244,20 +256,20 @@ def match_abundance(line_model: LineModel, z: Float, log_l: Float) -> Float:
     Parameters
     ----------
     line_model : LineModel
-        The model with the matching table.
+        The model with the table of shifts.
     z : float array, shape (n,)
         Redshift.
     log_l : float array, shape (n,)
-        log10 L, erg/s.
+        log10 of the H alpha luminosity after attenuation, erg/s.
 
     Returns
     -------
     float array, shape (n,)
-        Shifted log10 L, erg/s.
+        log10 of the shifted luminosity, erg/s.
 
     Notes
     -----
-    The shift is bilinear in z and log10 L, and constant beyond the edges of the table.
+    The shift is interpolated linearly in z and log10 L, and constant beyond the edges of the table.
     """
     row, part = bracket(line_model.z, z)
     column, share = bracket(line_model.log_l, log_l)
@@ -272,7 +284,7 @@ def has_lines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
     Parameters
     ----------
     law : Halpha
-        Parameters.
+        Parameters, of which `red_sfr` (Msun/yr) is used.
     log_sfr : float array, shape (n,)
         log10 of the star formation rate, Msun/yr.
     red : bool array, shape (n,)
@@ -287,23 +299,23 @@ def has_lines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
 
 
 def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> Float:
-    """Return the metallicity of the gas.
+    """Return the metallicity of the gas from stellar mass and star formation rate.
 
     Parameters
     ----------
     law : Metals
-        Parameters.
+        Parameters of the relation.
     log_mass : float array, shape (n,)
         log10 of the stellar mass, Msun.
     log_sfr : float array, shape (n,)
         log10 of the star formation rate, Msun/yr.
     normal : float array, shape (n,)
-        Normal deviates.
+        Standard normal deviates, which give the scatter.
 
     Returns
     -------
     float array, shape (n,)
-        12 + log(O/H).
+        12 + log10(O/H), within the limits of `law`.
 
     References
     ----------
@@ -318,12 +330,12 @@ def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> 
 def fluxes(
     line_model: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: AnyGenerator
 ) -> dict[str, Float]:
-    """Draw the flux of the primary component of each line.
+    """Draw the emission line fluxes of galaxies: one flux per line, or per doublet the flux of its stronger line.
 
     Parameters
     ----------
     line_model : LineModel
-        The model.
+        Model of the emission lines.
     z : float array, shape (n,)
         True redshift.
     log_mass : float array, shape (n,)
@@ -333,12 +345,13 @@ def fluxes(
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
     rng : AnyGenerator
-        Random numbers of dust, luminosities and ratios.
+        Random numbers of the scatter of dust, luminosity, metallicity and line ratios.
 
     Returns
     -------
     dict of str to float array, shape (n,)
-        Flux by column of table `galaxies`, erg s-1 cm-2, before magnification and the Milky Way's dust.
+        Flux by column of table `galaxies` such as "flux_halpha", erg s-1 cm-2. The dust inside the galaxy is included;
+        magnification and the Milky Way's dust are not. Galaxies without lines (see `has_lines`) have flux 0.
     """
     normals = np.stack([rng.standard_normal(z.size) for _ in range(_DEVIATES)])
     a_halpha = halpha_attenuation(line_model.gas, log_mass, normals[0])
@@ -353,26 +366,27 @@ def fluxes(
 
 
 def mean_line_flux(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
-    """Return the band-averaged f_nu of all lines.
+    """Return the mean f_nu in a passband that the emission lines of each galaxy add.
 
     Parameters
     ----------
     band : Passband
         Passband.
     z_obs : float array, shape (n,)
-        Observed redshift.
+        Observed redshift, with the peculiar velocity.
     fluxes : mapping of str to float array, shape (n,)
-        Flux by column of table `galaxies`, erg s-1 cm-2.
+        Line flux by column of table `galaxies`, erg s-1 cm-2.
 
     Returns
     -------
     float array, shape (n,)
-        f_nu, erg s-1 cm-2 Hz-1.
+        Sum over all lines, erg s-1 cm-2 Hz-1; 0 if no line is in the passband.
     """
     weights = np.pad(passbands.weights(band), 1)
     total = np.zeros(z_obs.size)
     for line in lines.line_list():
-        # The flux of a line is in bins of 1 A. Lines beyond the band add nothing.
+        # Interpolate the weights, which have steps of 1 A, at the wavelength of the line: its width is neglected. The
+        # zeros that were added at both ends exclude lines outside the band.
         at = line.vacuum * (1.0 + z_obs) - band.wavelength[0] + 1.0
         place = np.clip(at, 0.0, weights.size - 1.0)
         below = np.minimum(place.astype(np.int64), weights.size - 2)
@@ -382,24 +396,24 @@ def mean_line_flux(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) ->
 
 
 def magnitude_with_light(magnitude: Float, light: Float) -> Float:
-    """Return the AB magnitude of sources (AB mag) after adding light (f_nu, erg s-1 cm-2 Hz-1)."""
+    """Return the AB magnitude of sources with `magnitude` (AB) after `light` (f_nu, erg s-1 cm-2 Hz-1) is added."""
     return np.asarray(magnitude - 2.5 * np.log10(1.0 + light * 10.0 ** (0.4 * (magnitude + AB_CGS))))
 
 
 def expected_counts(flux: Float, z_min: float, z_max: float) -> Float:
-    """Return the number of galaxies above H alpha fluxes between two redshifts.
+    """Return the observed number of galaxies per deg2 that are brighter than H alpha fluxes, between two redshifts.
 
     Parameters
     ----------
-    flux : float array, shape (n,)
-        H alpha flux, erg s-1 cm-2.
+    flux : float or float array, shape (n,)
+        Smallest observed H alpha flux, erg s-1 cm-2.
     z_min, z_max : float
         Redshift limits.
 
     Returns
     -------
     float array, shape (n,)
-        Number per deg2.
+        Number per deg2 above each flux.
 
     References
     ----------
@@ -420,7 +434,7 @@ def expected_counts(flux: Float, z_min: float, z_max: float) -> Float:
 
 
 def _density_above(law: Pozzetti, z: Float, log_l: Float) -> Float:
-    """Density n(> L) of each luminosity, Mpc^-3."""
+    """Return the number density (Mpc^-3) of galaxies at redshift z with log10 L (H alpha, erg/s) above `log_l`."""
     fitted = np.maximum(z, law.z_fit)
     log_star = law.l_inf + (1.5 / (1.0 + fitted)) ** law.beta * (law.l_half - law.l_inf)
     log_y = _L_NODES - 42.0
@@ -432,7 +446,11 @@ def _density_above(law: Pozzetti, z: Float, log_l: Float) -> Float:
 
 
 def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float, normals: Float) -> dict[str, Float]:
-    """log10 of the intrinsic luminosities by column, for `excess` = 12 + log(O/H) minus the Sun's value."""
+    """Return log10 of the luminosity (erg/s) of each line before attenuation, by column of table `galaxies`.
+
+    `halpha` is log10 of the H alpha luminosity, and `excess` is 12 + log10(O/H) minus the Sun's value. `normals`, shape
+    (6, n), are normal deviates for the scatter of [N II], [O III], [O II], [S II], [S III] and He I, in this order.
+    """
     ratios, other_lines = line_model.ratios, line_model.other_lines
     n2, r3, r2, s2 = (_ratio(numbers, excess) for numbers in (ratios.n2, ratios.r3, ratios.r2, ratios.s2))
     hbeta = halpha - np.log10(line_model.hydrogen["halpha"])
@@ -444,7 +462,8 @@ def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float,
     return {
         **{f"flux_{line}": hbeta + np.log10(ratio) for line, ratio in line_model.hydrogen.items()},
         "flux_hbeta": hbeta,
-        # The catalogue contains one line per pair: half of doublets with equal lines, otherwise the stronger line.
+        # Table `galaxies` contains one line of each doublet: half of the flux of [O II] and [S II], whose two lines
+        # are equal in this model, and the stronger line of [O III], [N II] and [S III].
         "flux_oii": hbeta + r2 + np.log10(0.5),
         "flux_oiii": hbeta + r3,
         "flux_nii": halpha + n2 + ratios.n2_scatter * normals[0],

@@ -1,11 +1,13 @@
-"""Galaxies of a user's catalogue as rows of table `galaxies`; missing properties are drawn like those of our galaxies.
+"""Make rows of table `galaxies` from a catalogue of the user; missing properties are drawn as for simulated galaxies.
 
-Columns of the catalogue are not changed, except the lensing and the position angles if the request changes them.
-Without lensing columns, galaxies are observed at their true positions and have no shear.
+Columns of the catalogue are not changed, except the lensing and the position angles if the request changes them, and
+line fluxes, from which magnification is removed if they include it. Without lensing columns, galaxies are observed at
+their true positions and have no shear.
 
-A galaxy's id contains the number of its halo in the generation cell (without halos, the number of the galaxy), in the
-order of position. A halo whose galaxies are in two cells therefore has two numbers. The identifier of the catalogue is
-in `origin_id`.
+Rows are made for one generation cell (HEALPix cell of order 8) at a time. In each cell the halos are numbered by
+position (or the galaxies, if the catalogue has no halos), and the identifier `id` of a galaxy contains the number of
+its halo. A halo whose galaxies are in two cells therefore has two numbers. The column
+`origin_id` contains the identifier in the user's catalogue.
 """
 
 from __future__ import annotations
@@ -37,26 +39,42 @@ from truesky.randomness.rng import stream
 
 CatalogueColumns = Mapping[str, Array]
 
-# Smallest upper end of the E(B-V) tables, mag; used if the mapping has no dust.
+# Smallest upper limit of E(B-V) (mag) in the tables of template brightness. The tables must cover the dust that is
+# drawn for galaxies whose dust the catalogue does not contain.
 _LEAST_EBV = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IngestModel:
-    """Model from which missing columns are drawn.
+    """Model from which the properties are drawn that a user's catalogue does not contain.
 
     Attributes
     ----------
+    seed : int
+        Seed of the random numbers.
     columns : Columns
-        Mapping of the catalogue.
+        Mapping from the columns of the catalogue to the properties of galaxies.
     lens : Shear or None
-        Lensing that replaces the catalogue's lensing; None to use that of the catalogue.
+        Uniform shear that replaces the catalogue's lensing; None to keep the lensing of the catalogue.
     rotation : float
-        Angle that is added to each position angle before lensing, deg.
+        Angle that is added to the position angle of each galaxy before lensing, deg.
     templates : int
-        Number of templates in the library.
+        Number of template spectra in the library.
+    colours, colour_limits : Colours, ColourLimits
+        Distributions of the colours, and the range of colours that the templates can have.
+    reference : BandRatios
+        Brightness of each template in observed 0.1r (SDSS r blueshifted to z = 0.1) by redshift.
+    colour : BandRatios
+        Brightness of each template in rest-frame 0.1g, relative to rest-frame 0.1r.
     observed_band : BandRatios or None
-        Table of the band of the mapping's `mag`; None if the mapping has no `mag`.
+        Brightness of each template in the band of the catalogue's `mag` by redshift, relative to rest-frame 0.1r; None
+        if the catalogue has no `mag`.
+    shapes : Shapes
+        Distributions of sizes and shapes.
+    masses, star_formation : MassToLight, StarFormation
+        Parameters of the stellar masses and of the star formation rates.
+    lines : LineModel
+        Model of the emission lines.
     """
 
     seed: int
@@ -78,27 +96,27 @@ class IngestModel:
 def model(
     seed: int, columns: Columns, split_catalogue: Split, lens: Shear | None = None, rotation: float = 0.0
 ) -> IngestModel:
-    """Make the model of a catalogue, with tables for its range of redshift and E(B-V).
+    """Return the model for the missing properties of a catalogue, with tables for its range of redshift and E(B-V).
 
     Parameters
     ----------
     seed : int
         Seed of the request.
     columns : Columns
-        Mapping of the catalogue.
+        Mapping from the columns of the catalogue to the properties of galaxies.
     split_catalogue : Split
-        The catalogue stored by cell.
+        The catalogue, stored in one file or more per order-5 cell.
     lens : Shear, optional
-        Lensing that replaces the catalogue's lensing.
+        Uniform shear that replaces the catalogue's lensing; None to keep the lensing of the catalogue.
     rotation : float
-        Angle that is added to each position angle before lensing, deg.
+        Angle that is added to the position angle of each galaxy before lensing, deg.
 
     Returns
     -------
     IngestModel
         The model.
     """
-    # Round up to steps of 0.1, so that similar catalogues share their tables.
+    # Round the ranges up to steps of 0.1, so that catalogues with similar ranges use the same tables in the disc cache.
     dustiest, z_max = (
         float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, split_catalogue.ebv_max), split_catalogue.z_max + 0.1)
     )
@@ -123,23 +141,29 @@ def model(
 
 
 def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Float32) -> pa.Table:
-    """Return table `galaxies` of one generation cell.
+    """Return the rows of table `galaxies` in one generation cell (HEALPix cell of order 8).
 
     Parameters
     ----------
     cell : int
-        Nested index of an order-8 cell.
+        Nested index of the order-8 cell.
     catalogue : mapping of str to array, shape (n,)
-        Rows of the cell, from `truesky.catalogue.external.ingest.rows_of_cell`.
+        Galaxies of the user's catalogue in the cell, from `truesky.catalogue.external.ingest.rows_of_cell`. It may be
+        empty.
     universe : IngestModel
-        Model of the missing columns.
+        Model of the missing properties.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag (truesky.catalogue.dust_map).
+        Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map); used if the catalogue has no column a_v.
 
     Returns
     -------
     Table
-        Rows of table `galaxies`.
+        Rows of table `galaxies`, sorted by _healpix_29; empty if `catalogue` is empty.
+
+    Raises
+    ------
+    BadInput
+        If a galaxy has a template index that is not in the library.
     """
     if not catalogue or not catalogue["index"].size:
         return GALAXIES.empty()
@@ -208,7 +232,7 @@ def _first_column(catalogue: CatalogueColumns, *names: str) -> Float:
 
 
 def _value_or_computed(catalogue: CatalogueColumns, name: str, computed: Float) -> Float:
-    """Return the catalogue's value, or the computed value if it is missing."""
+    """Return the catalogue's column `name` with `computed` in place of NaN, or `computed` if the column is missing."""
     return np.where(np.isnan(catalogue[name]), computed, catalogue[name]) if name in catalogue else computed
 
 
@@ -227,7 +251,11 @@ def _mask_missing(name: str, values: Array) -> Any:
 
 
 def _identity(catalogue: CatalogueColumns, cell: int, kind: Int) -> dict[str, Int]:
-    """Number halos by their first galaxy; the central galaxy is member 0, and its satellites follow."""
+    """Return the columns `id` and `halo_id` of the galaxies in a cell.
+
+    Halos are numbered in the order of their first galaxies. In a halo the central galaxy is member 0, and the
+    satellites are numbered from 1.
+    """
     n = catalogue["index"].size
     host = catalogue["halo"] if "halo" in catalogue else np.arange(n)
     _, first, host_row = np.unique(host, return_index=True, return_inverse=True)
@@ -237,7 +265,7 @@ def _identity(catalogue: CatalogueColumns, cell: int, kind: Int) -> dict[str, In
     begins = np.searchsorted(host_row[order], np.arange(first.size))
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n) - begins[host_row[order]]
-    # Number the members from 1 if the halo has no central galaxy in this cell.
+    # The satellites are also numbered from 1 if the halo has no central galaxy in this cell.
     lacks_central = np.ones(first.size, bool)
     lacks_central[host_row[kind != SATELLITE]] = False
     source = ids.source_id(kind, cell, number[host_row], rank + lacks_central[host_row])
@@ -255,7 +283,11 @@ def _lensing(catalogue: CatalogueColumns, n: int) -> dict[str, Array]:
 def _intrinsic_mag(
     catalogue: CatalogueColumns, universe: IngestModel, lens: Mapping[str, Array], a_v: Float
 ) -> Float | None:
-    """Return `mag` before magnification and the Milky Way's extinction."""
+    """Return the catalogue's magnitude `mag` without magnification and the Milky Way's extinction (mag).
+
+    Without a column `mag`, return None. If the mapping does not say that `mag` includes both effects, return it
+    unchanged.
+    """
     if "mag" not in catalogue:
         return None
     over_v = universe.columns.seen_over_v
@@ -265,7 +297,10 @@ def _intrinsic_mag(
 
 
 def _inverse_magnification(lens: Mapping[str, Array]) -> Float:
-    """1 / magnification, limited to its value at the edge of the caustic region; galaxies beyond it are quarantined."""
+    """Return 1 / |magnification|, at least the smallest value for which weak lensing is valid.
+
+    Galaxies below this value are later moved from table `galaxies` to the table `quarantine`.
+    """
     determinant = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
     return np.asarray(np.maximum(np.abs(determinant), lensing.settings().caustic))
 
@@ -273,9 +308,15 @@ def _inverse_magnification(lens: Mapping[str, Array]) -> Float:
 def _light(
     catalogue: CatalogueColumns, universe: IngestModel, z: Float, kind: Int, intrinsic_mag: Float | None, rng: Any
 ) -> tuple[Float, Colour, Sed, Int, Float]:
-    """Return M_r, colours, spectra, and extinction law and E(B-V) of the second component."""
+    """Return absolute 0.1r magnitude, colours, spectra, and the dust (law and E(B-V), mag) of each second template.
+
+    A spectrum is a mixture of two templates. The dust in the spectra is that of the first template; in a catalogue, the
+    second template may have other dust.
+    Values of the catalogue are kept; missing values are drawn or computed from the existing ones. `intrinsic_mag` is
+    the catalogue's `mag` without magnification and extinction, or None without `mag`.
+    """
     m_r = catalogue.get("abs_mag_r01")
-    # Without an absolute magnitude, draw colours for the absolute magnitude of a flat spectrum.
+    # Without an absolute magnitude, estimate it for a spectrum with constant f_lambda, in order to draw a colour.
     apparent = catalogue.get("mag_r01", intrinsic_mag)
     guess = m_r if m_r is not None else np.asarray(apparent) - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
@@ -331,7 +372,8 @@ def _shapes(
     bulge, disc = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
     disc_ratio = morphology.disc_axis_ratio(shapes, n, rng)
     if "inclination" in catalogue:
-        # Table `galaxies` defines the inclination by q^2 = cos^2 i + h^2 sin^2 i.
+        # An inclination i and an axis ratio q are related by q^2 = cos^2 i + h^2 sin^2 i. Here h is the scale height of
+        # the disc divided by its scale length.
         inclined = np.radians(catalogue["inclination"])
         disc_ratio = np.hypot(np.cos(inclined), shapes.scale_height * np.sin(inclined))
     disc_ratio = catalogue.get("disk_axis_ratio", disc_ratio)
@@ -345,7 +387,8 @@ def _shapes(
         "inclination": catalogue.get("inclination", morphology.inclination(disc_ratio, shapes.scale_height)),
         "position_angle": sky.wrap_position_angle(catalogue.get("position_angle", morphology.position_angle(n, rng))),
     }
-    # The bulge fraction of a catalogue applies to all bands, unless the catalogue also has a bulge colour.
+    # The bulge fraction of a catalogue applies to all bands, unless the catalogue also has a bulge colour: without a
+    # bulge colour (NaN), bulge and disc have the same spectrum.
     colour = np.full(n, np.nan) if "bulge_fraction" in catalogue else morphology.bulge_colour(shapes.bulge, n, rng)
     columns["bulge_color"] = catalogue.get("bulge_color", colour)
     return {name: np.asarray(values, np.float64) for name, values in columns.items()}

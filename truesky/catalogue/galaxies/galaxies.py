@@ -1,7 +1,8 @@
-"""Galaxies and halos of one generation cell; table `galaxies` is a pure function of (seed, cell, model).
+"""Draw the rows of tables `galaxies` and `halos` in one generation cell (HEALPix cell of order 8).
 
-The members of halos get colours, dust, spectra, masses and lines; galaxies brighter than the limit are selected and get
-shapes and lensing. Random numbers depend on the galaxy and on the step. A new column or a deeper request therefore does
+The rows depend only on the seed, the cell and the model. The galaxies in halos get colours, dust and spectra. Galaxies
+that may be brighter than the magnitude limit get masses and emission lines. Galaxies that are brighter also get shapes
+and lensing. Each property of each galaxy has separate random numbers, so a new column or a deeper magnitude limit does
 not change existing values.
 """
 
@@ -51,54 +52,56 @@ from truesky.fluxes.passbands import Passband
 from truesky.randomness.per_source import PerSourceGenerator
 from truesky.request.schema import Universe
 
-# Candidates are drawn deeper than the brightest SED requires by _CANDIDATE_MARGIN, mag. Emission lines brighten all but
-# one galaxy in 10^4 by less than this (tests). Lines are computed only for candidates whose continuum is at most
-# _LINE_MARGIN fainter than the limit.
-_CANDIDATE_MARGIN, _LINE_MARGIN = 0.25, 0.75
+# Margin (mag) by which the faintest drawn galaxies are fainter than the magnitude limit, even with the brightest
+# spectrum. Emission lines make galaxies brighter, but only one galaxy in 10^4 by more than this margin (tests).
+_CANDIDATE_MARGIN = 0.25
+# Emission lines are computed only for galaxies whose continuum is at most this much (mag) fainter than the limit.
+_LINE_MARGIN = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GalaxyModel:
-    """Model from which galaxies are drawn; a few MB, made once by `model`.
+    """Model from which galaxies are drawn: parameters and tables of a few MB, made once by `model`.
 
     Attributes
     ----------
     limit : float
-        Faintest AB magnitude, before the Milky Way's dust and intergalactic hydrogen, with emission lines.
+        Faintest apparent AB magnitude of a galaxy. It includes emission lines, but not the absorption by the Milky
+        Way's dust and by intergalactic hydrogen.
     band : Passband
-        Passband of the limit.
+        Passband in which `limit` applies.
     population : Population
-        Halos and their members.
+        Halos and the galaxies in them.
     lens : Lens
-        Lensing by the box, or a uniform shear.
+        Lensing maps of the simulated matter, or a uniform shear.
     rotation : float
-        Angle that is added to each position angle before lensing, deg.
+        Angle that is added to the position angle of each galaxy before lensing, deg.
     alignments : Alignments or None
-        Intrinsic alignments; None without alignments.
+        Model of intrinsic alignments; None for random orientations.
     luminosities : Schechter
         Luminosity function.
     colours, colour_limits : Colours, ColourLimits
-        Distributions of the colours, and their limits from the templates.
+        Distributions of the colours, and the range of colours that the template spectra can have.
     halo_shares : quenching.Shares
-        Fractions of galaxies that halos quench.
+        Fractions of satellites, and of galaxies that halos quench, by redshift and luminosity.
     selection : BandRatios
-        Table of the limit's band by redshift.
+        Brightness of each template spectrum in `band` by redshift, relative to 0.1r (SDSS r blueshifted to z = 0.1).
     reference : BandRatios
-        Table of 0.1r by redshift.
+        Brightness of each template spectrum in observed 0.1r by redshift, relative to rest-frame 0.1r.
     colour : BandRatios
-        Table of 0.1g at rest.
+        Brightness of each template spectrum in rest-frame 0.1g, relative to rest-frame 0.1r.
     shapes : Shapes
         Distributions of sizes and shapes.
     masses : stellar_mass.MassToLight
-        Mass-to-light ratios.
+        Parameters of the mass-to-light ratios.
     star_formation : stellar_mass.StarFormation
-        Star formation rates.
+        Parameters of the star formation rates.
     lines : LineModel
-        Emission lines.
+        Model of the emission lines.
     distant : tuple of Kind
-        Quasars and galaxies beyond the light-cone.
+        Quasars, and galaxies beyond redshift 6.
     training : Training or None
-        Observed galaxies whose spectra are used; None to choose spectra by colour.
+        The user's observed galaxies, whose spectra are used; None to choose spectra by colour.
     """
 
     limit: float
@@ -124,20 +127,20 @@ class GalaxyModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelectedGalaxies:
-    """Selected galaxies.
+    """Galaxies that are bright enough for the catalogue, as rows of a `Members` table of galaxies in halos.
 
     Attributes
     ----------
     row : int array, shape (n,)
-        Row of the member.
+        Row of each galaxy in `Members`.
     z : float array, shape (n,)
         Redshift.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     magnitude : float array, shape (n,)
-        Magnitude of the continuum, from `apparent_magnitude`.
+        Apparent magnitude without emission lines, from `apparent_magnitude`.
     colour : Colour
-        Colours of the spectra.
+        Rest-frame colours of the spectra.
     sed : Sed
         Spectra.
     """
@@ -150,7 +153,7 @@ class SelectedGalaxies:
     sed: Sed
 
     def select(self, keep: Bool) -> SelectedGalaxies:
-        """Return the galaxies of a bool mask, shape (n,)."""
+        """Return the galaxies for which the mask `keep`, shape (n,), is True."""
         rows = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
         return SelectedGalaxies(*rows, self.colour.select(keep), self.sed.select(keep))
 
@@ -158,18 +161,18 @@ class SelectedGalaxies:
 def model(
     seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> GalaxyModel:
-    """Return the model of the galaxies of a seed that are brighter than the limit and at z < z_max.
+    """Return the model of galaxies that are brighter than a magnitude limit and nearer than a redshift.
 
     Parameters
     ----------
     seed : int
-        Seed of the request.
+        Seed of all random numbers.
     requested : Universe
-        Section `universe` of the request.
+        Section `universe` of the request, with the limits in magnitude and redshift.
     light_cone : LightCone, optional
-        The user's halos, which replace the drawn halos.
+        The user's halos, which replace the drawn halos; None to draw halos.
     training : Training, optional
-        The user's observed galaxies, whose spectra are used.
+        The user's observed galaxies, whose spectra are used; None to choose spectra by colour.
 
     Returns
     -------
@@ -178,9 +181,9 @@ def model(
 
     Notes
     -----
-    The halos and galaxies of a nearer or shallower universe also exist in a deeper one, because both draw from the same
-    distributions with the same random numbers. The model takes 1 s to make. With an empty cache, the box and its
-    lensing take longer (density_box.load, lensing.load).
+    A model with a larger redshift or a fainter limit contains the same halos and galaxies and more, because it draws
+    from the same distributions with the same random numbers. The model takes 1 s to make. With an empty disc cache, the
+    box of simulated matter and its lensing maps take longer (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sequences.model()
     selection = _selection(requested, training)
@@ -217,23 +220,23 @@ def model(
 def halos_and_galaxies(
     seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> Population:
-    """Return the halos and their members, before these have colours.
+    """Return the model of halos and of the galaxies in them, without the colours of the galaxies.
 
     Parameters
     ----------
     seed : int
-        Seed of the request.
+        Seed of all random numbers.
     requested : Universe
-        Section `universe` of the request.
+        Section `universe` of the request, with the limits in magnitude and redshift.
     light_cone : LightCone, optional
-        The user's halos, which replace the drawn halos.
+        The user's halos, which replace the drawn halos; None to draw halos.
     training : Training, optional
-        The user's observed galaxies, whose spectra are used.
+        The user's observed galaxies, whose dust may be thicker than the dust of the model.
 
     Returns
     -------
     Population
-        The population, complete to the magnitude limit.
+        The population. It is complete for galaxies brighter than the magnitude limit, whatever their spectrum.
     """
     nodes, brightest = band_ratios.brightest_offset(_selection(requested, training))
 
@@ -248,7 +251,7 @@ def halos_and_galaxies(
 
 @cache
 def _inverse() -> Inverse:
-    """Return the luminosities of number densities, which are the same for every request (0.2 s)."""
+    """Return the table of luminosity by cumulative number density; it takes 0.2 s and is the same for every request."""
     return luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
 
 
@@ -271,16 +274,17 @@ def draw(cell: int, universe: GalaxyModel, cells: CellCache, dust: Float32) -> p
     cell : int
         Nested index of the order-8 cell.
     universe : GalaxyModel
-        The model.
+        Model of the galaxies.
     cells : CellCache
-        Cache of the drawn halos and members.
+        Cache of the halos and galaxies that are already drawn, by HEALPix cell.
     dust : float32 array, shape (pixels,)
         Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map).
 
     Returns
     -------
     Table
-        Rows of table `galaxies`, sorted by _healpix_29 of the observed positions.
+        Rows of table `galaxies`, sorted by _healpix_29 (the HEALPix cell of order 29 of the observed position). A cell
+        without galaxies gives an empty table.
     """
     lens = halo_lensing.lens_of_cell(universe.lens, cells, cell)
     return draw_members(cell, universe, population.members(cells, cell), lens, dust)
@@ -294,27 +298,29 @@ def draw_members(
     dust: Float32,
     position_filter: PositionFilter | None = None,
 ) -> pa.Table:
-    """Draw the properties of members of a cell, and its quasars and galaxies beyond the light-cone.
+    """Draw the properties of the galaxies in a cell's halos, and the quasars and galaxies beyond z = 6 in the cell.
 
     Parameters
     ----------
     cell : int
         Nested index of the order-8 cell.
     universe : GalaxyModel
-        The model.
+        Model of the galaxies.
     members : Members
-        Members of the cell, or a selection of them.
+        Galaxies in halos whose true positions are in the cell, or a selection of these galaxies.
     lens : Lens or Neighbourhood
-        Lensing in the cell.
+        Lensing maps, a uniform shear, or maps with the halos that lens sources in the cell.
     dust : float32 array, shape (pixels,)
         Map of the Milky Way's A(V), mag.
     position_filter : callable, optional
-        Function that selects true positions of quasars and of galaxies beyond the light-cone; None selects all.
+        Function that returns True for the true positions (ra, dec) of quasars and galaxies beyond z = 6 to keep. None
+        keeps all. `members` are not filtered.
 
     Returns
     -------
     Table
-        Rows of table `galaxies` brighter than the limit, sorted by _healpix_29 of the observed positions.
+        Rows of table `galaxies` brighter than the limit, sorted by _healpix_29 (the HEALPix cell of order 29 of the
+        observed position).
     """
     seed = universe.population.seed
     drawn, physical = _bright(
@@ -336,21 +342,21 @@ def draw_members(
 
 
 def halo_table(cell: int, universe: Population, cells: CellCache) -> pa.Table:
-    """Return table `halos` of one order-8 cell, sorted by _healpix_29.
+    """Return the rows of table `halos` whose true positions are in one order-8 cell.
 
     Parameters
     ----------
     cell : int
         Nested index of the order-8 cell.
     universe : Population
-        The population.
+        Model of the halos.
     cells : CellCache
-        Cache of the drawn halos.
+        Cache of the halos that are already drawn, by HEALPix cell.
 
     Returns
     -------
     Table
-        Rows of table `halos`.
+        Rows of table `halos`, sorted by _healpix_29 (the HEALPix cell of order 29 of the position).
     """
     hosts = population.halos_of(cells, cell)
     ra, dec = sky.positions_of_indices(hosts.index)
@@ -370,7 +376,10 @@ def halo_table(cell: int, universe: Population, cells: CellCache) -> pa.Table:
 
 
 def halo_limits(universe: Population) -> pa.Table:
-    """Return table `halo_limits`, from the nearest halos to the largest distance of the request."""
+    """Return table `halo_limits`: redshifts, and log10 of the mass (Msun/h) above which table `halos` is complete.
+
+    The last row is at the largest distance of galaxies in `universe`.
+    """
     chi = universe.halos.steps.middle
     chi = np.append(chi[chi < universe.halos.max_distance], universe.halos.max_distance)
     return HALO_LIMITS.build(
@@ -393,18 +402,18 @@ def select(
     z : float array, shape (n,)
         Redshift.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     colour : Colour
-        Drawn colours.
+        Drawn colours, which the spectra may not reach exactly.
     sed : Sed
-        Spectra.
+        Spectra of the n galaxies.
     deeper : float
-        Margin beyond the limit, mag.
+        Galaxies that are fainter than the limit by less than this are also selected, mag.
 
     Returns
     -------
     SelectedGalaxies
-        The selected galaxies.
+        The selected galaxies, with the colours of their spectra instead of the drawn colours.
     """
     magnitude = apparent_magnitude(universe, z, m_r, sed)
     row = np.flatnonzero(magnitude < universe.limit + deeper)
@@ -416,7 +425,11 @@ def select(
 def _bright(
     universe: GalaxyModel, members: Members, drawn: SelectedGalaxies
 ) -> tuple[SelectedGalaxies, dict[str, Float]]:
-    """Select galaxies brighter than the limit with emission lines; return also masses, rates and line fluxes."""
+    """Return the galaxies whose magnitude with emission lines is brighter than the limit, and some of their columns.
+
+    The columns, by name, are log10 of the stellar mass (Msun) and of the star formation rate (Msun/yr), and the fluxes
+    of emission lines (erg s-1 cm-2).
+    """
     seed, source_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
     main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
@@ -431,7 +444,7 @@ def _bright(
 
 
 def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
-    """Return the magnitude of the continuum in the limit's band.
+    """Return the apparent magnitude without emission lines in the passband of the magnitude limit.
 
     Parameters
     ----------
@@ -440,14 +453,14 @@ def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) ->
     z : float array, shape (n,)
         Redshift.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     sed : Sed
         Spectra of the n galaxies.
 
     Returns
     -------
     float array, shape (n,)
-        AB magnitude before magnification, intergalactic hydrogen and the Milky Way's dust.
+        AB magnitude without magnification, and without absorption by intergalactic hydrogen and the Milky Way's dust.
 
     Notes
     -----
@@ -457,7 +470,7 @@ def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) ->
 
 
 def _draw_candidates(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
-    """Draw the candidates of a cell: z, M_r, colours, spectra."""
+    """Return redshift, absolute 0.1r magnitude (h = 1), colour and spectrum of each galaxy in `members`."""
     z, colours, colour_limits = members.z, universe.colours, universe.colour_limits
     m_r = universe.population.halos.matching.magnitude(z, members.proxy)
     satellites = quenching.satellite_share(universe.halo_shares, members)
@@ -528,7 +541,10 @@ def _shape_columns(
 
 
 def _mean_ellipticities(universe: GalaxyModel, members: Members, drawn: SelectedGalaxies) -> Complex:
-    """Return the mean ellipticities that the alignments predict."""
+    """Return the mean intrinsic ellipticity of each galaxy as a complex number, 0 without an alignment model.
+
+    Central galaxies follow the tidal field, and satellites point to their central galaxy.
+    """
     mean, alignment_model = np.zeros(drawn.row.size, complex), universe.alignments
     if alignment_model is None:
         return mean

@@ -1,10 +1,12 @@
-"""Lensing by halos in addition to the matter of the box, as used in table `galaxies`.
+"""Lensing of galaxies by halos, in addition to the lensing by the large-scale matter of the simulated box.
 
 Notes
 -----
-The matter of the box deflects the light of a halo as well as the light of sources behind it, by 20 to 40 arcsec less.
-Distances between halos and sources are therefore measured between the positions at which the box alone shows them. From
-there, one Newton step of theta = beta + alpha(theta) leads to the image, and the lensing is summed again at the image.
+The large-scale matter deflects the light of a halo as well as the light of a source behind the halo; the two
+deflections differ by 20 to 40 arcsec. Distances between halos and sources on the sky are therefore measured between the
+positions at which they are observed with the lensing by the box alone. Lensing by halos is summed at this position
+beta. If it is not weak there, one Newton step of theta = beta + alpha(theta) leads to the image at theta, where the
+lensing is summed again. Sources close to a caustic keep the lensing at beta.
 
 The lens equation is solved to 0.5 arcsec for 99 % of the sources (tests). Terms of about kappa^2, in which halos lens
 the light of other halos, are left out.
@@ -34,41 +36,48 @@ from truesky.catalogue.halos.lens_halos import Settings
 from truesky.catalogue.halos.population import CellCache, Population
 from truesky.fluxes import cosmology, sources
 
-# Sources in one cell of this order use the same list of halos.
+# All sources in one HEALPix cell of this order are compared with the same halos.
 _SOURCE_ORDER = 11
-# Rows of the cached table of halos: direction (3), the rows of halo_lensing_sums from the distance on, log10 of the
-# mass.
+# Row numbers of the cached table of halos (10 rows). Rows 0 to 2 are the unit vector of the direction. Rows 3 to 8 are
+# the rows CHI (comoving distance) to CONCENTRATION of halo_lensing_sums; row 7 (_CIRCLE) is the angle beyond which the
+# halo does not lens, rad. Row 9 (_MASS) is log10 of the mass in Msun/h.
 _CHI, _CIRCLE, _MASS = 3, 7, 9
-# Number of cached cells with halos: the neighbourhood of a cell and of its neighbours.
+# Largest number of HEALPix cells whose halos are cached. It is enough for all cells with halos that lens sources in an
+# order-8 cell and its neighbours.
 _MAX_CACHED_CELLS = 1024
-# Upper limit of the deflection by all halos except the strongest, rad.
+# Upper limit of the deflection by all halos together except the strongest one, rad.
 _OTHER_DEFLECTION = float(np.radians(45.0 / 3600.0))
-# The grid extends beyond the cell by this angle, rad; no source is deflected farther.
+# Angle (rad) by which the grid for the slowly varying part of the halos' lensing extends beyond the cell with the
+# sources. It is larger than any deflection.
 _GRID_MARGIN = np.radians(7.0 / 60.0)
-# Function of (order, cell) that returns a distance in rad.
+# Function of the order and the nested index of a HEALPix cell. It returns a lower limit of the distance on the sky
+# (rad) between this cell and the sources whose lensing is needed.
 MinDistance = Callable[[int, int], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Matter that lenses the sources of one cell: the box, and halos in the tangent plane of the cell's centre.
+    """All matter that lenses the sources in one order-8 cell: maps of the simulated matter, and single halos.
+
+    Halos are projected on the plane that touches the sphere at the centre of the cell.
 
     Attributes
     ----------
     box : Planes
-        Lensing maps of the box.
+        Lensing maps of the simulated matter.
     settings : Settings
-        Settings of the halo lensing.
+        Masses, distances and angles to which halos are used.
     frame : float array, shape (3, 3)
-        East, north and direction of the centre.
+        Unit vectors at the centre of the cell: to the east, to the north and to the centre.
     halos : float array, shape (8, h)
-        Halos in the form of halo_lensing_sums.
+        Position, distance and profile of each halo, in the rows that halo_lensing_sums defines.
     planes : float array, shape (p,)
-        Inverse distances, h/Mpc.
+        Inverse comoving distances of the sources of `smooth`, ascending from 0, h/Mpc.
     smooth : float array, shape (p, side, side, 5)
-        Smooth part of the halo lensing at the nodes of a grid in the plane.
+        Part of the halos' lensing that varies slowly, at the nodes of a square grid in the plane: kappa, gamma1,
+        gamma2, deflection to the east and north (rad).
     max_deflection : float
-        Largest deflection by halos, rad.
+        Upper limit of the deflection by halos, rad.
     """
 
     box: Planes
@@ -83,24 +92,26 @@ class Neighbourhood:
 def lens_of_cell(
     lens: Lens, cells: CellCache, cell: int, min_distance: MinDistance | None = None
 ) -> Lens | Neighbourhood:
-    """Collect the halos that lens sources in a generation cell.
+    """Collect the halos that lens sources in a generation cell (HEALPix cell of order 8).
 
     Parameters
     ----------
     lens : Lens
-        Maps of the box; a uniform shear is returned unchanged.
+        Lensing maps of the simulated matter, or a uniform shear.
     cells : CellCache
-        Cache of the drawn halos, in which the lensing of halos is also cached.
+        Cache of the halos that are already drawn; the tables of their lensing are cached in it too.
     cell : int
-        Nested index of the order-8 cell.
+        Nested index of the order-8 cell with the true positions of the sources.
     min_distance : callable, optional
-        Lower limit of the distance of the relevant sources from a cell (order, cell), rad; None to use all halos of the
-        cell.
+        Function of (order, cell) that returns a lower limit (rad) of the distance between a HEALPix cell and the
+        sources that matter. Halos in cells that are too far away are left out. None to use all halos that can lens a
+        source in the cell.
 
     Returns
     -------
     Lens or Neighbourhood
-        Halos sorted by distance, then by mass and identifier, with the maps of the box.
+        The maps with the halos, which are sorted by comoving distance, then by mass and identifier. A uniform shear is
+        returned unchanged.
     """
     if not isinstance(lens, Planes):
         return lens
@@ -112,7 +123,7 @@ def lens_of_cell(
     halo_cells = halo_cells if min_distance is None else _select_reaching(settings, halo_cells, min_distance)
     parts = [_cached_lenses(settings, lens, cells, *place) for place in halo_cells]
     halos, identifiers = np.concatenate([part[0] for part in parts], 1), np.concatenate([part[1] for part in parts])
-    # A chord is never longer than its arc, so this comparison selects enough halos.
+    # A chord is never longer than its arc, so comparing chords with angles never excludes a halo that lenses a source.
     squared_chord = np.sum((halos[:3] - frame[2][:, None]) ** 2, 0)
     reaching = squared_chord <= (np.maximum(halos[_CHI + 2], halos[_CIRCLE]) + np.radians(radius)) ** 2
     halos, identifiers = halos[:, reaching], identifiers[reaching]
@@ -127,7 +138,7 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
     Parameters
     ----------
     lens : Lens or Neighbourhood
-        Halos and maps, maps alone, or a uniform shear.
+        Maps with halos, maps alone, or a uniform shear.
     ra, dec : float array, shape (n,)
         True positions, deg.
     chi : float array, shape (n,)
@@ -136,7 +147,12 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
     Returns
     -------
     dict of str to array, shape (n,)
-        Observed and true positions, convergence and shear.
+        Columns by name: ra, dec and _healpix_29 of the observed positions, ra_true, dec_true, kappa, gamma1 and gamma2.
+
+    Raises
+    ------
+    BadInput
+        If halos deflect a source by more than `lens.max_deflection`.
     """
     if not isinstance(lens, Neighbourhood):
         return lensing.columns(lens, ra, dec, chi)
@@ -152,20 +168,23 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
 def lensing_at_images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
     """Return the lensing by halos at the images of sources.
 
+    It is computed at the given position instead of the image if it is very weak, or if the source is close to a
+    caustic.
+
     Parameters
     ----------
     lens : Neighbourhood
-        Halos that lens the cell with the true positions of the sources.
+        Halos that lens the sources in the cell with their true positions.
     ra, dec : float array, shape (n,)
-        Positions at which the box alone shows the sources, deg.
+        Positions at which the sources are observed with the lensing by the maps alone, deg.
     chi : float array, shape (n,)
         Comoving distance, Mpc/h.
 
     Returns
     -------
     float array, shape (5, n)
-        kappa, gamma1, gamma2, deflection to the east and north (rad). The result of a source does not depend on the
-        other sources.
+        kappa, gamma1, gamma2, deflection to the east and north (rad) of each source. It does not depend on the other
+        sources.
     """
     cell = sky.cell_at(ra, dec, _SOURCE_ORDER)
     row = np.lexsort((-chi, cell))
@@ -182,7 +201,10 @@ def lensing_at_images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) ->
 
 
 def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
-    """Raise BadInput for a deflection that could move a source into a cell that does not search for it."""
+    """Raise BadInput if halos deflect a source by more than `lens.max_deflection`.
+
+    Catalogues search for lensed sources only within this distance of a cell, so such a source could be missing.
+    """
     largest = float(np.hypot(*deflection).max(initial=0.0))
     if largest > lens.max_deflection:
         largest_arcsec, allowed_arcsec = (np.degrees(angle) * 3600.0 for angle in (largest, lens.max_deflection))
@@ -192,13 +214,14 @@ def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
         )
 
 
-# ------------------------------------------------------------------------------------------------ halos
-
-
 def _cells_with_halos(
     settings: Settings, cell: int, centre: tuple[float, float], radius: float
 ) -> list[tuple[int, int, float]]:
-    """Return (order, cell, lowest mass) of cells whose halos may lens the generation cell."""
+    """Return (order, nested index, log10 of the lowest mass in Msun/h) of cells whose halos may lens sources in `cell`.
+
+    Halos that span large angles are drawn in larger cells (lower orders). In distant cells of order 8, only heavy halos
+    are used. `centre` (ra, dec, deg) and `radius` (deg) are a circle around all sources.
+    """
     close_cells = set(sky.cells_in_cone(*centre, radius + settings.wide / 60.0, GENERATION_ORDER).tolist())
     cells_in_reach = sky.cells_in_cone(*centre, radius + settings.reach / 60.0, GENERATION_ORDER).tolist()
     selected = [
@@ -217,7 +240,11 @@ def _cells_with_halos(
 def _select_reaching(
     settings: Settings, candidates: list[tuple[int, int, float]], min_distance: MinDistance
 ) -> list[tuple[int, int, float]]:
-    """Select the cells of `_cells_with_halos` whose halos may reach grid nodes around the sources."""
+    """Select the cells whose halos may lens the relevant sources or the grid nodes around these sources.
+
+    `candidates` and the result contain (order, nested index, log10 of the lowest mass in Msun/h). `min_distance`
+    returns a lower limit of the distance (rad) between a cell (order, nested index) and the relevant sources.
+    """
     margin = np.radians((settings.strip + 2.0 * settings.step) / 60.0)
     wide, selected = np.radians(settings.wide / 60.0), []
     for order, cell, min_mass in candidates:
@@ -231,7 +258,10 @@ def _select_reaching(
 def _cached_lenses(
     settings: Settings, box: Planes, cells: CellCache, order: int, cell: int, min_mass: float
 ) -> tuple[Float, Int]:
-    """Return (table, shape (10, h); identifiers) of halos above a mass in a cell, where the box alone shows them."""
+    """Return a table of the halos above log10 mass `min_mass` (Msun/h) in a HEALPix cell, and their identifiers.
+
+    The table has the rows of `_lens_table`. It is cached in `cells`.
+    """
     cache, key, full_key = cells.lenses, (order, cell, min_mass), (order, cell, settings.lowest)
     if key not in cache:
         max_distance = (
@@ -253,7 +283,11 @@ def _cached_lenses(
 
 
 def _lens_table(settings: Settings, box: Planes, population: Population, hosts: Halos, order: int) -> tuple[Float, Int]:
-    """Return the table and identifiers of `_cached_lenses` for given halos."""
+    """Return the table, shape (10, h), and the identifiers of h halos that lens.
+
+    The rows are: unit vector of the direction (3), comoving distance (Mpc/h), lensing strength, three angles (rad),
+    concentration and log10 mass (Msun/h). The direction is where the halo is observed with the lensing by `box` alone.
+    """
     ra, dec = sky.positions_of_indices(hosts.index)
     deflection = lensing.interpolate(box, ra, dec, hosts.chi)[3:]
     direction = _frames(*lensing.displace(ra, dec, *deflection))[:, 2]
@@ -263,7 +297,10 @@ def _lens_table(settings: Settings, box: Planes, population: Population, hosts: 
 
 
 def _max_deflection(halos: Float) -> float:
-    """Upper limit of the deflection: the strongest halo with sources at infinity, plus a limit for all other halos."""
+    """Return an upper limit (rad) of the deflection by `halos`.
+
+    It is the deflection by the strongest halo for sources at infinity, plus a fixed limit for all other halos together.
+    """
     # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
@@ -276,7 +313,10 @@ def _max_deflection(halos: Float) -> float:
 
 @lru_cache
 def _max_enclosed_ratio() -> tuple[Float, Float]:
-    """Return (concentrations; largest enclosed mass / radius, both in units of the halo's values)."""
+    """Return concentrations, and the largest ratio of projected mass to projected radius in a halo with each of them.
+
+    The mass inside a circle is in units of the halo's mass, and the radius of the circle in units of R_200m.
+    """
     from truesky.catalogue.halos import projected_nfw
 
     nodes, shares = np.geomspace(1.0, 100.0, 25), np.linspace(0.02, 0.99, 98)
@@ -287,7 +327,11 @@ def _max_enclosed_ratio() -> tuple[Float, Float]:
 
 
 def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
-    """Return (planes[p]; smooth[p, side, side, 5]) of the halos that reach into a cell."""
+    """Return the slowly varying part of the lensing by halos on a grid around the centre of an order-8 cell.
+
+    Return the inverse comoving distances of the planes, shape (p,), h/Mpc, and the lensing of sources at the nodes:
+    kappa, gamma1, gamma2, deflection to the east and north (rad), shape (p, side, side, 5).
+    """
     # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
@@ -304,11 +348,11 @@ def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
     return inverse_distances, np.ascontiguousarray(out.T).reshape(inverse_distances.size, side, side, 5)
 
 
-# ------------------------------------------------------------------------------------------------ sources
-
-
 def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell: Int) -> Float:
-    """Lensing in the tangent plane, shape (5, n); sources must be sorted by cell, then by decreasing distance."""
+    """Return kappa, gamma1, gamma2 and deflection (rad) by all halos at places in the tangent plane, shape (5, n).
+
+    Sources must be sorted by `cell` (order `_SOURCE_ORDER`), then by decreasing comoving distance.
+    """
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     first = np.append(np.unique(cell, return_index=True)[1], cell.size)
@@ -319,7 +363,11 @@ def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell:
 
 
 def _rows_to_repeat(settings: Settings, terms: Float) -> Int:
-    """Rows that are summed again at their images: neither weakly lensed nor close to a caustic."""
+    """Return the rows of sources whose lensing must be summed again at their image.
+
+    `terms` are kappa, gamma1, gamma2 and the deflection of all sources. The selected sources are lensed so strongly
+    that the lensing changes between source and image, but they are not close to a caustic.
+    """
     kappa, gamma1, gamma2 = terms[:3]
     strong = np.abs(kappa) + np.hypot(gamma1, gamma2) > settings.repeat_threshold
     weak = sources.determinant(kappa, gamma1, gamma2) >= settings.least_determinant
@@ -327,7 +375,10 @@ def _rows_to_repeat(settings: Settings, terms: Float) -> Int:
 
 
 def _newton_step(terms: Float) -> Float:
-    """Step from theta = beta to the root of theta - alpha(theta) - beta, shape (2, n), rad."""
+    """Return the first Newton step from beta to the root theta of theta - alpha(theta) - beta, shape (2, n), rad.
+
+    `terms` are kappa, gamma1, gamma2 and deflection alpha at theta = beta.
+    """
     kappa, gamma1, gamma2, east, north = terms
     x = (1.0 - kappa + gamma1) * east + gamma2 * north
     y = gamma2 * east + (1.0 - kappa - gamma1) * north
@@ -335,7 +386,10 @@ def _newton_step(terms: Float) -> Float:
 
 
 def _frames(ra: Float, dec: Float) -> Float:
-    """East, north and direction of positions in deg, shape (n, 3, 3)."""
+    """Return the unit vectors to the east, to the north and to the position itself, shape (n, 3, 3).
+
+    Positions are in deg.
+    """
     lon, lat = np.radians(ra), np.radians(dec)
     sin, cos, up, flat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
     rows = (-sin, cos, np.zeros_like(lon)), (-up * cos, -up * sin, flat), (flat * cos, flat * sin, up)
@@ -343,13 +397,22 @@ def _frames(ra: Float, dec: Float) -> Float:
 
 
 def _stereographic(frame: Float, direction: Float) -> Float:
-    """Project directions (n, 3) stereographically (conformally) around the centre of a frame, shape (2, n), rad."""
+    """Return the stereographic projection (x, y) in rad, shape (2, n), of unit vectors of shape (n, 3).
+
+    `frame` has the unit vectors to the east, to the north and to the centre of the projection. The projection is
+    conformal.
+    """
     x, y, along = (np.sum(direction * axis, -1) for axis in frame)
     return np.asarray(np.stack([x, y]) * (2.0 / (1.0 + along)))
 
 
 def _rotate_to_sources(terms: Float, frame: Float, frames: Float) -> Float:
-    """Rotate from the frame of the plane to east and north at each source."""
+    """Rotate shear and deflection from the axes of the tangent plane (`frame`) to east and north at each source.
+
+    `terms`, shape (5, n), are kappa, gamma1, gamma2 and the deflection along both axes. `frame` has the unit vectors
+    along the axes and to the centre of the plane. `frames` has the unit vectors to the east, to the north and to the
+    source itself for each source, shape (n, 3, 3).
+    """
     x, y = (np.sum(frames[:, 0] * frame[axis], -1) for axis in range(2))
     length = np.hypot(x, y)
     cos, sin = x / length, y / length

@@ -1,8 +1,8 @@
-"""Quasars and galaxies beyond redshift 6: rows of table `galaxies` of kinds 2 and 3.
+"""Draw quasars (`kind` 2) and galaxies beyond redshift 6 (`kind` 3) as rows of table `galaxies`.
 
-They are drawn at random positions without clustering. `density_boost` is the ratio of the drawn to the natural number
-density. Each magnitude is drawn separately, so that a shallower request contains the brighter objects of a deeper one.
-The parameters are in high_redshift.toml.
+Their positions are random, without clustering. The column `density_boost` is the ratio of the drawn to the natural
+number density. Each interval of one magnitude is drawn separately, so a catalogue with a brighter limit contains the
+same bright objects as a deeper one. The parameters are in high_redshift.toml.
 
 References
 ----------
@@ -42,39 +42,44 @@ from truesky.randomness.rng import stream
 
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
-# Function of ra and dec (deg) that selects positions.
+# Function that returns True for the positions (ra and dec arrays, deg) of the objects to draw.
 PositionFilter = Callable[[Float, Float], Bool]
-_Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
-# Redshift at which the light-cone of galaxies ends and the other populations begin, and the brightest magnitude drawn.
-_LIGHTCONE_END, _FIRST_MAGNITUDE = 6.0, 10
+# Width of the cells in redshift and in absolute magnitude (mag) in which objects are counted.
+_Z_STEP, _M_STEP = 0.02, 0.02
+# Brightest absolute ultraviolet AB magnitude that is drawn.
+_M_BRIGHTEST = -32.0
+# Redshift at which the galaxies in halos end and the galaxies of this module begin.
+_LIGHTCONE_END = 6.0
+# Brightest apparent magnitude that is drawn, an integer.
+_FIRST_MAGNITUDE = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
-    """Parameters of a kind of object, and its counts per deg2 in cells of (z, M), by integer apparent magnitude.
+    """Luminosity function of quasars, or of galaxies beyond redshift 6, as counts in cells of redshift and magnitude.
 
     Attributes
     ----------
     code : int
-        Kind: HIGH_REDSHIFT or QUASAR.
+        Kind of the objects: HIGH_REDSHIFT or QUASAR.
     numbers : dict
-        Parameters of the file.
+        Parameters from high_redshift.toml, by name.
     boost : float
         Ratio of the drawn to the natural number density.
     z : float array, shape (r,)
         Lower edges of the redshift cells.
     m : float array, shape (c,)
-        Lower edges of the cells of absolute ultraviolet magnitude.
+        Lower edges of the cells of absolute ultraviolet AB magnitude.
     limit : float
-        Faintest ultraviolet AB magnitude.
+        Faintest apparent ultraviolet AB magnitude.
     z_end : float
-        Redshift at which the request's universe ends. Objects beyond z = 6 are kept.
+        Redshift beyond which objects are left out; objects beyond z = 6 are always kept.
     first : int
-        First integer magnitude.
+        Apparent magnitude of the first arrays of `cells` and `counts`.
     cells : tuple of int array
-        Flat indices into (r, c) of the cells of each integer magnitude.
+        One array per integer apparent magnitude: the cells with this magnitude, as flat indices into an array (r, c).
     counts : tuple of float array
-        Cumulative counts of these cells.
+        For each array of `cells`, the cumulative sum of the natural number of objects per deg2.
     """
 
     code: int
@@ -89,7 +94,11 @@ class Kind:
     counts: tuple[Float, ...]
 
     def per_deg2(self, z_min: float = 0.0, z_max: float = np.inf) -> float:
-        """Return the natural number per deg2 between two redshifts, which should be edges of the redshift cells."""
+        """Return the natural number of observable objects per deg2 between two redshifts, without the boost.
+
+        The redshifts should be edges of the redshift cells (multiples of 0.02 from the first edge), because cells are
+        counted as a whole.
+        """
         number = 0.0
         for cells, counts in zip(self.cells, self.counts, strict=True):
             z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
@@ -107,21 +116,21 @@ class Kind:
 def model(
     galaxy_boost: float = 1.0, quasar_boost: float = 1.0, limit: float = 26.0, z_end: float = 6.0
 ) -> tuple[Kind, ...]:
-    """Return the kinds that are drawn; a kind with boost 0 is left out.
+    """Return the luminosity functions of the objects to draw: galaxies beyond redshift 6, and quasars.
 
     Parameters
     ----------
     galaxy_boost, quasar_boost : float
-        Ratio of the drawn to the natural number density.
+        Ratio of the drawn to the natural number density; with 0, these objects are left out.
     limit : float
-        Faintest AB magnitude at 1500 A (galaxies) or 1450 A (quasars) in the rest frame.
+        Faintest apparent AB magnitude at 1500 A (galaxies) or 1450 A (quasars) in the rest frame.
     z_end : float
-        Largest redshift of the universe's galaxies.
+        Redshift beyond which quasars are left out; quasars and galaxies beyond z = 6 are always kept.
 
     Returns
     -------
     tuple of Kind
-        The kinds.
+        Zero to two luminosity functions, galaxies first.
     """
     kinds = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
     included = ((code, parameters.section(_FILE, name), boost) for code, name, boost in kinds if boost > 0.0)
@@ -136,7 +145,7 @@ def draw(
     dust: Float32,
     position_filter: PositionFilter | None = None,
 ) -> pa.Table:
-    """Draw the objects of one kind whose true positions are in a generation cell.
+    """Draw the quasars, or the galaxies beyond redshift 6, whose true positions are in a HEALPix cell of order 8.
 
     Parameters
     ----------
@@ -147,23 +156,23 @@ def draw(
     kind : Kind
         Luminosity function and boost.
     lens : Lens or Neighbourhood
-        Halos and maps, maps alone, or a uniform shear.
+        Lensing maps, a uniform shear, or maps with the halos that lens sources in the cell.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag (truesky.catalogue.dust_map).
+        Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map).
     position_filter : callable, optional
-        Function that selects true positions; None selects all.
+        Function that returns True for the true positions (ra, dec) to keep; None keeps all.
 
     Returns
     -------
     Table
-        Rows of table `galaxies`.
+        Rows of table `galaxies`, not sorted; empty if there are no objects.
     """
     samples = [_draw_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
     z, m, ra, dec = (np.concatenate(column) for column in zip(*samples, strict=True))
     selected = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _LIGHTCONE_END))
     if position_filter is not None:
         selected &= position_filter(ra, dec)
-    # The numbers count all drawn objects, so that they do not depend on the selection.
+    # The numbers in the identifiers count all drawn objects, so an identifier does not depend on the selection.
     numbers = ids.FIRST_NUMBER + np.flatnonzero(selected)
     z, m, ra, dec = z[selected], m[selected], ra[selected], dec[selected]
     source = ids.source_id(np.full(numbers.size, kind.code), cell, numbers)
@@ -193,7 +202,10 @@ def draw(
 
 
 def _draw_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
-    """Redshift, M, ra and dec (deg) of the objects of one integer magnitude."""
+    """Draw redshift, absolute magnitude, ra and dec (deg) of the objects with apparent magnitude kind.first + step.
+
+    The apparent magnitude is rounded down to an integer, so all objects of an interval of one magnitude are drawn.
+    """
     rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
     total = float(counts[-1]) if counts.size else 0.0
     n = int(rng.poisson(kind.boost * total * sky.cell_area(GENERATION_ORDER)))
@@ -205,14 +217,14 @@ def _draw_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float,
 
 
 def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
-    """Return the luminosity function dn/dM.
+    """Return the luminosity function dn/dM of quasars, or of galaxies beyond redshift 6.
 
     Parameters
     ----------
     code : int
-        Kind: HIGH_REDSHIFT or QUASAR.
+        Kind of the objects: HIGH_REDSHIFT or QUASAR.
     numbers : dict
-        Parameters of its luminosity function.
+        Parameters of the luminosity function, by name, from high_redshift.toml.
     m : float array
         Absolute ultraviolet AB magnitude.
     z : float array
@@ -221,7 +233,7 @@ def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
     Returns
     -------
     float array
-        dn/dM, Mpc^-3 mag^-1.
+        dn/dM, Mpc^-3 mag^-1, for h = 0.67.
     """
     z_offset = z - _LIGHTCONE_END
     if code == QUASAR:
@@ -258,7 +270,8 @@ def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: floa
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
     volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
     counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
-    # Draw all objects of each integer magnitude, slightly beyond the limit.
+    # Group the cells by apparent magnitude rounded down. The last group may contain cells beyond the limit, because
+    # `draw` draws whole groups and selects by the exact limit.
     mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
     last = int(np.ceil(limit + 2.0 * _M_STEP))
     cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
@@ -267,7 +280,12 @@ def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: floa
 
 
 def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
-    """Index of the template: slope first, then the strength of the lines."""
+    """Draw the index of the template spectrum of each object with absolute magnitude `m`.
+
+    The templates have several ultraviolet slopes with k line strengths each. The template with slope i and strength j
+    has the index i k + j. The slope of a galaxy follows from its absolute magnitude, with a scatter. The slope of a
+    quasar and all line strengths are random.
+    """
     if kind.code == QUASAR:
         slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)
         return np.asarray(slope * len(QUASAR_STRENGTHS) + rng.integers(0, len(QUASAR_STRENGTHS), m.size), np.int64)
@@ -281,7 +299,10 @@ def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
 
 
 def _shapes(kind: Kind, z: Float, m: Float, rng: AnyGenerator) -> dict[str, npt.NDArray[np.generic]]:
-    """Shape of a single Sersic component, which is stored as the bulge."""
+    """Draw the shape of each object, as columns of table `galaxies`.
+
+    An object is one Sersic profile, which is stored as a bulge with all of the light.
+    """
     law, n = kind.numbers, z.size
     if kind.code == QUASAR:
         radius, ratio, sersic = np.full(n, law["radius"]), np.ones(n), 1.0

@@ -1,4 +1,4 @@
-"""Compiled loop over pairs of lenses and sources; each pair has separate random numbers."""
+"""Compiled loop that draws pairs of a strong lens and a source behind it; each pair has separate random numbers."""
 
 from __future__ import annotations
 
@@ -9,36 +9,41 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.compiled_draws import child_key, normal, uniform
 
-# Purposes of the random numbers of a pair.
+# Each pair draws one random number per purpose: whether the pair exists (CHANCE), a number with which the caller
+# compares the Einstein radius (RADIUS), the axis ratio of the lens (SHAPE), and the distance and direction of the
+# source from the lens (OFFSET, ANGLE).
 CHANCE, RADIUS, SHAPE, OFFSET, ANGLE = range(5)
 
 
 @exact_jit
 def find_pairs(lenses: Any, sources: Any, min_z_difference: Any, out: Any) -> int:
-    """Find the pairs of lenses and sources that are drawn.
+    """Draw which sources are lensed by which lenses.
 
     Parameters
     ----------
     lenses : tuple of array, shape (l,)
-        key (uint64), start, window, chance and z (float64): start and length of a window of places, and the probability
-        of each source to be lensed.
+        Five arrays: key of the random numbers (uint64), start and length of the window, probability that the lens
+        lenses a given source behind it, and redshift (float64).
     sources : tuple of array, shape (s,)
-        key (uint64), place and z (float64), sorted by place, which is in [0, 1).
+        Three arrays: key of the random numbers (uint64), place on a circle and redshift (float64). Places are random
+        numbers in [0, 1), in ascending order.
     min_z_difference : float
         Smallest redshift difference between source and lens.
     out : tuple of array
-        Filled if it is long enough: lens and source (int64[n]), key of the pair (uint64[n]) and random numbers
-        (float64[n, 4]; the second is a normal deviate, the others are uniform).
+        Four arrays of length n to fill: rows of lens and source (int64), key for more random numbers of the pair
+        (uint64), and random numbers (float64[n, 4]; the second column is a normal deviate, the others are uniform).
+        Pairs after the n-th are not stored.
 
     Returns
     -------
     int
-        Number of pairs, which may be larger than `out`.
+        Number of drawn pairs, which may be larger than n; then call the function again with longer arrays.
 
     Notes
     -----
-    A lens is paired only with the sources whose place on a circle is in its window. Their probability is divided by the
-    length of the window, so that the mean number of pairs does not depend on it.
+    To save time, a lens is compared only with the sources in its window: with a place from `start` to
+    `start` + `window` on a circle of length 1. The probability of these sources is divided by the length of the window,
+    so the mean number of pairs does not depend on the window.
     """
     key, start, window, chance, z = lenses
     source_key, place, z_source = sources

@@ -1,7 +1,8 @@
-"""Weak lensing by the box: maps of convergence, shear and deflection on source planes, and observed positions.
+"""Weak lensing by the simulated matter: full-sky maps of convergence, shear and deflection, and observed positions.
 
-A uniform shear, or none, can replace the maps. gamma1 and gamma2 are in the frame (x, y) = (east, north): gamma1 < 0
-east and west of a mass, and gamma2 < 0 north-east of it. Deflections point away from a mass.
+There is one map per source plane (comoving distance). The matter fills a periodic box, which is repeated along the line
+of sight. A uniform shear, or a shear of 0, can replace the maps. gamma1 and gamma2 are in the frame (x, y) = (east,
+north): gamma1 < 0 east and west of a mass, and gamma2 < 0 north-east of it. Deflections point away from a mass.
 
 Notes
 -----
@@ -32,12 +33,13 @@ from truesky.fluxes import cosmology, sources
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
+# Columns of a map: convergence, two components of the shear, and deflection to the east and north (rad).
 KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of the maps (lensing.toml, [lensing])."""
+    """Source planes, resolution and limits of the lensing maps; explained in lensing.toml, [lensing]."""
 
     planes: tuple[float, ...]
     far_planes: tuple[float, ...]
@@ -49,16 +51,17 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planes:
-    """Lensing maps for sources at p comoving distances.
+    """Lensing maps for sources at p comoving distances (source planes).
 
     Attributes
     ----------
     nside : int
-        Resolution of the maps.
+        HEALPix resolution of the maps.
     chi : float array, shape (p,)
-        Comoving distances, Mpc/h.
+        Comoving distances of the planes, ascending, Mpc/h.
     maps : tuple of float32 array, shape (12 nside^2, 5)
-        One map per plane, nested: kappa, gamma1, gamma2, deflection to the east and north (rad).
+        One map per plane in nested order. The columns are kappa, gamma1, gamma2, and deflection to the east and to the
+        north (rad).
     """
 
     nside: int
@@ -68,10 +71,10 @@ class Planes:
 
 @dataclass(frozen=True, slots=True)
 class Shear:
-    """Uniform shear without convergence, which replaces the lensing by the box.
+    """Uniform shear without convergence, which replaces the lensing by the simulated matter.
 
-    Because kappa = 0, gamma equals the reduced shear. A uniform shear has no origin on the sphere, so sources are
-    observed at their true positions.
+    g1 and g2 are gamma1 and gamma2 in the frame (east, north); because kappa = 0, they equal the reduced shear.
+    Sources are observed at their true positions, because a uniform shear has no fixed point on the sphere.
     """
 
     g1: float = 0.0
@@ -82,21 +85,21 @@ Lens = Planes | Shear
 
 
 def settings() -> Settings:
-    """Return the lensing settings of the embedded universe."""
+    """Return the built-in source planes, resolution and limits of the lensing maps."""
     return Settings(**parameters.section("lensing.toml", "lensing"))
 
 
 def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
-    """Return the lensing maps of a box, from the cache or made now.
+    """Return the lensing maps of a box of simulated matter, from the disc cache if they have been made before.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of matter, which is repeated along the line of sight.
     nside : int
-        Resolution of the maps, a power of 2 from 16 to 2048.
+        HEALPix resolution of the maps, a power of 2 from 16 to 2048.
     with_far_planes : bool
-        If True, include planes beyond the galaxies, for sources up to z = 10.
+        If True, include source planes at z = 6 and 10 for distant quasars and galaxies. Galaxies in halos end at z = 6.
 
     Returns
     -------
@@ -110,7 +113,7 @@ def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
 
     Notes
     -----
-    The maps take 15 s for nside = 256, and four times as long for twice the resolution.
+    Making the maps takes 15 s for nside = 256, and four times as long for twice the nside.
     """
     if nside not in (1 << order for order in range(4, 12)):
         raise BadInput(f"lensing_nside = {nside} is not a power of two from 16 to 2048")
@@ -131,7 +134,7 @@ def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
 
 
 def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
-    """Interpolate the lensing of sources, bilinearly on the sky and linearly in distance between the planes.
+    """Interpolate the lensing of sources, bilinearly on the sky and linearly in distance between source planes.
 
     Parameters
     ----------
@@ -140,7 +143,8 @@ def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     ra, dec : float array, shape (n,)
         True positions, deg.
     chi : float array, shape (n,)
-        Comoving distance, Mpc/h. Sources beyond the last plane get the values of that plane.
+        Comoving distance, Mpc/h. Sources beyond the last plane get the values of the last plane. Between the observer,
+        where the lensing is 0, and the first plane the interpolation is also linear.
 
     Returns
     -------
@@ -152,7 +156,7 @@ def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     upper = np.clip(np.searchsorted(node, chi, side="right"), 1, planes.chi.size)
     part = (chi - node[upper - 1]) / (node[upper] - node[upper - 1])
     total = np.zeros((5, chi.size))
-    # At the observer there is no lensing, so there is no map below the first plane.
+    # Plane -1 is the observer: the lensing is 0 there, so nothing is added.
     for plane, share in ((upper - 1, part), (upper - 2, 1.0 - part)):
         for number in np.unique(plane[plane >= 0]).tolist():
             rows = np.flatnonzero(plane == number)
@@ -172,12 +176,12 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
     ra, dec : float array, shape (n,)
         True positions, deg.
     chi : float array, shape (n,)
-        Comoving distance, Mpc/h.
+        Comoving distance, Mpc/h; not used for a uniform shear.
 
     Returns
     -------
     dict of str to array, shape (n,)
-        Observed and true positions, convergence and shear.
+        Columns by name: the columns of `position_columns`, kappa, gamma1 and gamma2.
     """
     if isinstance(lens, Shear):
         gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}
@@ -188,7 +192,10 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
 
 
 def position_columns(observed: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, Array]:
-    """Return the columns of positions from observed and true (ra, dec) in deg."""
+    """Return the columns ra, dec, _healpix_29, ra_true and dec_true from observed and true (ra, dec) in deg.
+
+    Right ascensions are wrapped to [0, 360). _healpix_29 is the order-29 cell of the observed position.
+    """
     return {
         "ra": sky.wrap_angle(observed[0]),
         "dec": observed[1],
@@ -199,7 +206,7 @@ def position_columns(observed: tuple[Float, Float], true: tuple[Float, Float]) -
 
 
 def max_deflection(planes: Planes, order: int, cell: int) -> float:
-    """Return the largest deflection of any source in a cell.
+    """Return an upper limit of the deflection of sources in a HEALPix cell.
 
     Parameters
     ----------
@@ -211,8 +218,8 @@ def max_deflection(planes: Planes, order: int, cell: int) -> float:
     Returns
     -------
     float
-        Largest deflection, rad. Interpolated deflections are means of the values at pixels and planes, so none is
-        larger.
+        Largest deflection (rad) of all planes at the pixels in and around the cell. Sources have weighted means of
+        these values, which are not larger.
     """
     map_order = int(np.log2(planes.nside))
     coarse = min(order, map_order)
@@ -224,7 +231,7 @@ def max_deflection(planes: Planes, order: int, cell: int) -> float:
     return max(float(np.hypot(*field[pixels.ravel(), EAST:].T).max()) for field in planes.maps)
 
 
-# Move positions by deflections.
+# Function that moves positions (ra, dec, deg) by angles to the east and north (rad).
 displace = sky.offset_positions
 
 
@@ -239,39 +246,39 @@ def rotate_position_angles(rows: pa.Table, angle: float) -> pa.Table:
 
 
 def is_near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:
-    """Return True for sources that weak lensing cannot describe, because they are at a caustic or beyond it.
+    """Return True for sources near a caustic or inside it, where weak lensing is not valid.
 
     Parameters
     ----------
     kappa, gamma1, gamma2 : float array, shape (n,)
         Convergence and shear.
     caustic : float
-        Smallest determinant that weak lensing describes.
+        Smallest determinant (1 - kappa)^2 - gamma^2 for which weak lensing is valid.
 
     Returns
     -------
     bool array, shape (n,)
-        True near a caustic.
+        True if the determinant is smaller, or if kappa >= 1.
     """
     return np.asarray((sources.determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
 def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
-    """Compute convergence, shear and deflection from a map of the convergence.
+    """Compute full-sky maps of filtered convergence, shear and deflection from a map of the convergence.
 
     Parameters
     ----------
     kappa : float32 array, shape (12 nside^2,)
-        Convergence, nested.
+        Convergence in nested order.
     nside : int
-        Resolution of the map.
+        HEALPix resolution of the map.
     gain : float array, shape (l_max + 1,)
-        Factor by which the coefficients kappa_lm are multiplied.
+        Factor by which the spherical harmonic coefficients kappa_lm are multiplied, by multipole l.
 
     Returns
     -------
     float32 array, shape (12 nside^2, 5)
-        Maps, nested: kappa, gamma1, gamma2, deflection to the east and north (rad).
+        Maps in nested order; the columns are kappa, gamma1, gamma2, deflection to the east and north (rad).
 
     References
     ----------
@@ -281,7 +288,7 @@ def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
     ring_of = hp.nest2ring(nside, np.arange(kappa.size))
     ring = np.empty(kappa.size)
     ring[ring_of] = kappa
-    # The error of the quadrature without iterations is 5e-4, a hundredth of the smoothing by the pixels of the map.
+    # Without iterations (iter=0) the error of the coefficients is 5e-4, a hundredth of the smoothing by the pixels.
     alm = hp.almxfl(hp.map2alm(ring, lmax=top, iter=0), gain)
     ell = np.arange(top + 1)
     inner = np.maximum(ell * (ell + 1.0), 1.0)
@@ -295,7 +302,7 @@ def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
 
 
 def _convergence_maps(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
-    # Import here, because compiling takes a second and is not needed if the planes are in the cache.
+    # Import here, because compiling takes a second and is not needed if the maps are in the disc cache.
     from truesky.catalogue.matter import convergence
 
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Sizes and shapes of galaxies: a Sersic bulge and an inclined exponential disc with the same position angle.
+"""Draw the sizes and shapes of galaxies: a Sersic bulge and an inclined exponential disc with the same position angle.
 
-All radii are semi-major axes. Galaxies on the red sequence (`red`) follow the relations of early types. The parameters
-and their sources are in morphology.toml.
+All radii are semi-major axes. Galaxies on the red sequence (`red` is True) follow the relations of early types, and all
+other galaxies those of late types. The parameters and their sources are in morphology.toml.
 
 References
 ----------
@@ -25,7 +25,7 @@ from truesky.randomness.per_source import AnyGenerator
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Relation of half-light radius and stellar mass (morphology.toml, [size])."""
+    """Parameters of the half-light radius by stellar mass and redshift; explained in morphology.toml, [size]."""
 
     z: tuple[float, ...]
     late_norm: tuple[float, ...]
@@ -43,7 +43,7 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class Bulge:
-    """Distributions of the bulge parameters (morphology.toml, [bulge])."""
+    """Parameters of the distributions of bulge fraction, radius, shape and colour; see morphology.toml, [bulge]."""
 
     early_a: float
     early_b: float
@@ -70,20 +70,20 @@ class Bulge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """Distributions and tables of the morphology, made once by `shapes`.
+    """Parameters and tables of the sizes and shapes of galaxies, made once by `shapes`.
 
     Attributes
     ----------
     size, bulge : Size, Bulge
-        Parameters of the file.
+        Parameters from morphology.toml.
     scale_height : float
         Scale height of discs in units of the scale length.
     disc_e, disc_cdf : float array, shape (m,)
-        Ellipticity of discs and its cumulative distribution.
-    fraction, ln_ratio, ln_sersic : float array
-        Axes of `ln_disc`: bulge fraction, ln of the ratio of the radii, ln of the Sersic index.
-    ln_disc : float array
-        ln(disc radius / total half-light radius) on a grid of these axes.
+        Apparent ellipticity (a - b) / (a + b) of discs, and the cumulative distribution at these values.
+    fraction, ln_ratio, ln_sersic : float array, shape (f,), (r,), (s,)
+        Axes of `ln_disc`: bulge fraction, ln(bulge radius / disc radius), ln of the bulge's Sersic index.
+    ln_disc : float array, shape (f, r, s)
+        ln(half-light radius of the disc / half-light radius of bulge and disc together).
     """
 
     size: Size
@@ -99,7 +99,10 @@ class Shapes:
 
 @cache
 def shapes() -> Shapes:
-    """Return the morphology of the embedded universe; reads the parameters and makes the tables (0.2 s) once."""
+    """Return the built-in parameters and tables of sizes and shapes.
+
+    The first call in a process makes the tables in 0.2 s; later calls return the same object.
+    """
     bulge = Bulge(**parameters.section("morphology.toml", "bulge"))
     e, cdf = _disc_distribution(**parameters.section("morphology.toml", "disc"))
     fraction = np.linspace(0.0, 1.0, _FRACTION_NODES)
@@ -119,8 +122,9 @@ def shapes() -> Shapes:
     )
 
 
-# Number of nodes of the radius table: bulge fraction, ratio of the radii, Sersic index.
+# Number of values on each axis of the table `ln_disc`: bulge fraction, bulge radius / disc radius, Sersic index.
 _FRACTION_NODES, _RATIO_NODES, _SERSIC_NODES = 49, 25, 9
+# Number of bisections in `disc_radius`.
 _BISECTIONS = 25
 
 
@@ -131,12 +135,12 @@ def _log_nodes(limits: tuple[float, float], number: int) -> Float:
 def half_light_radius(
     size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: AnyGenerator
 ) -> Float:
-    """Draw the half-light semi-major axis of the total light.
+    """Draw the half-light semi-major axis of the total light of bulge and disc.
 
     Parameters
     ----------
     size : Size
-        Parameters of the relation.
+        Parameters of the relation between size and mass.
     z : float array, shape (n,)
         Redshift.
     log_stellar_mass : float array, shape (n,)
@@ -144,14 +148,14 @@ def half_light_radius(
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
     kpc_per_arcsec : float array, shape (n,)
-        Proper scale.
+        Proper length per angle at the redshift, kpc/arcsec.
     rng : AnyGenerator
         Random numbers of the scatter.
 
     Returns
     -------
     float array, shape (n,)
-        Semi-major axis, arcsec.
+        Semi-major axis in arcsec, limited to `size.smallest` to `size.largest`.
 
     References
     ----------
@@ -174,18 +178,18 @@ def _at_redshift(size: Size, values: tuple[float, ...], z: Float) -> Float:
 
 
 def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: AnyGenerator) -> Float:
-    """Draw the fraction of the flux in the bulge.
+    """Draw the fraction of the rest-frame 0.1r flux that is in the bulge, from a beta distribution.
 
     Parameters
     ----------
     bulge : Bulge
-        Parameters of the relation.
+        Parameters of the distribution.
     log_stellar_mass : float array, shape (n,)
         log10 of the stellar mass, Msun.
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
     rng : AnyGenerator
-        Random numbers of the scatter.
+        Random numbers.
 
     Returns
     -------
@@ -213,14 +217,14 @@ def sersic_index(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
     Returns
     -------
     float array, shape (n,)
-        Sersic index.
+        Sersic index, limited to `bulge.sersic_limits`.
     """
     log_n = np.log10(np.where(red, bulge.early_sersic, bulge.late_sersic))
     return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
 def radius_ratio(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
-    """Draw the ratio of the half-light radii of bulge and disc.
+    """Draw the half-light radius of the bulge relative to the disc.
 
     Parameters
     ----------
@@ -234,7 +238,7 @@ def radius_ratio(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
     Returns
     -------
     float array, shape (n,)
-        Bulge radius / disc radius.
+        Bulge radius / disc radius, limited to `bulge.ratio_limits`.
     """
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
     return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
@@ -255,7 +259,7 @@ def bulge_colour(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
     Returns
     -------
     float array, shape (n,)
-        0.1(g - r) of the bulge minus the value of the disc, mag.
+        0.1(g - r) (rest-frame SDSS g - r in bands blueshifted to z = 0.1) of the bulge minus that of the disc, mag.
     """
     return np.asarray(np.clip(bulge.colour_mean + bulge.colour_scatter * rng.standard_normal(n), *bulge.colour_limits))
 
@@ -268,7 +272,7 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
     model : Shapes
         Tables of the radii.
     radius : float array, shape (n,)
-        Total half-light radius in any unit, which is also the unit of the result.
+        Half-light radius of bulge and disc together, in any unit; the result has the same unit.
     fraction : float array, shape (n,)
         Fraction of the flux in the bulge.
     ratio : float array, shape (n,)
@@ -283,13 +287,14 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
 
     Notes
     -----
-    The fraction of light within `radius` is 0.5 to 0.005 (tests/truesky/catalogue/galaxies/test_morphology.py).
+    The fraction of light within `radius` is 0.5 within an error of 0.005
+    (tests/truesky/catalogue/galaxies/test_morphology.py).
     """
     # Import here, because scipy.interpolate is slow to import and not needed to submit a job.
     from scipy.interpolate import RegularGridInterpolator
 
     axes = (model.fraction, model.ln_ratio, model.ln_sersic)
-    # Rounding of a logarithm may put a limit slightly outside the table: extrapolate instead of raising an error.
+    # Rounding of a logarithm may put a value slightly outside the table: extrapolate instead of raising an error.
     table = RegularGridInterpolator(axes, model.ln_disc, bounds_error=False, fill_value=None)
     disc = radius * np.exp(table(np.stack([fraction, np.log(ratio), np.log(sersic)], axis=-1)))
     return ratio * disc, disc
@@ -310,7 +315,7 @@ def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayL
     Returns
     -------
     float array
-        Fraction of the light.
+        Fraction of the total light, 0 to 1.
 
     References
     ----------
@@ -325,7 +330,7 @@ def _enclosed_light(x: Float, n: Float, b: Float) -> Float:
 
 
 def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
-    """Compute disc radius / total half-light radius by bisection, for the table of `component_radii`.
+    """Compute the half-light radius of the disc relative to bulge and disc together, by bisection.
 
     Parameters
     ----------
@@ -339,9 +344,9 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
     Returns
     -------
     float array
-        Disc radius / total half-light radius.
+        Half-light radius of the disc / half-light radius of bulge and disc together.
     """
-    # The total radius is between the radii of the components, so the result is between 1 and 1 / ratio.
+    # The radius of bulge and disc together is between the two radii, so the result is between 1 and 1 / ratio.
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
     disc_sersic = np.ones(1)
     b_bulge, b_disc = gammaincinv(2.0 * sersic, 0.5), gammaincinv(2.0 * disc_sersic, 0.5)
@@ -354,12 +359,12 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
 
 
 def disc_axis_ratio(model: Shapes, n: int, rng: AnyGenerator) -> Float:
-    """Draw the apparent axis ratio (minor / major) of discs.
+    """Draw the apparent axis ratio (minor / major) of discs with random inclinations.
 
     Parameters
     ----------
     model : Shapes
-        Distribution of the ellipticity.
+        Distribution of the apparent ellipticity.
     n : int
         Number of galaxies.
     rng : AnyGenerator
@@ -402,7 +407,9 @@ def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
 
 
 def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
-    """Return the inclination of discs (deg) from axis ratio q and scale height h in units of the scale length.
+    """Return the inclination of discs in deg, 0 (face-on) to 90, from the axis ratio and the scale height.
+
+    The axis ratio q is minor / major, and the scale height h is in units of the scale length.
 
     Notes
     -----
@@ -410,8 +417,8 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
 
         sin^2 i = (1 - q^2) / (1 - h^2)
 
-    and is 90 deg if q < h. The published form with an arcsine is not defined for q < h and loses half its digits near
-    90 deg; the form used here avoids both.
+    and is 90 deg if q < h. The published form with an arcsine is not defined for q < h, and near 90 deg rounding
+    destroys half of its digits. The arctangent used here has neither problem.
 
     References
     ----------
@@ -424,7 +431,7 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
 
 
 def position_angle(n: int, rng: AnyGenerator) -> Float:
-    """Draw uniform position angles of the major axis, deg in [0, 180)."""
+    """Draw position angles of the major axis of `n` galaxies uniformly, deg in [0, 180)."""
     return 180.0 * rng.random(n)
 
 
@@ -435,4 +442,5 @@ def _disc_distribution(e_max: float, e_fall: float, e_core: float) -> tuple[Floa
     return e, cdf / cdf[-1]
 
 
+# Number of ellipticities at which the cumulative distribution of the discs' ellipticity is tabulated.
 _E_NODES = 2001

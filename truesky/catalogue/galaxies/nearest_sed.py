@@ -1,7 +1,7 @@
-"""Spectra from the nearest of many observed galaxies in colour, luminosity and redshift: the user's training table.
+"""Give each simulated galaxy the spectrum of a similar observed galaxy from a training table of the user.
 
-The distance is the sum of the differences in 0.1(g - r), M_r and z, each divided by its unit (sed_assignment.toml,
-[nearest]).
+Similar means nearest in the rest-frame colour 0.1(g - r), the absolute magnitude M_r and redshift. The distance is the
+sum of the three absolute differences, each divided by its unit (sed_assignment.toml, [nearest]).
 
 References
 ----------
@@ -34,21 +34,22 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 
+# Columns of a training table: 0.1(g - r), absolute magnitude, redshift, real template index, extinction law, E(B-V).
 _KEYS = ("color_gr_01", "abs_mag_r01", "z_true", "sed", "ext_law", "ebv")
 
 
 @dataclass(frozen=True, slots=True)
 class Nearness:
-    """Units of distance, and scatter (sed_assignment.toml, [nearest]).
+    """Parameters of the search for similar galaxies (sed_assignment.toml, [nearest]).
 
     Attributes
     ----------
     units : tuple of float
-        Units of 0.1(g - r), M_r and z.
+        Differences in 0.1(g - r) (mag), M_r (mag) and redshift that count as a distance of 1.
     index : float
-        Scatter of the template's index.
+        Standard deviation of the scatter that is added to the index of the template spectrum.
     ebv : float
-        Scatter of E(B-V), mag.
+        Standard deviation of the scatter that is added to E(B-V), mag.
     """
 
     units: tuple[float, float, float]
@@ -63,13 +64,13 @@ class Training:
     Attributes
     ----------
     law : Nearness
-        Units and scatter.
+        Units of distance, and scatter.
     tree : KDTree
-        Tree of 0.1(g - r), M_r and z in the units of `law`.
+        Search tree of 0.1(g - r), M_r and redshift, each divided by its unit in `law`.
     sed : float array, shape (n,)
-        Real index of the template.
+        Index of the template spectrum. It is a real number: 3.4 is a mixture of the templates 3 and 4.
     ext_law : int array, shape (n,)
-        Extinction law.
+        Extinction law, 0 (no dust) to 4.
     ebv : float array, shape (n,)
         E(B-V), mag.
     last : int
@@ -85,31 +86,32 @@ class Training:
 
     @property
     def dustiest(self) -> float:
-        """Return the largest E(B-V), mag."""
+        """Return the largest E(B-V) of all galaxies in the table, mag."""
         return float(self.ebv.max())
 
 
 def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Training:
-    """Return the training table of files, from the cache or read now.
+    """Read a training table from files, or from the disc cache if the same files have been read before.
 
     Parameters
     ----------
     files : sequence of Path
-        Files of the table.
+        Files with the rows of the table.
     sha256 : sequence of str
-        SHA-256 of the files, which identify the cached copy.
+        SHA-256 of each file, by which the cache recognises the files.
     columns : Columns
-        Mapping of the columns.
+        Mapping from the columns of the files to the properties of galaxies.
 
     Returns
     -------
     Training
-        The table.
+        The training table.
 
     Raises
     ------
     BadInput, Damaged
-        If a value cannot be used; the message names the file, the column and the row.
+        If a file cannot be read, a value is missing or out of range, a template index is beyond the library, or the
+        files contain no rows. For values, the message names the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     last = templates.galaxy_library().flux.shape[0] - 1
@@ -118,7 +120,11 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
 
 
 def build_training(values: dict[str, Array], last: int) -> Training:
-    """Return a training table from columns: color_gr_01 and abs_mag_r01 (mag), z_true, sed, ext_law, ebv (mag)."""
+    """Return a training table from arrays of n galaxies.
+
+    `values` has the arrays color_gr_01 and abs_mag_r01 (mag), z_true, sed (real template index), ext_law and ebv (mag).
+    `last` is the index of the last template of the library.
+    """
     # Import here, because scipy.spatial is slow to import and rarely needed.
     from scipy.spatial import KDTree
 
@@ -128,16 +134,18 @@ def build_training(values: dict[str, Array], last: int) -> Training:
 
 
 def assign(training: Training, colour: Float, m_r: Float, z: Float, rng: AnyGenerator) -> Sed:
-    """Return a spectrum for each galaxy: the spectrum of the nearest training galaxy, with scatter.
+    """Return a spectrum for each galaxy: the spectrum of the most similar training galaxy, with scatter.
+
+    The scatter is added to the template index and to E(B-V), within the range of the library and of the table.
 
     Parameters
     ----------
     training : Training
         The training table.
     colour : float array, shape (n,)
-        0.1(g - r), mag.
+        Rest-frame colour 0.1(g - r): SDSS g - r in bands blueshifted to z = 0.1, mag.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
     rng : AnyGenerator

@@ -1,4 +1,7 @@
-"""Compiled loop of band_ratios.ln_ratio: interpolation in redshift, and a polynomial through the nodes of E(B-V)."""
+"""Compiled loop of `band_ratios.ln_ratio`, which interpolates the brightness of template spectra in a passband.
+
+The interpolation is linear in ln(1 + z), and a Lagrange polynomial through the nodes of E(B-V).
+"""
 
 from __future__ import annotations
 
@@ -11,29 +14,35 @@ from truesky.numerics.compiling import exact_jit
 
 @exact_jit
 def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: Any, ebv: Any, out: Any) -> None:
-    """Fill `out` with ln(ratio), linear in ln(1 + z) and polynomial in E(B-V).
+    """Interpolate ln(flux in a band at z / rest-frame flux in 0.1r) of template spectra in redshift and E(B-V).
+
+    0.1r is the SDSS r band blueshifted to z = 0.1. This logarithm is called ln(ratio) below.
 
     Parameters
     ----------
     values : float32 array, shape (z, 4, templates, e)
-        Values of the table.
+        ln(ratio) by redshift, extinction law (1 to 4), template and E(B-V).
     step : float
-        Step of ln(1 + z).
+        Step of ln(1 + z) between two redshifts of `values`; the first redshift is 0.
     nodes : float array, shape (e,)
-        Nodes of E(B-V), mag; the first is 0.
+        E(B-V) of the last axis of `values`, mag; the first is 0.
     z : float array, shape (n,)
-        Redshift.
+        Redshift. Values beyond the table are extrapolated linearly.
     template : int array, shape (n,)
         Index of the template.
     law : int array, shape (n,)
-        Extinction law; 0 means no dust.
+        Extinction law, 0 to 4; 0 means no dust, and E(B-V) is then ignored.
     ebv : float array, shape (n,)
         E(B-V), mag.
     out : float array, shape (n,)
-        Result.
+        Filled with ln(ratio).
+
+    Notes
+    -----
+    The interpolation is linear in ln(1 + z), and a Lagrange polynomial through all nodes in E(B-V).
     """
     count = nodes.size
-    # Inverse denominators of the Lagrange polynomials.
+    # scale[i] is the inverse of the denominator of the i-th Lagrange polynomial.
     scale = np.ones(count)
     for i in range(count):
         for j in range(count):
@@ -48,7 +57,7 @@ def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: An
         if law[k] == 0 or ebv[k] == nodes[0]:
             out[k] = (1.0 - part) * low[0] + part * high[0]
             continue
-        # The product of all differences except the i-th is the product before it times the product after it.
+        # The product of (ebv - nodes[j]) over all j except i is lower_product (j < i) times upper_products[i] (j > i).
         upper_product = 1.0
         for i in range(count - 1, -1, -1):
             upper_products[i] = upper_product

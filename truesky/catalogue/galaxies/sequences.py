@@ -1,7 +1,8 @@
-"""Colours and dust of galaxies: red and blue sequences of 0.1(g - r), and dusty (green) galaxies between them.
+"""Draw the colours and the dust of galaxies: a red and a blue sequence, and dusty (green) galaxies between them.
 
-Colours and E(B-V) are drawn from truncated distributions by inversion, so that galaxies do not pile up at the limits.
-The parameters and their sources are in sed_assignment.toml.
+The colour is the rest-frame 0.1(g - r): SDSS g - r in bands blueshifted to z = 0.1. Colours and E(B-V) are drawn from
+truncated distributions by inversion, so that galaxies do not pile up at the limits. The parameters and their sources
+are in sed_assignment.toml.
 
 References
 ----------
@@ -25,18 +26,22 @@ from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "sed_assignment.toml"
 BLUE, GREEN, RED = 0, 1, 2
-# The sequences are functions of M_r - _PIVOT.
+# Zero point of the linear relations of the sequences, which are constant + rate (M_r - _PIVOT). M_r is the absolute
+# magnitude in 0.1r.
 _PIVOT = -20.0
-# Limit of the distance of a catalogued galaxy from its sequence, in units of the scatter.
+# Largest difference between the colour of a galaxy from a user's catalogue and the mean of its sequence, in units of
+# the scatter; larger differences are set to this value.
 _MAX_DEVIATE = 3.0
-# Number of nodes of E(B-V) for the colour of the bluest template, and nodes of the Gamma distribution in units of its
-# mean / shape, denser towards 0 (relative error 1e-4).
-_EBV_NODES, _GAMMA_NODES = 65, 60.0 * np.linspace(0.0, 1.0, 8001) ** 3
+# Number of values of E(B-V) at which the colour of the bluest template is tabulated.
+_EBV_NODES = 65
+# Values at which the cumulative Gamma distribution of E(B-V) is tabulated, in units of its scale (mean / shape). They
+# are denser towards 0. The relative error is 1e-4.
+_GAMMA_NODES = 60.0 * np.linspace(0.0, 1.0, 8001) ** 3
 
 
 @dataclass(frozen=True, slots=True)
 class RedFraction:
-    """Fraction of galaxies on the red sequence (sed_assignment.toml, [red_fraction])."""
+    """Parameters of the fraction of red galaxies by luminosity and redshift (sed_assignment.toml, [red_fraction])."""
 
     blue: float
     blue_rate: float
@@ -54,7 +59,7 @@ class RedFraction:
 
 @dataclass(frozen=True, slots=True)
 class Green:
-    """Dusty galaxies between the sequences (sed_assignment.toml, [green])."""
+    """Parameters of the dusty galaxies between the sequences; explained in sed_assignment.toml, [green]."""
 
     z_norm: float
     z_rate: float
@@ -70,7 +75,7 @@ class Green:
 
 @dataclass(frozen=True, slots=True)
 class ColourSequence:
-    """Mean colours and scatters of the sequences (sed_assignment.toml, [sequence])."""
+    """Parameters of the mean colour and scatter of both sequences; explained in sed_assignment.toml, [sequence]."""
 
     red: float
     red_rate: float
@@ -96,7 +101,7 @@ class ColourSequence:
 
 @dataclass(frozen=True, slots=True)
 class Dust:
-    """Dust of galaxies that are not red (sed_assignment.toml, [dust])."""
+    """Parameters of the dust of galaxies that are not red; explained in sed_assignment.toml, [dust]."""
 
     shape: float
     mean: float
@@ -114,7 +119,7 @@ class Dust:
 
 @dataclass(frozen=True, slots=True)
 class Colours:
-    """Distributions of colours and dust, made once by `model`."""
+    """All parameters of the distributions of the colours and the dust of galaxies (sed_assignment.toml)."""
 
     fraction: RedFraction
     green: Green
@@ -124,16 +129,16 @@ class Colours:
 
 @dataclass(frozen=True, slots=True)
 class ColourLimits:
-    """Range of the colours of the templates.
+    """Range of rest-frame colours 0.1(g - r) that the template spectra can have.
 
     Attributes
     ----------
     bluest, reddest : float
-        0.1(g - r) without dust, mag.
+        0.1(g - r) of the bluest and of the reddest template without dust, mag.
     ebv : float array, shape (e,)
-        Nodes of E(B-V), mag.
+        E(B-V) of the last axis of `bluest_dusty`, mag.
     bluest_dusty : float array, shape (laws, e)
-        0.1(g - r) of the bluest template behind this E(B-V), mag.
+        0.1(g - r) of the bluest template behind dust, by extinction law (1 to 4) and E(B-V), mag.
     """
 
     bluest: float
@@ -149,11 +154,12 @@ class Colour:
     Attributes
     ----------
     sequence : int array, shape (n,)
-        BLUE, GREEN or RED.
+        Sequence of the galaxy: BLUE, GREEN or RED.
     colour : float array, shape (n,)
-        0.1(g - r), mag.
+        Rest-frame 0.1(g - r), mag.
     deviate : float array, shape (n,)
-        Normal deviate of the colour on its sequence.
+        Place of the colour in the distribution of its sequence, as a standard normal deviate; negative means bluer than
+        the median.
     """
 
     sequence: Int
@@ -166,12 +172,12 @@ class Colour:
         return np.asarray(self.sequence == RED)
 
     def select(self, keep: npt.NDArray[np.generic]) -> Colour:
-        """Return the galaxies of a bool mask or of row numbers."""
+        """Return the colours of some galaxies, given as a bool mask of shape (n,) or as row numbers."""
         return Colour(self.sequence[keep], self.colour[keep], self.deviate[keep])
 
 
 def model() -> Colours:
-    """Return the colours of the embedded universe."""
+    """Return the built-in parameters of the distributions of colours and dust."""
     return Colours(
         RedFraction(**parameters.section(_FILE, "red_fraction")),
         Green(**parameters.section(_FILE, "green")),
@@ -181,7 +187,11 @@ def model() -> Colours:
 
 
 def colour_limits(table: BandRatios, dust: Dust) -> ColourLimits:
-    """Return the range of colours of a library, from its table of 0.1g at z = 0 and the dust model."""
+    """Return the range of colours of a library of templates.
+
+    `table` is the library's table of the passband 0.1g. The limits are tabulated for E(B-V) from 0 to the largest value
+    that the dust model `dust` allows.
+    """
     ebv = np.linspace(0.0, dust.highest, _EBV_NODES)
     ln_ratio = table.values[0].astype(np.float64)
     bare = -2.5 / np.log(10.0) * ln_ratio[0, :, 0]
@@ -197,7 +207,7 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int)
     law : RedFraction
         Parameters of the relation.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
     satellite : float or int array, shape (n,)
@@ -220,7 +230,7 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int)
 
 
 def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Float:
-    """Return the fraction of green galaxies among galaxies that are not red.
+    """Return the fraction of green (dusty) galaxies among the galaxies that are not red.
 
     Parameters
     ----------
@@ -229,7 +239,7 @@ def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Floa
     fraction : RedFraction
         Parameters of the red fraction.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute 0.1r magnitude for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
 
@@ -247,30 +257,30 @@ def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Floa
 
 
 def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Float, rng: AnyGenerator) -> Colour:
-    """Draw sequence and colour of galaxies.
+    """Draw the sequence (red, green or blue) and the colour of galaxies.
 
     Parameters
     ----------
     colours : Colours
-        Distributions.
+        Parameters of the distributions.
     limits : ColourLimits
         Range of the colours of the templates.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute 0.1r magnitude for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
     odds : float array, shape (n,)
         Probability of a galaxy to be red.
     rng : AnyGenerator
-        Random numbers of the sequence, then of the colour on it.
+        Random numbers: first the numbers that select the sequence, then those of the colour.
 
     Returns
     -------
     Colour
-        Sequence and colour.
+        Sequence and colour of each galaxy.
     """
     law, chosen, uniform = colours.sequence, rng.random(z.size), _open_uniform(rng, z.size)
-    # One random number decides between red, green and blue.
+    # `chosen` selects the sequence: red below `odds`, green between `odds` and `green`, blue above.
     green = odds + (1.0 - odds) * green_share(colours.green, colours.fraction, m_r, z)
     sequence = np.where(chosen < odds, RED, np.where(chosen < green, GREEN, BLUE))
     mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
@@ -282,25 +292,25 @@ def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Flo
 
 
 def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red: Bool) -> Colour:
-    """Return the deviates of given colours on the red and blue sequences.
+    """Return how far the given colours of galaxies are from the mean of the red or blue sequence.
 
     Parameters
     ----------
     colours : Colours
-        Distributions.
+        Parameters of the distributions.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute 0.1r magnitude for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
     colour : float array, shape (n,)
-        0.1(g - r), mag.
+        Rest-frame 0.1(g - r), mag.
     red : bool array, shape (n,)
-        True for galaxies on the red sequence; the others are on the blue sequence.
+        True for galaxies on the red sequence; all other galaxies are on the blue sequence.
 
     Returns
     -------
     Colour
-        The colours with their sequence and deviates.
+        The colours with their sequence, and the difference from its mean in units of its scatter, limited to -3 to 3.
     """
     sequence = np.where(red, RED, BLUE)
     mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
@@ -308,7 +318,7 @@ def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red
 
 
 def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> tuple[Float, Float]:
-    """Mean and scatter of 0.1(g - r) on the sequence of each galaxy."""
+    """Return the mean and the scatter (mag) of 0.1(g - r) on the sequence of each galaxy, at its M_r and redshift."""
     law, x = colours.sequence, m_r - _PIVOT
     red_mean = law.red + law.red_rate * x - law.red_z_rate * z
     blue_mean = np.clip(law.blue + law.blue_rate * x, *law.blue_limits)
@@ -324,25 +334,26 @@ def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> 
 
 
 def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
-    """Convert uniform numbers to normal deviates between two limits.
+    """Convert uniform random numbers to standard normal deviates between two limits, by inversion.
 
     Parameters
     ----------
     low, high : float array, shape (n,)
-        Limits.
+        Limits, in standard deviations.
     uniform : float array, shape (n,)
-        Numbers in (0, 1); the deviates increase with them.
+        Numbers in (0, 1); larger numbers give larger deviates.
 
     Returns
     -------
     float array, shape (n,)
-        Deviates. They are computed in the tail that keeps their precision.
+        Deviates. If both limits are positive, the lower tail is used and mirrored, which is more precise.
     """
     mirrored = low > 0.0
     a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
     below, above = ndtr(a), ndtr(b)
     u = np.where(mirrored, 1.0 - uniform, uniform)
-    # If both limits are 30 standard deviations away, the result is the nearer limit.
+    # Limit the probability to avoid infinite deviates. If both limits are 30 standard deviations away from 0, the
+    # result is about the nearer limit.
     deviate = ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
     return np.asarray(np.where(mirrored, -deviate, deviate))
 
@@ -350,27 +361,27 @@ def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
 def draw_dust(
     colours: Colours, limits: ColourLimits, m_r: Float, z: Float, colour: Colour, rng: AnyGenerator
 ) -> tuple[Int, Float]:
-    """Draw extinction law and E(B-V) of galaxies; red galaxies have no dust.
+    """Draw extinction law and E(B-V) of the dust inside galaxies; red galaxies have no dust.
 
     Parameters
     ----------
     colours : Colours
-        Extinction laws and the distribution of E(B-V).
+        Parameters of the extinction laws and of the distribution of E(B-V).
     limits : ColourLimits
         Range of the colours of the templates.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute 0.1r magnitude for h = 1, mag.
     z : float array, shape (n,)
         Redshift.
     colour : Colour
         Sequence and colour of the galaxies.
     rng : AnyGenerator
-        Random numbers of E(B-V), then of the law.
+        Random numbers: first the numbers of E(B-V), then those of the law.
 
     Returns
     -------
     law : int array, shape (n,)
-        Extinction law, 0 without dust.
+        Extinction law: 0 without dust, 1 for Prevot, 2 to 4 for Calzetti with a 2175 A bump of increasing strength.
     ebv : float array, shape (n,)
         E(B-V), mag.
 
@@ -387,7 +398,7 @@ def draw_dust(
     mean = np.clip(law.mean + law.mean_rate * (m_r - law.pivot), *law.mean_limits)
     mean = mean * (1.0 - law.far_z_rate * np.clip(z - law.far_z, 0.0, law.far_z_range))
     scale = np.where(green, colours.green.ebv, mean) / law.shape
-    # Limit E(B-V) so that the bluest template behind the dust is still as blue as the galaxy.
+    # Limit E(B-V) so that the bluest template behind the dust is at least as blue as the drawn colour.
     max_ebv = np.empty(m_r.size)
     for code in range(1, LAW_COUNT):
         selected = np.flatnonzero(curve == code)
@@ -400,12 +411,12 @@ def draw_dust(
 
 
 def _open_uniform(rng: AnyGenerator, n: int) -> Float:
-    """Uniform numbers in (0, 1), shape (n,); numpy's generator may return 0."""
+    """Return `n` uniform random numbers in (0, 1); a 0, which the generator may return, is replaced by 2^-54."""
     return np.maximum(rng.random(n), 2.0**-54)
 
 
 def _gamma_table(shape: float) -> Float:
-    """Cumulative Gamma distribution at _GAMMA_NODES."""
+    """Return the cumulative Gamma distribution with this shape and scale 1 at `_GAMMA_NODES`."""
     return np.asarray(gammainc(shape, _GAMMA_NODES))
 
 

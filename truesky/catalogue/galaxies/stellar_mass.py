@@ -1,7 +1,8 @@
 """Stellar masses and star formation rates of galaxies.
 
-Luminosities are physical here: M = M_r + 5 log10 h with h = 0.67. Masses and rates are for the initial mass functions
-of Chabrier 2003 and Kroupa 2001, which give the same values. The parameters are in stellar_mass.toml.
+M_r is the absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1. Here it is converted to h = 0.67:
+M = M_r + 5 log10 h. Masses are for the initial mass function of Chabrier 2003 and rates for Kroupa 2001, which give
+about the same values. The parameters are in stellar_mass.toml.
 
 References
 ----------
@@ -25,7 +26,7 @@ _FILE = "stellar_mass.toml"
 
 @dataclass(frozen=True, slots=True)
 class MassToLight:
-    """Relation of colour and mass-to-light ratio (stellar_mass.toml, [mass_to_light])."""
+    """Parameters of the mass-to-light ratio by colour and redshift; explained in stellar_mass.toml, [mass_to_light]."""
 
     sun: float
     intercept: float
@@ -40,7 +41,7 @@ class MassToLight:
 
 @dataclass(frozen=True, slots=True)
 class StarFormation:
-    """Main sequence of star formation, and the scatter around and below it (stellar_mass.toml, [star_formation])."""
+    """Parameters of the star formation rate by mass and redshift; explained in stellar_mass.toml, [star_formation]."""
 
     sequence: float
     sequence_t: float
@@ -60,12 +61,12 @@ class StarFormation:
 
 
 def mass_to_light() -> MassToLight:
-    """Return the mass-to-light ratios of the embedded universe."""
+    """Return the built-in parameters of the mass-to-light ratio."""
     return MassToLight(**parameters.section(_FILE, "mass_to_light"))
 
 
 def star_formation() -> StarFormation:
-    """Return the star formation rates of the embedded universe."""
+    """Return the built-in parameters of the star formation rate."""
     return StarFormation(**parameters.section(_FILE, "star_formation"))
 
 
@@ -75,18 +76,18 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> F
     Parameters
     ----------
     law : MassToLight
-        Parameters.
+        Parameters of the relation.
     m_r : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     colour : float array, shape (n,)
-        0.1(g - r), mag.
+        Rest-frame 0.1(g - r) (SDSS bands blueshifted to z = 0.1), mag.
     z : float array, shape (n,)
         Redshift.
 
     Returns
     -------
     float array, shape (n,)
-        log10 of the stellar mass, Msun (Chabrier).
+        log10 of the stellar mass in Msun, for h = 0.67 and the initial mass function of Chabrier 2003.
 
     References
     ----------
@@ -105,7 +106,7 @@ def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
     Parameters
     ----------
     law : StarFormation
-        Parameters.
+        Parameters of the relation.
     log_mass : float array, shape (n,)
         log10 of the stellar mass, Msun.
     z : float array, shape (n,)
@@ -127,18 +128,19 @@ def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
 
 
 def log_sfr(law: StarFormation, main: Float, sequence: Int, deviate: Float, rng: AnyGenerator) -> Float:
-    """Draw star formation rates; bluer galaxies on the blue sequence form more stars.
+    """Draw star formation rates around the main sequence (blue galaxies) or below it (green and red galaxies).
 
     Parameters
     ----------
     law : StarFormation
-        Parameters.
+        Parameters of the scatter.
     main : float array, shape (n,)
-        Median rate, from `main_sequence`.
+        log10 of the median rate of star-forming galaxies (Msun/yr), from `main_sequence`.
     sequence : int array, shape (n,)
-        Sequence: BLUE, GREEN or RED.
+        Colour sequence of the galaxy: BLUE, GREEN or RED.
     deviate : float array, shape (n,)
-        Normal deviate of the colour on its sequence.
+        Place of the colour on its sequence, as a standard normal deviate; the bluer a blue galaxy (negative values),
+        the higher its rate.
     rng : AnyGenerator
         Random numbers of the scatter.
 

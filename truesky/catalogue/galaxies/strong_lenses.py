@@ -1,10 +1,10 @@
-"""Strong lenses: singular isothermal ellipsoids (SIE), and images of the sources behind them by inverse ray shooting.
+"""Draw strong lenses: singular isothermal ellipsoids (SIE), and images of the sources behind them by ray shooting.
 
-All galaxies redder than the blue sequence are lenses. At 0.1 < z < 0.7 the fourth moment of their dispersions, which
-determines the total cross-section, agrees with Choi et al. 2007 within 15 %. With the detection criteria of Collett
-2015, the number is 10.2 +- 1.1 deg-2 for sources with I_E < 26 and z < 2.3 (14.9 +- 1.3 in total), compared to 11.3 of
-Collett 2015. Central galaxies of halos above 10^12.7 Msun/h are only a fifth of the lenses: most lenses are galaxies of
-smaller halos.
+Every galaxy beyond z = 0.02 that is redder than the blue sequence can be a lens. The total cross-section follows from
+the fourth moment of the velocity dispersions, which agrees with Choi et al. 2007 within 15 % at 0.1 < z < 0.7. With the
+detection criteria of Collett 2015, the number of lenses is 10.2 +- 1.1 deg-2 for sources with I_E < 26 and z < 2.3
+(14.9 +- 1.3 for all sources). Collett 2015 predicts 11.3. Central galaxies of halos above 10^12.7 Msun/h are only a
+fifth of the lenses: most lenses are galaxies of smaller halos.
 
 Coordinates are in arcsec east and north of the lens on the tangent plane. The images contain only the smooth lens; weak
 lensing by matter in front of and behind the lens is left out.
@@ -40,21 +40,36 @@ COLUMNS = (
     "id", "kind", "ra", "dec", "_healpix_29", "ra_true", "dec_true", "z_true", "abs_mag_r01", "color_gr_01",
     "disk_half_light_radius", "disk_axis_ratio", "position_angle",
 )  # fmt: skip
+# Code of strong lenses in column `kind` and in identifiers.
 STRONG_LENS = 4
 _FILE = "strong_lenses.toml"
-# Fraction of the smallest magnification below which a first image with one ray per pixel excludes a system.
+# A lens must have a total magnification above `least_magnification` (strong_lenses.toml). To save time, no exact
+# image is computed if an image with one ray per pixel has less than this fraction of that limit.
 _QUICK_SHARE = 0.7
-# Half of the light of an exponential disc with scale length h is inside r = _B h.
+# Half-light radius of an exponential disc in units of its scale length.
 _B = 1.6783469900166605
-# Number of angles in the search for sign changes; images closer than one step are merging at a caustic.
+# Number of directions, uniform over the circle, in which `image_positions` searches for images. Two images that are
+# closer than one step of direction can be missed; they are about to merge at a caustic.
 _ANGLE_COUNT = 4096
-# Fraction of the sources with which a lens is paired; all sources if the boost makes their probability larger.
+# Fraction of the sources with which a lens is compared, to save time. A lens is compared with all sources if its
+# probability to lens a given source is at least this large. This happens only if the boost, the ratio of the drawn to
+# the natural number of lenses, is large.
 _WINDOW = 1.0 / 64.0
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """SIE with Einstein radius (arcsec), axis ratio (minor / major) and position angle of the major axis (deg)."""
+    """Singular isothermal ellipsoid (SIE).
+
+    Attributes
+    ----------
+    radius : float
+        Einstein radius, arcsec.
+    axis_ratio : float
+        Minor / major axis.
+    angle : float
+        Position angle of the major axis, deg from north through east.
+    """
 
     radius: float
     axis_ratio: float
@@ -63,7 +78,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """Exponential disc of flux 1 at (east, north).
+    """Light of a lensed source: an exponential disc of flux 1.
 
     Attributes
     ----------
@@ -74,7 +89,7 @@ class Disc:
     axis_ratio : float
         Minor / major axis.
     angle : float
-        Position angle of the major axis, deg.
+        Position angle of the major axis, deg from north through east.
     """
 
     east: float
@@ -86,7 +101,7 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Laws:
-    """Selection and properties of lenses (strong_lenses.toml, [lenses])."""
+    """Parameters of the selection and the properties of lenses; explained in strong_lenses.toml, [lenses]."""
 
     reddest_blue: float
     sigma_star: float
@@ -106,15 +121,16 @@ class Pair:
     Attributes
     ----------
     lens, source : int
-        Rows of the galaxies.
+        Rows of lens and source in the table of galaxies.
     sigma : float
-        Velocity dispersion, km/s.
+        Velocity dispersion of the lens, km/s.
     radius : float
         Einstein radius, arcsec.
     key : int
-        Key of the pair's random numbers.
+        64-bit number that identifies the pair; the identifier of the strong lens is made from it.
     numbers : float array, shape (4,)
-        Random numbers of the pair.
+        Random numbers that decide about the pair, the axis ratio of the lens, and the distance and direction of the
+        source. The second is a standard normal deviate, the others are uniform.
     """
 
     lens: int
@@ -127,7 +143,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """Settings of the images (strong_lenses.toml, [stamp])."""
+    """Pixel scale, size and sampling of the images of lensed sources; explained in strong_lenses.toml, [stamp]."""
 
     pixel_scale: float
     sides: tuple[int, int]
@@ -136,33 +152,34 @@ class Stamps:
 
 
 def laws() -> Laws:
-    """Return the lens selection of the embedded universe."""
+    """Return the built-in parameters of the selection and the properties of lenses."""
     return Laws(**parameters.section(_FILE, "lenses"))
 
 
 def stamps() -> Stamps:
-    """Return the image settings of the embedded universe."""
+    """Return the built-in pixel scale, size and sampling of the images of lensed sources."""
     return Stamps(**parameters.section(_FILE, "stamp"))
 
 
 def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
-    """Draw table `strong_lenses` of one order-8 cell.
+    """Draw the rows of table `strong_lenses` in one order-8 cell.
 
     Parameters
     ----------
     cell : int
         Nested index of the order-8 cell.
     galaxies : Table
-        Rows of table `galaxies` in the cell, with COLUMNS.
+        Rows of table `galaxies` in the cell, with the columns COLUMNS.
     seed : int
         Seed of the request.
     boost : float
-        Ratio of the drawn to the natural number density.
+        Ratio of the drawn to the natural number density of strong lenses.
 
     Returns
     -------
     Table
-        Rows of table `strong_lenses`.
+        Rows of table `strong_lenses`, sorted by the order-29 cell of the lens, then by identifier. Empty if no source
+        is magnified enough.
 
     Notes
     -----
@@ -175,7 +192,7 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     for pair in _pairs(law, columns, boost, sky.cell_area(GENERATION_ORDER) * 3600.0**2, seed):
         system = _system(law, columns, pair)
         side = _side(stamp_settings, *system)
-        # A first image with few rays excludes most systems that are too faint.
+        # An image with one ray per pixel takes little time, and excludes most lenses whose magnification is too small.
         if (
             shoot_rays(*system, replace(stamp_settings, samples=(1, 1)), side).sum()
             < _QUICK_SHARE * law.least_magnification
@@ -189,14 +206,14 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
 
 
 def einstein_radius(sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.ArrayLike) -> Float:
-    """Return the Einstein radius in a flat space.
+    """Return the Einstein radius of singular isothermal lenses in a flat universe.
 
     Parameters
     ----------
     sigma : float array, shape (n,)
-        Velocity dispersion, km/s.
+        Velocity dispersion of the lens, km/s.
     z_lens, z_source : float array, shape (n,)
-        Redshifts.
+        Redshifts of lens and source.
 
     Returns
     -------
@@ -208,24 +225,24 @@ def einstein_radius(sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.A
 
 
 def _max_einstein_radius(sigma: npt.ArrayLike) -> Float:
-    """Einstein radius for sources at infinity, arcsec."""
+    """Return the Einstein radius (arcsec) for sources at infinite distance, from the velocity dispersion (km/s)."""
     return np.asarray(np.degrees(4.0 * np.pi * (np.asarray(sigma, float) / LIGHT_KM_S) ** 2) * 3600.0)
 
 
 def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
-    """Return the deflection of rays by an SIE.
+    """Return the deflection angles of rays by a singular isothermal ellipsoid.
 
     Parameters
     ----------
     lens : Lens
         The lens.
     east, north : float array
-        Position of the rays relative to the lens, arcsec.
+        Positions of the rays in the image relative to the lens, arcsec.
 
     Returns
     -------
     east, north : float array
-        Deflection, arcsec. A ray comes from its position minus the deflection.
+        Deflection, arcsec. The position minus the deflection is the place of the ray in the source plane.
 
     References
     ----------
@@ -244,19 +261,19 @@ def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
 
 
 def magnification(lens: Lens, east: Float, north: Float) -> Float:
-    """Return the magnification of a point image.
+    """Return the magnification of images of point sources.
 
     Parameters
     ----------
     lens : Lens
         The lens.
     east, north : float array
-        Position of the image relative to the lens, arcsec.
+        Positions of the images relative to the lens, arcsec.
 
     Returns
     -------
     float array
-        1 / (1 - 2 kappa), negative for mirrored images.
+        1 / (1 - 2 kappa), where kappa is the convergence; negative for mirrored images, infinite on the critical curve.
     """
     along, across = _to_axes(lens.angle, east, north)
     return np.asarray(1.0 / (1.0 - lens.radius * np.sqrt(lens.axis_ratio) / np.hypot(lens.axis_ratio * along, across)))
@@ -275,13 +292,14 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
     Returns
     -------
     float array, shape (n, 2)
-        Positions of the images (east, north), arcsec.
+        Positions of the n images (east, north) relative to the lens, arcsec; n is 0 if no image is found.
 
     Notes
     -----
-    The deflection of an SIE depends only on the direction. An image in direction phi is at distance::
+    The deflection alpha of a singular isothermal ellipsoid depends only on the direction phi. With the position beta of
+    the source and the unit vector e(phi), there is an image at distance r from the lens in every direction with::
 
-        r = (beta + alpha(phi)) . e(phi) > 0,    where (beta + alpha(phi)) x e(phi) = 0
+        (beta + alpha(phi)) x e(phi) = 0    and    r = (beta + alpha(phi)) . e(phi) > 0
     """
 
     def across(phi: npt.ArrayLike) -> Any:
@@ -289,7 +307,7 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
         x, y = deflection(lens, np.asarray(e), np.asarray(n))
         return (east + x) * n - (north + y) * e
 
-    # Start at an arbitrary angle, so that no image is exactly at a node.
+    # Start at an arbitrary angle, so that no root of `across` is exactly at one of the angles in `phi`.
     phi = 0.1234567 + np.linspace(0.0, 2.0 * np.pi, _ANGLE_COUNT + 1)
     values = across(phi)
     images = []
@@ -313,18 +331,19 @@ def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> F
     source : Disc
         Exponential disc behind the lens.
     stamp_settings : Stamps
-        Samples and pixel scale.
+        Pixel scale, and number of rays per pixel.
     side : int
         Side of the image, pixels.
 
     Returns
     -------
     float32 array, shape (side, side)
-        Image from south to north and west to east; its sum is the magnification.
+        Image centred on the lens. Rows run from south to north, columns from west to east. The sum of the pixels is the
+        total magnification.
 
     Notes
     -----
-    The error of the magnification is 1 % (tests) for sources larger than a quarter of a pixel.
+    The error of the magnification is 1 % (tests) for sources with a half-light radius above a quarter of a pixel.
     """
     samples = np.ceil(
         stamp_settings.samples_a_radius * stamp_settings.pixel_scale / (source.radius * source.axis_ratio)
@@ -342,13 +361,10 @@ def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> F
     return picture
 
 
-# ------------------------------------------------------------------------------------------------ a cell
-
-
 def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed: int) -> list[Pair]:
-    """Draw pairs of lenses and sources in a cell with an area in arcsec2.
+    """Draw pairs of a lens and a source from the galaxies of a cell with an area in arcsec2.
 
-    Each pair is drawn independently of all others, so that a deeper catalogue contains the same lenses and more.
+    Each pair is drawn independently of all other pairs. A deeper catalogue therefore contains the same pairs and more.
     """
     is_galaxy = columns["kind"] < 2
     lens = np.flatnonzero(is_galaxy & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
@@ -356,7 +372,8 @@ def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed
     m_star, _, _ = luminosity_function.schechter().parameters_at(z_lens)
     brighter = m_star - columns["abs_mag_r01"][lens]
     sigma = law.sigma_star * 10.0 ** (0.1 * brighter + law.scatter * rng.standard_normal())
-    # Einstein radius for a source at infinity, an upper limit for each lens.
+    # Draw the sources inside the Einstein radius for a source at infinity, which is an upper limit. Sources outside the
+    # Einstein radius for their own redshift are removed below.
     max_radius = _max_einstein_radius(sigma)
     chance = boost * np.pi * max_radius**2 / area
     window = np.where(chance < _WINDOW, _WINDOW, 1.0)
@@ -390,7 +407,11 @@ def _allocate(count: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
 
 
 def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Disc]:
-    """Return lens and source of a pair: mass follows light in angle, and the source is within the Einstein radius."""
+    """Return the lens and the source of a pair.
+
+    The mass of the lens has the position angle of its light. The source is at a random place in the circle with the
+    Einstein radius around the lens.
+    """
     _, shape_deviate, area_fraction, angle_fraction = pair.numbers.tolist()
     q = float(np.clip(law.axis_ratio + law.axis_ratio_scatter * shape_deviate, *law.axis_ratio_limits))
     offset, phi = pair.radius * np.sqrt(area_fraction), 2.0 * np.pi * angle_fraction
@@ -401,7 +422,10 @@ def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Dis
 
 
 def _side(stamp_settings: Stamps, lens: Lens, source: Disc) -> int:
-    """Side of the image in pixels: twice the Einstein radius and several radii of the source fit, within limits."""
+    """Return the side of the image in pixels, an even number within the limits of `stamp_settings`.
+
+    Half a side covers twice the Einstein radius along the major axis plus four half-light radii of the source.
+    """
     reach = 2.0 * lens.radius / np.sqrt(lens.axis_ratio) + 4.0 * source.radius
     return int(np.clip(2 * np.ceil(reach / stamp_settings.pixel_scale), *stamp_settings.sides))
 
@@ -444,7 +468,7 @@ def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) 
 
 
 def _to_axes(angle: float, east: Float, north: Float) -> tuple[Float, Float]:
-    """Components along and across the major axis."""
+    """Return the components of vectors (east, north) along and across an axis with a position angle in deg."""
     sin, cos = np.sin(np.radians(angle)), np.cos(np.radians(angle))
     return east * sin + north * cos, east * cos - north * sin
 

@@ -1,1 +1,1 @@
-"""Halos and the galaxies in them."""
+"""Draw dark matter halos, and the galaxies in them with their luminosities."""

@@ -1,4 +1,8 @@
-"""Compiled loops of halos.draw and satellites.draw; the random numbers depend on the block, the halo and the member."""
+"""Compiled loops of `halos.draw` and `satellites.draw`, which draw halos and satellite galaxies.
+
+The random numbers of a halo depend only on its block (sky cell, step in distance and mass bin) and its number in the
+block. The random numbers of a satellite depend only on its halo and its number in the halo.
+"""
 
 from __future__ import annotations
 
@@ -9,28 +13,31 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.compiled_draws import child_key, normal, poisson, uniform
 
-# Numbers of the child keys for each property of a halo and of a satellite.
+# Numbers with which the keys of a halo's random numbers are derived, one per property: voxel (piece of volume),
+# distance, mass, position in the voxel, and scatter between mass and luminosity.
 VOXEL, DISTANCE, MASS, PLACE, SCATTER = range(5)
+# Numbers with which the keys of a satellite's random numbers are derived, one per property: step of the mass ratio,
+# radius, height and azimuth in the halo, velocity, and scatter between mass and luminosity.
 STEP, RADIUS, HEIGHT, AZIMUTH, KICK, SUB_SCATTER = range(6)
 
 
 @exact_jit
 def cut_normal(key: Any, number: Any, cut: Any) -> Any:
-    """Draw a standard normal number that is at most `cut` standard deviations from 0, by rejection.
+    """Draw a standard normal deviate that is at most `cut` standard deviations from 0, by rejection.
 
     Parameters
     ----------
     key : uint64
-        Key of the random numbers.
+        Key from which the random numbers are made.
     number : int
-        Number of the first child key; each rejection adds 64.
+        Number with which the key of the first deviate is derived from `key`; it increases by 64 per rejected deviate.
     cut : float
         Limit, standard deviations.
 
     Returns
     -------
     float
-        The number.
+        The deviate, from -cut to cut.
     """
     while True:
         deviate = normal(child_key(key, number))
@@ -41,31 +48,36 @@ def cut_normal(key: Any, number: Any, cut: Any) -> Any:
 
 @exact_jit
 def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amplitude: Any, field: Any, g: Any) -> Any:
-    """Draw the number of halos of each block (step and mass bin) in a cell.
+    """Draw the number of halos in each block (step in distance and mass bin) of a sky cell.
 
     Parameters
     ----------
     key : uint64
-        Key of the cell.
+        Key from which the random numbers of the cell are made.
     first : int array, shape (s + 1,)
-        First voxel of each step.
+        First voxel of each step; a voxel is a small piece of the volume of the cell. The last value is the number of
+        voxels.
     steps : int array, shape (s,)
-        Numbers of the steps.
+        Numbers of the steps, counted from the observer.
     used : bool array, shape (s, bins)
         True for blocks that are drawn.
     ln_number : float array, shape (s, bins)
-        ln of the mean number per voxel without structure.
+        ln of the number of halos per voxel where the Gaussian field is 0.
     amplitude : float array, shape (s, bins)
-        Amplitude of the field.
+        Factor of the field in the exponential.
     field : int array, shape (s, bins)
-        Column of the field in `g`.
+        Column of `g` with the field that the halos of a block follow.
     g : float32 array, shape (v, fields)
-        Gaussian fields in the voxels.
+        Gaussian fields of matter in the voxels.
 
     Returns
     -------
     int array, shape (s, bins)
-        Number of halos.
+        Number of halos; 0 for blocks that are not used.
+
+    Notes
+    -----
+    The numbers are Poisson with the mean of exp(ln_number + amplitude g), summed over the voxels of the step.
     """
     halo_counts = np.zeros(used.shape, np.int64)
     bins = used.shape[1]
@@ -92,29 +104,32 @@ def fill_halos(
     limits: Any,
     out: Any,
 ) -> int:
-    """Draw the halos of each block and fill `out` with those above the limits.
+    """Draw the voxel and the random numbers of each halo, and store the halos that may reach a mass limit in `out`.
 
     Parameters
     ----------
     key : uint64
-        Key of the cell.
+        Key from which the random numbers of the cell are made.
     first, steps : int array
-        First voxel of each step and numbers of the steps, as in `draw_counts`.
+        First voxel of each step and numbers of the steps, same as in `draw_counts`.
     number : int array, shape (s, bins)
-        Number of halos of each block.
+        Number of halos in each block (step in distance and mass bin).
     ln_number, amplitude, field, g : array
         Same as in `draw_counts`.
     limits : tuple
-        Upper edges of the mass bins (bins,); lower limits of log10 mass and of log10 proxy mass (s,), of which one must
-        be reached; scatter of the proxy mass in dex, and its cut in standard deviations.
+        Five values: upper edges of the mass bins, shape (bins,); lower limits of log10 mass, shape (s,), and of log10
+        proxy mass (mass with a scatter), shape (s,), in Msun/h; the scatter, dex; and the largest scatter, standard
+        deviations. A halo is stored if the upper edge of its bin reaches the first limit, or with the scatter the
+        second limit.
     out : tuple of array
-        voxel, row of the step, bin, number in the block (int64[n]); random bits of the place (uint64[n]); random
-        numbers (float64[n, 3]: uniform in volume, uniform in mass, scatter).
+        Six arrays to fill, long enough for all halos: voxel, row of the step, mass bin and number in the block
+        (int64[n]); random bits for the position (uint64[n]); random numbers (float64[n, 3]: uniform for the distance,
+        uniform for the mass, normal deviate of the scatter).
 
     Returns
     -------
     int
-        Number of halos in `out`.
+        Number of halos that are stored in `out`.
     """
     voxel, row, column, rank, place, drawn = out
     upper_edge, host_limit, central_limit, scatter, cut = limits
@@ -149,16 +164,16 @@ def fill_halos(
 
 @exact_jit
 def count_before(block: Any, cell: Any, out: Any) -> None:
-    """Fill `out` with the number of earlier halos of the same block and cell.
+    """Number the halos with the same block and cell: 0, 1, 2 and so on, in the order of the arrays.
 
     Parameters
     ----------
     block : int array, shape (n,)
-        Block of each halo; equal values are consecutive.
+        Number of the block (step in distance and mass bin) of each halo; equal values must be consecutive.
     cell : int array, shape (n,)
-        Cell of each halo.
+        Nested index of the order-8 cell of each halo.
     out : int array, shape (n,)
-        Result.
+        Filled with the numbers.
     """
     begin = 0
     for i in range(block.size):
@@ -174,34 +189,36 @@ def count_before(block: Any, cell: Any, out: Any) -> None:
 def fill_satellites(
     keys: Any, log_mass: Any, limit: Any, min_ratio: Any, ratio: Any, scatter: Any, depth: Any, out: Any
 ) -> int:
-    """Draw the satellites of hosts and fill `out` if it is long enough.
+    """Draw the satellites of host halos, and store the satellites above a mass limit in `out`.
 
     Parameters
     ----------
     keys : uint64 array, shape (h,)
-        Keys of the hosts.
+        Keys from which the random numbers of each host are made.
     log_mass : float array, shape (h,)
-        log10 of the mass of the hosts.
+        log10 of the masses of the hosts, Msun/h.
     limit : float array, shape (h,)
-        Lower limit of log10 of the scattered sub-mass.
+        Lower limit of log10 of the proxy mass (mass of the sub-halo with a scatter) for each host, Msun/h.
     min_ratio : float
-        Smallest ratio of host mass and sub-mass (min_mass_ratio in halos.toml).
+        Smallest ratio of host mass and sub-halo mass (min_mass_ratio in halos.toml).
     ratio : float array, shape (h,)
-        Mean step of the mass ratio from one satellite to the next.
+        Mean increase of this ratio from one satellite to the next.
     scatter, depth : float
-        Scatter and its limit, dex (halos.toml).
+        Standard deviation and largest value of the scatter of the proxy mass, dex (halos.toml).
     out : tuple of array
-        host and member (int64[n]), proxy (float64[n]) and random numbers (float64[n, 4]: uniform in enclosed mass,
-        height and angle; a normal deviate).
+        Four arrays of length n to fill: row of the host and number of the satellite in it from 1 (int64), log10 of the
+        proxy mass (float64), and random numbers (float64[n, 4]: uniform for enclosed mass, height and azimuth, and a
+        normal deviate for the velocity). Satellites after the n-th are not stored.
 
     Returns
     -------
     int
-        Number of satellites that reach the limit of their host.
+        Number of satellites above the limit, which may be larger than n; then call the function again with longer
+        arrays.
 
     Notes
     -----
-    Satellites are drawn in the order of decreasing sub-mass m. The mass ratio M / m is a Poisson process of rate
+    Satellites are drawn in the order of decreasing sub-halo mass m. The mass ratios M / m are a Poisson process of rate
     1 / `ratio` that begins at `min_ratio`.
     """
     host, member, proxy, drawn = out

@@ -1,7 +1,7 @@
-"""The user's halo light-cone, for example of a simulation, which replaces the drawn halos.
+"""Read a table of halos of the user, for example the light-cone of an N-body simulation, which replaces drawn halos.
 
-Masses are M_200m in Msun/h. The galaxies and their abundance remain those of the embedded universe. The user's halos
-also lens, but the lensing maps do not contain the structure around them.
+Masses are M_200m in Msun/h. The galaxies in these halos and their luminosities are drawn by the same model as in drawn
+halos. The user's halos also lens, but the lensing maps do not contain the matter around them.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from truesky.randomness.per_source import PerSourceGenerator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightCone:
-    """Halos sorted by index.
+    """The user's halos, sorted by position, then by distance.
 
     Attributes
     ----------
     index : int array, shape (n,)
-        Order-29 cell.
+        Position: nested index of the HEALPix cell of order 29.
     chi : float array, shape (n,)
         Comoving distance, Mpc/h.
     log_mass : float array, shape (n,)
         log10 M_200m / (Msun/h).
     velocity : float array, shape (n,)
-        Line-of-sight velocity, km/s, positive if receding.
+        Line-of-sight peculiar velocity, km/s, positive if receding.
     """
 
     index: Int
@@ -52,26 +52,27 @@ class LightCone:
 
 
 def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> LightCone:
-    """Read and check the halos of files, or map them from the cache.
+    """Read and check the user's halos, or map them from the disc cache if the same files have been read before.
 
     Parameters
     ----------
     files : sequence of Path
-        Files of the halos.
+        Files with the halos.
     sha256 : sequence of str
-        SHA-256 of the files, which identify the cached copy.
+        SHA-256 of each file, by which the cache recognises the files.
     columns : Columns
-        Mapping of the columns.
+        Mapping from the columns of the files to the properties of halos.
 
     Returns
     -------
     LightCone
-        The halos. The first call holds all of them in memory.
+        The halos. The first call for these files needs memory for all rows.
 
     Raises
     ------
     BadInput, Damaged
-        If a value cannot be used; the message names the file, the column and the row.
+        If a file cannot be read, has no rows, or has a missing, wrong or repeated value. For values, the message names
+        the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     arrays = cached_arrays(
@@ -81,30 +82,33 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
 
 
 def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: int, cell: int) -> Halos:
-    """Return the halos of one level in a cell, with the same selection as halos.draw.
+    """Return the user's halos in a HEALPix cell that belong to the level (order) of this cell.
+
+    The angular radius of a halo determines its level: halos that span a larger angle belong to larger cells.
 
     Parameters
     ----------
     model : HaloModel
-        Levels and limits.
+        Mass limits and distance limits of the catalogue.
     masses : Masses
-        Tables of halos by mass.
+        Tables of halos, of which the radius is used.
     cone : LightCone
         The user's halos.
     seed : int
-        Seed of the request, for the scatter of the proxy masses.
+        Seed of the random scatter between halo mass and proxy mass (which determines luminosities).
     order, cell : int
-        Order and nested index of the cell.
+        Order (8, 5 or 2) and nested index of the cell.
 
     Returns
     -------
     Halos
-        The halos.
+        Halos in the cell that may contain a galaxy that is bright enough for the catalogue.
     """
     rows = slice(*np.searchsorted(cone.index, sky.cell_range(order, cell)))
     index, velocity = cone.index[rows], cone.velocity[rows]
     chi, log_mass = cone.chi[rows], cone.log_mass[rows]
-    # Number all halos of a generation cell in the order of the file, so that numbers do not depend on the selection.
+    # Number all halos of an order-8 cell in the order of `cone`, before any selection, so that the identifiers do not
+    # depend on the limits of the catalogue.
     generation_cell = index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     identifiers = ids.source_id(
         0, generation_cell, np.arange(generation_cell.size) - np.searchsorted(generation_cell, generation_cell)

@@ -1,9 +1,12 @@
-"""Compiled sums of the convergence, shear and deflection by halos.
+"""Compiled sums of the convergence, shear and deflection by halos at the positions of sources.
 
-A table of halos has the rows X to CONCENTRATION: position in the plane of the sources (rad), distance (Mpc/h,
-ascending), amplitude, angles (rad) and concentration. Sources have positions (2, n) in the same plane (rad) and inverse
-distances 1 / chi (h/Mpc). Sums have shape (5, n): kappa, gamma1, gamma2, deflection along x and y (rad). The lensing of
-a source by a halo depends only on these two, and halos are added in the order of the table.
+Halos and sources are in the tangent plane of a sky cell. A table of halos has 8 rows: position x and y (rad), comoving
+distance (Mpc/h, ascending), lensing strength, three angles (rad) and concentration. The angles are theta_200 (radius of
+the halo), theta_s (within which the halo is summed for each source) and theta_c (beyond which it does not lens).
+
+Sources have positions (2, n) in the same plane (rad) and inverse comoving distances 1 / chi (h/Mpc). Sums have shape
+(5, n): kappa, gamma1, gamma2, deflection along x and y (rad). Halos are added in the order of the table, so the sum for
+a source does not depend on the other sources.
 """
 
 from __future__ import annotations
@@ -14,31 +17,37 @@ from lake_schema.arrays import Float, Int
 from truesky.catalogue.halos import projected_nfw
 from truesky.numerics.compiling import exact_jit
 
+# Rows of a table of halos: position x and y, comoving distance, lensing strength, theta_200 (SIZE), theta_s (CLOSE),
+# theta_c (WIDE) and concentration.
 X, Y, CHI, AMPLITUDE, SIZE, CLOSE, WIDE, CONCENTRATION = range(8)
 _profile, _total = projected_nfw.profile, projected_nfw.total
-# Inner radius in units of theta_200. Closer to the centre, values are frozen at this radius, except that shear and
+# Radius in units of theta_200 within which the profile of a halo is constant, to avoid a division by zero. Shear and
 # deflection are 0 at the centre.
 _CENTRE = 1e-6
-# Margin for rounding errors in the comparison of distances.
+# Angle (rad) that is added to radii before comparing distances, because of rounding errors.
 _ROUNDING_ERROR = 1e-9
 
 
 @exact_jit
 def add_halos(place: Float, inverse_distance: Float, first: Int, halo: Float, out: Float) -> None:
-    """Add the short-range lensing of halos to sources behind them, with masses compensated within theta_s.
+    """Add the lensing by halos at short range to the sources behind them.
+
+    At short range, the mass of a halo is compensated by an equal negative mass within the angle theta_s, beyond which
+    there is no lensing. `add_smooth` adds the rest.
 
     Parameters
     ----------
     place : float array, shape (2, n)
-        Positions of the sources, rad, sorted by piece of the plane, then by decreasing distance.
+        Positions of the sources in the tangent plane, rad. They are sorted by piece of the plane (for example a HEALPix
+        cell), then by decreasing distance.
     inverse_distance : float array, shape (n,)
-        Inverse distances of the sources, h/Mpc.
+        Inverse comoving distances of the sources, h/Mpc.
     first : int array, shape (pieces + 1,)
-        Row of the first source of each piece.
+        Row of the first source of each piece; the last value is n.
     halo : float array, shape (8, h)
-        Table of halos.
+        Table of halos with the rows X to CONCENTRATION, ascending in distance.
     out : float array, shape (5, n)
-        Sums, to which the lensing is added.
+        kappa, gamma1, gamma2, deflection along x and y (rad), to which the lensing is added.
     """
     for piece in range(first.size - 1):
         start, stop = first[piece], first[piece + 1]
@@ -67,7 +76,11 @@ def add_halos(place: Float, inverse_distance: Float, first: Int, halo: Float, ou
 
 @exact_jit
 def _add_point(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> None:
-    """Add a point with the halo's mass, compensated within theta_s, so that there is no lensing beyond."""
+    """Add the lensing by a point with the mass of a halo at sources behind it.
+
+    The mass is compensated by an equal negative mass within theta_s, so there is no lensing beyond this angle. `halo`
+    is a column of the table of halos. The sources are at `x`, `y` (rad) and 1 / comoving distance `inverse` (h/Mpc).
+    """
     kappa, gamma1, gamma2, along_x, along_y = out[0], out[1], out[2], out[3], out[4]
     at_x, at_y, chi, amplitude = halo[X], halo[Y], halo[CHI], halo[AMPLITUDE]
     min_square, inverse_close = (_CENTRE * halo[SIZE]) ** 2, 1.0 / halo[CLOSE] ** 2
@@ -91,7 +104,10 @@ def _add_point(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> N
 
 @exact_jit
 def _add_inside(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> None:
-    """Add the difference between the halo's profile and a point of its mass, inside R_200m."""
+    """Add the lensing by an NFW halo minus the lensing by a point of the same mass, for sources inside R_200m.
+
+    The arguments have the same meaning as in `_add_point`. Sources outside R_200m are not changed.
+    """
     size, concentration = halo[SIZE], halo[CONCENTRATION]
     min_square, max_square = (_CENTRE * size) ** 2, size * size
     total_mass = _total(concentration)
@@ -116,18 +132,21 @@ def _add_inside(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> 
 
 @exact_jit
 def add_smooth(place: Float, inverse_distance: Float, halo: Float, out: Float) -> None:
-    """Add the long-range lensing of halos: their mass spread within theta_s, and compensated within theta_c.
+    """Add the lensing by halos at long range to the nodes of a grid behind them.
+
+    At long range, the mass of a halo is spread within the angle theta_s and compensated by an equal negative mass
+    within theta_c, beyond which there is no lensing.
 
     Parameters
     ----------
     place : float array, shape (2, n)
-        Positions of the nodes, rad, sorted by decreasing distance.
+        Positions of the nodes in the tangent plane, rad, sorted by decreasing distance.
     inverse_distance : float array, shape (n,)
-        Inverse distances of the nodes, h/Mpc.
+        Inverse comoving distances of the nodes, h/Mpc; 0 for infinity.
     halo : float array, shape (8, h)
-        Table of halos.
+        Table of halos with the rows X to CONCENTRATION, in any order.
     out : float array, shape (5, n)
-        Sums, to which the lensing is added.
+        kappa, gamma1, gamma2, deflection along x and y (rad), to which the lensing is added.
     """
     for h in range(halo.shape[1]):
         behind_count = inverse_distance.size
@@ -155,22 +174,25 @@ def add_smooth(place: Float, inverse_distance: Float, halo: Float, out: Float) -
 
 @exact_jit
 def add_nodes(place: Float, inverse_distance: Float, planes: Float, step: float, table: Float, out: Float) -> None:
-    """Add values of a table to sources: cubic on the grid, linear in inverse distance between planes.
+    """Add the lensing at the nodes of a grid to sources, by interpolation.
+
+    The interpolation is cubic in position, and linear in the inverse distance between two planes.
 
     Parameters
     ----------
     place : float array, shape (2, n)
-        Positions of the sources, rad.
+        Positions of the sources in the tangent plane, rad.
     inverse_distance : float array, shape (n,)
-        Inverse distances of the sources, h/Mpc.
+        Inverse comoving distances of the sources, h/Mpc. Nothing is added to sources nearer than the nearest plane.
     planes : float array, shape (p,)
-        Inverse distances of the planes, h/Mpc, ascending from 0.
+        Inverse comoving distances of the planes, h/Mpc, ascending from 0 (infinity).
     step : float
-        Node spacing, rad.
+        Distance between nodes, rad.
     table : float array, shape (p, side, side, 5)
-        Values at the nodes of a square around the origin; sources outside get the values of its border.
+        Lensing at the nodes of a square around the origin of the plane, by plane, y and x. The interpolation needs four
+        nodes per axis, so sources in the outermost ring of cells or outside get the values one node inside the border.
     out : float array, shape (5, n)
-        Sums, to which the values are added.
+        kappa, gamma1, gamma2, deflection along x and y (rad), to which the values are added.
 
     References
     ----------
@@ -194,7 +216,11 @@ def add_nodes(place: Float, inverse_distance: Float, planes: Float, step: float,
 
 @exact_jit
 def _node(at: float, step: float, side: int, weight: Float) -> int:
-    """Return the first of the four nodes around a position, and fill in their weights."""
+    """Return the first of the four nodes around a position on one axis, and fill `weight` with their cubic weights.
+
+    `at` is the position relative to the middle of the `side` nodes, and `step` the distance between nodes (both rad).
+    Positions before the second or behind the last but one node are moved to that node.
+    """
     where = min(max(at / step + 0.5 * (side - 1), 1.0), side - 2.000001)
     node = int(where)
     t = where - node

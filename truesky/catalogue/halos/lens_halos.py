@@ -1,4 +1,4 @@
-"""Halos that lens: all halos above a fixed mass, independent of the limit and the redshifts of a request.
+"""Select the halos that lens: all halos above a fixed mass, independent of the limits of the galaxy catalogue.
 
 Notes
 -----
@@ -23,7 +23,12 @@ from truesky.fluxes import cosmology
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Selection and ranges of the lensing halos (lens_halos.toml; angles in arcmin, planes are redshifts)."""
+    """Limits in mass, redshift and angle of the halos that lens; explained in lens_halos.toml.
+
+    The masses `lowest` and `heavy` are log10 M_200m / (Msun/h), and `planes` are redshifts. The unit of `span` is
+    comoving Mpc/h, and the unit of `radii` and `close_radii` is R_200m. Angles are in arcmin: `wide`, `reach`, `close`,
+    `step` and `strip`.
+    """
 
     lowest: float
     z_max: float
@@ -42,45 +47,48 @@ class Settings:
 
     @property
     def max_distance(self) -> float:
-        """Return the largest distance of lensing halos, Mpc/h."""
+        """Return the largest comoving distance of halos that lens, Mpc/h."""
         return float(cosmology.comoving_distance(self.z_max))
 
     @property
     def wide_distance(self) -> float:
-        """Return the distance beyond which no theta_c is larger than `wide`, Mpc/h."""
+        """Return the comoving distance (Mpc/h) beyond which no halo lenses at angles larger than `wide` (arcmin)."""
         return float(self.span / np.radians(self.wide / 60.0))
 
 
 def settings() -> Settings:
-    """Return the settings of the embedded universe."""
+    """Return the built-in limits in mass, redshift and angle of the halos that lens."""
     return Settings(**parameters.section("lens_halos.toml", "lenses"))
 
 
 def draw(population: Population, min_log_mass: float, max_distance: float, order: int, cell: int) -> Halos:
-    """Return the lensing halos of one level in a cell, which are a subset of the halos of a deep request.
+    """Return all halos above a mass and nearer than a distance that are drawn in a HEALPix cell.
+
+    They do not depend on the magnitude limit and the redshift range of the galaxy catalogue.
 
     Parameters
     ----------
     population : Population
-        Halos and their model.
+        Model from which halos are drawn, or the user's halos.
     min_log_mass : float
         Lower limit of log10 M_200m / (Msun/h).
     max_distance : float
-        Largest distance, Mpc/h.
+        Largest comoving distance, Mpc/h.
     order, cell : int
-        Order and nested index of the cell.
+        Order (8, 5 or 2) and nested index of the cell. Halos with larger angular radii are drawn in larger cells.
 
     Returns
     -------
     Halos
-        The halos.
+        The halos, sorted by position.
     """
     model = population.halos
     if population.light_cone is None:
         limits = np.where(model.steps.edge[:-1] < max_distance, min_log_mass, np.inf)
         drawn = halos.draw(model, population.seed, order, cell, limits)
     else:
-        # Select by the limits of lensing instead of the limits of galaxies.
+        # Replace the limits of the galaxy catalogue by the limits of lensing, because `halo_catalogue.draw` selects the
+        # user's halos by the limits of its model.
         deep = replace(model, limit=np.full(model.limit.shape, min_log_mass), max_distance=max_distance)
         cone, seed = population.light_cone, population.seed
         drawn = halo_catalogue.draw(deep, population.masses, cone, seed, order, cell)
@@ -88,16 +96,16 @@ def draw(population: Population, min_log_mass: float, max_distance: float, order
 
 
 def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, log_mass: Float) -> Float:
-    """Return the lensing strength and the angles of halos.
+    """Return the lensing strength, the angles and the concentration of halos.
 
     Parameters
     ----------
     masses : Masses
-        Tables of halos by mass.
+        Tables of radius and concentration of halos.
     chosen : Settings
-        Ranges of the lensing.
+        Angles to which halos lens.
     order : int
-        Order of the level.
+        HEALPix order (8, 5 or 2) of the cells in which the halos are drawn; it limits theta_c.
     z : float array, shape (n,)
         Redshift.
     chi : float array, shape (n,)
@@ -108,12 +116,12 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
     Returns
     -------
     float array, shape (5, n)
-        Amplitude; theta_200, theta_s and theta_c in rad; concentration.
+        Amplitude (rad^2), theta_200, theta_s and theta_c (rad), and concentration c_200m.
 
     Notes
     -----
     The convergence of a halo is the amplitude times 1 - chi / chi_source times a function of angle. The mean of this
-    function inside theta is 1 / theta^2 if the circle contains the whole mass.
+    function inside a circle of radius theta that contains the whole mass is 1 / theta^2.
 
     theta_200 is the angle of R_200m. Halos are summed for each source within theta_s; the rest of their lensing is
     smooth. The mass of a halo is compensated by an equal negative mass within theta_c, so that the mean density does
@@ -135,7 +143,11 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
 
 
 def max_circle(chosen: Settings, order: int) -> float:
-    """Return the largest theta_c of a level (rad), limited by the neighbouring cells that are searched."""
+    """Return the largest angle (rad) at which the halos of a level (order 8, 5 or 2) may lens.
+
+    For orders 5 and 2, the halos that lens a source are searched only in the cell of the source and the neighbouring
+    cells. A larger angle would reach beyond these cells.
+    """
     if order == GENERATION_ORDER:
         return float(np.radians(chosen.reach / 60.0))
     return float(halos.reach(order) - np.radians(chosen.strip / 60.0))

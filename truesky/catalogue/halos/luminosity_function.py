@@ -1,7 +1,7 @@
-"""Evolving luminosity function of galaxies, and its inverse.
+"""Luminosity function of galaxies by redshift, and its inverse.
 
-Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, volumes are comoving (Mpc/h)^3. The parameters and their sources are
-in luminosity_function.toml.
+Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, where 0.1r is SDSS r blueshifted to z = 0.1. Volumes are comoving
+(Mpc/h)^3. The parameters and their sources are in luminosity_function.toml.
 
 References
 ----------
@@ -21,20 +21,34 @@ from lake_schema.errors import OutOfRange
 from truesky.catalogue import parameters
 from truesky.catalogue.interpolation import bracket
 
+# Factor between magnitudes and natural logarithms of the luminosity.
 _LN10_04 = 0.4 * np.log(10.0)
-# Redshift beyond which a separate population begins (Serrano et al. 2024, "Galaxy catalogues").
+# Largest redshift of galaxies with this luminosity function. Another one is used beyond (Serrano et al. 2024, "Galaxy
+# catalogues").
 _Z_MAX_LIMIT = 6.0
 
-# Resolution of the tables, chosen to keep the stated errors.
+# Smallest distance of a, the first argument of the incomplete Gamma function Gamma(a, x), from 0 and -1. A closer a
+# is moved to this distance above 0 or -1, because the recurrence in a divides by zero there.
 _SMALLEST_A = 1e-5
+# Value of a above which the incomplete Gamma function Gamma(a, x) is computed from Gamma(a + 1, x). For smaller a, it
+# is computed from Gamma(a + 2, x).
 _ONE_STEP = -0.95
-_A_NODES, _A_MARGIN = 384, 0.01
-_LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
+# Number of values of a = alpha + 1 in the table of `inverse`; alpha is the slope of the Schechter function.
+_A_NODES = 384
+# The table of `inverse` extends beyond the largest a = alpha + 1 of the luminosity function by this margin.
+_A_MARGIN = 0.01
+# Range of ln x = ln(L / L*) of the table of `inverse`.
+_LN_X_RANGE = (-20.0, 6.4)
+# Number of values of ln x = ln(L / L*) at which Gamma(a, x) is computed for the table of `inverse`.
+_X_NODES = 3001
+# Step between the values of ln x that are used for the table of `inverse`: Gamma(a, x) is computed at `_X_NODES` values
+# of ln x, and its logarithms at every fifth of them are the columns of the table.
+_X_STEP = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Schechter:
-    """Schechter function whose parameters depend on redshift (luminosity_function.toml, [schechter])."""
+    """Schechter function whose parameters depend on redshift; explained in luminosity_function.toml, [schechter]."""
 
     z_anchor: float
     m_star: float
@@ -51,7 +65,7 @@ class Schechter:
     far_alpha: tuple[float, ...]
 
     def parameters_at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
-        """Return M* (mag), phi* ((Mpc/h)^-3) and alpha at each redshift."""
+        """Return the Schechter parameters M* (mag), phi* ((Mpc/h)^-3) and alpha at each redshift."""
         redshift = np.asarray(z, float)
         z_offset = redshift - self.z_anchor
         m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-z_offset / self.m_star_scale)
@@ -69,7 +83,7 @@ class Schechter:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """Redshift range, and the faintest M_r that is drawn (luminosity_function.toml, [volume])."""
+    """Redshift range of galaxies in halos, and the faintest absolute magnitude M_r (mag) that is drawn."""
 
     z_min: float
     z_max: float
@@ -78,18 +92,20 @@ class Volume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """Table of the luminosity at a number density: ln x for Gamma(a, x) = g, with x = L/L* and a = alpha + 1.
+    """Table of the luminosity above which galaxies have a given number density.
+
+    It contains the solution x of Gamma(a, x) = g, the upper incomplete Gamma function, with x = L/L* and a = alpha + 1.
 
     Attributes
     ----------
     schechter : Schechter
         The luminosity function.
     a : float array, shape (k,)
-        Uniform nodes of a.
+        Values of a of the rows, with constant steps.
     ln_g : float array, shape (m,)
-        Nodes of ln g in ascending order.
+        Values of ln g of the columns, ascending; g is the number density divided by phi*.
     ln_x : float array, shape (k, m)
-        ln x.
+        Solutions ln x.
     """
 
     schechter: Schechter
@@ -99,14 +115,15 @@ class Inverse:
 
 
 def schechter() -> Schechter:
-    """Return the luminosity function of the embedded universe."""
+    """Return the built-in parameters of the luminosity function of galaxies."""
     return Schechter(**parameters.section("luminosity_function.toml", "schechter"))
 
 
 def volume(z_max: float | None = None) -> Volume:
-    """Return the redshift range of the embedded universe, with another upper end if `z_max` is given.
+    """Return the redshift range of galaxies in halos, and the faintest absolute magnitude that is drawn.
 
-    Raises OutOfRange if z_max is outside (z_min, 6].
+    `z_max` is the largest redshift; None for the built-in value of 6. Raises OutOfRange if it is not above the smallest
+    redshift (0.002) or above 6.
     """
     numbers = parameters.section("luminosity_function.toml", "volume")
     if z_max is not None:
@@ -122,9 +139,9 @@ def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     Parameters
     ----------
     lf : Schechter
-        Parameters.
+        Parameters of the luminosity function.
     m : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude M_r, mag.
     z : float array, shape (n,)
         Redshift.
 
@@ -143,14 +160,14 @@ def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
 
 def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """Return the number density of galaxies brighter than M.
+    """Return the number density of galaxies brighter than an absolute magnitude.
 
     Parameters
     ----------
     lf : Schechter
-        Parameters.
+        Parameters of the luminosity function.
     m : float array, shape (n,)
-        M_r, mag.
+        Absolute magnitude M_r, mag.
     z : float array, shape (n,)
         Redshift.
 
@@ -165,7 +182,9 @@ def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
 
 def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
-    """Return the upper incomplete Gamma function Gamma(a, x) for a > -2 and x > 0; scipy requires a > 0.
+    """Return the upper incomplete Gamma function Gamma(a, x) for a > -2 and x > 0, because scipy requires a > 0.
+
+    Raises OutOfRange if a <= -2. The function is not normalised by Gamma(a).
 
     Notes
     -----
@@ -179,10 +198,11 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
     order, at = np.asarray(a, float), np.asarray(x, float)
     if order.size and order.min() <= -2.0:
         raise OutOfRange("a", float(order.min()), -2.0, "infinity")
-    # The recurrence divides zero by zero at a = 0 and -1. Moving a by this small step changes Gamma by less than 1e-4.
+    # The recurrence from Gamma(a + 1, x) to Gamma(a, x) divides zero by zero at a = 0 and -1. Moving a by this small
+    # step changes Gamma by less than 1e-4 (relative).
     order = np.where(np.abs(order) < _SMALLEST_A, _SMALLEST_A, order)
     order = np.where(np.abs(order + 1.0) < _SMALLEST_A, _SMALLEST_A - 1.0, order)
-    # Each step of the recurrence loses digits at large x: use two steps only if one is not enough.
+    # Each step of the recurrence from a + 1 to a loses digits at large x: use two steps only if one is not enough.
     second = order < _ONE_STEP
     start = np.where(second, order + 2.0, order + 1.0)
     above = gamma(start) * gammaincc(start, at)
@@ -192,13 +212,16 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
 
 
 def inverse(lf: Schechter, z_max: float = _Z_MAX_LIMIT) -> Inverse:
-    """Return the table for `magnitude`: ln(L/L*) as a function of a and of g = Gamma(a, L/L*)."""
+    """Return the table that `magnitude` interpolates: the luminosity above which galaxies have a given number density.
+
+    The table covers redshifts from 0 to `z_max`.
+    """
     alpha = lf.parameters_at(np.linspace(0.0, z_max, _A_NODES))[2]
     a = np.linspace(alpha.min(), alpha.max() + _A_MARGIN, _A_NODES) + 1.0
     ln_x = np.linspace(*_LN_X_RANGE, _X_NODES)
     with np.errstate(divide="ignore"):
         ln_g = np.log(upper_gamma(a[:, None], np.exp(ln_x)[None, :]))
-    # Use the nodes of the steepest function, which cover the range of all others.
+    # `nodes` are the values of ln g in the first row (smallest a), whose range contains the ranges of all other rows.
     nodes = ln_g[0, ::-_X_STEP][np.isfinite(ln_g[0, ::-_X_STEP])]
     rows = [np.interp(nodes, row[::-1], ln_x[::-1]) for row in ln_g]
     return Inverse(lf, a, nodes, np.stack(rows))
@@ -210,7 +233,7 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     Parameters
     ----------
     table : Inverse
-        Table from `inverse`.
+        Table from `inverse`, which must cover the redshifts.
     number : float array, shape (n,)
         Comoving number density, (Mpc/h)^-3.
     z : float array, shape (n,)
@@ -219,7 +242,7 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     Returns
     -------
     float array, shape (n,)
-        M_r such that n(< M_r, z) = number.
+        Absolute magnitude M_r (mag) such that n(< M_r, z) = number. Beyond the table, the magnitude at its edge.
 
     Notes
     -----

@@ -1,9 +1,9 @@
 """Assign galaxy luminosities to halos and sub-halos by abundance matching.
 
-The proxy mass m' of a central galaxy is the mass of its halo, that of a satellite is its sub-mass, both with a
-log-normal scatter. M_r follows from n_tot(> m', z) = n(< M_r, z), so that the luminosity function is reproduced
-exactly. n_tot counts centrals and satellites after the scatter; a deconvolution is not necessary. Parameters: see
-halos.toml.
+The proxy mass m' of a central galaxy is the mass of its halo, and the proxy mass of a satellite is the mass of its
+sub-halo, both with a log-normal scatter. The absolute magnitude M_r follows from n_tot(> m', z) = n(< M_r, z), so the
+luminosity function n is reproduced exactly. n_tot counts centrals and satellites after the scatter; therefore no
+deconvolution is necessary. The parameters are in halos.toml. M_r is in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1.
 
 References
 ----------
@@ -25,14 +25,17 @@ from truesky.catalogue.matter import linear_theory
 from truesky.fluxes import cosmology
 from truesky.numerics import matrices
 
-# Redshift range of the tables (beyond 6), uniform in ln(1 + z); masses in steps of 0.02 dex.
-Z_LAST, _Z_NODES = 6.1, 69
+# Last redshift of all tables by redshift; galaxies in halos end at z = 6.
+Z_LAST = 6.1
+# Number of redshifts of the tables from 0 to Z_LAST, uniform in ln(1 + z).
+_Z_NODES = 69
+# log10 of the masses (Msun/h) of the tables, in steps of 0.02 dex.
 _LOG_MASS = np.linspace(8.0, 16.4, 421)
 
 
 @dataclass(frozen=True, slots=True)
 class Occupation:
-    """Satellites of halos (halos.toml, [occupation])."""
+    """Parameters of the number and the masses of satellites in halos; explained in halos.toml, [occupation]."""
 
     min_mass_ratio: float
     ratio: float
@@ -44,14 +47,17 @@ class Occupation:
     concentration: float
 
     def ratio_at(self, z: Float) -> Float:
-        """Return the increase of M / m (halo mass / sub-mass) per additional satellite on average, at redshifts z."""
+        """Return the mean increase of the mass ratio halo / sub-halo from one satellite to the next, at each redshift.
+
+        The satellites of a halo are in the order of decreasing sub-halo mass.
+        """
         stretch = (1.0 + self.z_pivot) / (1.0 + np.minimum(z, self.z_last))
         return np.asarray(self.ratio * stretch**self.ratio_z)
 
 
 @dataclass(frozen=True, slots=True)
 class HaloShape:
-    """Sizes and velocities of halos (halos.toml, [halo])."""
+    """Parameters of the radius and the velocity dispersion of halos; explained in halos.toml, [halo]."""
 
     overdensity: float
     critical_density: float
@@ -62,22 +68,22 @@ class HaloShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Masses:
-    """Tables of halos by redshift (uniform in ln(1 + z)) and mass (uniform in the logarithm).
+    """Tables of halo properties by redshift (uniform in ln(1 + z)) and mass (uniform in the logarithm).
 
     Attributes
     ----------
     log_mass : float array, shape (m,)
-        log10 M_200m / (Msun/h).
+        log10 M_200m / (Msun/h) of the columns.
     z : float array, shape (z,)
-        Redshift nodes.
+        Redshifts of the rows of `ln_density` and `bias`.
     ln_density : float array, shape (z, m)
-        ln of dn/dlog10 M, comoving (Mpc/h)^-3.
+        ln of the abundance dn/dlog10 M in comoving (Mpc/h)^-3.
     bias : float array, shape (z, m)
-        Halo bias.
+        Linear halo bias.
     concentration : float array, shape (coarse z, m)
-        Concentration c_200m.
+        Concentration c_200m at fewer redshifts, also uniform in ln(1 + z) over the same range.
     shape : HaloShape
-        Sizes and velocities.
+        Parameters of radius and velocity dispersion.
     """
 
     log_mass: Float
@@ -88,21 +94,21 @@ class Masses:
     shape: HaloShape
 
     def interpolate(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """Interpolate a table linearly in ln(1 + z) and log10 M on a grid.
+        """Interpolate one of the tables at all combinations of redshifts and masses, linearly in ln(1 + z) and log10 M.
 
         Parameters
         ----------
-        table : float array, shape (z nodes, masses)
-            Table.
+        table : float array, shape (z, m)
+            Table such as `bias`; its redshifts are uniform in ln(1 + z).
         z : float array, shape (a,)
-            Redshift.
+            Redshift. Values beyond the table are extrapolated.
         log_mass : float array, shape (b,)
-            log10 mass, Msun/h.
+            log10 mass, Msun/h. Values beyond the table are extrapolated.
 
         Returns
         -------
         float array, shape (a, b)
-            Values.
+            Values of the table.
         """
         row, part = _redshift_node(z, table.shape[0])
         column, share = _mass_node(log_mass, self.log_mass)
@@ -110,26 +116,26 @@ class Masses:
         return np.asarray(along[row] * (1.0 - part)[:, None] + along[row + 1] * part[:, None])
 
     def interpolate_pairs(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """Interpolate a table linearly in ln(1 + z) and log10 M at pairs of values.
+        """Interpolate one of the tables at n pairs of redshift and mass, linearly in ln(1 + z) and log10 M.
 
         Parameters
         ----------
-        table : float array, shape (z nodes, masses)
-            Table.
+        table : float array, shape (z, m)
+            Table such as `bias`; its redshifts are uniform in ln(1 + z).
         z : float array, shape (n,)
-            Redshift.
+            Redshift. Values beyond the table are extrapolated.
         log_mass : float array, shape (n,)
-            log10 mass, Msun/h.
+            log10 mass, Msun/h. Values beyond the table are extrapolated.
 
         Returns
         -------
         float array, shape (n,)
-            Values.
+            Values of the table.
         """
         return _interpolate_pairs(table, self.log_mass, z, log_mass)
 
     def radius(self, log_mass: Float) -> Float:
-        """Return R_200m in comoving Mpc/h, from log10 of the mass in Msun/h."""
+        """Return the halo radius R_200m in comoving Mpc/h, from log10 of M_200m in Msun/h."""
         density = self.shape.overdensity * cosmology.OMEGA_M * self.shape.critical_density
         return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
 
@@ -146,16 +152,18 @@ class Masses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matching:
-    """M_r of proxy masses.
+    """Table of the absolute magnitude of galaxies by redshift and proxy mass.
+
+    The proxy mass is the mass of the halo (central galaxies) or of the sub-halo (satellites) with a scatter.
 
     Attributes
     ----------
     log_mass : float array, shape (m,)
-        log10 of the proxy mass, Msun/h.
+        log10 of the proxy masses of the columns, Msun/h.
     m_r : float array, shape (z, m)
-        M_r in mag, with z uniform in ln(1 + z).
+        Absolute magnitude in 0.1r for h = 1, mag. The redshifts of the rows are uniform in ln(1 + z), from 0 to 6.1.
     occupation : Occupation
-        Satellites of halos.
+        Parameters of the satellites and of the scatter.
     """
 
     log_mass: Float
@@ -163,18 +171,26 @@ class Matching:
     occupation: Occupation
 
     def magnitude(self, z: Float, proxy: Float) -> Float:
-        """Return M_r of redshifts and log10 proxy masses (Msun/h)."""
+        """Return the absolute magnitude M_r (mag) of galaxies at redshifts z.
+
+        `proxy` is log10 of the proxy mass (Msun/h): the mass of the halo or sub-halo with a scatter. Values beyond the
+        table are extrapolated.
+        """
         return _interpolate_pairs(self.m_r, self.log_mass, z, proxy)
 
     def proxy_mass(self, z: Float, m_r: Float) -> Float:
-        """Return log10 of the proxy mass (Msun/h) of redshifts and M_r (mag)."""
+        """Return log10 of the proxy mass (Msun/h) of galaxies with redshifts z and absolute magnitudes M_r (mag).
+
+        The proxy mass is the mass of the halo or sub-halo with a scatter. Magnitudes beyond the table get the first or
+        last mass of the table.
+        """
         row, part = _redshift_node(z, self.m_r.shape[0])
         curves = self.m_r[row] * (1.0 - part)[:, None] + self.m_r[row + 1] * part[:, None]
         return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
 
 
 def masses() -> Masses:
-    """Return the halo tables of the embedded universe, 0 <= z <= 6.1."""
+    """Return the tables of halo abundance, bias and concentration in the built-in cosmology, for z = 0 to 6.1."""
     z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
     tables = linear_theory.halo_tables(_LOG_MASS, z)
     shape = HaloShape(**parameters.section("halos.toml", "halo"))
@@ -183,23 +199,32 @@ def masses() -> Masses:
 
 
 def match_luminosities(halos: Masses, luminosities: Inverse) -> Matching:
-    """Return M_r of every proxy mass and redshift."""
+    """Return the table of absolute magnitudes by redshift and proxy mass that reproduces the luminosity function.
+
+    The proxy mass is the mass of a halo or sub-halo with a scatter. `luminosities` is the inverse of the luminosity
+    function.
+    """
     occupation = Occupation(**parameters.section("halos.toml", "occupation"))
     rows = [
         luminosity_function.magnitude(luminosities, number, np.full(number.size, z))
         for z, number in zip(halos.z, proxy_density(halos, occupation), strict=True)
     ]
-    # Keep the brightest magnitude at the end of the mass function, where the density is 0.
+    # At the highest masses the density underflows; the brightest magnitude of lower masses is repeated there.
     return Matching(halos.log_mass, np.minimum.accumulate(np.array(rows), axis=1), occupation)
 
 
 def proxy_density(halos: Masses, occupation: Occupation) -> Float:
-    """Return n_tot(> m'), comoving (Mpc/h)^-3, shape (z, m): centrals and satellites with scatter."""
+    """Return the number density of central galaxies and satellites above each proxy mass, shape (z, m).
+
+    The proxy mass is the mass of the halo or sub-halo with a scatter. The density is in comoving (Mpc/h)^-3, at the
+    redshifts and masses of `halos`.
+    """
     step = halos.log_mass[1] - halos.log_mass[0]
     number = np.exp(halos.ln_density) * step
     satellites = matrices.matmul(number, satellites_above(halos.log_mass, occupation).T)
     satellites *= satellite_evolution(halos.z, occupation)[:, None]
-    # Difference of the cumulative number of satellites in each mass interval.
+    # Add the satellites in each mass interval: the difference of two cumulative numbers. The last interval contains all
+    # satellites above its lower edge.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
     smooth = scatter_masses(inside, step, occupation)
     above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
@@ -207,21 +232,21 @@ def proxy_density(halos: Masses, occupation: Occupation) -> Float:
 
 
 def scatter_masses(number: Float, step: float, occupation: Occupation) -> Float:
-    """Convolve numbers per mass bin with the scatter of the proxy mass.
+    """Convolve numbers of galaxies per mass bin with the log-normal scatter between mass and luminosity.
 
     Parameters
     ----------
     number : float array, shape (z, m)
-        Number per mass bin.
+        Number per bin of the mass without scatter.
     step : float
         Width of a bin, dex.
     occupation : Occupation
-        Scatter and its limit.
+        Standard deviation and largest value of the scatter, dex.
 
     Returns
     -------
     float array, shape (z, m)
-        Number per bin of the proxy mass.
+        Number per bin of the proxy mass, that is the mass with the scatter.
     """
     half = round(occupation.depth / step)
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
@@ -232,16 +257,16 @@ def scatter_masses(number: Float, step: float, occupation: Occupation) -> Float:
 
 
 def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
-    """Return the mean number of satellites above mass m[i] in a halo of mass M[j] at z = z_pivot, shape (m, m).
+    """Return the mean number of satellites with a sub-halo mass above m[i] in a halo of mass M[j], shape (m, m).
 
-    `log_mass` contains log10 of both masses, Msun/h.
+    Both masses have the values 10^log_mass (Msun/h). The number is for the redshift `z_pivot` of `occupation`.
     """
     over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
     return np.asarray(np.maximum(over - occupation.min_mass_ratio, 0.0) / occupation.ratio)
 
 
 def satellite_evolution(z: Float, occupation: Occupation) -> Float:
-    """Return the number of satellites of a halo at each redshift, relative to z = z_pivot."""
+    """Return the number of satellites of a halo at each redshift, relative to the redshift `z_pivot`."""
     return np.asarray(occupation.ratio / occupation.ratio_at(z))
 
 

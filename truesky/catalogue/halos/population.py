@@ -1,8 +1,9 @@
-"""Members of a generation cell: central galaxies of its halos, and satellites whose positions are inside it.
+"""Draw the halos of one generation cell (HEALPix cell of order 8), and the galaxies whose true positions are inside it.
 
-A galaxy belongs to the cell of its true position. The halos of neighbouring cells are drawn as well, and their
-satellites inside the cell are kept, so that every satellite is in exactly one cell. The content of a cell depends only
-on the seed and the cell. A nearer or shallower request has a subset of it.
+The galaxies in halos are called members: central galaxies and satellites. The halos of neighbouring cells are drawn as
+well, and their satellites inside the cell are kept, so every satellite is in exactly one cell. A cell has the same
+halos and galaxies whatever other cells are drawn; they depend on the seed and the number of the cell. A catalogue with
+a smaller redshift range or a brighter limit contains a subset of them.
 """
 
 from __future__ import annotations
@@ -27,13 +28,25 @@ from truesky.catalogue.halos.satellites import Satellites
 from truesky.catalogue.matter import density_box
 
 CENTRAL, SATELLITE = 0, 1
-# Number of cached cells, enough for a block of cells and its neighbours.
+# Largest number of HEALPix cells whose halos are kept in memory, enough for neighbouring cells drawn one after another.
 _MAX_CACHED_CELLS = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """Model of halos and luminosities; `light_cone` are the user's halos, which replace the drawn ones."""
+    """Model of the halos, and of the luminosities of the galaxies in them.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of all random numbers.
+    halos : HaloModel
+        Tables from which halos are drawn, and the limits of the catalogue.
+    masses : Masses
+        Abundance, bias and concentration of halos by mass and redshift.
+    light_cone : LightCone or None
+        The user's halos, which replace the drawn halos; None to draw halos.
+    """
 
     seed: int
     halos: HaloModel
@@ -43,18 +56,21 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Members:
-    """Halos of a cell, and its candidate galaxies sorted by index.
+    """Halos of an order-8 cell, and the galaxies in halos (members) whose true positions are in the cell.
+
+    Galaxies are sorted by position. Their magnitudes and colours are drawn later, so some are too faint for the
+    catalogue.
 
     Attributes
     ----------
     halos : Halos
-        Halos of the cell.
+        Halos whose centres are in the cell.
     id, halo_id : int array, shape (n,)
         Identifiers of the galaxy and of its halo.
     kind : int array, shape (n,)
         CENTRAL or SATELLITE.
     index : int array, shape (n,)
-        Order-29 cell.
+        True position: nested index of the HEALPix cell of order 29.
     ra, dec : float array, shape (n,)
         True position, deg.
     chi : float array, shape (n,)
@@ -62,11 +78,12 @@ class Members:
     z, z_obs : float array, shape (n,)
         Redshift without and with the peculiar velocity.
     proxy : float array, shape (n,)
-        log10 of the proxy mass, Msun/h.
+        log10 of the proxy mass (Msun/h), which determines the luminosity: mass of the halo (central galaxies) or of the
+        sub-halo (satellites) with a scatter.
     host_mass : float array, shape (n,)
         log10 M_200m / (Msun/h) of the halo.
     host_index : int array, shape (n,)
-        Order-29 cell of the halo.
+        Position of the halo: nested index of the HEALPix cell of order 29.
     radius : float array, shape (n,)
         Distance from the centre of the halo in units of R_200m, 0 for central galaxies.
     """
@@ -87,23 +104,24 @@ class Members:
     radius: Float
 
     def select(self, keep: Bool) -> Members:
-        """Return the same halos with the galaxies of a bool mask, shape (n,)."""
+        """Return the same halos, with the galaxies for which the mask `keep`, shape (n,), is True."""
         columns = (getattr(self, name)[keep] for name in self.__slots__ if name != "halos")
         return Members(self.halos, *columns)
 
 
 @dataclass(slots=True, eq=False)
 class CellCache:
-    """Cache of drawn cells of a population, which neighbouring cells share.
+    """Halos that are already drawn, kept in memory because neighbouring cells need the same halos.
 
     Attributes
     ----------
     population : Population
-        The population.
+        Model from which halos are drawn.
     drawn : OrderedDict
-        Halos and all their satellites by (order, cell).
+        Halos drawn in a HEALPix cell and all their satellites, by (order, nested index). The most recently used cells
+        are last.
     lenses : OrderedDict
-        Lensing of the halos by (order, cell, lowest mass).
+        Table and identifiers of the halos that lens, by (order, nested index, log10 of the lowest mass in Msun/h).
     """
 
     population: Population
@@ -111,7 +129,10 @@ class CellCache:
     lenses: OrderedDict[tuple[int, int, float], tuple[Float, Int]] = field(default_factory=OrderedDict)
 
     def halos_and_satellites(self, order: int, cell: int) -> tuple[Halos, Satellites]:
-        """Return the halos that a cell of a level draws, and all their satellites, which may be in other cells."""
+        """Return the halos drawn in a HEALPix cell of order 8, 5 or 2, and all their satellites.
+
+        The halos of a larger order have smaller angular radii. Satellites may be in neighbouring cells.
+        """
         place = (order, cell)
         if place not in self.drawn:
             population = self.population
@@ -136,27 +157,28 @@ def model(
     faintest: Callable[[Float], Float],
     light_cone: LightCone | None = None,
 ) -> Population:
-    """Return the population of a seed.
+    """Return the model from which the halos of a seed, and the galaxies in them, are drawn.
 
     Parameters
     ----------
     seed : int
-        Seed of the box of matter.
+        Seed of the simulated matter and of all halos and galaxies.
     box_cells : int
-        Cells per side of the box.
+        Cells per side of the box of simulated matter, an even number.
     volume : Volume
-        Redshift range, and the faintest M_r.
+        Redshift range, and the faintest absolute magnitude.
     luminosities : Inverse
-        Inverse of the luminosity function.
+        Table of luminosity by cumulative number density (inverse of the luminosity function).
     faintest : callable
-        Function that returns the faintest requested M_r at each redshift; the limit of `volume` also applies.
+        Function that returns the faintest absolute magnitude M_r (0.1r for h = 1) of the catalogue at redshifts. The
+        limit of `volume` also applies.
     light_cone : LightCone, optional
-        The user's halos, which replace the drawn ones.
+        The user's halos, which replace the drawn halos; None to draw halos.
 
     Returns
     -------
     Population
-        The population.
+        The model.
     """
     masses = matching.masses()
     matched = matching.match_luminosities(masses, luminosities)
@@ -170,7 +192,10 @@ def model(
 
 
 def halos_of(cells: CellCache, cell: int) -> Halos:
-    """Return the halos of the request in a generation cell (nested index at order 8), sorted by position."""
+    """Return the halos of the catalogue whose positions are in the order-8 cell with nested index `cell`.
+
+    They are sorted by position, then by identifier.
+    """
     selected, max_distance = [], cells.population.halos.max_distance
     for order in LEVELS:
         hosts, _ = cells.halos_and_satellites(order, cell >> 2 * (GENERATION_ORDER - order))
@@ -182,21 +207,22 @@ def halos_of(cells: CellCache, cell: int) -> Halos:
 
 
 def members(cells: CellCache, cell: int, is_requested: Callable[[int, int], bool] | None = None) -> Members:
-    """Return the halos and candidate galaxies of one generation cell.
+    """Return the halos in one generation cell (HEALPix cell of order 8), and the galaxies in halos inside the cell.
 
     Parameters
     ----------
     cells : CellCache
-        Cache of drawn cells.
+        Cache of the halos that are already drawn, by HEALPix cell.
     cell : int
         Nested index of the order-8 cell.
     is_requested : callable, optional
-        Function of (order, cell) that returns True if satellites of halos in that cell are needed; None for all cells.
+        Function of (order, nested index) that returns True if the satellites of the halos drawn in that HEALPix cell
+        are needed. None for all cells.
 
     Returns
     -------
     Members
-        Halos and galaxies.
+        Halos, and central galaxies and satellites that may be bright enough for the catalogue.
     """
     cell_halos = halos_of(cells, cell)
     bright = cell_halos.select(cell_halos.proxy >= cells.population.halos.mass_limit(cell_halos.chi))
@@ -239,7 +265,12 @@ def _cells_around(order: int, cell: int) -> list[int]:
 
 
 def _satellites_inside(cells: CellCache, order: int, host_cell: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
-    """Columns of `members` for the satellites of one cell's halos that are in the generation cell."""
+    """Return the satellites in the order-8 cell `cell` of the halos that are drawn in the cell (order, host_cell).
+
+    Return them as arrays: identifier, identifier of the halo, position (order-29 cell), ra and dec (deg), comoving
+    distance (Mpc/h), velocity (km/s), log10 proxy mass, log10 mass and position of the halo, and distance from its
+    centre (R_200m).
+    """
     hosts, candidates = cells.halos_and_satellites(order, host_cell)
     model = cells.population.halos
     candidates = candidates.select(
@@ -258,7 +289,7 @@ def _satellites_inside(cells: CellCache, order: int, host_cell: int, cell: int) 
 
 
 def _may_be_inside(candidates: Satellites, cell: int) -> Bool:
-    """True for satellites that may be in the cell: not farther from its centre than its corners."""
+    """Return True for satellites that are not farther from the centre of an order-8 cell than its corners."""
     ra, dec = sky.cell_centre(GENERATION_ORDER, cell)
     radius = sky.cell_radius(GENERATION_ORDER)
     return np.asarray(sky.separation(candidates.ra, candidates.dec, ra, dec) <= 1.001 * radius)

@@ -1,4 +1,4 @@
-"""Projected profile of halos with the profile of Navarro, Frenk & White, cut at R_200m.
+"""Surface density and enclosed projected mass of NFW halos (Navarro, Frenk & White) that are cut at R_200m.
 
 x = r / r_s is the projected radius in scale radii and c is the concentration; the profile ends at x = c. The usual
 formulae have separate cases for x < 1 and x > 1 and lose precision close to x = 1. The form used here is valid for
@@ -19,24 +19,26 @@ import numpy as np
 
 from truesky.numerics.compiling import exact_jit
 
-# Below this x, the first terms x^2 ln x are sufficient.
+# Below this projected radius x, only the leading terms in x are used.
 _CENTRE = 1e-4
-# The series with this number of terms is used up to this |v|; its error is 0.04^9 / 21 of Psi.
+# For |v| up to _SERIES_LIMIT, the function (artanh(sqrt(v)) / sqrt(v) - 1) / v is computed as a power series with
+# _SERIES_TERMS terms; the error is 0.04^9 / 21.
 _SERIES_LIMIT, _SERIES_TERMS = 0.04, 9
 
 
 @exact_jit
 def total(c: float) -> float:
-    """Return m(c) = M / (4 pi rho_s r_s^3) of a concentration."""
+    """Return the mass of a halo with concentration c in units of 4 pi rho_s r_s^3: ln(1 + c) - c / (1 + c)."""
     mass: float = np.log1p(c) - c / (1.0 + c)
     return mass
 
 
 @exact_jit
 def profile(x: float, c: float) -> tuple[float, float]:
-    """Return surface density and enclosed mass at projected radius x of a halo with concentration c, 0 < x < c.
+    """Return surface density and enclosed projected mass of a halo at projected radius x (scale radii), 0 < x < c.
 
-    The results are F with Sigma = 2 rho_s r_s F, and m with the mass 4 pi rho_s r_s^3 m inside the circle.
+    c is the concentration. The surface density F is in units of 2 rho_s r_s. The mass m inside the circle of radius x
+    is in units of 4 pi rho_s r_s^3. The range of x is not checked.
     """
     if x < _CENTRE:
         centre = np.log(2.0 / x) + np.log(c / (1.0 + c)) - c / (1.0 + c)
@@ -51,7 +53,7 @@ def profile(x: float, c: float) -> tuple[float, float]:
     else:
         root = np.sqrt(abs(v))
         if v > 0.0:
-            # 1 - v in a form without loss of precision.
+            # rest = 1 - v, in a form without loss of precision for v close to 1.
             rest = 2.0 * x * (1.0 + c) / ((1.0 + x) * (c + x))
             phi = (np.log1p(root) - 0.5 * np.log(rest)) / root
         else:

@@ -1,7 +1,9 @@
-"""Quenching by halos: red central galaxies of groups, and red satellites by halo mass and distance from the centre.
+"""Quenching by halos: decide which galaxies are red, by the mass of their halo and their distance from its centre.
 
-Halos change which galaxies are red, but not their number. At every luminosity and redshift the mean equals the fraction
-of red galaxies, unless halos alone quench more galaxies than that. The parameters are in halos.toml, [quenching].
+A fraction of the central galaxies of massive halos and of the satellites is quenched, that is red because of the halo.
+Halos change which galaxies are red, but not how many: at every luminosity and redshift, the mean probability to be red
+equals the given fraction of red galaxies, unless halos alone quench more. The parameters are in halos.toml,
+[quenching].
 """
 
 from __future__ import annotations
@@ -17,15 +19,18 @@ from truesky.catalogue.halos.matching import Masses, Occupation
 from truesky.catalogue.halos.population import SATELLITE, Members
 from truesky.numerics import matrices
 
-# Pivot of log10 M for the quenched fraction of satellites.
+# Zero point of the quenched fraction of satellites, which is linear in log10 M - _PIVOT within limits. M is the mass of
+# the halo in Msun/h.
 _PIVOT = 13.0
-# Nodes of the mean radius of satellites, in concentration and enclosed mass.
-_CONCENTRATIONS, _ENCLOSED = np.geomspace(1.0, 60.0, 40), np.asarray((np.arange(500) + 0.5) / 500.0, np.float64)
+# Concentrations at which the mean distance of satellites from the centre of their halo is computed.
+_CONCENTRATIONS = np.geomspace(1.0, 60.0, 40)
+# Fractions of the halo mass. The radii that enclose them are averaged to get the mean distance of satellites.
+_ENCLOSED = np.asarray((np.arange(500) + 0.5) / 500.0, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Quenching:
-    """Parameters of quenching by halos (halos.toml, [quenching])."""
+    """Parameters of the fraction of galaxies that halos quench; explained in halos.toml, [quenching]."""
 
     central: float
     central_mass: float
@@ -43,18 +48,20 @@ class Quenching:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shares:
-    """Averages of galaxies by redshift and proxy mass (the nodes of `Masses`).
+    """Averages over all galaxies of the same redshift and proxy mass, that is of the same luminosity.
+
+    The proxy mass is the mass of the halo or sub-halo with a scatter.
 
     Attributes
     ----------
     law : Quenching
-        Parameters.
+        Parameters of the quenched fractions.
     masses : Masses
-        Tables of halos.
+        Tables of halos, with the redshifts (z) and masses (m) of the arrays below.
     satellites : float array, shape (z, m)
-        Fraction of satellites.
+        Fraction of galaxies that are satellites.
     quenched : float array, shape (z, m)
-        Mean fraction that halos quench, of galaxies that are not red for other reasons.
+        Mean fraction of galaxies that their halos quench, among galaxies that are not red for other reasons.
     """
 
     law: Quenching
@@ -64,21 +71,21 @@ class Shares:
 
 
 def model() -> Quenching:
-    """Return the quenching parameters of the embedded universe."""
+    """Return the built-in parameters of the fraction of galaxies that halos quench."""
     return Quenching(**parameters.section("halos.toml", "quenching"))
 
 
 def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
-    """Compute the averages over halos and their satellites, with the scatter of the proxy masses.
+    """Compute the mean fractions of satellites and of quenched galaxies, by redshift and luminosity.
 
     Parameters
     ----------
     law : Quenching
-        Parameters.
+        Parameters of the quenched fractions.
     masses : Masses
-        Tables of halos.
+        Tables of halo abundance and concentration.
     occupation : Occupation
-        Satellites of halos.
+        Number of satellites by halo mass, and scatter of the proxy masses (which determine luminosities).
 
     Returns
     -------
@@ -102,32 +109,32 @@ def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
         evolution * matrices.matmul(centrals * of_satellite, inside.T),
     )
     central, satellite, red_central, red_satellite = (matching.scatter_masses(n, step, occupation) for n in numbers)
-    # Avoid a division by zero beyond the end of the mass function.
+    # Avoid a division by zero at the highest masses, at which there are no halos.
     total = np.maximum(central + satellite, 1e-30)
     return Shares(law, masses, satellite / total, (red_central + red_satellite) / total)
 
 
 def satellite_share(average: Shares, members: Members) -> Float:
-    """Return the fraction of satellites among all galaxies of the same luminosity and redshift as each member."""
+    """Return the fraction of satellites among all galaxies with the luminosity and redshift of each of `members`."""
     return average.masses.interpolate_pairs(average.satellites, members.z, members.proxy)
 
 
 def odds(average: Shares, members: Members, share: Float) -> Float:
-    """Return the probability of each galaxy to be red.
+    """Return the probability of each galaxy to be red, given its halo.
 
     Parameters
     ----------
     average : Shares
-        Averages from `shares`.
+        Mean quenched fractions from `shares`.
     members : Members
-        Galaxies in their halos.
+        Galaxies with their halos.
     share : float array, shape (n,)
-        Red fraction of galaxies of the same luminosity.
+        Fraction of red galaxies among all galaxies of the same luminosity and redshift.
 
     Returns
     -------
     float array, shape (n,)
-        Probability.
+        Probability, 0 to 1.
     """
     z, halo = members.z, members.host_mass
     mean = average.masses.interpolate_pairs(average.quenched, z, members.proxy)
@@ -142,7 +149,7 @@ def quenched_central(law: Quenching, z: Float, log_mass: Float) -> Float:
     Parameters
     ----------
     law : Quenching
-        Parameters.
+        Parameters of the quenched fractions.
     z : float array
         Redshift.
     log_mass : float array
@@ -163,7 +170,7 @@ def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float)
     Parameters
     ----------
     law : Quenching
-        Parameters.
+        Parameters of the quenched fractions.
     z : float array
         Redshift.
     log_mass : float array
@@ -182,27 +189,30 @@ def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float)
 
 
 def red_odds(share: Float, quenched: Float | float = 0.0, mean: Float | float = 0.0) -> Float:
-    """Return the probability to be red of galaxies in halos.
+    """Return the probability of galaxies to be red, from the red fraction and the quenching by their halos.
 
     Parameters
     ----------
     share : float array, shape (n,)
-        Red fraction of all galaxies of the same luminosity.
+        Fraction of red galaxies among all galaxies of the same luminosity and redshift.
     quenched : float or float array, shape (n,)
-        Fraction that the galaxy's halo quenches, of galaxies that are not yet red.
+        Probability that the galaxy's halo quenches it, if it is not red for other reasons.
     mean : float or float array, shape (n,)
-        Mean of `quenched` over all galaxies of the same luminosity.
+        Mean of `quenched` over all galaxies of the same luminosity and redshift, below 1.
 
     Returns
     -------
     float array, shape (n,)
-        Probability; its mean over the galaxies of a luminosity is `share`, unless `mean` is larger.
+        Probability. Its mean over all galaxies of the same luminosity is `share`, or `mean` if this is larger.
     """
     red_before = np.clip((share - mean) / (1.0 - np.asarray(mean)), 0.0, 1.0)
     return np.asarray(red_before + quenched * (1.0 - red_before))
 
 
 def _mean_radius(concentration: Float) -> Float:
-    """Mean radius of satellites in units of R_200m, for each concentration."""
+    """Return the mean distance of satellites from the centre of their halo (R_200m), for each concentration.
+
+    Concentrations are limited to 1 to 60.
+    """
     grid = [satellites.nfw_radius(np.full(_ENCLOSED.size, float(c)), _ENCLOSED).mean() for c in _CONCENTRATIONS]
     return np.asarray(np.interp(np.log(np.clip(concentration, 1.0, 60.0)), np.log(_CONCENTRATIONS), grid))

@@ -1,7 +1,7 @@
-"""Satellite galaxies of halos: number, sub-mass, position and velocity.
+"""Draw the satellite galaxies of halos: their number, mass of the sub-halo, position and velocity.
 
-Satellites are a Poisson sample with an NFW profile. Halos are isotropic, spherical and end at R_200m. The parameters
-are in halos.toml.
+Satellites are a Poisson sample with an NFW profile. Halos are spherical, have isotropic velocities and end at R_200m.
+The parameters are in halos.toml.
 
 References
 ----------
@@ -23,29 +23,31 @@ from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.interpolation import bracket
 from truesky.randomness import per_source
 
-# Nodes of the inverse NFW mass profile in concentration and enclosed mass; the error of a radius is 1e-3.
+# Concentrations and fractions of the enclosed mass at which the radius of an NFW profile is tabulated; the error of a
+# radius is 1e-3.
 _C_NODES, _U_NODES = np.geomspace(1.0, 60.0, 40), np.linspace(0.0, 1.0, 256)
+# Radii (R_200m) at which the enclosed mass of an NFW profile is computed; the inverse is interpolated from it.
 _X_NODES = np.linspace(0.0, 1.0, 2001) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Satellites:
-    """Satellites sorted by host.
+    """Satellite galaxies, sorted by host halo.
 
     Attributes
     ----------
     host : int array, shape (n,)
-        Row of the host.
+        Row of the host in the table of halos.
     member : int array, shape (n,)
-        Number from 1, in the order of decreasing sub-mass.
+        Number of the satellite in its host, from 1, in the order of decreasing mass of the sub-halo.
     proxy : float array, shape (n,)
-        log10 of the scattered sub-mass, Msun/h.
+        log10 of the proxy mass (Msun/h), which determines the luminosity: mass of the sub-halo with a scatter.
     ra, dec : float array, shape (n,)
         Position, deg.
     chi : float array, shape (n,)
         Comoving distance, Mpc/h.
     velocity : float array, shape (n,)
-        Line-of-sight velocity including that of the host, km/s, positive if receding.
+        Line-of-sight peculiar velocity including the velocity of the host, km/s, positive if receding.
     radius : float array, shape (n,)
         Distance from the centre of the host in units of R_200m.
     """
@@ -60,33 +62,33 @@ class Satellites:
     radius: Float
 
     def select(self, keep: npt.NDArray[np.generic]) -> Satellites:
-        """Return the satellites of a bool mask or of row numbers."""
+        """Return some of the satellites, given as a bool mask of shape (n,) or as row numbers."""
         return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
 def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellites:
-    """Draw the satellites of hosts that reach the mass limit at their distance.
+    """Draw the satellites of host halos that may be bright enough for the catalogue.
 
     Parameters
     ----------
     halos : HaloModel
-        Tables of halos.
+        Model with the smallest proxy mass (mass of the sub-halo with a scatter) by distance.
     masses : Masses
-        Tables of halos by mass.
+        Tables of radius, concentration and velocity dispersion of halos.
     hosts : Halos
-        The hosts.
+        The host halos.
     seed : int
-        Seed of the request.
+        Seed of the random numbers.
 
     Returns
     -------
     Satellites
-        The satellites.
+        The satellites, sorted by host; positions may be outside the sky cell of the host.
 
     Notes
     -----
-    The satellites of a host are drawn in the order of decreasing sub-mass, each with separate random numbers, so that a
-    deeper request only appends satellites.
+    The satellites of a host are drawn in the order of decreasing sub-halo mass, each with separate random numbers. A
+    fainter limit therefore only adds satellites.
     """
     occupation, limit, z = halos.matching.occupation, halos.mass_limit(hosts.chi), halos.distances.redshift(hosts.chi)
     ratio = occupation.ratio_at(z)
@@ -118,12 +120,15 @@ def _allocate(count: int) -> tuple[Int, Int, Float, Float]:
 
 
 def nfw_radius(concentration: Float, enclosed: Float) -> Float:
-    """Return the radius in units of R_200m that encloses a fraction (0 to 1) of the mass inside R_200m (error 1e-3)."""
+    """Return the radius, in units of R_200m, inside which an NFW halo has a fraction `enclosed` of its mass (0 to 1).
+
+    `concentration` is c_200m. The error is 1e-3.
+    """
     row, part = bracket(np.log(_C_NODES), np.log(concentration), extrapolated=True)
     step = np.asarray(enclosed) * (_U_NODES.size - 1)
     column = np.clip(step.astype(np.int64), 0, _U_NODES.size - 2)
     share = step - column
-    # Interpolate the square of the radius, which is almost linear in the enclosed mass at the centre.
+    # Interpolate the square of the radius, because near the centre it is almost linear in the enclosed mass.
     low = _SQUARES[row, column] * (1.0 - share) + _SQUARES[row, column + 1] * share
     high = _SQUARES[row + 1, column] * (1.0 - share) + _SQUARES[row + 1, column + 1] * share
     return np.asarray(np.sqrt(low * (1.0 - part) + high * part))
@@ -138,7 +143,10 @@ def _squares() -> Float:
 def _offsets(
     masses: Masses, concentration_factor: float, log_mass: Float, z: Float, host: Int, numbers: Float
 ) -> Float:
-    """Offsets from the centres of the hosts, shape (n, 3), comoving Mpc/h."""
+    """Return the positions of satellites relative to the centres of their hosts, shape (n, 3), comoving Mpc/h.
+
+    The first three columns of `numbers` are uniform random numbers for enclosed mass, height and azimuth.
+    """
     c = concentration_factor * masses.interpolate_pairs(masses.concentration, z, log_mass)
     radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], numbers[:, 0])
     height, azimuth = 2.0 * numbers[:, 1] - 1.0, 2.0 * np.pi * numbers[:, 2]

@@ -1,1 +1,1 @@
-"""Linear theory, the box of matter, its light-cone and the convergence."""
+"""Simulate the large-scale matter: linear theory, a periodic box, its light-cone and the lensing convergence."""

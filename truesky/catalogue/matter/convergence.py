@@ -1,9 +1,10 @@
-"""Convergence of the box's matter on source planes, summed along straight lines of sight.
+"""Lensing convergence by the simulated matter for sources at several distances, summed along straight lines of sight.
 
 Notes
 -----
-This is the Born approximation. Matter is constant within the cells of the box, or within cubes of several cells if a
-pixel is that wide. This removes power at the scales of cells. `transfer` restores the power, but not the structure.
+Straight lines are the Born approximation. The density is constant within the cells of the box. If a pixel of the
+lensing map is wider than a cell, the density is averaged over cubes of several cells. Both steps remove power on small
+scales. The factors of `transfer` restore this power, but not the structure.
 
 References
 ----------
@@ -27,40 +28,54 @@ from truesky.fluxes import cosmology
 from truesky.numerics import matrices
 from truesky.numerics.compiling import exact_jit
 
-# Redshift limit of the tables. It does not depend on the last plane, so that nearer planes do not change with it.
+# Last redshift of the tables of distance and growth. It does not depend on the most distant sources, so that the
+# convergence of nearer sources does not change with them.
 _Z_LAST = 12.0
-_GAIN_NODES, _ELL_NODES, _K_BINS, _K_NODES = 9, 60, 24, 48
-# Number of directions for the average of the window, number of images per side, and the range of its nodes in units of
-# the highest k.
-_DIRECTIONS, _IMAGES, _WINDOWS = 48, 2, 8.0
-# Upper limit of the transfer in amplitude; more power is missing only for sources at z < 0.3.
+# Number of values of the linear growth D at which the power of the log-normal density relative to linear theory, and
+# the factors that correct this power, are computed. Between these values of D, both are interpolated.
+_GAIN_NODES = 9
+# Number of multipoles above 32 at which the function `transfer` computes its factors; between them, the factors are
+# interpolated.
+_ELL_NODES = 60
+# Number of bins of k for the power of the log-normal density.
+_K_BINS = 24
+# Number of wave numbers at which `window` is computed.
+_K_NODES = 48
+# Number of directions of the wave vector over which `window` is averaged.
+_DIRECTIONS = 48
+# Number of aliased images of the power spectrum on each side along each axis in `window`.
+_IMAGES = 2
+# Largest wave number at which `window` is computed, in units of the Nyquist wave number of the box.
+_WINDOWS = 8.0
+# Upper limit of the factors of `transfer`; they would be larger only for sources at z < 0.3.
 _MAX_TRANSFER = 2.0
-# Number of pixels per patch: few enough that the cells of the box that they share stay in the processor's cache.
+# Number of neighbouring pixels that are summed together: few enough that the cells of the box on their lines of sight
+# stay in the processor's cache.
 _PATCH_SIZE = 1024
-# Number of patches per task of a thread.
+# Number of patches of 1024 neighbouring pixels that a thread sums per task.
 _PATCHES_PER_CALL = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """Layers of matter from near to far.
+    """Spherical layers of matter around the observer, from near to far.
 
     Attributes
     ----------
     middle : float array, shape (s,)
-        Distance of the middle, Mpc/h.
+        Comoving distance of the middle of the layer, Mpc/h.
     factor : int array, shape (s,)
-        Number of box cells per side over which matter is averaged.
+        Number of box cells per side over which matter is averaged; also the thickness of the layer in cells.
     stretch : int array, shape (s,)
-        Number of the stretch; matter within a stretch uses the same growth.
+        Number of the stretch (interval of distance) of the layer. The averaged density is computed once per stretch.
     growth : float array, shape (s,)
-        Growth D for which the matter is averaged.
+        Linear growth D in the middle of the stretch, for which the averaged density is computed.
     growth_here : float array, shape (s,)
-        Growth D at the layer.
+        Linear growth D in the middle of the layer.
     gain : float array, shape (s,)
-        Factor that gives delta the power of linear theory.
+        Factor by which the overdensity is multiplied to have the power of linear theory.
     weight : float array, shape (s,)
-        Weight of linear delta / D in the convergence, without the factors of the source distance.
+        Weight of the overdensity in the convergence, without the factor 1 - chi / (distance of the source).
     """
 
     middle: Float
@@ -72,7 +87,7 @@ class Layers:
     weight: Float
 
     def select(self, cut: slice) -> Layers:
-        """Return the layers of a slice."""
+        """Return the layers with the row numbers of a slice."""
         return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
 
 
@@ -82,22 +97,24 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     direction : float32 array, shape (3, n)
-        Unit vectors, with neighbours close to each other; n is a multiple of 1024.
+        Unit vectors of the lines of sight; n must be a multiple of 1024. It is faster if consecutive vectors are close
+        to each other on the sky.
     width : float
         Width of a pixel, rad.
     chi : float array, shape (p,)
         Comoving distances of the sources, Mpc/h, ascending.
     coarsest : int
-        Largest number of cells per side over which matter is averaged.
+        Largest number of box cells per side over which matter is averaged.
     stretch : float
-        Depth in Mpc/h within which the growth is linear.
+        Depth (Mpc/h) of the intervals of distance in which the averaged density is computed once; within an interval it
+        is scaled by the linear growth.
 
     Returns
     -------
     float32 array, shape (p, n)
-        Convergence.
+        Convergence kappa for each source distance and line of sight.
 
     Notes
     -----
@@ -108,7 +125,7 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
     direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH_SIZE).swapaxes(0, 1))
     replicas = lightcone.draw_replicas(box, float(chi[-1]))
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
-    # Because kappa(chi) = first - second / chi, two sums are enough for all planes.
+    # Because kappa(chi) = sums[:, 0] - sums[:, 1] / chi, two sums along each line of sight are enough for all sources.
     sums = np.zeros((len(direction), 2, _PATCH_SIZE), np.float32)
     planes = np.empty((chi.size, len(direction), _PATCH_SIZE), np.float32)
     done = 0
@@ -123,20 +140,20 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
 
 
 def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: float) -> Layers:
-    """Return layers as thick as the cubes of cells over which a pixel is averaged.
+    """Divide the matter out to a distance into layers as thick as the cubes of cells over which it is averaged.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     width : float
         Width of a pixel, rad.
     max_distance : float
-        Distance of the last layer, Mpc/h.
+        Comoving distance that the layers reach, Mpc/h.
     coarsest : int
-        Largest number of cells per side over which matter is averaged.
+        Largest number of box cells per side over which matter is averaged.
     stretch : float
-        Depth in Mpc/h within which the growth is linear.
+        Depth (Mpc/h) of the intervals of distance in which the averaged density is computed once.
 
     Returns
     -------
@@ -162,12 +179,12 @@ def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: 
 
 
 def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stretch: float) -> Float:
-    """Return the factor that gives the multipoles of the convergence the power of linear theory.
+    """Return the factors by which the multipoles of the convergence get the power of linear theory.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     width : float
         Width of a pixel, rad.
     chi : float array, shape (p,)
@@ -175,14 +192,14 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
     l_max : int
         Highest multipole.
     coarsest : int
-        Largest number of cells per side over which matter is averaged.
+        Largest number of box cells per side over which matter is averaged.
     stretch : float
-        Depth in Mpc/h within which the growth is linear.
+        Depth (Mpc/h) of the intervals of distance in which the averaged density is computed once.
 
     Returns
     -------
     float array, shape (p, l_max + 1)
-        sqrt(C_l of linear theory / C_l of the box), at most 2.
+        sqrt(C_l of linear theory / C_l of the simulated convergence) for each source distance, at most 2.
 
     Notes
     -----
@@ -204,7 +221,10 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
 
 
 def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
-    """Power of the matter along lines of sight / linear power, shape (l, s)."""
+    """Return the power of the averaged density divided by the linear power.
+
+    `k` (h/Mpc) and the result have the shape (l, s): l wave numbers for each of the s layers of `slabs`.
+    """
     growths = np.linspace(float(slabs.growth_here.min()), 1.0, _GAIN_NODES)
     edges = np.linspace(0.0, np.pi / model.cell, _K_BINS + 1)
     at, share = density_box.linear_share(model, growths, edges)
@@ -220,7 +240,7 @@ def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
 
 
 def window(cell: float, factor: int, k: Float) -> Float:
-    """Return the power of matter that is averaged over cubes of cells and constant within them / linear power.
+    """Return the power of a density that is averaged over cubes of cells, relative to the linear power.
 
     Parameters
     ----------
@@ -234,11 +254,12 @@ def window(cell: float, factor: int, k: Float) -> Float:
     Returns
     -------
     float array, shape (n,)
-        Ratio of the powers, averaged over directions.
+        Ratio of the powers at each wave number, averaged over directions of the wave vector.
 
     Notes
     -----
-    The power contains modes up to the highest of the lattice of cells, and their images, which constant cubes produce.
+    The density is constant within each cube, so the modes of the lattice of cells (up to its Nyquist wave number) also
+    appear as aliased images at higher wave numbers. The ratio includes them.
     """
     wide = cell * factor
     number = np.arange(_DIRECTIONS) + 0.5
@@ -264,23 +285,23 @@ def window(cell: float, factor: int, k: Float) -> Float:
 
 
 def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
-    """Return the matter overdensity in cubes of cells.
+    """Return the matter overdensity, averaged over cubes of cells of the box.
 
     Parameters
     ----------
     box : Box
-        Matter in a box of n^3 cells.
+        Periodic box of simulated matter with n^3 cells.
     growth : float
-        Growth of the linear density, 1 today.
+        Linear growth D, 1 at z = 0.
     factor : int
-        Number of cells per side of a cube.
+        Number of cells per side of a cube, which should divide n.
     pool : ThreadPoolExecutor
         Threads that share the work.
 
     Returns
     -------
     float32 array, shape (n / factor, n / factor, n / factor)
-        Overdensity.
+        Mean overdensity of each cube.
     """
     n = box.n // factor
     mean = np.empty((n, n, n), np.float32)
@@ -298,7 +319,11 @@ def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecut
 
 
 def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
-    """Yield slices of layers that share their matter and the planes behind them."""
+    """Yield slices of consecutive layers that have the same averaged density and the same sources behind them.
+
+    Layers have the same averaged density if they are in the same stretch (interval of distance) and matter is averaged
+    over cubes of the same size. `plane` is the number of source distances that are nearer than each layer.
+    """
     same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
     at = 0
     for _, group in groupby(same):
@@ -310,7 +335,10 @@ def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
 def _add_group(
     box: Box, replicas: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
 ) -> None:
-    """Add layers of the same growth and factor to both sums."""
+    """Add consecutive layers to the sums from which the convergence follows; `sums` is changed in place.
+
+    The layers must have the same averaged density. `direction` and `sums` have the shapes of `add_layers`.
+    """
     factor = int(slabs.factor[0])
     delta = average_density(box, float(slabs.growth[0]), factor, pool).ravel()
     shell = (slabs.middle // box.length).astype(np.int64)
@@ -338,29 +366,29 @@ def add_layers(
     weights: Float32,
     sums: Float32,
 ) -> None:
-    """Add the weighted matter along lines of sight to the sums.
+    """Add the weighted overdensity of several layers along lines of sight to two sums per line of sight.
 
     Parameters
     ----------
     direction : float32 array, shape (patches, 3, p)
-        Unit vectors.
+        Unit vectors of the lines of sight, in patches of p neighbours.
     delta : float32 array, shape (n^3,)
-        Overdensity of the periodic box.
+        Overdensity in cubes of the periodic box.
     n : int
         Number of cubes per side of the box.
     axes : int array, shape (s, 3)
-        Axes of the direction in the frame of the box.
+        Permutation of the axes between the sky and the box for each layer.
     scale, shift : float32 array, shape (s, 3)
-        Position in units of the box = direction[axes] scale + shift.
+        Position in the box in units of its side = direction[axes] * scale + shift, modulo 1.
     weights : float32 array, shape (2, s)
-        Weights of the layers in both sums.
+        Weights of each layer in the first and in the second sum.
     sums : float32 array, shape (patches, 2, p)
         Sums, changed in place.
 
     Notes
     -----
-    For both k, sums[:, k, p] increases by the sum over layers s of weights[k, s] delta(cell of line of sight p in layer
-    s).
+    For k = 0 and 1, the sum k of a line of sight increases by weights[k, s] times the overdensity at its position in
+    layer s, for all layers.
     """
     pixels = direction.shape[2]
     index = np.empty(pixels, np.int64)

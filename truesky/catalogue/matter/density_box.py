@@ -1,10 +1,13 @@
-"""Matter of the embedded universe: one periodic log-normal box with its linear velocities.
+"""Simulated matter: the log-normal density and the linear velocities in one periodic box.
 
-The fields are, with the Gaussian field g and the growth D (D(0) = 1)::
+From a Gaussian random field g(x) follow, with the linear growth D (D = 1 at z = 0), the matter overdensity delta, the
+number density of halos n_halo and the velocity v::
 
     1 + delta(x, z) = exp(D(z) g(x) - D(z)^2 var(g) / 2)
-    n_halo(x, z) ~ exp(A g_R - A^2 var(g_R) / 2)                  g_R smoothed; R and A depend on b D
-    v(x, z) = a H f D u(x)                                        u from the linear density of g
+    n_halo(x, z) ~ exp(A g_R - A^2 var(g_R) / 2)                  g_R is g smoothed with length R
+    v(x, z) = a H f D u(x)                                        u is made from the linear density at z = 0
+
+R and the amplitude A depend on the halo bias times D; f is the growth rate.
 
 Notes
 -----
@@ -38,18 +41,21 @@ from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 
 _FILE = "density_box.toml"
-# Number of interpolation nodes of P(k), in ln k over the modes of a box; the relative error is 1e-5.
+# Number of values of ln k at which the power spectrum P(k) is computed before it is interpolated to the modes of a box;
+# the relative error is 1e-5.
 _K_NODES = 2000
-# Cells per side of the box in which the gain is computed. It is the same for all boxes, and its error is 0.5 %.
+# Cells per side of the box in which the ratios of `linear_share` and the halo bias are computed. The results are used
+# for boxes of every size; their error is 0.5 %.
 _GAIN_CELLS = 96
+# Number of amplitudes at which the halo bias is computed, for each smoothed field.
 _BIAS_NODES = 10
-# More threads do not make the Fourier transforms of a box faster.
+# Largest number of threads of the Fourier transforms; more threads are not faster.
 _MAX_WORKERS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class BoxModel:
-    """Parameters of the box (density_box.toml, [box])."""
+    """Parameters of the box of simulated matter; explained in density_box.toml, [box]."""
 
     cell: float
     smoothing: tuple[float, ...]
@@ -64,22 +70,22 @@ class BoxModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """Fields of a periodic cube of n^3 cells.
+    """Simulated matter in a periodic cube of n^3 cells.
 
     Attributes
     ----------
     model : BoxModel
-        Parameters.
+        Parameters of the box.
     n : int
         Cells per side.
     seed : int
-        Seed of the fields.
+        Seed of the random numbers.
     smoothed : tuple of float32 array, shape (n, n, n)
-        g smoothed with each length in model.smoothing.
-    variance : float array
+        Gaussian field g, smoothed with each length in `model.smoothing`; the first one is not smoothed.
+    variance : float array, shape (number of smoothed fields,)
         Variance of each smoothed field.
     velocity : tuple of float32 array, shape (n, n, n)
-        u_x, u_y, u_z in Mpc/h, with v = velocity_factor(z) u.
+        Components u_x, u_y and u_z in Mpc/h; the velocity in km/s is velocity_factor(z) times u.
     """
 
     model: BoxModel
@@ -96,15 +102,15 @@ class Box:
 
 
 def box_model() -> BoxModel:
-    """Return the parameters of the embedded universe's box."""
+    """Return the built-in parameters of the box of simulated matter."""
     return BoxModel(**parameters.section(_FILE, "box"))
 
 
 def load(seed: int, n: int) -> Box:
-    """Return the box of a seed with n cells per side, from the cache or made now.
+    """Return the box of simulated matter for a seed with n cells per side, from the disc cache or made now.
 
-    The nine fields are made and stored one at a time; 10 s and 0.4 GB of memory for n = 256. Raises BadInput if n is
-    not an even number of at least 2.
+    Making it takes 10 s and 0.4 GB of memory for n = 256, because the fields are made and stored one at a time. Raises
+    BadInput if n is not an even number of at least 2.
     """
     if n < 2 or n % 2:
         raise BadInput(f"a box must have an even number of cells per side, got {n}")
@@ -124,9 +130,10 @@ def load(seed: int, n: int) -> Box:
 
 
 def tides(box: Box) -> tuple[Float32, ...]:
-    """Return the traceless tidal field of the linear density today, from the cache or made now (5 s for n = 256).
+    """Return the traceless tidal field of the linear density at z = 0, from the disc cache or made now.
 
-    The fields are xx, yy, xy, xz and yz, float32, shape (n, n, n) each; zz is -xx - yy. They are::
+    The components are xx, yy, xy, xz and yz, float32, shape (n, n, n) each; zz is -xx - yy. Making them takes 5 s for
+    n = 256. They are::
 
         T_ij = (d_i d_j / nabla^2 - delta_ij / 3) delta
     """
@@ -157,7 +164,10 @@ def growth_rate(z: npt.ArrayLike, index: float) -> Float:
 
 
 def velocity_factor(model: BoxModel, z: npt.ArrayLike) -> Float:
-    """Return a H f D at each redshift, km/s per Mpc/h."""
+    """Return a H f D at each redshift in km/s per Mpc/h: the factor from `Box.velocity` to velocities in km/s.
+
+    a is the scale factor, H the Hubble rate, f the growth rate and D the linear growth.
+    """
     rate = 100.0 * cosmology.expansion_rate(z) / (1.0 + np.asarray(z, float))
     return np.asarray(rate * growth_rate(z, model.growth_index) * growth(z))
 
@@ -168,11 +178,11 @@ def overdensity(box: Box, index: Int, growths: npt.ArrayLike) -> Float:
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     index : int array, shape (n,)
-        Flat index of the cells.
+        Flat index of the cells in arrays of shape (n, n, n).
     growths : float array, shape (n,)
-        Growth D.
+        Linear growth D for each cell, 1 at z = 0.
 
     Returns
     -------
@@ -184,9 +194,10 @@ def overdensity(box: Box, index: Int, growths: npt.ArrayLike) -> Float:
 
 
 def matter_gain(model: BoxModel, growths: Float) -> Float:
-    """Return the factor that gives delta the power of linear theory at each growth D; it is 1 at D = 1.
+    """Return the factor that gives the overdensity the power of linear theory, for each linear growth D.
 
-    (1 + xi)^(D^2) - 1 is smaller than D^2 xi at large xi. Without this factor, 10 % of the power is missing at z = 1.
+    The factor is 1 at D = 1 (z = 0). The log-normal field has the correlation function (1 + xi)^(D^2) - 1, which is
+    smaller than D^2 xi at large xi. Without the factor, 10 % of the power is missing at z = 1.
     """
     low, high = model.gain_band
     _, share = linear_share(model, growths, np.array([low, high]))
@@ -194,12 +205,15 @@ def matter_gain(model: BoxModel, growths: Float) -> Float:
 
 
 def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
-    """Return the smoothed field that halos with x = b D follow, and its amplitude A.
+    """Return the index of the smoothed field that halos with x = bias times growth follow, and the amplitude A.
+
+    `x` may have any shape, and both results have the same shape.
 
     Notes
     -----
-    Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model. A = x would be
-    wrong by up to a factor of 1.5. The bias is within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests).
+    Halos that are drawn with a density ~ exp(A g_R), where g_R is the smoothed field, have the power spectrum
+    x^2 P_linear(z = 0) in the range of k that `bias_band` of `model` gives (h/Mpc). A = x would be wrong by up to a
+    factor of 1.5. The bias is accurate within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests).
     """
     names = [float(value) for name in astuple(model) for value in np.atleast_1d(name)]
     key = content_key(code_key(__name__), *names)
@@ -213,14 +227,14 @@ def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
 
 
 def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, Float]:
-    """Return the power of delta relative to linear theory.
+    """Return the power spectrum of the log-normal overdensity relative to linear theory.
 
     Parameters
     ----------
     model : BoxModel
         Parameters of the box.
     growths : float array, shape (n,)
-        Growth D.
+        Linear growth D, 1 at z = 0.
     edges : float array, shape (bins + 1,)
         Edges of the bins of k, h/Mpc.
 
@@ -229,7 +243,7 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
     k : float array, shape (bins,)
         Mean k of the modes of each bin, h/Mpc.
     ratio : float array, shape (n, bins)
-        Power of delta / (D^2 linear power).
+        Power of the overdensity / (D^2 times the linear power at z = 0).
     """
     n, cell = _GAIN_CELLS, model.cell
     power = _power_on_modes(n, cell)
@@ -250,15 +264,16 @@ def linear_power(k: npt.ArrayLike) -> Float:
     return linear_theory.power(np.asarray(k, float))
 
 
-# ------------------------------------------------------------------------------------------------ making
-
-
 def _bias_table(model: BoxModel) -> dict[str, Float]:
-    """Bias at z = 0 of amplitudes in each range of x, shape (ranges, m), with the effect of voxels."""
+    """Return the arrays "amplitude" and "bias", shape (smoothed fields, m) each.
+
+    Halos with a density ~ exp(A g_R), with the amplitude A and the smoothed Gaussian field g_R, have the bias in "bias"
+    relative to matter at z = 0. It includes that a halo has a random position within its voxel (small piece of volume).
+    """
     n, cell = _GAIN_CELLS, model.cell
     power, k_squared = _power_on_modes(n, cell), _k_squared(n, cell)
     band = (k_squared > model.bias_band[0] ** 2) & (k_squared < model.bias_band[1] ** 2)
-    # Give each ln k the same weight, so that the many modes on small scales do not dominate.
+    # Give each interval of ln k the same weight, so that the many modes on small scales do not dominate.
     weight = k_squared[band].astype(float) ** -1.5 / power[band]
     linear_sum, damped_weight = np.sum(weight * power[band]), weight * np.exp(-(model.bias_hold**2) * k_squared[band])
     log_power, edge = _log_power(n, cell), (0.0, *model.bias_edges, model.bias_most)
@@ -283,10 +298,10 @@ def _cached_field(key: str, name: str, make: Callable[[], npt.NDArray[np.generic
 
 
 def _gaussian(seed: int, n: int, cell: float) -> Float32:
-    """Gaussian field g whose exponential has the linear power at z = 0."""
+    """Return the Gaussian field g, float32 (n, n, n), for which exp(g) has the linear power spectrum at z = 0."""
     noise = np.empty((n, n, n), np.float32)
     for x in range(n):
-        # Draw one plane at a time, so that the double-precision numbers are never all in memory.
+        # Draw one plane of cells at a time, so that no second array of n^3 numbers is needed.
         noise[x] = stream(seed, "box", x).standard_normal((n, n), np.float32)
     modes = fft.rfftn(noise, overwrite_x=True)
     del noise
@@ -295,7 +310,11 @@ def _gaussian(seed: int, n: int, cell: float) -> Float32:
 
 
 def _log_power(n: int, cell: float) -> Float32:
-    """Power of g on the modes of the box in (Mpc/h)^3: the transform of the correlation function ln(1 + xi)."""
+    """Return the power of the Gaussian field g on the Fourier modes of the box, (Mpc/h)^3.
+
+    It is the Fourier transform of the correlation function ln(1 + xi), where xi is the linear one. Negative values are
+    set to 0.
+    """
     power = _power_on_modes(n, cell)
     correlation = fft.irfftn(power, (n, n, n), overwrite_x=True) / np.float32(cell**3)
     transformed = fft.rfftn(np.log1p(correlation), overwrite_x=True).real * np.float32(cell**3)
@@ -304,7 +323,7 @@ def _log_power(n: int, cell: float) -> Float32:
 
 
 def _power_on_modes(n: int, cell: float) -> Float32:
-    """Linear power on the modes of the box, 0 at k = 0."""
+    """Return the linear power at z = 0 on the Fourier modes of the box, (Mpc/h)^3; 0 at k = 0."""
     k = np.sqrt(_k_squared(n, cell))
     largest = np.sqrt(3.0) * np.pi / cell
     ln_k = np.linspace(np.log(np.pi / (n * cell)), np.log(1.01 * largest), _K_NODES)
@@ -322,14 +341,14 @@ def _smooth(g: Float32, cell: float, radius: float) -> Float32:
 
 
 def _displacement(g: Float32, cell: float, axis: int) -> Float32:
-    """Field u along one axis in Mpc/h: i k / k^2 times the linear density."""
+    """Return the component of u (see `Box.velocity`) along one axis in Mpc/h: i k / k^2 times the linear density."""
     modes, k_squared = _linear_modes(g, cell)
     modes *= (1j * _k_signed(g.shape[0], cell, axis) / k_squared).astype(np.complex64)
     return _to_real(modes, g.shape[0])
 
 
 def _tide(g: Float32, cell: float, axis_1: int, axis_2: int) -> Float32:
-    """k_i k_j / k^2 times the linear density, minus a third of the density if i = j."""
+    """Return one component of the tidal field: k_i k_j / k^2 times the linear density, minus density / 3 if i = j."""
     modes, k_squared = _linear_modes(g, cell)
     n = g.shape[0]
     product = _k_signed(n, cell, axis_1) * _k_signed(n, cell, axis_2) / k_squared
@@ -338,7 +357,10 @@ def _tide(g: Float32, cell: float, axis_1: int, axis_2: int) -> Float32:
 
 
 def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
-    """Modes of the linear density, which have the phases of g, and their k^2 (1 at k = 0)."""
+    """Return the Fourier modes of the linear density at z = 0, and k^2 of the modes.
+
+    The modes have the phases of g. k^2 is set to 1 at k = 0, so that a division is possible.
+    """
     n = g.shape[0]
     modes = fft.rfftn(g)
     log_power = _log_power(n, cell)
@@ -350,7 +372,7 @@ def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
 
 
 def _k_signed(n: int, cell: float, axis: int) -> Float:
-    """k of an axis; 0 at the highest frequency, because its sign is undefined."""
+    """Return the wave numbers (h/Mpc) along one axis, with 0 at the Nyquist frequency, where the sign is undefined."""
     k = _k_axes(n, cell)[axis].copy()
     k[np.abs(k) > 0.999 * np.pi / cell] = 0.0
     return k

@@ -1,8 +1,9 @@
-"""Light-cone through replicas of the box, and the voxels of a cell of the sky.
+"""Light-cone through copies of the box of simulated matter, and its division into voxels (small pieces of volume).
 
-Each spherical shell, as deep as the side of the box, contains a rotated, mirrored and shifted replica, so that
-structure does not repeat along a line of sight. Structure is discontinuous only where chi is a multiple of the side.
-The seed determines the position of the observer in the box. Distances are comoving, in Mpc/h.
+Space around the observer is divided into spherical shells, as deep as the side of the box. In each shell the periodic
+box is rotated, mirrored and shifted in another way (a replica), so that structure does not repeat along a line of
+sight. Structure is discontinuous only at the edges of the shells. The seed determines the position of the observer in
+the box. Distances are comoving, in Mpc/h.
 """
 
 from __future__ import annotations
@@ -19,15 +20,19 @@ from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology
 from truesky.randomness.rng import stream
 
-# Side of a HEALPix cell in units of 1 / nside (rad), and largest width of a voxel in units of a cell of the box.
-_SIDE, _WIDEST = 1.023, 1.2
-# Step of the table of redshifts, Mpc/h.
+# Side of a HEALPix cell in rad, times nside.
+_SIDE = 1.023
+# Largest width of a voxel across the line of sight, in units of a cell of the box.
+_WIDEST = 1.2
+# Step in distance of the table of redshifts, Mpc/h.
 _CHI_STEP = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replicas:
-    """Rotation and shift of the box in each shell: the box position of x is sign[j] x[axes[j]] + shift[j] in shell j.
+    """Rotation and shift of the box in each spherical shell.
+
+    The position x relative to the observer in shell j is at sign[j] x[axes[j]] + shift[j] in the periodic box.
 
     Attributes
     ----------
@@ -46,12 +51,12 @@ class Replicas:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """Radial steps; no step contains a multiple of the box's cell size inside.
+    """Steps in comoving distance; multiples of the cell size of the box are always edges.
 
     Attributes
     ----------
     edge : float array, shape (s + 1,)
-        Edges, Mpc/h.
+        Edges of the steps, ascending, Mpc/h.
     z : float array, shape (s,)
         Redshift at the middle of each step.
     """
@@ -61,29 +66,30 @@ class Steps:
 
     @property
     def middle(self) -> Float:
-        """Return the middle of each step, Mpc/h."""
+        """Return the comoving distance of the middle of each step, shape (s,), Mpc/h."""
         return 0.5 * (self.edge[1:] + self.edge[:-1])
 
     @property
     def volume(self) -> Float:
-        """Return the volume of each step in (Mpc/h)^3 per steradian."""
+        """Return the comoving volume of each step per solid angle, shape (s,), (Mpc/h)^3 per steradian."""
         return np.asarray((self.edge[1:] ** 3 - self.edge[:-1] ** 3) / 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Pieces of the volume of a cell of the sky.
+    """Small pieces of the light-cone in a sky cell: the volume of a smaller HEALPix cell in one step in distance.
 
     Attributes
     ----------
     step : int array, shape (v,)
-        Radial step.
+        Number of the step in distance.
     order, cell : int array, shape (v,)
-        Order and nested index of the HEALPix cell that bounds the voxel.
+        Order and nested index of the HEALPix cell that bounds the voxel on the sky.
     box : int array, shape (v,)
-        Flat cell of the box.
+        Flat index of the cell of the box that contains the centre of the voxel.
     velocity : float array, shape (v,)
-        u along the line of sight, positive if receding, Mpc/h; times velocity_factor it is in km/s.
+        Component of `Box.velocity` along the line of sight, positive if receding, Mpc/h. Multiplied by
+        `density_box.velocity_factor` it is in km/s.
     """
 
     step: Int
@@ -95,13 +101,16 @@ class Voxels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distances:
-    """Table of redshifts at uniform comoving distances from 0; z(chi) is accurate to 1e-8."""
+    """Table of redshifts z at comoving distances chi (Mpc/h), which start at 0 and have a constant step.
+
+    Interpolated redshifts are accurate to 1e-8.
+    """
 
     chi: Float
     z: Float
 
     def redshift(self, chi: npt.ArrayLike) -> Float:
-        """Return the redshift of comoving distances in Mpc/h, which must be inside the table."""
+        """Return the redshifts of comoving distances in Mpc/h, which must be inside the table; nothing is checked."""
         at = np.asarray(chi, float) / _CHI_STEP
         node = np.minimum(at.astype(np.int64), self.z.size - 2)
         low = self.z[node]
@@ -109,14 +118,17 @@ class Distances:
 
 
 def distance_table(z_max: float) -> Distances:
-    """Return the table of redshifts out to z_max or up to one step farther."""
+    """Return the table of redshift by comoving distance from 0 to z_max, or up to one step farther."""
     steps = int(np.ceil(float(cosmology.comoving_distance(z_max)) / _CHI_STEP))
     chi = np.asarray(_CHI_STEP * np.arange(steps + 1), float)
     return Distances(chi, cosmology.redshift(chi))
 
 
 def draw_replicas(box: Box, chi_max: float) -> Replicas:
-    """Return the replicas out to chi_max (Mpc/h) from the box's seed; the nearest replica is not rotated."""
+    """Draw the rotations and shifts of the box in the shells out to the distance chi_max (Mpc/h).
+
+    They depend only on the seed and the side of the box. The box in the nearest shell is shifted, but not rotated.
+    """
     turns = [(axes, sign) for axes in permutations(range(3)) for sign in product((1.0, -1.0), repeat=3)]
     shells = int(chi_max // box.length) + 1
     chosen, shifts = [], []
@@ -130,25 +142,25 @@ def draw_replicas(box: Box, chi_max: float) -> Replicas:
 
 
 def box_cells(box: Box, replicas: Replicas, direction: Float, chi: Float) -> tuple[Int, Float]:
-    """Return the cell of the box, and the direction in the frame of the box, at positions of the light-cone.
+    """Return the cell of the box at positions of the light-cone, and the directions in the frame of the box.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     replicas : Replicas
-        Rotation of each replica.
+        Rotation and shift of the box in each shell.
     direction : float array, shape (n, 3)
-        Unit vectors.
+        Unit vectors from the observer to the positions.
     chi : float or float array, shape (n,)
         Comoving distance, Mpc/h.
 
     Returns
     -------
     cell : int array, shape (n,)
-        Flat cell of the box.
+        Flat index of the cell of the box.
     direction : float array, shape (n, 3)
-        Unit vectors in the frame of the box.
+        The same unit vectors in the frame of the box.
     """
     shell = np.broadcast_to(np.asarray(chi // box.length, np.int64), direction.shape[:1])
     box_direction = replicas.sign[shell] * np.take_along_axis(direction, replicas.axes[shell], 1)
@@ -158,16 +170,16 @@ def box_cells(box: Box, replicas: Replicas, direction: Float, chi: Float) -> tup
 
 
 def radial_steps(cell: float, start: float, end: float, table: Distances) -> Steps:
-    """Return radial steps with edges at multiples of the cell size.
+    """Return steps in comoving distance with edges at all multiples of the cell size between two distances.
 
     Parameters
     ----------
     cell : float
         Side of the box's cells, Mpc/h.
     start, end : float
-        First and last edge, Mpc/h.
+        First and last edge of the steps, Mpc/h.
     table : Distances
-        Table of redshifts.
+        Table of redshift by comoving distance.
 
     Returns
     -------
@@ -180,25 +192,28 @@ def radial_steps(cell: float, start: float, end: float, table: Distances) -> Ste
 
 
 def voxels(box: Box, replicas: Replicas, steps: Steps, order: int, cell: int, used: Bool) -> Voxels:
-    """Return the voxels of a cell of the sky, about 4 Mpc/h wide.
+    """Divide the light-cone in a sky cell into voxels (small pieces of volume).
+
+    A voxel is as deep as a step in distance (4 Mpc/h, except the first step) and at most about 5 Mpc/h wide. Close to
+    the observer, where the whole sky cell is narrower, a voxel is as wide as the cell.
 
     Parameters
     ----------
     box : Box
-        Matter in a box.
+        Periodic box of simulated matter.
     replicas : Replicas
-        Rotation of each replica.
+        Rotation and shift of the box in each shell.
     steps : Steps
-        Steps along the line of sight.
+        Steps in comoving distance.
     order, cell : int
-        Order and nested index of the cell.
+        Order and nested index of the HEALPix cell.
     used : bool array, shape (s,)
-        True for the steps to divide.
+        True for the steps to divide; other steps have no voxels.
 
     Returns
     -------
     Voxels
-        The voxels, sorted by the order of their HEALPix cells, then by step.
+        The voxels, sorted by the order of their HEALPix cells, then by step. Empty if no step is used.
     """
     min_order = np.ceil(np.log2(np.maximum(_SIDE * steps.middle / (_WIDEST * box.model.cell), 1.0)))
     orders = np.maximum(min_order.astype(np.int64), order)

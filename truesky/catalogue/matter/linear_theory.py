@@ -1,6 +1,6 @@
-"""Linear power, halo abundance, halo bias and concentrations of the embedded universe, computed with colossus.
+"""Linear power spectrum, and halo abundance, bias and concentration in the built-in cosmology, computed with colossus.
 
-Colossus writes no files: its persistent storage is off, and the results are in the cache of this package.
+Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky.
 
 References
 ----------
@@ -20,10 +20,14 @@ from truesky.fluxes import cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
+# Halo masses are M_200m, as colossus calls them.
 MASS_DEFINITION = "200m"
+# Colossus models of the linear power spectrum, the halo mass function, the halo bias and the concentration.
 _POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
-# Concentrations are slow to compute (0.1 s per redshift and mass): use 10 redshifts and every 20th mass.
-_Z_COARSE, _COARSE = 10, 20
+# Number of redshifts of the table of concentrations. It is small, because a concentration takes 0.1 s to compute.
+_Z_COARSE = 10
+# Concentrations are computed only for every 20th mass, and interpolated between these masses.
+_COARSE = 20
 
 
 def power(k: Float) -> Float:
@@ -32,10 +36,11 @@ def power(k: Float) -> Float:
 
 
 def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
-    """Return tables of halos by redshift and log10 M_200m (Msun/h), from the cache or made now.
+    """Return tables of halo properties by redshift and log10 M_200m (Msun/h), by name.
 
-    The tables are dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), `bias` (z, m), and `concentration`
-    c_200m at 10 redshifts that are uniform in ln(1 + z) over the same range (10, m).
+    The tables are the abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m),
+    and the `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range. They are
+    read from the disc cache if they have been computed before.
     """
     numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
     key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
@@ -58,12 +63,12 @@ def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
 
 @cache
 def _power_cosmology() -> Any:
-    """Return the cosmology of `power`; cached, because a new one computes its normalisation and table of k again."""
+    """Return the colossus cosmology for `power`; it is cached, because a new one computes its power spectrum again."""
     return _set_cosmology()
 
 
 def _set_cosmology() -> Any:
-    """Set the cosmology of colossus, with its files disabled and its folder in our cache."""
+    """Set the cosmology of colossus to truesky's built-in cosmology, and return it; colossus must not write files."""
     from colossus import settings
     from colossus.cosmology import cosmology as colossus
 

@@ -1,1 +1,1 @@
-"""Stars of the Milky Way, and Gaia's measurements of them."""
+"""Draw the stars of the Milky Way, and simulated Gaia measurements of these stars."""

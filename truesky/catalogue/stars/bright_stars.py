@@ -1,6 +1,6 @@
-"""Bright stars of Tycho-2, which replace the model's stars brighter than the hand-over magnitude, V = 11.
+"""Read the bright stars of the Tycho-2 catalogue, which replace drawn stars brighter than V = 11 (hand-over magnitude).
 
-The files are tyc2.dat and its first supplement, or FITS versions of them.
+The files are tyc2.dat and suppl_1.dat (the first supplement) of Tycho-2, or FITS versions of these files.
 
 References
 ----------
@@ -29,9 +29,10 @@ from truesky.fluxes.libraries.stellar import StellarTypes
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Fields between the bars of a record: their number, mean position, observed position, B_T, V_T.
+# Number of fields between the bars of a record of each file, and indices of the fields: mean position (ra, dec),
+# observed position (ra, dec), B_T magnitude, V_T magnitude.
 _FIELDS = {"tyc2.dat": (32, (2, 3), (24, 25), 17, 19), "suppl_1.dat": (18, (2, 3), (2, 3), 11, 13)}
-# Column names of FITS versions, in the same order.
+# Possible column names in FITS versions of the files: mean position (ra, dec), observed position (ra, dec), B_T, V_T.
 _TITLES = (
     (("RAmdeg", "mRAdeg"), ("DEmdeg", "mDEdeg")),
     (("RAdeg", "RA(ICRS)", "RA_ICRS_", "RA"), ("DEdeg", "DE(ICRS)", "DE_ICRS_", "DE")),
@@ -44,20 +45,22 @@ _KIND, _LONGEST_LINE = "catalogue of stars", 1000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightStars:
-    """Stars brighter than the hand-over, sorted by cell and position.
+    """Tycho-2 stars brighter than the hand-over magnitude, sorted by position.
 
     Attributes
     ----------
     hand_over : float
-        V magnitude of the hand-over.
+        Observed V magnitude (Vega) above which drawn stars are used instead.
     index : int array, shape (n,)
-        Order-29 cell.
+        Position: nested index of the HEALPix cell of order 29.
     ra, dec : float array, shape (n,)
         J2000 position, deg.
     mag_v, color_bv : float array, shape (n,)
-        Johnson V and B - V, mag.
-    record_count, without_color, without_magnitude : int
-        Number of records of the files, and number of those without a colour and without any magnitude.
+        Observed Johnson V and B - V (Vega), mag.
+    record_count : int
+        Number of records of the files.
+    without_color, without_magnitude : int
+        Number of records with only one of the magnitudes B_T and V_T, and number of records with neither.
     """
 
     hand_over: float
@@ -72,14 +75,15 @@ class BrightStars:
 
 
 def sha256(files: tuple[Path, ...]) -> list[str]:
-    """Return the SHA-256 of the files, for the key of the results."""
+    """Return the SHA-256 of each file. Raises BadInput if a file does not exist."""
     return [file_sha256(user_files.check_file(file, _KIND, "stars.tycho2")) for file in files]
 
 
 def load(files: tuple[Path, ...], checksums: list[str]) -> BrightStars:
-    """Return the stars brighter than the hand-over, from the cache or read now.
+    """Read the Tycho-2 stars brighter than the hand-over magnitude, from the disc cache if they have been read before.
 
-    `checksums` is the SHA-256 of each file. Raises BadInput with the file and the record.
+    `checksums` is the SHA-256 of each file, by which the cache recognises the files. Raises BadInput if a file has
+    another format, or a value that is not a number or not on the sky; the message names the file and the record.
     """
     key = content_key(code_key(__name__), *checksums)
     arrays = cached_arrays("tycho2", key, lambda: _read(files))
@@ -89,27 +93,30 @@ def load(files: tuple[Path, ...], checksums: list[str]) -> BrightStars:
 
 
 def rows_of_cell(stars: BrightStars, cell: int) -> slice:
-    """Return the rows of an order-8 cell."""
+    """Return the range of rows whose stars are in an order-8 cell (nested index)."""
     first, last = np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell))
     return slice(int(first), int(last))
 
 
 def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, Any]:
-    """Return columns of table `stars`: template, magnitude and temperature by B - V; unknown columns are masked.
+    """Return columns of table `stars` for Tycho-2 stars.
+
+    Each star gets the template spectrum, the V - H colour and the temperature of the stellar type with the nearest
+    B - V. Columns with unknown values are masked.
 
     Parameters
     ----------
     stars : BrightStars
-        The stars.
+        All stars.
     rows : slice
-        Rows of the stars.
+        Range of the rows to return, n rows.
     types : StellarTypes
-        Stellar types of the library.
+        Stellar types of the template library.
 
     Returns
     -------
     dict of str to array, shape (n,)
-        Columns.
+        Columns by name.
     """
     nearest = np.abs(types.color_bv - stars.color_bv[rows, None]).argmin(1)
     blank = masked_column(nearest.size)
@@ -125,7 +132,7 @@ def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, A
 
 
 def masked_column(n: int) -> np.ma.MaskedArray[Any, Any]:
-    """Return a column of n unknown values."""
+    """Return a column of n masked (unknown) values."""
     return np.ma.MaskedArray(np.zeros(n, np.int64), mask=True)
 
 
@@ -156,7 +163,10 @@ def _read(files: tuple[Path, ...]) -> dict[str, Array]:
 
 
 def _records(file: Path) -> tuple[Float, Float, Float]:
-    """Positions (2, n), B_T and V_T (NaN if blank); the observed position is used if there is no mean position."""
+    """Read a file, and return positions (ra, dec, deg), shape (2, n), and B_T and V_T magnitudes (NaN if blank).
+
+    The observed position is used if there is no mean position. Raises BadInput if a position is not on the sky.
+    """
     values = _read_fits(file) if file.suffix.lower() in (".fits", ".fit", ".fz") else _read_text(file)
     mean, observed = np.stack(values[:2]), np.stack(values[2:4])
     place = np.where(np.isfinite(mean), mean, observed)
@@ -174,7 +184,7 @@ def _read_text(file: Path) -> list[Float]:
     with user_files.open_file(file, _KIND) as stream:
         line = stream.readline(_LONGEST_LINE)
     if len(line) == _LONGEST_LINE:
-        # The CSV reader would allocate memory for every field of this line.
+        # Refuse a long first line, because the CSV reader would allocate memory for each of its fields.
         raise BadInput(f"{file}: the first record has {_LONGEST_LINE} characters or more, must have fewer")
     count = line.count(b"|") + 1
     layouts = [layout for layout in _FIELDS.values() if layout[0] == count]

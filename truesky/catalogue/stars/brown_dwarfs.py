@@ -1,4 +1,4 @@
-"""L and T dwarfs: expected numbers along lines of sight, and draws of them.
+"""Draw L and T dwarfs, and compute their expected numbers along lines of sight.
 
 The templates are from truesky.fluxes.libraries.brown_dwarfs. The parameters and their sources are in milky_way.toml.
 """
@@ -28,7 +28,7 @@ class BrownDwarfs:
     Attributes
     ----------
     law : Exponential
-        Density law.
+        Density law in the Milky Way.
     log_g : float
         log10 of the surface gravity, cm s-2.
     metallicity : tuple of float
@@ -36,13 +36,13 @@ class BrownDwarfs:
     boost : float
         Ratio of the drawn to the natural number density.
     first_template : int
-        Index of the first template in the stellar library.
+        Index of the first template spectrum of a dwarf in the stellar library.
     local_density : float array, shape (365,)
-        Natural number density at the Sun for each template, pc^-3.
+        Natural number density near the Sun of the dwarfs with each template, pc^-3.
     teff : float array, shape (365,)
-        Temperature, K.
+        Temperature of each template, K.
     m_h : float array, shape (365,)
-        Absolute H magnitude (Vega).
+        Absolute H magnitude (Vega) of each template.
     """
 
     law: Exponential
@@ -57,14 +57,17 @@ class BrownDwarfs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Dwarfs with a template (0 to 364) and a distance in pc, shape (n,) each."""
+    """Random sample of n dwarfs: index of the template spectrum (0 to 364) and distance (pc) of each dwarf."""
 
     template: Int
     distance: Float
 
 
 def brown_dwarfs(boost: float) -> BrownDwarfs:
-    """Return the L and T dwarfs of the embedded universe; all templates of a subtype have the same density."""
+    """Return the model of L and T dwarfs with the built-in parameters and a boost of the number density.
+
+    All templates of a spectral subtype have the same number density.
+    """
     numbers = parameters.section(_FILE, "brown_dwarfs")
     templates = spectra.templates()
     share = 1.0 / np.bincount(templates.subtype)
@@ -86,14 +89,14 @@ def brown_dwarfs(boost: float) -> BrownDwarfs:
 def expected_counts(
     dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float
 ) -> Float:
-    """Return the expected number of dwarfs in cells, before extinction.
+    """Return the expected number of dwarfs in sky cells, without extinction and with the boost.
 
     Parameters
     ----------
     dwarfs : BrownDwarfs
-        The dwarfs.
+        Model of the dwarfs.
     galaxy : MilkyWay
-        The Milky Way.
+        Model of the Milky Way, of which the Sun's position and the shells of distance are used.
     lon, lat : float array, shape (n,)
         Galactic coordinates of the cells' centres, deg.
     area : float
@@ -120,14 +123,14 @@ def expected_counts(
 def draw(
     dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float, rng: np.random.Generator
 ) -> Sample:
-    """Draw a Poisson sample of the dwarfs in a cell that are brighter than the limit before extinction.
+    """Draw a Poisson sample of the dwarfs in a sky cell that may be brighter than a limit without extinction.
 
     Parameters
     ----------
     dwarfs : BrownDwarfs
-        The dwarfs.
+        Model of the dwarfs.
     galaxy : MilkyWay
-        The Milky Way.
+        Model of the Milky Way, of which the Sun's position and the shells of distance are used.
     lon, lat : float
         Galactic coordinates of the cell's centre, deg.
     area : float
@@ -140,7 +143,7 @@ def draw(
     Returns
     -------
     Sample
-        The dwarfs.
+        The dwarfs. A few are fainter than the limit, because shells of distance are selected as a whole.
     """
     r, z, _ = milky_way.cylindrical(galaxy, lon, lat, milky_way.shell_distances(galaxy))
     per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.shell_volumes(galaxy, area)
@@ -150,5 +153,5 @@ def draw(
 
 
 def _is_bright_enough(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> Bool:
-    """True if a template is brighter than the limit at the near edge of a shell, shape (365, s)."""
+    """Return True for templates that are brighter than H = h_limit at the near edge of a shell, shape (365, s)."""
     return np.asarray(dwarfs.m_h[:, None] + 5.0 * np.log10(galaxy.distance[:-1]) - 5.0 < h_limit)

@@ -1,4 +1,4 @@
-"""Binaries: the fraction of stars with a companion, and the masses and separations of companions.
+"""Draw the companions of stars in binaries: which stars have one, and the masses and separations of companions.
 
 A companion has the age and the metallicity of its primary. The parameters and their sources are in milky_way.toml.
 
@@ -20,21 +20,21 @@ from truesky.catalogue import parameters
 from truesky.catalogue.stars.stellar_populations import Pieces, Tracks
 
 _FILE = "milky_way.toml"
-# Quantiles of the mass ratio for the expected number of companions.
+# Quantiles of the distribution of mass ratios over which `expected_density` averages.
 _RATIOS = (np.arange(16) + 0.5) / 16
 _DAY_PER_YEAR = 365.25
-# Offset of log mass from one track to the next, so that one sorted array contains all tracks.
+# Number that is added to log10 mass per isochrone, so that one sorted array contains the masses of all isochrones.
 _TRACK_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Companions:
-    """Companions of stars.
+    """Companions of stars in binaries.
 
     Attributes
     ----------
     primary : int array, shape (n,)
-        Index of the primary among the given stars.
+        Index of the primary star in the arrays of stars from which the companions are drawn.
     mass : float array, shape (n,)
         Mass at birth, Msun.
     m_h : float array, shape (n,)
@@ -53,16 +53,16 @@ class Companions:
 
 
 def expected_density(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
-    """Return the expected density of companions to the stars on stretches of isochrones.
+    """Return the expected number density of companions by absolute H magnitude.
 
     Parameters
     ----------
     tracks : Tracks
         Isochrones.
     pieces : Pieces
-        Stretches of the isochrones.
+        Stretches of the isochrones with the number density of primary stars; no white dwarfs.
     m_h : float array, shape (b + 1,)
-        Edges of the bins of M_H.
+        Edges of the bins of the companions' absolute H magnitude (Vega).
 
     Returns
     -------
@@ -82,16 +82,16 @@ def expected_density(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
 
 
 def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> Companions:
-    """Draw companions of stars; a companion lighter than the lightest star is left out.
+    """Draw the companions of stars; companions below the lowest mass of the isochrones are left out.
 
     Parameters
     ----------
     tracks : Tracks
         Isochrones.
     track : int array, shape (n,)
-        Index of each star's isochrone, -1 for stars without companions.
+        Index of each star's isochrone, -1 for stars that get no companion (white dwarfs).
     mass : float array, shape (n,)
-        Mass at birth, Msun.
+        Mass of the star at birth, Msun; not used if `track` is -1.
     rng : Generator
         Random numbers.
 
@@ -113,25 +113,27 @@ def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> C
 
 
 def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Draw offsets of companions from their primaries: semi-major axes in random directions.
+    """Draw the projected offsets of companions from their primaries.
+
+    The separation is the drawn semi-major axis in a random direction in space; orbital phases are not drawn.
 
     Parameters
     ----------
     primary, companion : float array, shape (n,)
-        Masses, Msun.
+        Masses of the two stars, Msun.
     rng : Generator
         Random numbers.
 
     Returns
     -------
     east, north : float array, shape (n,)
-        Offsets, AU.
+        Offsets of the companions on the sky, AU.
     """
     law = _law()
     n = primary.size
     deviate, cosine, angle = rng.standard_normal(n), rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     years = 10.0 ** (law["log_period"] + law["log_period_scatter"] * deviate) / _DAY_PER_YEAR
-    # Kepler's third law in AU, years and solar masses.
+    # Kepler's third law in units of AU, years and solar masses.
     of_sun = np.cbrt((primary + companion) * years**2)
     of_dwarf = 10.0 ** (law["log_axis_dwarf"] + law["log_axis_dwarf_scatter"] * deviate)
     axis = np.minimum(np.where(primary < law["dwarf_below"], of_dwarf, of_sun), law["widest"])
@@ -149,13 +151,16 @@ def _binary_fraction(law: dict[str, Any], log_mass: Float) -> Float:
 
 
 def _mass_ratio(law: dict[str, Any], log_mass: Float, chance: Float) -> Float:
-    """Mass ratio in (0, 1] with a power-law distribution, from its quantile."""
+    """Return the mass ratio (companion / primary, in (0, 1]) at the quantile `chance` of a power-law distribution."""
     slope = np.interp(log_mass, np.log10(law["mass"]), law["ratio_slope"])
     return np.asarray(np.maximum(chance, 1e-12) ** (1.0 / (1.0 + slope)))
 
 
 def _main_sequence_values(tracks: Tracks, track: Int, log_mass: Float) -> tuple[Float, Float, Float]:
-    """M_H, log Teff and log g of masses on the main sequences of tracks; heavier stars have the values at the end."""
+    """Return M_H, log10 Teff and log10 g of stars with masses on the main sequences of isochrones.
+
+    Heavier (lighter) stars get the values at the last (first) point of the main sequence.
+    """
     last = tracks.evolved
     track_offset = _TRACK_SPACING * np.arange(tracks.age.size)[:, None]
     line = (tracks.log_mass[:, :last] + track_offset).ravel()

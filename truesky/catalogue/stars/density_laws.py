@@ -1,8 +1,8 @@
-"""Density laws of the Milky Way's components, relative to the density at the Sun.
+"""Density laws of stars in the Milky Way's components, relative to the density at the Sun.
 
-Exponential and PowerLaw are from Juric et al. 2008. OldDisc, YoungDisc, Parabolic and CoredPowerLaw are from Robin et
-al. 2003, the Besancon model: thin disc by age, thick disc and spheroid. Bar is the bulge of Robin et al. 2012, relative
-to the density at the centre.
+Exponential (discs) and PowerLaw (halo) are from Juric et al. 2008. OldDisc and YoungDisc (thin disc), Parabolic (thick
+disc) and CoredPowerLaw (halo) are from the Besancon model of Robin et al. 2003. Bar is the bulge of Robin et al. 2012,
+relative to the density at its centre.
 
 Lengths are in pc; R, azimuth and z are Galactocentric cylindrical coordinates. The parameters are in milky_way.toml.
 """
@@ -27,7 +27,7 @@ class Sun:
 
 @dataclass(frozen=True, slots=True)
 class Exponential:
-    """Density exp(-R / length - |z| / height)."""
+    """Density exp(-R / length - |z| / height) in Galactocentric cylindrical coordinates R and z, pc."""
 
     length: float
     height: float
@@ -35,7 +35,7 @@ class Exponential:
 
 @dataclass(frozen=True, slots=True)
 class PowerLaw:
-    """Density (R^2 + (z / flattening)^2 + core^2)^(slope / 2)."""
+    """Density (R^2 + (z / flattening)^2 + core^2)^(slope / 2) in Galactocentric cylindrical coordinates R and z, pc."""
 
     flattening: float
     slope: float
@@ -44,7 +44,10 @@ class PowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class OldDisc:
-    """Density exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)), a^2 = R^2 + (z / flattening)^2."""
+    """Density exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)).
+
+    Here a^2 = R^2 + (z / flattening)^2 in Galactocentric cylindrical coordinates R and z, pc.
+    """
 
     flattening: float
     outer: float
@@ -53,7 +56,10 @@ class OldDisc:
 
 @dataclass(frozen=True, slots=True)
 class YoungDisc:
-    """Density exp(-a^2 / outer^2) - exp(-a^2 / inner^2), with a as in OldDisc."""
+    """Density exp(-a^2 / outer^2) - exp(-a^2 / inner^2).
+
+    Here a^2 = R^2 + (z / flattening)^2 in Galactocentric cylindrical coordinates R and z, pc.
+    """
 
     flattening: float
     outer: float
@@ -62,7 +68,11 @@ class YoungDisc:
 
 @dataclass(frozen=True, slots=True)
 class Parabolic:
-    """Density exp(-R / length) times a parabola in z up to the height `joint`, with a smooth exponential beyond."""
+    """Density exp(-R / length) times a function of z: a parabola up to |z| = joint, then an exponential.
+
+    R and z are Galactocentric cylindrical coordinates, pc. The function of z and its derivative are continuous. The
+    exponential has the scale height `height`.
+    """
 
     length: float
     height: float
@@ -71,7 +81,10 @@ class Parabolic:
 
 @dataclass(frozen=True, slots=True)
 class CoredPowerLaw:
-    """Density max(a, core)^slope, with a as in OldDisc."""
+    """Density max(a, core)^slope.
+
+    Here a^2 = R^2 + (z / flattening)^2 in Galactocentric cylindrical coordinates R and z, pc.
+    """
 
     flattening: float
     slope: float
@@ -80,11 +93,14 @@ class CoredPowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """Density sech^2(s) of a bar, whose near end is `angle` deg from the Sun's direction, towards positive longitudes.
+    """Density sech^2(s) of a bar, where s is a distance from the centre in units of the axes of the bar.
+
+    As seen from the Galactic centre, the near end of the bar is `angle` deg from the Sun, towards positive Galactic
+    longitudes.
 
     Notes
     -----
-    With x along the bar and y across it::
+    With x along the bar and y across it in the Galactic plane::
 
         s^parallel = [(x / length)^perpendicular + (y / width)^perpendicular]^(parallel / perpendicular)
                      + (z / height)^parallel
@@ -102,16 +118,16 @@ Law = Bar | Exponential | PowerLaw | OldDisc | YoungDisc | Parabolic | CoredPowe
 
 
 def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, azimuth: npt.ArrayLike = 0.0) -> Float:
-    """Return the density relative to the density at the Sun (for a bar, at the centre).
+    """Return the density of a component relative to its density at the Sun (for a bar, at the centre).
 
     Parameters
     ----------
     law : Law
         Density law of a component.
     sun : Sun
-        Position of the Sun.
+        Position of the Sun in the Milky Way.
     radius, height : float array
-        Galactocentric R and z, pc, broadcast against each other.
+        Galactocentric cylindrical coordinates R and z, pc, broadcast against each other.
     azimuth : float array
         Angle from the Sun's direction, rad, positive towards positive Galactic longitudes; only bars use it.
 
@@ -133,7 +149,7 @@ def _bar_density(law: Bar, r: Float, z: Float, azimuth: Float) -> Float:
     flat = np.abs(r * np.cos(along) / law.length) ** law.perpendicular
     flat = flat + np.abs(r * np.sin(along) / law.width) ** law.perpendicular
     s = (flat ** (law.parallel / law.perpendicular) + np.abs(z / law.height) ** law.parallel) ** (1.0 / law.parallel)
-    # sech^2 without overflow.
+    # Compute sech^2(s) with exp(-s), because exp(s) overflows at large s.
     falling = np.exp(-s)
     return np.asarray((2.0 * falling / (1.0 + falling**2)) ** 2)
 
@@ -163,7 +179,7 @@ def _a2(flattening: float, r: Float, z: Float) -> Float:
 
 
 def _log_difference(small: Float, large: Float) -> Float:
-    """log(exp(-small) - exp(-large)) for large >= small; -inf in the hole at the centre."""
+    """Return ln(exp(-small) - exp(-large)) for large >= small without underflow; -inf if both are equal."""
     with np.errstate(divide="ignore"):
         return np.asarray(-small + np.log(-np.expm1(small - large)))
 

@@ -1,8 +1,8 @@
-"""Stars of a user's catalogue, such as an output of the Besancon model, which replace the drawn stars.
+"""Read a star catalogue of the user, such as an output of the Besancon model, which replaces the drawn stars.
 
-A catalogue is a text or FITS table; the request names its columns. A text table has fields separated by blanks or
-commas below a line with the column names. Lines before this line are ignored. The table ends at the first line with
-another number of fields.
+A catalogue is a text or FITS table, whose column names are given by the request. A text table has fields separated by
+blanks or commas below a line with the column names. Lines before this line are ignored. The table ends at the first
+line with another number of fields.
 """
 
 from __future__ import annotations
@@ -28,41 +28,56 @@ from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Lowest and highest valid value by key. The groups of alternatives in _REQUIRED_KEYS each require one key.
+# Lowest and highest valid value of each property that a catalogue can contain. _REQUIRED_KEYS lists groups of which
+# exactly one property is required.
 KEYS = {
     "ra": (-360.0, 360.0), "dec": (-90.0, 90.0),  # deg, ICRS
     "l": (-360.0, 360.0), "b": (-90.0, 90.0),  # deg, Galactic
     "mag_h": (-10.0, 40.0),  # 2MASS H, Vega, before extinction
-    "mag_h_seen": (-10.0, 60.0),  # with the extinction a_v
+    "mag_h_seen": (-10.0, 60.0),  # 2MASS H, Vega, with the extinction a_v
     "teff": (300.0, 1e5),  # K
     "log_teff": (2.4, 5.0),
     "distance": (0.0, 1e6),  # pc
     "distance_kpc": (0.0, 1e3),
     "log_g": (-1.0, 10.0),
     "metallicity": (-5.0, 1.5),  # [M/H]
-    "a_v": (0.0, 40.0),  # mag, R_V = 3.1; by default from our dust map
-    "age_class": (1.0, 10.0),  # Besancon model: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
-    "luminosity_class": (1.0, 7.0),  # Besancon model: 1-3 giants, 4 5 7 main sequence, 6 white dwarfs
+    "a_v": (0.0, 40.0),  # extinction A(V) by the Milky Way, mag, R_V = 3.1; by default from the dust map
+    "age_class": (1.0, 10.0),  # code of the Besancon model: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
+    "luminosity_class": (1.0, 7.0),  # code of the Besancon model: 1-3 giants; 4, 5, 7 main sequence; 6 white dwarfs
 }  # fmt: skip
 _REQUIRED_KEYS = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_teff"))
 _COMPONENT = np.array([0] * 8 + [1, 2, 5])
 _STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
 _LONGEST_LINE = 100_000
-# Largest number of lines before the column names; models write their settings there.
+# The line with the column names must be among this number of lines at the beginning of the file. Programs such as the
+# Besancon model write their settings before it.
 _MAX_HEADER_LINES = 10_000
 KIND = "catalogue of stars"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarCatalogue:
-    """Stars sorted by cell and position: order-29 index, and values by key (deg, mag, K, pc) that the file contains."""
+    """Stars of a user's catalogue, sorted by position.
+
+    Attributes
+    ----------
+    index : int array, shape (n,)
+        Position: nested index of the HEALPix cell of order 29.
+    values : mapping of str to array, shape (n,)
+        Properties that the file contains, by name: ra, dec (deg), mag_h (Vega, without extinction), teff (K), and if
+        present distance (pc), log_g (cm s-2), metallicity ([M/H]), a_v (mag), component (code of the population, such
+        as the thin disc) and stage (code of the evolutionary stage).
+    """
 
     index: Int
     values: Mapping[str, Array]
 
 
 def check_columns(columns: Mapping[str, str]) -> None:
-    """Raise BadInput if a mapping of our keys to column names is not complete."""
+    """Raise BadInput if a mapping from properties to column names is incomplete, or has a property not in `KEYS`.
+
+    Required are a position, an H magnitude and a temperature. A magnitude with extinction also requires the extinction.
+    """
     for key in columns:
         if key not in KEYS:
             raise BadInput(f"stars.catalogue.columns.{key} is not one of {', '.join(KEYS)}")
@@ -76,16 +91,16 @@ def check_columns(columns: Mapping[str, str]) -> None:
 
 
 def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
-    """Return the stars of a file, from the cache or read now.
+    """Read and check the stars of a catalogue, or map them from the disc cache if the file has been read before.
 
     Parameters
     ----------
     file : Path
-        File of the catalogue.
+        File of the catalogue: FITS (.fits or .fit), otherwise text.
     sha256 : str
-        SHA-256 of the file.
+        SHA-256 of the file, by which the cache recognises it.
     columns : mapping of str to str
-        Column name in the file by key.
+        Column name in the file by property; `check_columns` checks it.
 
     Returns
     -------
@@ -95,8 +110,8 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
     Raises
     ------
     BadInput
-        If a value is missing or out of bounds. The message names the file, the column and the first such row, and gives
-        their number.
+        If the file cannot be read or has no such columns, or if a value is missing or outside the range in `KEYS`. For
+        values, the message names the file, the column and the first bad row, and the number of bad rows.
     """
     key = content_key(code_key(__name__), sha256, canonical(dict(columns)))
     arrays = cached_arrays("star_catalogue", key, lambda: _read(file, columns))
@@ -104,14 +119,14 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
 
 
 def star_counts(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
-    """Return the number of stars in order-8 cells (nested indices)."""
+    """Return the number of the catalogue's stars in order-8 cells (nested indices), as floats."""
     edges = np.stack([np.asarray(cells, np.int64), np.asarray(cells, np.int64) + 1])
     first, last = np.searchsorted(stars.index, edges << 2 * (sky.MAX_ORDER - GENERATION_ORDER))
     return np.asarray(last - first, float)
 
 
 def stars_of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
-    """Return the values of the stars in an order-8 cell by key, in the units of `load`, with `index`."""
+    """Return the stars in an order-8 cell: their order-29 cells as `index`, and the properties in `stars.values`."""
     rows = slice(*np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell)))
     return {"index": stars.index[rows], **{name: values[rows] for name, values in stars.values.items()}}
 

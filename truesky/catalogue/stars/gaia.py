@@ -1,8 +1,8 @@
-"""Measurements of the stars by Gaia's second data release: each row of table `gaia` is a function of (seed, star).
+"""Simulate measurements of stars as in Gaia's second data release (DR2): rows of table `gaia`.
 
-Random numbers depend on the star, so that its measurement is the same in every file. Errors are not correlated. The
-true positions and proper motions are from table `stars`, which has the epoch of DR2. The parameters and their sources
-are in gaia.toml.
+Random numbers depend only on the seed and the identifier of the star, so its measurement is the same in every file.
+Errors of different quantities are not correlated. The true positions and proper motions are from table `stars`, which
+has the epoch of DR2. The parameters and their sources are in gaia.toml.
 
 References
 ----------
@@ -31,27 +31,28 @@ FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
 _FILE = "gaia.toml"
 _MAS = 1.0 / 3.6e6
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
-# Numbers of the random numbers of a star.
+# Rows of the array of random numbers: one per measured quantity, and one (_LISTED) for whether Gaia detects the star.
 _RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE = range(10)
 _COUNT = _RUWE + 1
 
 
 def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
-    """Draw Gaia's measurements of stars.
+    """Draw simulated Gaia measurements of stars.
 
     Parameters
     ----------
     stars : Table
-        Rows of table `stars` with STAR_COLUMNS.
+        Rows of table `stars` with the columns STAR_COLUMNS.
     fluxes : Table
-        Fluxes of the same rows with FLUX_COLUMNS.
+        Rows of table `star_fluxes` for the same stars in the same order, with the columns FLUX_COLUMNS.
     seed : int
         Seed of the request.
 
     Returns
     -------
     Table
-        Rows of table `gaia`, sorted by the cell of the measured position. Stars that Gaia misses have no row.
+        Rows of table `gaia`, sorted by _healpix_29 (the order-29 cell of the measured position). Stars that Gaia does
+        not detect have no row.
     """
     ids = stars["id"].to_numpy()
     chance = uniforms(ids, _COUNT, seed, "gaia")
@@ -70,18 +71,22 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
 
 
 def ab_minus_vega() -> tuple[float, ...]:
-    """Return AB - Vega magnitude in each of BANDS as defined by Gaia, 0.04 mag from the values of Vega's spectrum."""
+    """Return the difference between AB and Vega magnitude in each of BANDS, as defined by Gaia's zero points.
+
+    The difference is the AB magnitude minus the Vega magnitude. It deviates by 0.04 mag from the value that follows
+    from a spectrum of Vega.
+    """
     return tuple(parameters.section(_FILE, "zero_points")["ab_minus_vega"])
 
 
 def completeness(g: npt.ArrayLike) -> Float:
-    """Return the fraction of stars of each G magnitude (Vega) that is in the catalogue."""
+    """Return the fraction of stars with each G magnitude (Vega) that Gaia detects, 0 to 1."""
     law = parameters.section(_FILE, "completeness")
     return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
 
 
 def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """Return the standard errors of right ascension times cos(dec), declination and parallax (mas) at each G (Vega)."""
+    """Return the standard errors (mas) of ra (times cos(dec)), dec and parallax for G magnitudes (Vega)."""
     law = parameters.section(_FILE, "astrometry")
     z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
     parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)
@@ -90,19 +95,19 @@ def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 
 def proper_motion_errors(g: npt.ArrayLike) -> tuple[Float, Float]:
-    """Return the standard errors of pmra (times cos(dec)) and pmdec, mas/yr, at each G magnitude (Vega)."""
+    """Return the standard errors (mas/yr) of the proper motions in ra (times cos(dec)) and dec, by Vega G magnitude."""
     law, (_, _, parallax) = parameters.section(_FILE, "proper_motion"), astrometric_errors(g)
     return law["ra"] * parallax, law["dec"] * parallax
 
 
 def mean_flux(mag: npt.ArrayLike, band: int) -> Float:
-    """Return the flux in electrons per second of magnitudes (Vega) in a band, given by its number in BANDS."""
+    """Return the flux (electrons per second) of stars with Vega magnitudes `mag` in the band number `band` of BANDS."""
     zero = parameters.section(_FILE, "flux_zero_points")["vega"][band]
     return np.asarray(10.0 ** (0.4 * (zero - np.asarray(mag, float))))
 
 
 def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
-    """Return the standard errors (mag) at magnitudes (Vega) of the same band; `kind` is "g", or "xp" for BP and RP."""
+    """Return the standard errors (mag) at Vega magnitudes `mag` in G (`kind` "g"), or in BP or RP (`kind` "xp")."""
     law = parameters.section(_FILE, "photometry")
     nodes, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
     slope = np.diff(error) / np.diff(nodes)
@@ -131,7 +136,7 @@ def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 
 
 def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
-    """Return proper motions and their errors, masked for stars without them."""
+    """Return the columns of measured proper motions and their errors, masked for stars without a true proper motion."""
     true = [np.asarray(pc.fill_null(stars[name], np.nan).to_numpy(), float) for name in ("pm_ra", "pm_dec")]
     errors, columns = proper_motion_errors(g), {}
     for name, value, error, deviate in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
@@ -146,7 +151,11 @@ def _ruwe(chance: Float) -> Float:
 
 
 def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:
-    """Return the columns of a band. The flux has a normal error; if it is negative, the magnitude is masked."""
+    """Return the columns of one band, with normal errors of the flux.
+
+    `short` is the band in column names, `kind` is "g" or "xp", and `vega` the AB - Vega magnitude. Stars whose measured
+    flux is not positive have masked values.
+    """
     error = photometric_errors(true_ab - vega, kind) / _MAG_OVER_FLUX
     flux = 1.0 + error * noise
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,7 +1,8 @@
-"""Stars of the Milky Way: expected numbers along lines of sight, and draws of them.
+"""Stars of the Milky Way: expected numbers along lines of sight, and random samples.
 
-The stars of a component are on stretches of isochrones of its ages and metallicities, or are white dwarfs. The
-parameters and their sources are in milky_way.toml.
+The Milky Way has components (thin disc, thick disc, halo and bulge), each with a density law, ages and metallicities.
+Stars are on isochrones of these ages and metallicities, which are cut into short stretches at the edges of bins of the
+absolute H magnitude M_H, or are white dwarfs. The parameters and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -35,25 +36,25 @@ MODELS = ("juric", "besancon")
 THIN, THICK, HALO, BULGE = 0, 1, 2, 5
 _FILE = "milky_way.toml"
 _SR_PER_DEG2 = np.radians(1.0) ** 2
-# Number of cells per batch; its shells take 20 MB.
+# Number of sky cells whose expected numbers are computed together; their arrays by shell of distance take 20 MB.
 _CELLS_AT_A_TIME = 1024
 
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """Density law and stars of a component.
+    """Component of the Milky Way, such as the thin disc.
 
     Attributes
     ----------
     law : Law
-        Density law.
+        Density law, relative to the density at the Sun (for the bulge, at its centre).
     share : float
-        Fraction of the systems below a solar mass at the Sun. For the bulge, the density at its centre in units of the
-        total density at the Sun.
+        Fraction of the stellar systems below a solar mass near the Sun that belong to the component. For the bulge, the
+        density of these systems at its centre in units of the total density near the Sun.
     code : int
         THIN, THICK, HALO or BULGE.
     population : Population
-        Ages and metallicities.
+        Ages and metallicities of the stars.
     """
 
     law: Law
@@ -69,29 +70,29 @@ class MilkyWay:
     Attributes
     ----------
     sun : Sun
-        Position of the Sun.
+        Position of the Sun in the Milky Way.
     components : tuple of Component
-        Components.
+        c components, such as the thin disc.
     tracks : Tracks
         k isochrones of all components.
     width : float array, shape (k,)
-        Width of the cell in [M/H] of each isochrone.
+        Range of [M/H] of the stars on each isochrone.
     limits : tuple of float
-        Limits of [M/H].
+        Lowest and highest [M/H] of stars.
     distance : float array, shape (s + 1,)
-        Edges of the shells, pc.
+        Edges of the shells of distance from the Sun, ascending, pc.
     m_h : float array, shape (b + 1,)
-        Edges of the bins of M_H, mag.
+        Edges of the bins of the absolute H magnitude (Vega), ascending.
     pieces : Pieces
-        n stretches of isochrones, sorted by component, then by bin.
+        n stretches of isochrones and of the white dwarf sequence, sorted by component, then by bin.
     first : int array, shape (c, b + 1)
-        First stretch of each bin.
+        Index of the first stretch of each component and bin.
     cumulative : float array, shape (n + 1,)
-        Cumulative density of the stretches, pc^-3.
+        Cumulative sum of the number densities of the stretches, pc^-3.
     local : float array, shape (c, b)
-        Density of single stars and primaries for a density law of 1, pc^-3.
+        Number density of single stars and primaries where the density law of the component is 1, pc^-3.
     companions : float array, shape (c, b)
-        Density of companions for a density law of 1, pc^-3.
+        Number density of companions where the density law of the component is 1, pc^-3.
     """
 
     sun: Sun
@@ -110,18 +111,18 @@ class MilkyWay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Drawn stars.
+    """Random sample of stars in one cell of the sky.
 
     Attributes
     ----------
     component : int array, shape (n,)
-        THIN, THICK, HALO or BULGE.
+        Component of the Milky Way: THIN, THICK, HALO or BULGE.
     stage : int array, shape (n,)
-        Stage of stellar_populations, for example DWARF.
+        Evolutionary stage, a constant of stellar_populations such as DWARF.
     track : int array, shape (n,)
         Index of the isochrone, -1 for white dwarfs.
     distance : float array, shape (n,)
-        Distance, pc.
+        Distance from the Sun, pc.
     m_h : float array, shape (n,)
         Absolute H magnitude (Vega).
     mass : float array, shape (n,)
@@ -150,7 +151,10 @@ class Sample:
 
 @cache
 def milky_way(model: str = "juric") -> MilkyWay:
-    """Return the Milky Way of one of MODELS; reads the parameters and makes the tables (0.2 s) once."""
+    """Return the tables of a Milky Way model, "juric" or "besancon" (any other name also gives the latter).
+
+    The first call in a process makes the tables in 0.2 s; later calls return the same object.
+    """
     sampling = parameters.section(_FILE, "sampling")
     sun, components = _juric() if model == "juric" else _besancon()
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
@@ -159,7 +163,8 @@ def milky_way(model: str = "juric") -> MilkyWay:
     m_h = sampling["brightest"] + sampling["bin_mag"] * np.arange(sampling["bins"] + 1)
     owner = np.repeat(np.arange(len(components)), [c.population.age.size for c in components])
     pieces = stellar_populations.build_pieces(tracks, population_cells.share, masses, m_h)
-    # Scale to the observed density of systems below a solar mass near the Sun.
+    # Scale the numbers of each component to the observed local density of its stellar systems below a solar mass that
+    # are not yet white dwarfs.
     piece_owner = owner[pieces.track]
     share = np.array([component.share for component in components])
     living = np.bincount(
@@ -214,7 +219,10 @@ def _populations(model: str) -> dict[str, Any]:
 
 
 def _thin(numbers: dict[str, Any], bins: slice) -> Population:
-    """Population with a constant birth rate over a slice of the age bins."""
+    """Return the stellar population of the thin disc in some of its age bins, with a constant birth rate.
+
+    `numbers` are the metallicities by age bin from milky_way.toml.
+    """
     law = parameters.section(_FILE, "metallicity")
     edges, parts = np.array(law["thin_age"]), np.array(law["thin_parts"])
     ages, shares, bin_of_age = [], [], []
@@ -228,14 +236,14 @@ def _thin(numbers: dict[str, Any], bins: slice) -> Population:
 
 
 def _single_age(numbers: dict[str, Any], name: str) -> Population:
-    """Population of a single age."""
+    """Return a stellar population of a single age; `name` is the prefix of its keys in `numbers`, such as "thick"."""
     law = parameters.section(_FILE, "metallicity")
     age, mean, scatter = (np.array([numbers[f"{name}_{quantity}"]]) for quantity in ("age", "metallicity", "scatter"))
     return stellar_populations.build_population(age, np.ones(1), mean, scatter, law["old_cells"])
 
 
 def _bulge() -> Component:
-    """Bulge of Robin et al. 2012."""
+    """Return the bulge component with the bar of Robin et al. 2012 and a single age."""
     number: dict[str, Any] = parameters.section(_FILE, "bulge")
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
     share = number["central_density"] * number["systems_per_mass"] / masses.local
@@ -244,7 +252,7 @@ def _bulge() -> Component:
 
 
 def _juric() -> tuple[Sun, tuple[Component, ...]]:
-    """Components of Juric et al. 2008."""
+    """Return the position of the Sun and the components of the model of Juric et al. 2008, with a bulge."""
     number: dict[str, Any] = parameters.section(_FILE, "juric")
     born = _populations("juric")
     thin = Exponential(number["thin_length"], number["thin_height"])
@@ -262,7 +270,7 @@ def _juric() -> tuple[Sun, tuple[Component, ...]]:
 
 
 def _besancon() -> tuple[Sun, tuple[Component, ...]]:
-    """Components of Robin et al. 2003."""
+    """Return the position of the Sun and the components of the Besancon model (Robin et al. 2003), with a bulge."""
     number: dict[str, Any] = parameters.section(_FILE, "besancon")
     born = _populations("besancon")
     flattening = number["thin_flattening"]
@@ -289,18 +297,18 @@ def cylindrical(
     Parameters
     ----------
     galaxy : MilkyWay
-        The Milky Way with the position of the Sun.
+        Model of the Milky Way with the position of the Sun.
     lon, lat : float array
-        Galactic coordinates, deg.
+        Galactic longitude and latitude, deg.
     distance : float array
-        Heliocentric distance, pc; broadcast against `lon` and `lat`.
+        Distance from the Sun, pc; broadcast against `lon` and `lat`.
 
     Returns
     -------
     radius, height : float array
-        R and z, pc.
+        Distance from the axis of the Milky Way, and height above its plane, pc.
     azimuth : float array
-        Azimuth, rad.
+        Angle from the direction of the Sun, rad, positive towards positive Galactic longitudes.
     """
     l_rad, b_rad = np.radians(lon), np.radians(lat)
     across = distance * np.cos(b_rad)
@@ -309,12 +317,12 @@ def cylindrical(
 
 
 def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
-    """Return the expected number of stars and companions in cells, before extinction.
+    """Return the expected number of stars and companions in sky cells, without extinction.
 
     Parameters
     ----------
     galaxy : MilkyWay
-        The Milky Way.
+        Model of the Milky Way.
     lon, lat : float array, shape (n,)
         Galactic coordinates of the cells' centres, deg.
     area : float
@@ -341,12 +349,12 @@ def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_lim
 
 
 def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
-    """Return the expected number of single stars and primaries in a cell by component, shell and bin of M_H.
+    """Return the expected number of single stars and primaries in a sky cell, without extinction.
 
     Parameters
     ----------
     galaxy : MilkyWay
-        The Milky Way.
+        Model of the Milky Way.
     lon, lat : float
         Galactic coordinates of the cell's centre, deg.
     area : float
@@ -357,7 +365,8 @@ def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_li
     Returns
     -------
     float array, shape (c, s, b)
-        Expected number, 0 if all stars are too faint.
+        Expected number by component, shell of distance and bin of the absolute H magnitude. It is 0 if all stars in the
+        shell and bin are too faint.
     """
     r, z, azimuth = cylindrical(galaxy, lon, lat, shell_distances(galaxy))
     relative = np.stack([density(component.law, galaxy.sun, r, z, azimuth) for component in galaxy.components])
@@ -366,34 +375,39 @@ def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_li
 
 
 def shell_distances(galaxy: MilkyWay) -> Float:
-    """Return the distance at which the density of each shell is computed, pc."""
+    """Return the distance (pc) at which the density in each shell is computed: the geometric mean of its edges."""
     return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
 
 
 def shell_volumes(galaxy: MilkyWay, area: float) -> Float:
-    """Return the volume of the shells within an area (deg2), pc^3."""
+    """Return the volume (pc^3) of each shell of distance inside a cone with a solid angle of `area` deg2."""
     inner, outer = galaxy.distance[:-1], galaxy.distance[1:]
     return np.asarray(area * _SR_PER_DEG2 * (outer - inner) * (outer**2 + outer * inner + inner**2) / 3.0)
 
 
 def _may_be_visible(galaxy: MilkyWay, h_limit: float) -> Bool:
-    """True if a star of the bin may be brighter than the limit in the shell, shape (s, b)."""
+    """Return True for shells of distance and bins of M_H, shape (s, b), in which stars may be brighter than `h_limit`.
+
+    Extinction is not included.
+    """
     return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
 
 
 def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.random.Generator) -> Sample:
-    """Draw a Poisson sample of the expected stars, uniform in volume within a shell and along stretches of isochrones.
+    """Draw a Poisson sample of stars from expected numbers.
+
+    Stars are uniform in volume within each shell of distance, and uniform along each stretch of an isochrone.
 
     Parameters
     ----------
     galaxy : MilkyWay
-        The Milky Way.
+        Model of the Milky Way.
     mean : float array, shape (c, s, b)
-        Expected numbers, from `expected_per_bin`.
+        Expected numbers by component, shell and bin of the absolute H magnitude, from `expected_per_bin`.
     rng : Generator
         Random numbers of counts, distances and magnitudes.
     labels : Generator
-        Random numbers of metallicities within their cells.
+        Random numbers of the metallicities around the values of the isochrones.
 
     Returns
     -------
@@ -405,7 +419,7 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.ran
     distance = _draw_distance(galaxy, shell, rng)
     first, last = galaxy.cumulative[galaxy.first[owner, m_bin]], galaxy.cumulative[galaxy.first[owner, m_bin + 1]]
     piece = np.searchsorted(galaxy.cumulative, first + (last - first) * rng.random(drawn.size), side="right") - 1
-    # The product may round up to the end of the interval.
+    # Limit the index to the stretches of the bin, because rounding may give the next one.
     piece = np.clip(piece, galaxy.first[owner, m_bin], galaxy.first[owner, m_bin + 1] - 1)
     pieces, along = galaxy.pieces, rng.random(drawn.size)
 
@@ -432,35 +446,35 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.ran
 
 
 def draw_in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
-    """Draw a Poisson sample of several kinds of object, uniform in volume within a shell.
+    """Draw a Poisson sample of objects of k kinds, uniform in volume within each shell of distance.
 
     Parameters
     ----------
     galaxy : MilkyWay
-        The Milky Way with the shells.
+        Model of the Milky Way with the edges of the shells.
     mean : float array, shape (k, s)
-        Expected number of each kind in each shell.
+        Expected number of objects of each kind in each shell.
     rng : Generator
         Random numbers.
 
     Returns
     -------
     kind : int array, shape (n,)
-        Kind of each object.
+        Kind of each object, 0 to k - 1.
     distance : float array, shape (n,)
-        Distance, pc.
+        Distance from the Sun, pc.
     """
     kind, shell = np.unravel_index(_draw_boxes(mean, rng), mean.shape)
     return np.asarray(kind), _draw_distance(galaxy, shell, rng)
 
 
 def _draw_boxes(mean: Float, rng: np.random.Generator) -> Int:
-    """Draw a Poisson number of objects and return the flat index of the box of each."""
+    """Draw a Poisson number of objects; return for each the flat index of its element in `mean` (expected numbers)."""
     boxes = np.flatnonzero(mean)
     cumulative = np.cumsum(mean.ravel()[boxes])
     total = float(cumulative[-1]) if boxes.size else 0.0
     n = int(rng.poisson(total))
-    # The product may round up to the total.
+    # Limit the index, because rounding may give one beyond the end of `boxes`.
     return boxes[np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))]
 
 

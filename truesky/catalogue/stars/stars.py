@@ -1,8 +1,9 @@
-"""Stars of one generation cell; table `stars` is a pure function of (seed, cell, model).
+"""Draw the rows of table `stars` in one generation cell (HEALPix cell of order 8).
 
-A cell contains up to four groups of stars: the model's stars (or a user's catalogue), their companions, L and T dwarfs,
-and Tycho-2 stars, which replace the model's bright stars if Tycho-2 is given. Numbers by distance and luminosity are
-drawn first, then positions, extinction, labels and spectra; then stars within the magnitude limits are selected.
+The rows depend only on the seed, the cell and the model. A cell contains up to four groups of stars: stars drawn from a
+model of the Milky Way (or a user's catalogue), their companions in binaries, L and T dwarfs, and stars of the Tycho-2
+catalogue. Tycho-2, if it is given, replaces the drawn bright stars. Numbers by distance and luminosity are drawn first,
+then positions, extinction and spectra. Then the stars within the magnitude limits are selected.
 """
 
 from __future__ import annotations
@@ -34,21 +35,22 @@ from truesky.fluxes.libraries.stellar import StellarTypes
 from truesky.fluxes.libraries.vega import vega_magnitude
 from truesky.randomness.rng import stream
 
-# A group of stars of a cell: values by column, without identifiers.
+# A group of stars in a cell: arrays by column of table `stars`, without identifiers.
 Lot = dict[str, Any]
-# Galactic l and b of a cell's centre (deg), its area (deg2), and the faintest H.
+# Galactic longitude and latitude of a cell's centre (deg), its area (deg2), and the faintest H magnitude (Vega).
 CellView = tuple[float, float, float, float]
 
 STAR = 5
 BRIGHT, BROWN = 3, 4
 _BROWN_DWARF = 3
-# Largest number of stars per generation cell, which is always drawn completely: 2e6 stars take 1.6 GB, and fit into the
-# 22 bits of an identifier.
+# Largest number of stars in an order-8 cell, which is always drawn as a whole: 2e6 stars take 1.6 GB of memory, and can
+# be numbered with the 22 bits that an identifier has for this number.
 _MAX_STARS = 2e6
-# Limit of |b| for the plane, and of |l| and |b| for the bulge (deg). A separate magnitude limit applies inside
-# them.
-PLANE, BULGE = 5.0, (20.0, 10.0)
-# One AU at a distance of one pc, deg.
+# Largest |b| (deg) of the Galactic plane, in which the magnitude limit `plane_limit` applies.
+PLANE = 5.0
+# Largest |l| and |b| (deg) of the region of the bulge, in which the magnitude limit of the Galactic plane applies.
+BULGE = (20.0, 10.0)
+# Angle of one AU at a distance of one pc, deg.
 _AU_PC = 1.0 / 3600.0
 
 
@@ -59,32 +61,32 @@ class StarModel:
     Attributes
     ----------
     limit : float
-        Faintest H (Vega), including the Milky Way's extinction.
+        Faintest observed H magnitude (Vega), that is with the Milky Way's extinction.
     plane_limit : float or None
-        Faintest H of cells whose centre is closer to the plane than PLANE or inside BULGE; None if these cells are
-        refused.
+        Faintest H of cells whose centre is in the Galactic plane (PLANE) or the bulge (BULGE). None if such cells
+        raise an error.
     brightest : float
-        Stars with a brighter H are left out.
+        Brightest H; brighter stars are left out.
     galaxy : MilkyWay
-        Milky Way whose stars are drawn if there is no catalogue.
+        Model of the Milky Way from which stars are drawn if there is no user's catalogue.
     catalogue : StarCatalogue or None
         The user's catalogue, which replaces the drawn stars.
     brown_dwarfs : BrownDwarfs or None
         L and T dwarfs; None without them.
     bright : BrightStars or None
-        Tycho-2; None to keep the model's bright stars.
+        Bright stars of Tycho-2, which replace the drawn bright stars; None to keep the drawn ones.
     layer : Layer
-        Dust layer.
+        Scale height of the dust layer.
     sin_b_min : float
-        Lower limit of |sin b| in the dust map.
+        Lower limit of |sin b| in the law of the dust, b being the Galactic latitude.
     h_over_v : float
-        A(H) / A(V).
+        Extinction ratio A(H) / A(V).
     types : StellarTypes
-        Stellar types of the library's first templates.
+        Properties of the stellar types, whose spectra are the first templates of the library.
     models : int
-        Index of the library's first model.
+        Index of the first template of the library that is a synthetic spectrum of a model atmosphere.
     v_minus_h : float array
-        V - H of the types and the models, mag.
+        V - H (Vega) of the stellar types, then of the model atmospheres, mag.
     """
 
     limit: float
@@ -111,24 +113,24 @@ def model(
     bright: BrightStars | None = None,
     brightest: float = -math.inf,
 ) -> StarModel:
-    """Return the model of the embedded universe's stars with brightest <= H < limit (0.2 s).
+    """Return the model of the stars with observed H magnitudes brightest <= H < limit; it takes 0.2 s.
 
     Parameters
     ----------
     limit : float
-        Faintest H (Vega).
+        Faintest observed H magnitude (Vega).
     plane_limit : float, optional
-        Faintest H in the Galactic plane and the bulge; None to refuse these cells.
+        Faintest H in the Galactic plane and the bulge; None to raise an error for cells there.
     density : str
-        Model of the Milky Way, one of milky_way.MODELS.
+        Model of the Milky Way, "juric" or "besancon".
     brown_dwarf_boost : float
-        Ratio of the drawn to the natural density of L and T dwarfs; 0 for none.
+        Ratio of the drawn to the natural number density of L and T dwarfs; 0 for no dwarfs.
     catalogue : StarCatalogue, optional
-        The user's catalogue, which replaces the drawn stars.
+        The user's catalogue, which replaces the drawn stars; None to draw stars.
     bright : BrightStars, optional
-        Tycho-2 stars, which replace the bright drawn stars.
+        Tycho-2 stars, which replace the drawn bright stars; None to keep the drawn ones.
     brightest : float
-        Brightest H (Vega).
+        Brightest observed H magnitude (Vega).
 
     Returns
     -------
@@ -154,9 +156,10 @@ def model(
 
 
 def expected_counts(cells: npt.ArrayLike, universe: StarModel) -> Float:
-    """Return the expected number of stars in order-8 cells (nested indices), before extinction (20 us per cell).
+    """Return the expected number of stars in order-8 cells (nested indices), without extinction (20 us per cell).
 
-    Raises BadInput if a cell is not to be drawn, or if it has too many stars.
+    Raises BadInput if a cell is in the Galactic plane or the bulge and the model has no limit for them, or if a cell
+    has more than 2e6 stars.
     """
     lon, lat = _centres(cells)
     limit = _limits(lon, lat, universe)
@@ -179,18 +182,21 @@ def expected_counts(cells: npt.ArrayLike, universe: StarModel) -> Float:
 
 
 def _centres(cells: npt.ArrayLike) -> tuple[Float, Float]:
-    """Galactic l and b (deg) of order-8 cells."""
+    """Return the Galactic longitude and latitude (deg) of the centres of order-8 cells (nested indices)."""
     return sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
 
 
 def _is_crowded(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Bool:
-    """True for positions near the Galactic plane or towards the bulge."""
+    """Return True for Galactic positions (deg) in the plane (PLANE) or in the region of the bulge (BULGE)."""
     in_bulge_longitude = np.abs((np.asarray(lon) + 180.0) % 360.0 - 180.0) < BULGE[0]
     return np.asarray((np.abs(lat) < PLANE) | (in_bulge_longitude & (np.abs(lat) < BULGE[1])))
 
 
 def _limits(lon: Float, lat: Float, universe: StarModel) -> Float:
-    """Faintest H of cells at Galactic coordinates."""
+    """Return the faintest H magnitude (Vega) in cells with these Galactic coordinates (deg).
+
+    Raises BadInput if a cell is in the Galactic plane or the bulge, and the model has no limit for them.
+    """
     in_plane = _is_crowded(lon, lat)
     if not in_plane.any():
         return np.full(lat.size, universe.limit)
@@ -204,7 +210,7 @@ def _limits(lon: Float, lat: Float, universe: StarModel) -> Float:
 
 
 def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
-    """Draw table `stars` of one order-8 cell.
+    """Draw the rows of table `stars` in one order-8 cell.
 
     Parameters
     ----------
@@ -213,23 +219,24 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     seed : int
         Seed of the request.
     universe : StarModel
-        The model.
+        Model of the stars.
     dust : float32 array, shape (pixels,)
         Map of the Milky Way's A(V) to infinity, mag (truesky.catalogue.dust_map).
 
     Returns
     -------
     Table
-        Rows of table `stars`, sorted by _healpix_29.
+        Rows of table `stars`, sorted by _healpix_29 (the order-29 cell of the position).
 
     Raises
     ------
     BadInput
-        If the cell is near the Galactic plane and the model has no limit for it.
+        If the cell is in the Galactic plane or the bulge, and the model has no magnitude limit for them.
 
     Notes
     -----
-    The density of the cell's centre is used; the error at its edges is 2 % at |b| = 20 deg.
+    The density of stars at the centre of the cell is used for the whole cell. The error at its edges is 2 % at
+    |b| = 20 deg.
     """
     lon, lat = _centres([cell])
     limit = float(_limits(lon, lat, universe)[0])
@@ -256,7 +263,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
 
 
 def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, where: CellView) -> list[Lot]:
-    """Draw stars of the Milky Way's model, and their companions."""
+    """Draw stars from the model of the Milky Way, and their companions; return both groups before any selection."""
     galaxy = universe.galaxy
     rngs = (stream(seed, f"stars.{quantity}", cell) for quantity in ("luminosity", "metallicity"))
     stars = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, *where), *rngs)
@@ -301,7 +308,10 @@ def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, 
 def _spectrum_columns(
     universe: StarModel, m_h: Float, distance: Float, teff: Float, log_g: Float, metallicity: Float
 ) -> Lot:
-    """Magnitudes, labels and mixture of spectra; white dwarfs use the dwarfs of their temperature."""
+    """Return columns of table `stars`: H magnitudes, temperature, surface gravity, and the mixture of template spectra.
+
+    White dwarfs get the spectra of main-sequence stars with their temperature.
+    """
     mixture = model_stars.mixture(universe.types, universe.models, teff, log_g, metallicity)
     lot: Lot = {
         "sed": mixture.sed[0],
@@ -311,7 +321,7 @@ def _spectrum_columns(
         "log_g": log_g,
     }
     for k in range(1, model_stars.MIXTURE_SIZE):
-        # Use the types of the table, because a crowded cell takes much memory.
+        # Use the small data types of the table now, because a crowded cell takes much memory.
         lot |= {f"sed_{k + 1}": mixture.sed[k].astype(np.int16), f"frac_{k + 1}": mixture.frac[k].astype(np.float32)}
     return lot
 
@@ -324,7 +334,11 @@ def _motion_columns(place: Lot, component: Int, age: Float, deviates: Float) -> 
 
 
 def _companion_positions(cell: int, place: Lot, primary: Int, offset: tuple[Float, Float]) -> Lot:
-    """Positions of companions; one that would leave the cell is mirrored at its star, or put on the star."""
+    """Return the positions of companions with given offsets (east, north, AU) from their primary stars.
+
+    A companion that would be outside the order-8 cell is placed on the other side of its star. If that position is also
+    outside, the companion gets the position of the star.
+    """
     ra, dec, index = (place[name][primary].copy() for name in ("ra", "dec", "_healpix_29"))
     east, north = (np.radians(_AU_PC * axis / place["distance"][primary]) for axis in offset)
     remaining = np.arange(primary.size)
@@ -346,7 +360,7 @@ def _companion_positions(cell: int, place: Lot, primary: Int, offset: tuple[Floa
 def _draw_brown_dwarfs(
     cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: CellView
 ) -> Lot:
-    """Draw L and T dwarfs."""
+    """Draw the L and T dwarfs in a cell, before the selection by observed magnitude."""
     dwarf_sample = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
     n = dwarf_sample.template.size
     m_h = dwarfs.m_h[dwarf_sample.template]
@@ -369,14 +383,18 @@ def _draw_brown_dwarfs(
 
 
 def _draw_positions(cell: int, universe: StarModel, dust: Float32, distance: Float, rng: np.random.Generator) -> Lot:
-    """Draw uniform positions in a cell, sorted by index, with the extinction on the line of sight."""
+    """Draw uniform positions in an order-8 cell for stars with distances (pc), and compute their extinction A(V)."""
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, distance.size, rng)
     a_v = _extinction(universe, distance, dust, ra, dec)
     return {"_healpix_29": index, "ra": ra, "dec": dec, "distance": distance, "a_v": a_v}
 
 
 def _stars_of_catalogue(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
-    """Return stars of the user's catalogue; missing values are null, missing dust and velocities are computed."""
+    """Return the stars of the user's catalogue in a cell, as columns of table `stars`.
+
+    Extinctions that the catalogue does not contain are computed from the dust map. Velocities are drawn if the
+    catalogue has distances. Stars without a population belong to the thin disc. Other missing values are null.
+    """
     values = from_catalogue.stars_of_cell(catalogue, cell)
     n = len(values["ra"])
     unknown = bright_stars.masked_column(n)
@@ -405,7 +423,7 @@ def _stars_of_catalogue(cell: int, seed: int, catalogue: StarCatalogue, universe
 
 
 def _tycho_stars(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
-    """Return stars of Tycho-2 as observed, without additional extinction."""
+    """Return the Tycho-2 stars in a cell; their magnitudes are observed ones, so their extinction is set to 0."""
     rows = bright_stars.rows_of_cell(bright, cell)
     columns = bright_stars.columns(bright, rows, types)
     n = len(columns["sed"])
@@ -421,7 +439,10 @@ def _tycho_stars(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
 
 
 def _is_selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
-    """True for stars within the magnitude limits that Tycho-2 does not replace."""
+    """Return True for stars within the limits of the observed H magnitude that Tycho-2 stars do not replace.
+
+    Tycho-2, if it is given, replaces the stars with an observed V magnitude brighter than its limit.
+    """
     mag = lot["mag_h"] + universe.h_over_v * lot["a_v"]
     is_visible = (mag < limit) & (mag >= universe.brightest)
     if universe.bright is None:
@@ -430,11 +451,11 @@ def _is_selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> B
 
 
 def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
-    """Return the observed V magnitude (Vega), infinite for L and T dwarfs."""
+    """Return the observed V magnitude (Vega, with extinction) of stars; it is infinite for L and T dwarfs."""
     n, dwarfs = universe.types.teff.size, universe.v_minus_h
     light = np.zeros(universe.models + dwarfs.size - n)
     light[:n], light[universe.models :] = 10.0 ** (0.4 * dwarfs[:n]), 10.0 ** (0.4 * dwarfs[n:])
-    # Ratio of H to V light; L and T dwarfs have no light in V.
+    # `light` is the flux in H relative to V of each template. L and T dwarfs have no flux in V.
     light[n : universe.models] = np.inf
     light_v = _main_fraction(lot) * light[lot["sed"]]
     for k in range(2, model_stars.MIXTURE_SIZE + 1):
@@ -444,7 +465,7 @@ def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
 
 
 def _main_fraction(lot: Mapping[str, Any]) -> Float:
-    """Fraction of the first template of each star."""
+    """Return the flux fraction of the first template of each star: 1 minus the fractions of its other templates."""
     other_fractions = [
         lot[name] for name in (f"frac_{k}" for k in range(2, model_stars.MIXTURE_SIZE + 1)) if name in lot
     ]
@@ -456,7 +477,7 @@ def _distance_modulus(distance: Float) -> Float:
 
 
 def nearest_template(library: Float, teff: Float) -> Int:
-    """Return the index of the library's star with the nearest ln(Teff); `library` (K) is in any order."""
+    """Return the index of the temperature in `library` (K, in any order) that is nearest to each `teff` in ln(Teff)."""
     order = np.argsort(library)
     between = 0.5 * np.log(library[order][1:] * library[order][:-1])
     return np.asarray(order[np.searchsorted(between, np.log(teff))], np.int64)

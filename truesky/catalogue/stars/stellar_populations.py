@@ -1,9 +1,9 @@
 """Stellar populations: luminosities, temperatures, gravities and numbers of stars by mass and age.
 
-Stars above 0.7 Msun are on isochrones. Stars below 0.5 Msun are on the mean sequence of nearby dwarfs; metal-poor ones
-are hotter by the difference of the isochrones at 0.5 Msun. The two are blended in between. Types later than M9 are a
-separate population, the brown dwarfs. Magnitudes are 2MASS H in the Vega system. The parameters and their sources are
-in milky_way.toml.
+Stars above 0.7 Msun are on isochrones. Stars below 0.5 Msun are on the mean sequence of nearby dwarfs, which is made
+hotter for low metallicities by the difference of the isochrones at 0.5 Msun. Both are blended between 0.5 and 0.7 Msun.
+Types later than M9 are a separate population, the brown dwarfs. Magnitudes are 2MASS H in the Vega system. The
+parameters and their sources are in milky_way.toml.
 
 References
 ----------
@@ -26,21 +26,21 @@ from truesky.fluxes.libraries.vega import vega_magnitude
 
 DWARF, GIANT, WHITE_DWARF, BROWN_DWARF, SUBGIANT = range(5)
 _FILE = "milky_way.toml"
-# Number of nodes of the cooling sequence.
+# Number of magnitudes at which the cooling sequence of white dwarfs is tabulated.
 _STEPS = 500
-# Nominal values of the Sun (IAU 2015).
+# Temperature (K) and absolute bolometric magnitude of the Sun (nominal values of IAU 2015).
 _SUN_TEFF, _SUN_M_BOL = 5772.0, 4.74
 # Masses (Msun) between which the sequence of nearby dwarfs and the isochrones are blended.
 _NEARBY_MASS, _MODEL_MASS = 0.5, 0.7
-# Evolved stars with a larger log g are subgiants, the others giants.
+# Stars after the main sequence are subgiants if their log g (cm s-2) is larger, and giants if it is smaller.
 _GIANT_LOG_G = 3.5
-# Range of the normal distribution of metallicity, standard deviations.
+# Largest distance from the mean of the normal distribution of metallicity, standard deviations.
 _REACH = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class MassFunction:
-    """Broken power law of stellar systems at birth (milky_way.toml, [mass_function])."""
+    """Parameters of the mass function of stellar systems at birth (milky_way.toml, [mass_function])."""
 
     lightest: float
     reference: float
@@ -51,7 +51,7 @@ class MassFunction:
 
 @dataclass(frozen=True, slots=True)
 class WhiteDwarfs:
-    """Luminosity function of white dwarfs (milky_way.toml, [white_dwarfs])."""
+    """Parameters of the luminosity function of white dwarfs; explained in milky_way.toml, [white_dwarfs]."""
 
     local: float
     slope: float
@@ -63,18 +63,18 @@ class WhiteDwarfs:
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """Cells of age and metallicity of a component.
+    """Ages and metallicities of a component of the Milky Way (such as the thin disc), divided into k cells.
 
     Attributes
     ----------
     age : float array, shape (k,)
-        Age, Gyr.
+        Age of each cell, Gyr.
     metallicity : float array, shape (k,)
-        [M/H].
+        [M/H] in the middle of the cell.
     width : float array, shape (k,)
         Width of the cell in [M/H].
     share : float array, shape (k,)
-        Fraction of the systems at birth; the sum is 1.
+        Fraction of the component's stellar systems that are born in the cell; the sum is 1.
     """
 
     age: Float
@@ -85,7 +85,7 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Isochrones with points in the order of increasing initial mass.
+    """k isochrones with q points each, in the order of increasing initial mass.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Tracks:
     metallicity : float array, shape (k,)
         [M/H].
     evolved : int
-        First point after the main sequence.
+        Index of the first point after the main sequence.
     log_mass : float array, shape (k, q)
         log10 of the initial mass, Msun.
     log_teff : float array, shape (k, q)
@@ -116,20 +116,22 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
-    """Stretches of isochrones and of white dwarf sequences within bins of M_H; values are linear along them.
+    """Isochrones and the cooling sequence of white dwarfs, cut into short stretches at the edges of bins of M_H.
+
+    M_H is the absolute H magnitude. Along a stretch, all values are linear.
 
     Attributes
     ----------
     track : int array, shape (n,)
         Index of the isochrone, -1 for white dwarfs.
     stage : int array, shape (n,)
-        DWARF, GIANT, WHITE_DWARF or SUBGIANT.
+        Evolutionary stage: DWARF, GIANT, WHITE_DWARF or SUBGIANT.
     bin : int array, shape (n,)
-        Bin of M_H.
+        Index of the bin of M_H that contains the stretch.
     number : float array, shape (n,)
-        Number density, pc^-3.
+        Number density of the stars on the stretch, pc^-3.
     log_mass, log_teff, log_g, m_h : float array, shape (2, n)
-        Values at both ends, in the units of `Tracks`.
+        Values at both ends of the stretch, in the units of `Tracks`.
     """
 
     track: Int
@@ -142,33 +144,33 @@ class Pieces:
     m_h: Float
 
     def take(self, chosen: Int | Bool) -> Pieces:
-        """Return the stretches of a bool mask or of indices."""
+        """Return some of the stretches, given as a bool mask of shape (n,) or as indices."""
         return Pieces(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
 
 
 def concatenate(parts: list[Pieces]) -> Pieces:
-    """Concatenate lists of stretches."""
+    """Return the stretches of all parts in one object, in the order of the list."""
     return Pieces(*(np.concatenate([getattr(part, f.name) for part in parts], -1) for f in fields(Pieces)))
 
 
 def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
-    """Divide a population into cells of age and metallicity.
+    """Divide a stellar population into cells of age and metallicity.
 
     Parameters
     ----------
     ages : float array, shape (a,)
         Ages, Gyr.
     shares : float array, shape (a,)
-        Fraction of the systems at birth.
+        Number of stellar systems that are born at each age, in any unit.
     mean, scatter : float array, shape (a,)
-        Mean and scatter of the normal distribution of [M/H], which is cut at 3 standard deviations.
+        Mean and standard deviation of the normal distribution of [M/H] at each age. It is cut at 3 standard deviations.
     cells : int
-        Number of cells per age.
+        Number of cells in [M/H] per age.
 
     Returns
     -------
     Population
-        The cells.
+        The a times `cells` cells; their fractions are normalised.
     """
     edges = np.linspace(-_REACH, _REACH, cells + 1)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
@@ -179,7 +181,10 @@ def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, ce
 
 
 def build_tracks(age: Float, metallicity: Float) -> Tracks:
-    """Return the isochrones of ages (Gyr) and metallicities, extended to low masses by nearby dwarfs."""
+    """Return isochrones of ages (Gyr) and metallicities [M/H], shape (k,), with the sequence of nearby dwarfs.
+
+    The sequence of nearby dwarfs replaces the isochrones below 0.5 Msun, and is blended with them up to 0.7 Msun.
+    """
     model, types = isochrones.isochrones(age, metallicity), stellar.types()
     solar = isochrones.isochrones(age, np.zeros(age.size))
     nearby = _nearby_dwarfs(types)
@@ -187,7 +192,7 @@ def build_tracks(age: Float, metallicity: Float) -> Tracks:
     quantities = (nearby.log_mass, nearby.log_teff, nearby.log_g, nearby.m_h)
     low = [np.tile(values[0, is_low_mass], (age.size, 1)) for values in quantities]
     log_mass = np.log10(model.mass)
-    # Weight and values of the nearby dwarfs at the masses of the isochrones.
+    # `nearby_weight` is the weight of the nearby dwarfs at the masses of the isochrones: 1 to 0 from 0.5 to 0.7 Msun.
     nearby_weight = np.clip((_MODEL_MASS - model.mass) / (_MODEL_MASS - _NEARBY_MASS), 0.0, 1.0)
     hotter = (model.log_teff - solar.log_teff)[:, :1]
     nearby_values = [
@@ -212,10 +217,10 @@ def build_tracks(age: Float, metallicity: Float) -> Tracks:
 
 
 def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:
-    """Mean dwarf sequence of Pecaut & Mamajek 2013, Table 5 and its updates."""
+    """Return the mean sequence of nearby dwarfs as one isochrone (Pecaut & Mamajek 2013, Table 5 and its updates)."""
     order = np.argsort(-types.abs_mag_h)
     log_mass = np.log10(types.mass[order])
-    # Types of almost equal mass are not in order: use the mean of the two monotone envelopes.
+    # Masses of neighbouring types are not always in order: use the mean of the two monotone envelopes of the masses.
     up = np.maximum.accumulate(log_mass)
     down = np.minimum.accumulate(log_mass[::-1])[::-1]
     mass = 0.5 * (up + down) + 1e-9 * np.arange(order.size)
@@ -224,23 +229,23 @@ def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:
 
 
 def build_pieces(tracks: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
-    """Divide isochrones into stretches within bins of M_H.
+    """Cut isochrones into stretches at the edges of bins of the absolute H magnitude.
 
     Parameters
     ----------
     tracks : Tracks
         k isochrones.
     share : float array, shape (k,)
-        Fraction of the systems of each isochrone.
+        Fraction of the stellar systems that belong to each isochrone.
     masses : MassFunction
-        Mass function, normalised to an integral of 1 below `reference` if all systems are still alive.
+        Mass function at birth. Numbers are per system that is born with a mass below `masses.reference`.
     m_h : float array, shape (b + 1,)
-        Edges of the bins, ascending.
+        Edges of the bins of the absolute H magnitude, ascending, with a constant step.
 
     Returns
     -------
     Pieces
-        The stretches.
+        The stretches with their numbers of stars, without the parts outside the bins.
     """
     born = _power_law(masses, np.maximum(10.0**tracks.log_mass, masses.lightest))
     number = np.diff(born, axis=1) / _power_law(masses, np.asarray(masses.reference)) * share[:, None]
@@ -257,7 +262,7 @@ def build_pieces(tracks: Tracks, share: Float, masses: MassFunction, m_h: Float)
 
 
 def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
-    """Cut stretches at the edges of the bins, and remove everything outside the bins."""
+    """Cut stretches at the edges of bins of M_H, which have a constant step, and remove the parts outside the bins."""
     step, first = edges[1] - edges[0], edges[0]
     place = (pieces.m_h - first) / step
     low, high = place.min(0), place.max(0)
@@ -266,7 +271,7 @@ def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
     piece_index = np.repeat(np.arange(start.size), count)
     bin_index = start[piece_index] + np.arange(piece_index.size) - np.repeat(np.cumsum(count) - count, count)
     span = np.maximum(high - low, 1e-12)[piece_index]
-    # Fraction along the stretch, from its fainter or brighter end.
+    # `part` is where the two ends of each new stretch are along the old one: 0 at its brighter, 1 at its fainter end.
     part = np.clip((np.stack([bin_index, bin_index + 1]) - low[piece_index]) / span, 0.0, 1.0)
     part[:, count[piece_index] == 1] = np.array([0.0, 1.0])[:, None]
     falling = place[0, piece_index] > place[1, piece_index]
@@ -286,7 +291,11 @@ def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
 
 
 def white_dwarf_pieces(m_h: Float) -> Pieces:
-    """Return cooling white dwarfs of one radius in bins of M_H with given edges."""
+    """Return the cooling sequence of white dwarfs as one stretch per bin of the absolute H magnitude.
+
+    `m_h` are the ascending edges of the bins, Vega magnitudes. All white dwarfs have the same radius and gravity, and
+    `log_mass` is 0, a placeholder. Bins without white dwarfs have no stretch.
+    """
     numbers = WhiteDwarfs(**parameters.section(_FILE, "white_dwarfs"))
     m_bol, at = _white_dwarf_magnitudes(numbers)
     number = np.diff(cumulative_white_dwarfs(numbers, m_h))
@@ -299,7 +308,7 @@ def white_dwarf_pieces(m_h: Float) -> Pieces:
 
 
 def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
-    """M_bol and M_H, both in ascending order."""
+    """Return absolute bolometric and absolute H magnitudes along the white dwarf sequence, both ascending."""
     m_bol = np.linspace(numbers.brightest, numbers.faintest, _STEPS)
     types = stellar.types()
     correction = np.interp(-_white_dwarf_teff(numbers, m_bol), -types.teff, types.bolometric_h)
@@ -308,12 +317,12 @@ def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
 
 
 def _white_dwarf_teff(numbers: WhiteDwarfs, m_bol: Float) -> Float:
-    """Temperature in K from the Stefan-Boltzmann law."""
+    """Return the temperature (K) of white dwarfs with these absolute bolometric magnitudes (Stefan-Boltzmann law)."""
     return np.asarray(_SUN_TEFF * 10.0 ** (-0.1 * (m_bol - _SUN_M_BOL)) / np.sqrt(numbers.radius))
 
 
 def _power_law(masses: MassFunction, m: Float) -> Float:
-    """Integral of the mass function of Kroupa 2001 below each mass (Msun), not normalised."""
+    """Return the integral of the mass function from the lightest mass to each mass m (Msun); it is not normalised."""
     edges = (masses.lightest, *masses.breaks, np.inf)
     total, height = np.zeros(m.shape), 1.0
     for i, slope in enumerate(masses.slopes):
@@ -325,7 +334,7 @@ def _power_law(masses: MassFunction, m: Float) -> Float:
 
 
 def cumulative_white_dwarfs(numbers: WhiteDwarfs, m_h: Float) -> Float:
-    """Return the number of white dwarfs per pc^3 at the Sun that are brighter than each M_H (Vega)."""
+    """Return the number of white dwarfs per pc^3 near the Sun that are brighter than absolute H magnitudes (Vega)."""
     m_bol, at = _white_dwarf_magnitudes(numbers)
     rise = numbers.slope * np.log(10.0)
     share = np.expm1(rise * (m_bol - m_bol[0])) / np.expm1(rise * (m_bol[-1] - m_bol[0]))
