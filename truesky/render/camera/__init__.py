@@ -1,1 +1,1 @@
-"""Detectors, pointing, astrometry and lamps."""
+"""Geometry of cameras: detectors, amplifiers, pointing, astrometry, filter and grism wheels, and calibration lamps."""

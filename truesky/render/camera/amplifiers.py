@@ -1,11 +1,12 @@
 """Amplifiers of a ground camera's detector: the pixels that each one reads, and their positions in the raw file.
 
-In the raw file the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. Pre- and
-overscan columns of amplifiers in the left half of the detector lie to the left of the pixels, the other ones to the
-right. Overscan rows lie below or above the pixels, as in the files of DECam and MegaCam.
+In the raw file the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. The prescan
+and overscan columns of amplifiers in the left half of the detector lie to the left of all pixels, the other ones to the
+right. Overscan rows lie below or above all pixels, as in the files of DECam and MegaCam.
 
-Planes in readout order have the axes [amplifier, row, column], where [0, 0] is read first. Columns are prescan, pixels
-and overscan; rows are pixels and overscan.
+An image that is split into amplifiers has planes "in readout order": its axes are [amplifier, row, column], and the
+pixel at [0, 0] of a plane is read first. The columns of a plane are prescan, pixels and overscan, in this order; the
+rows are pixels and overscan.
 """
 
 from __future__ import annotations
@@ -28,30 +29,38 @@ from truesky.render.camera.sections import Section, Sections
 
 Number = TypeVar("Number", bound=np.generic)
 
-# Deviations of single amplifiers from the mean are clipped at this number of standard deviations.
+# Random deviations of an amplifier's parameters, such as the gain, from the mean of its detector are limited to this
+# number of standard deviations. Random crosstalk coefficients have a log-normal distribution, in which the largest
+# coefficient of the mission database is at this number of standard deviations above the median.
 _MAX_DEVIATION = 3.0
-# Crosstalk falls off with this power of the distance between two outputs, in amplifiers, and is 0 beyond the maximum.
-# Outputs at opposite ends of the columns are farther apart by the last number. In LSSTCam, crosstalk beyond the
-# neighbours was measured to be below 5e-5.
-_FALLOFF_POWER, _MAX_DISTANCE, _OPPOSITE_END_DISTANCE = 2.6, 4.0, 2.0
+# Crosstalk is proportional to 1 / distance to this power. The distance between two amplifiers is in units of the size
+# of an amplifier's pixel area; below 1 it counts as 1.
+_FALLOFF_POWER = 2.6
+# Distance between two amplifiers beyond which they have no crosstalk, in units of the size of an amplifier. In LSSTCam,
+# the crosstalk of amplifiers that are not neighbours was measured to be below 5e-5 of the signal.
+_MAX_DISTANCE = 4.0
+# Distance that is added for two amplifiers that are read at opposite ends of the columns, because it reduces their
+# crosstalk. The unit is the size of an amplifier.
+_OPPOSITE_END_DISTANCE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Amplifier:
-    """An amplifier and the pixels that it reads.
+    """An amplifier of a detector, the pixels that it reads, and the direction in which it reads them.
 
     Attributes
     ----------
     name : str
         Name of the amplifier.
     pixels : Section
-        Its pixels on the detector.
+        Rectangle of the detector's pixels that the amplifier reads.
     read_right : bool
-        True if its last column is read first.
+        True if the last column of the rectangle is read first.
     read_top : bool
-        True if its last row is read first.
+        True if the last row of the rectangle is read first.
     ratios_to_first : (float, float)
-        Its gain and its read noise, relative to the first amplifier in the camera's table.
+        Gain and read noise of the amplifier, divided by those of the first amplifier in the camera's table of
+        amplifiers.
     """
 
     name: str
@@ -63,16 +72,18 @@ class Amplifier:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Amplifiers of a detector, all with the same number of pixels, in the order in which arrays contain them.
+    """Amplifiers of a ground camera's detector, in the order of the planes of an image that is split into amplifiers.
+
+    All amplifiers of a detector have the same number of pixels.
 
     Attributes
     ----------
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and rows of the detector.
     prescan, overscan : int
-        Columns that an amplifier reads before and after its pixels.
+        Number of columns that each amplifier reads before and after its pixels.
     overscan_rows : int
-        Rows that it reads after its pixels.
+        Number of rows that each amplifier reads after its pixels.
     amplifiers : tuple of Amplifier
         The amplifiers.
     """
@@ -86,35 +97,40 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Number of pixel columns per amplifier."""
+        """Number of pixel columns of each amplifier, without prescan and overscan."""
         return self.amplifiers[0].pixels.nx
 
     @property
     def height(self) -> int:
-        """Number of pixel rows per amplifier."""
+        """Number of pixel rows of each amplifier, without overscan."""
         return self.amplifiers[0].pixels.ny
 
     @property
     def scan_columns(self) -> int:
-        """Number of prescan and overscan columns per amplifier."""
+        """Number of prescan and overscan columns of each amplifier together."""
         return self.prescan + self.overscan
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
-        """First row, row after the last, and True if the register lies above, for each segment of a column."""
+        """Parts of every column of the detector, each shifted as a whole to one serial register, sorted by row.
+
+        Each part is (first row, last row + 1, True if the serial register is above the part and False if it is below).
+        """
         pieces = {(a.pixels.y, a.pixels.y + a.pixels.ny, a.read_top) for a in self.amplifiers}
         return tuple(sorted(pieces))
 
     @property
     def unread_pixels(self) -> Bool:
-        """Mask [ny, nx] of the pixels that no amplifier reads."""
+        """Mask, bool[ny, nx], that is True for the pixels of the detector that no amplifier reads."""
         out = np.ones((self.ny, self.nx), bool)
         for amplifier in self.amplifiers:
             out[amplifier.pixels.slices] = False
         return out
 
     def split(self, frame: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """Split a frame [ny, nx] into planes [amplifier, row, column] in readout order, with 0 in pre- and overscan.
+        """Split a frame [ny, nx] into planes [amplifier, row, column], in which the pixel at [0, 0] is read first.
+
+        Prescan and overscan are 0. Pixels that no amplifier reads are lost.
 
         Raises
         ------
@@ -132,7 +148,10 @@ class Layout:
         return out
 
     def assemble(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """Join planes [amplifier, row, column] in readout order to a frame [ny, nx]; pixels that are not read are 0."""
+        """Join planes [amplifier, row, column], the result of `split`, to a frame [ny, nx].
+
+        Prescan and overscan are removed. Pixels that no amplifier reads are 0.
+        """
         out = np.zeros((self.ny, self.nx), planes.dtype)
         for plane, amplifier in zip(planes, self.amplifiers, strict=True):
             pixels = plane[: self.height, self.prescan : self.prescan + self.width]
@@ -141,48 +160,65 @@ class Layout:
 
     @property
     def data_section(self) -> Section:
-        """Pixels of the detector in its raw file."""
+        """Rectangle of the raw file that contains the detector's pixels, without prescan and overscan."""
         across, up = (len(starts) for starts in self._starts)
         return Section((across // 2) * self.scan_columns, (up // 2) * self.overscan_rows, self.nx, self.ny)
 
     @property
     def raw_shape(self) -> tuple[int, int]:
-        """Rows and columns of the raw file."""
+        """Number of rows and columns of the raw file, with prescan and overscan."""
         across, up = (len(starts) for starts in self._starts)
         return self.ny + up * self.overscan_rows, self.nx + across * self.scan_columns
 
     def amplifier_data_section(self, number: int) -> Section:
-        """Pixels of an amplifier in the raw file."""
+        """Return the rectangle of the raw file with the pixels of an amplifier, given by its index."""
         pixels, data = self.amplifiers[number].pixels, self.data_section
         return Section(data.x + pixels.x, data.y + pixels.y, pixels.nx, pixels.ny)
 
     def amplifier_bias_section(self, number: int) -> Section:
-        """Overscan columns in the rows of an amplifier's pixels, in the raw file; its prescan if it has no overscan."""
+        """Return the rectangle of the raw file with an amplifier's overscan columns, which measure its bias level.
+
+        It covers the rows of the amplifier's pixels. An amplifier without overscan columns has the prescan columns
+        instead. `number` is the index of the amplifier.
+        """
         first, count = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
         return self._scan_columns_section(number, first, count)
 
     def amplifier_prescan_section(self, number: int) -> Section:
-        """Prescan columns of an amplifier in the raw file."""
+        """Return the rectangle of the raw file with the prescan columns of an amplifier, in the rows of its pixels."""
         return self._scan_columns_section(number, 0, self.prescan)
 
     def amplifier_overscan_section(self, number: int) -> Section:
-        """Overscan rows of an amplifier, in the columns of its pixels, in the raw file."""
+        """Return the rectangle of the raw file with the overscan rows of an amplifier, in the columns of its pixels."""
         pixels, (_, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
         return Section(pixels.x, scan_y, pixels.nx, self.overscan_rows)
 
     def _scan_columns_section(self, number: int, first: int, count: int) -> Section:
-        """Return `count` pre- or overscan columns of an amplifier in the raw file, from `first` in readout order."""
+        """Return the rectangle of the raw file with `count` prescan or overscan columns of an amplifier.
+
+        `first` is the first of these columns, counted in the order in which prescan and overscan columns are read.
+        `number` is the index of the amplifier.
+        """
         amplifier, (scan_x, _) = self.amplifiers[number], self._scan_origin(number)
         if amplifier.read_right:
             first = self.scan_columns - first - count
         return Section(scan_x + first, self.amplifier_data_section(number).y, count, self.height)
 
     def to_detector_axes(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
-        """Convert an amplifier's plane [row, column] from readout order to the orientation on the detector."""
+        """Flip an amplifier's plane from readout order (pixel [0, 0] read first) to the axes of the detector.
+
+        `number` is the index of the amplifier.
+        """
         return _flip_to_readout_order(plane, self.amplifiers[number])
 
     def amplifier_sections(self, number: int) -> Sections:
-        """Sections of an array with an amplifier's pixels, pre- and overscan, oriented as by `to_detector_axes`."""
+        """Return the sections for the FITS header of an array with an amplifier's pixels, prescan and overscan.
+
+        They are the rectangle of the pixels in the array, the rectangle of the same pixels on the detector, and the
+        columns that measure the bias: overscan, or prescan if there is no overscan.
+        The array is a plane in readout order, flipped to the axes of the detector by `to_detector_axes`. `number` is
+        the index of the amplifier.
+        """
         amplifier = self.amplifiers[number]
         x = self.overscan if amplifier.read_right else self.prescan
         data = Section(x, self.overscan_rows if amplifier.read_top else 0, self.width, self.height)
@@ -194,7 +230,7 @@ class Layout:
         return Sections(data, amplifier.pixels, bias)
 
     def to_raw_image(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """Convert planes [amplifier, row, column] in readout order to the image of the raw file."""
+        """Arrange planes [amplifier, row, column], whose pixel [0, 0] is read first, as the image of the raw file."""
         out = np.zeros(self.raw_shape, planes.dtype)
         for number, (plane, amplifier) in enumerate(zip(planes, self.amplifiers, strict=True)):
             pixels, (scan_x, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
@@ -209,12 +245,15 @@ class Layout:
 
     @property
     def _starts(self) -> tuple[list[int], list[int]]:
-        """First columns and first rows of the amplifiers' pixels, each in increasing order."""
+        """First columns of the amplifiers' pixels on the detector, and their first rows, sorted without duplicates."""
         places = [amplifier.pixels for amplifier in self.amplifiers]
         return sorted({place.x for place in places}), sorted({place.y for place in places})
 
     def _scan_origin(self, number: int) -> tuple[int, int]:
-        """First pre- or overscan column, and first overscan row, of an amplifier in the raw file."""
+        """Return the lowest prescan or overscan column of an amplifier in the raw file, and its lowest overscan row.
+
+        Both count from 0. `number` is the index of the amplifier.
+        """
         pixels, (across, up) = self.amplifiers[number].pixels, self._starts
         i, j = across.index(pixels.x), up.index(pixels.y)
         x = i * self.scan_columns + (self.nx if i >= len(across) // 2 else 0)
@@ -223,14 +262,20 @@ class Layout:
 
 
 def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> npt.NDArray[Number]:
-    """Convert a plane from readout order to the orientation on the detector, or back."""
+    """Flip an amplifier's plane from readout order (pixel [0, 0] read first) to the axes of the detector, or back."""
     return plane[:: -1 if amplifier.read_top else 1, :: -1 if amplifier.read_right else 1]
 
 
 def _scan_segments(
     n_before: int, pixels: int, n_after: int, pixels_start: int, scan_start: int, is_flipped: bool
 ) -> list[tuple[int, int, int]]:
-    """Return (start in the plane, start in the file, length) of prescan, pixels and overscan along one axis."""
+    """Return where prescan, pixels and overscan of an amplifier are along one axis, in its plane and in the raw file.
+
+    A plane is the array of one amplifier, here with the axes of the detector. Each of the three segments is (start in
+    the plane, start in the file, length), in pixels from 0. `n_before`, `pixels` and `n_after` are the lengths of
+    prescan, pixels and overscan. `pixels_start` is the position of the first pixel in the file, and `scan_start` the
+    position of the first prescan or overscan pixel. `is_flipped` is True if the last pixel of the plane is read first.
+    """
     parts = [(n_before, scan_start), (pixels, pixels_start), (n_after, scan_start + n_before)]
     if is_flipped:
         parts = [(n_after, scan_start), (pixels, pixels_start), (n_before, scan_start + n_after)]
@@ -243,17 +288,21 @@ def _scan_segments(
 
 @lru_cache(maxsize=256)
 def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
-    """Amplifiers of a detector, or None if its camera has no table of amplifiers or has a special readout.
+    """Return the amplifiers of a ground camera's detector.
+
+    The result is None if the mission database has no table of amplifiers for the camera, or a table without the column
+    `prescan`, as for cameras with a special readout. It is also None if the table has no amplifiers for the type of the
+    detector.
 
     Raises
     ------
     BadInput
-        If the detector is too small for its amplifiers.
+        If the detector has fewer columns or rows than amplifiers along them.
 
     Notes
     -----
-    A detector that is smaller or larger than its type is divided in the same way, in whole pixels. The remainder is not
-    read.
+    A detector that is smaller or larger than the detectors of its type in the mission database is divided in the same
+    way, in whole pixels. The remainder is not read.
     """
     rows = [row for row in _table(detector.section, mission) if row["type"] == detector.kind]
     if not rows:
@@ -285,19 +334,27 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
 
 
 def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, str], ...]:
-    """Rows of a ground camera's table of amplifiers, () if it has none with prescans."""
+    """Return the rows of a ground camera's table of amplifiers in the mission database.
+
+    The result is () if there is no table, or if the table has no column `prescan`.
+    """
     key = f"{section}.amplifiers"
     rows = mission.rows(key) if section.startswith("ext.") and key in mission else ()
     return rows if rows and "prescan" in rows[0] else ()
 
 
 def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
-    """Columns and rows of a ground camera's detectors of this type; `detector` may be a part of one."""
+    """Return the numbers of columns and rows of a detector type of a ground camera, from the mission database.
+
+    `detector` may be smaller, if only a part of a detector is simulated. If the type is unknown, the size of `detector`
+    is returned.
+    """
     of_kind = (row for row in mission.rows(f"{detector.section}.layout") if row["type"] == detector.kind)
     return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
-# Parameters for which the table has a value per amplifier, and their index in `Amplifier.ratios_to_first`.
+# Parameters that have a value for each amplifier in the camera's table of amplifiers, with their index in the pair
+# `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
 _RELATIVE = {"gain": 0, "read_noise": 1}
 
 
@@ -305,14 +362,14 @@ _RELATIVE = {"gain": 0, "read_noise": 1}
 def values(
     key: str, unit: str, detector: Detector, mission: MissionConfiguration, detector_layout: Layout
 ) -> float | Float:
-    """Values of a parameter for each amplifier of a detector.
+    """Return the values of a parameter for all amplifiers of a detector, with random deviations.
 
     Parameters
     ----------
     key : str
-        Parameter within the camera's section, such as "gain".
+        Name of the parameter without the prefix of the camera, such as "gain".
     unit : str
-        Unit of the parameter.
+        Unit of the result.
     detector : Detector
         The detector.
     mission : MissionConfiguration
@@ -323,12 +380,18 @@ def values(
     Returns
     -------
     float or float array, shape (n_amplifiers,)
-        The values; one number if all are equal.
+        Values in the order of `detector_layout.amplifiers`. One number if all are equal.
 
     Notes
     -----
-    The parameter `key` is the mean and `key` + "_spread" the rms between amplifiers. The deviations are a property of
-    the hardware and therefore the same in every lake. A value that a request sets is used without deviations.
+    The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
+    the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
+    for other amplifiers it is multiplied by their ratio to the first one. The random deviations are a property of the
+    hardware and therefore the same in all simulations.
+
+    If the request of the user sets the parameter for the whole camera, it is used without ratio and random deviations,
+    unless the request also sets the spread. A value that the request sets for a detector or an amplifier is always used
+    as it is.
     """
     name, spread = f"{detector.section}.{key}", f"{detector.section}.{key}_spread"
     rms = mission.value(spread, unit) if spread in mission else 0.0
@@ -347,12 +410,17 @@ def values(
     return results if np.ptp(results) > 0.0 else float(results[0])
 
 
-# Unit and smallest allowed value for each amplifier, the same as the limits of the mean in bounds.csv.
+# Unit and smallest allowed value of the gain and of the read noise of any amplifier, checked by `refuse_spread`. The
+# file bounds.csv of the mission database has the same limits for the means over amplifiers.
 _MIN_VALUES = {"gain": ("electron / adu", 1e-3), "read_noise": ("electron", 0.0)}
 
 
 def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) -> None:
-    """Raise BadInput with the first amplifier whose gain or read noise would be below its limit."""
+    """Check that the random differences between amplifiers give none of them too low a gain or read noise.
+
+    BadInput is raised for the first detector with an amplifier below the limit, which is 0.001 electrons per ADU for
+    gain and 0 electrons for read noise. The message names the amplifier of this detector with the lowest value.
+    """
     for detector in detectors:
         detector_layout = layout(detector, mission)
         for key, (unit, minimum) in _MIN_VALUES.items() if detector_layout else ():
@@ -374,14 +442,14 @@ def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) 
 
 
 def crosstalk_couplings(median: float, largest: float, detector: Detector, detector_layout: Layout) -> Float:
-    """Crosstalk coefficients between the amplifiers of a detector.
+    """Return the crosstalk coefficients between the amplifiers of a detector, with random differences.
 
     Parameters
     ----------
     median : float
         Median coefficient of neighbouring amplifiers, as a fraction of the signal.
     largest : float
-        Largest coefficient, as a fraction of the signal.
+        Largest coefficient, as a fraction of the signal. If it is below `median`, all neighbours have the median.
     detector : Detector
         The detector.
     detector_layout : Layout
@@ -390,13 +458,12 @@ def crosstalk_couplings(median: float, largest: float, detector: Detector, detec
     Returns
     -------
     float array, shape (n_amplifiers, n_amplifiers)
-        Fraction of the signal in the amplifier of the second index that appears in that of the first; 0 on the
-        diagonal.
+        Element [i, j] is the fraction of the signal in amplifier j that appears in amplifier i; 0 on the diagonal.
 
     Notes
     -----
-    Coefficients of neighbours are log-normal about the median, with the largest at 3 sigma. They fall off with
-    distance. They are a property of the camera, and the same in every lake.
+    The coefficients of neighbours have a log-normal distribution about the median, with `largest` at 3 sigma. They fall
+    off with distance and are 0 beyond 4 amplifiers. They are a property of the camera, and the same in all simulations.
     """
     places = np.array(
         [[a.pixels.x / detector_layout.width, a.pixels.y / detector_layout.height] for a in detector_layout.amplifiers]

@@ -1,9 +1,9 @@
 """World coordinate systems (WCS) of detectors: conversion between pixels and the sky, and FITS cards.
 
-Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, with the sky seen from the inside:
-if y points north, x points west (east is left). If the optics distort, they are the positions of the detectors, and
-`distortion` gives the sky positions seen there. Pixel coordinates (column, row) are 0-based, with integers at pixel
-centres.
+Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight. The sky is seen from the inside: if
+y points north, x points west (east is left). If the optics distort, (x, y) are the positions of the detectors, and the
+module `distortion` gives the sky positions seen there. Pixel coordinates (column, row) are 0-based, with integers at
+pixel centres.
 """
 
 from __future__ import annotations
@@ -23,25 +23,23 @@ from truesky.render.camera import distortion, pointing, tpv
 from truesky.render.camera.detectors import Detector
 from truesky.render.camera.pointing import ARCSEC
 
-# ------------------------------------------------------------------------------------------------ pixels
-
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
-    """World coordinate system of a detector: ICRS, TAN about the boresight, with the distortion as SIP.
+    """Return the world coordinate system (WCS) of a detector: ICRS, tangent plane about the boresight, SIP distortion.
 
     Parameters
     ----------
     detector : Detector
         The detector.
     ra, dec : float
-        Boresight, deg.
+        Right ascension and declination of the boresight, deg.
     position_angle : float
         Angle of the focal plane's y axis at the boresight, deg from north through east.
 
     Returns
     -------
     WCS
-        The system, with the projection TAN or, if the optics distort, TAN-SIP.
+        World coordinate system with the projection TAN or, if the optics distort, TAN-SIP.
     """
     angle, turn = np.radians(position_angle), np.radians(detector.rotation)
     # The columns of `axes` are the directions (east, north) of the focal plane's x and y axes.
@@ -56,7 +54,7 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
     system.wcs.cd = matrices.matmul(axes, rotation) * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
-    # With the default, north would be turned by 180 deg for a boresight exactly at the pole.
+    # Set the longitude of the pole: with the default, north is turned by 180 deg for a boresight exactly at the pole.
     system.wcs.lonpole = 180.0
     if has_distortion:
         system.sip = Sip(
@@ -66,7 +64,7 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     return system
 
 
-# Projections without and with SIP.
+# Names of the projections in FITS headers, without and with SIP distortion.
 _PROJECTIONS = ("TAN", "TAN-SIP")
 
 
@@ -82,7 +80,7 @@ def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tupl
     system : WCS
         World coordinate system of the detector.
     column, row : array_like
-        0-based pixel coordinates.
+        0-based pixel coordinates, also outside the detector.
 
     Returns
     -------
@@ -106,7 +104,8 @@ def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Fl
     Returns
     -------
     (float array, float array)
-        Columns and rows, 0-based, with rounding errors of 1e-8 pixels.
+        Columns and rows, 0-based, with rounding errors of 1e-8 pixels. Positions far outside the camera are not
+        corrected for distortion.
     """
     column, row = system.wcs_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
     if system.sip is None:
@@ -117,7 +116,7 @@ def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Fl
 
 
 def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
-    """Derivative of the local tangent plane (u west, v north) with respect to pixel coordinates.
+    """Return the derivative of sky positions (u west, v north, local tangent plane) with respect to pixel coordinates.
 
     Parameters
     ----------
@@ -133,7 +132,7 @@ def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
 
     Notes
     -----
-    The relative error is 2e-8, from the central difference over one pixel and from rounding of positions.
+    The relative error is 2e-8. It comes from the central difference over one pixel and from rounding of positions.
     """
     x, y = np.asarray(column, float), np.asarray(row, float)
     east, north, _ = pointing.basis(*sky_of_pixel(system, x, y))
@@ -151,30 +150,34 @@ def _direction(system: WCS, x: Float, y: Float) -> Float:
 
 
 def corners(detector: Detector, system: WCS) -> Float:
-    """Right ascension and declination [4, 2] of the detector's outer corners, in order around it, deg."""
+    """Return right ascension and declination (deg) of the detector's outer corners, in order around it, float[4, 2]."""
     x = np.array([-0.5, detector.nx - 0.5, detector.nx - 0.5, -0.5])
     y = np.array([-0.5, -0.5, detector.ny - 0.5, detector.ny - 0.5])
     return np.stack(sky_of_pixel(system, x, y), axis=1)
 
 
 def centre(detector: Detector, system: WCS) -> tuple[float, float]:
-    """Right ascension and declination of the detector's centre, deg."""
+    """Return right ascension and declination of the detector's centre, deg."""
     ra, dec = sky_of_pixel(system, [(detector.nx - 1) / 2], [(detector.ny - 1) / 2])
     return float(ra[0]), float(dec[0])
 
 
 def s_region(detector: Detector, system: WCS) -> str:
-    """Footprint of a detector as an STC-S polygon.
+    """Return the footprint of a detector on the sky as text: an STC-S polygon "POLYGON ICRS ..." of its corners in deg.
 
     Notes
     -----
-    The sides are straight; the true edges deviate by up to 2 pixels for VIS and 7 for HSC.
+    The sides of the polygon are straight. The true edges of detectors deviate by up to 2 pixels for VIS and 7 for HSC.
     """
     return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
 
 
 def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
-    """FITS cards of a world coordinate system; a card stores 16 characters of a number, 1e-14 in relative terms."""
+    """Return the FITS cards (keyword, value, comment) of a world coordinate system with the projection TAN or TAN-SIP.
+
+    `system` is a result of `wcs`, perhaps shifted by `shift_pixels`. In the file, a number has at most 20 characters,
+    so that its relative precision is 1e-13.
+    """
     header, has_distortion = system.wcs, system.sip is not None
     projection = "gnomonic projection" + (", distortion as SIP" if has_distortion else "")
     return (
@@ -198,7 +201,7 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
 
 
 def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
-    """Yield the cards of the SIP polynomials, without terms that are 0."""
+    """Yield the FITS cards (keyword, value, comment) of the SIP polynomials, without coefficients that are 0."""
     for name, coefficients in (("A", sip.a), ("B", sip.b)):
         yield f"{name}_ORDER", len(coefficients) - 1, f"degree of distortion in {'columns' if name == 'A' else 'rows'}"
         for p, q in np.argwhere(coefficients).tolist():
@@ -206,19 +209,19 @@ def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
 
 
 def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
-    """World coordinate system of a frame in which all pixel coordinates are larger by given numbers.
+    """Return the world coordinate system of an image in which pixel coordinates are larger by given numbers.
 
     Parameters
     ----------
     system : WCS
-        World coordinate system of the original frame.
+        World coordinate system of the original image.
     columns, rows : float
-        Numbers added to the pixel coordinates.
+        Numbers that are added to the columns and rows, such as the number of prescan columns.
 
     Returns
     -------
     WCS
-        The shifted system.
+        World coordinate system of the shifted image; `system` is unchanged.
     """
     out = system.deepcopy()
     out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
@@ -229,12 +232,14 @@ def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
 
 
 def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
-    """Build the world coordinate system from cards of `cards`, or from the same cards after `tpv.from_sip`.
+    """Build the world coordinate system from FITS cards (keyword, value, comment) that truesky has written.
+
+    The cards are the result of `cards`, or the same cards with the distortion converted to TPV by `tpv.from_sip`.
 
     Raises
     ------
     BadInput
-        If a card is missing.
+        If a necessary card is missing. The message names its keyword.
     """
     values = {keyword: value for keyword, value, _ in header}
     try:

@@ -12,25 +12,27 @@ from lake_schema.mission import detector_overrides
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.render.camera import distortion
 
-# VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
-# Document, LE1 VIS).
+# First column of the grid of VIS CCDs, counted from 1, whose CCDs are mounted upside down. They form the right half of
+# the focal plane (Euclid Data Product Description Document, LE1 VIS).
 _VIS_FIRST_ROTATED_COLUMN = 4
-# NISP detectors of the lower half are also mounted upside down (Euclid Data Product Description Document, LE1 NISP).
+# First row of the grid of NISP detectors, counted from 1 at the top, whose detectors are mounted upside down. They form
+# the lower half of the focal plane (Euclid Data Product Description Document, LE1 NISP).
 _NISP_FIRST_ROTATED_ROW = 3
 
 
 @dataclass(frozen=True, slots=True)
 class FilterWheel:
-    """Effects of a tilt of a camera's filter, see `filter_wheel`.
+    """Shift and distortion of the image by a filter that its wheel leaves slightly tilted, see module `filter_wheel`.
 
     Attributes
     ----------
     tilt_rms : float
         Rms tilt of the filter, rad.
     shift : float
-        Shift of the image, arcsec on the sky per rad of tilt.
+        Shift of the whole image, arcsec on the sky per rad of tilt.
     bend : float
-        Distortion in arcsec on the sky per rad of tilt and per squared distance from the axis in rad^2.
+        Distortion of the image, in arcsec on the sky per rad of tilt and per rad^2 of the squared angular distance on
+        the sky from the optical axis.
     """
 
     tilt_rms: float
@@ -40,28 +42,29 @@ class FilterWheel:
 
 @dataclass(frozen=True, slots=True)
 class Detector:
-    """One detector of a camera.
+    """One detector of a camera: its size, position in the focal plane, and distortion.
 
     Attributes
     ----------
     name : str
         Name of the detector.
     section : str
-        Prefix of its parameters in the mission database: "vis", "nisp" or, for instance, "ext.lsstcam".
+        Prefix of the detector's parameters in the mission database: "vis", "nisp" or, for instance, "ext.lsstcam".
     nx, ny : int
-        Columns and rows of its image.
+        Number of columns and rows of the detector's image.
     x, y : float
-        Position of its centre in the focal plane, arcsec.
+        Position of the detector's centre in the focal plane, arcsec.
     rotation : float
-        Rotation of its columns and rows against the focal plane, from x to y, deg.
+        Angle from the x axis of the focal plane to the direction in which the detector's column index increases,
+        counted from x to y, deg.
     pixel_scale : float
         Arcsec per pixel.
     distortion_terms : distortion.Terms
-        Distortion of its camera's optics.
+        Polynomial of the optical distortion of the camera; () without distortion.
     injection_rows : int
-        Charge injection rows between its halves. They are included in `ny` and are not read.
+        Number of charge-injection rows between the halves of the detector. They are included in `ny` and are not read.
     filter_wheel : FilterWheel or None
-        Filter wheel of its camera; None if the filters do not tilt.
+        Effects of a tilt of the filter; None for a camera whose filters do not tilt.
     kind : str
         Type of the detector in the layout of a ground camera; "" for VIS and NISP.
     """
@@ -81,17 +84,20 @@ class Detector:
 
     @property
     def upside_down(self) -> bool:
-        """True if the detector is mounted upside down."""
+        """True if the detector is mounted upside down: turned by more than 90 deg against the focal plane."""
         return float(np.cos(np.radians(self.rotation))) < 0.0
 
     @property
     def half_diagonal(self) -> float:
-        """Distance from centre to corner, arcsec."""
+        """Distance from the centre of the detector to its corners, arcsec."""
         return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))
 
 
 def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """Detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
+    """Return all detectors of a camera ("vis", "nisp" or a ground camera), in the order of its layout.
+
+    BadInput is raised if the camera is unknown, if its distortion cannot be inverted at its corners, or if a VIS
+    detector cannot be divided into four equal quadrants.
 
     References
     ----------
@@ -116,12 +122,12 @@ def _load_detectors(camera: str, mission: MissionConfiguration) -> tuple[Detecto
 
 
 def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
-    """Return the detector of a camera with a given name.
+    """Return the detector of a camera that has a given name.
 
     Parameters
     ----------
     camera : str
-        "vis", "nisp" or a ground camera.
+        Name of the camera: "vis", "nisp" or a ground camera.
     name : str
         Name of the detector.
     mission : MissionConfiguration
@@ -135,7 +141,7 @@ def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
     Raises
     ------
     BadInput
-        If the camera has no detector of that name.
+        If the camera is unknown or has no detector with this name.
     """
     for candidate in detectors(camera, mission):
         if candidate.name == name:
@@ -144,7 +150,7 @@ def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
 
 
 def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
-    """Raise BadInput if a number of pixels is odd, since detectors are read as four equal quadrants."""
+    """Raise BadInput if a number of pixels of a camera's detectors is odd: they are read as four equal quadrants."""
     for name in ("nx", "ny", "charge_injection_rows"):
         count = mission.value(f"{section}.fpa.{name}", "pix")
         if count % 2.0:
@@ -154,7 +160,11 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
 def _grid_detectors(
     section: str, is_upside_down: Callable[[int, int], bool], mission: MissionConfiguration
 ) -> tuple[Detector, ...]:
-    """Return the detectors of a grid with metrology, distortion and filter wheel."""
+    """Return the detectors of a camera that form a grid, with mounting errors, distortion and tilt of the filter.
+
+    `is_upside_down` is a function of the row and column in the grid, counted from 1 at the top and at the left. It
+    returns True if the detector there is turned by 180 deg.
+    """
     designed, distortion_terms = _designed_grid(mission, section, is_upside_down), distortion.terms(section, mission)
     wheel = _load_filter_wheel(section, mission)
     return tuple(
@@ -164,7 +174,11 @@ def _grid_detectors(
 
 
 def _load_filter_wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
-    """Effects of a tilted filter: a plane-parallel plate in the beam between collimator and camera."""
+    """Return the shift and distortion of the image by a tilted filter, a plane-parallel plate behind the collimator.
+
+    They are given per radian of tilt, together with the rms tilt that the filter wheel leaves. The result is None if
+    the mission database has no tilt for the camera.
+    """
     if f"{section}.filter_wheel_error" not in mission:
         return None
     thickness, refractive_index = (
@@ -187,10 +201,12 @@ def _load_filter_wheel(section: str, mission: MissionConfiguration) -> FilterWhe
 def _designed_grid(
     mission: MissionConfiguration, section: str, is_upside_down: Callable[[int, int], bool]
 ) -> Iterator[Detector]:
-    """Yield the detectors of a grid, rows from the top and columns from the left.
+    """Yield the detectors of a grid without mounting errors: rows from the top, and in each row columns from the left.
 
-    The pitch is the sum of published pixels, without charge injection rows, and published gaps: VIS spans 0.7781 deg.
-    For VIS the gap between images of neighbours in a column is therefore smaller than the published gap by 0.4 arcsec.
+    The distance between the centres of neighbours is the published size of a detector plus the published gap. This
+    gives the published extent of the VIS focal plane, 0.7781 deg. The size does not include the charge-injection rows
+    of VIS, but the image of a detector does. The gap between the images of neighbours in a column is therefore smaller
+    than the published gap by 0.4 arcsec.
     """
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
@@ -214,7 +230,10 @@ def _designed_grid(
 
 
 def _apply_metrology(designed: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
-    """Shift and rotate each detector by its measured mounting error."""
+    """Yield the detectors of a camera, shifted and rotated by their measured mounting errors.
+
+    The measurements are in the mission database. Detectors without a measurement are unchanged.
+    """
     key = f"{section}.fpa.metrology"
     if key not in mission:
         yield from designed
@@ -231,7 +250,7 @@ def _apply_metrology(designed: Iterable[Detector], section: str, mission: Missio
 
 
 def _read_layout(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """Return the detectors of a layout in millimetres."""
+    """Return the detectors of a ground camera, whose layout in the mission database gives positions in millimetres."""
     distortion_terms = distortion.terms(section, mission)
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")

@@ -1,8 +1,8 @@
 """Geometric distortion of optics, as a polynomial in the focal plane and as SIP in pixels.
 
 A focal-plane position P (arcsec) receives the light that a perfect camera would image at P + D(P). The polynomial D has
-no constant and no linear terms, so that it preserves the boresight and the scale there. In pixels, D becomes the
-polynomial of the SIP convention.
+no constant and no linear terms, so that the boresight and the scale there are unchanged. In pixels, D becomes the
+polynomial of the SIP (Simple Imaging Polynomial) convention of FITS headers.
 
 References
 ----------
@@ -22,30 +22,45 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.numerics import matrices
 
-# Each term contains the powers of x and y, and its coefficients for x and y, arcsec^(1 - sum of powers).
+# A distortion: each term is (power of x, power of y, coefficient for x, coefficient for y). x and y are in arcsec, and
+# the unit of a coefficient is arcsec^(1 - sum of powers).
 Terms = tuple[tuple[int, int, float, float], ...]
 
+# Arcseconds per degree.
 _ARCSEC = 3600.0
-# Inversion: tolerance in pixels, maximum number of steps (each doubles the digits), and the largest distance from the
-# boresight of any camera, in pixels. Positions beyond it are not corrected.
-_TOLERANCE, _MAX_STEPS, _MAX_RADIUS = 1e-9, 30, 6e4
-# The inverse exists if a pixel keeps more than this fraction of its area. Numbers of distances and directions to test.
-_MIN_AREA, _RINGS, _RAYS = 0.1, 60, 24
+# The iteration of `undo_sip`, which removes the distortion from pixel positions, ends when its last step changes no
+# position by this number of pixels or more.
+_TOLERANCE = 1e-9
+# Largest number of iterations with which `undo_sip` removes the distortion from pixel positions; each doubles the
+# number of correct digits. BadInput is raised if more would be needed.
+_MAX_STEPS = 30
+# Largest distance of any camera's pixels from the boresight, in pixels. Positions beyond it are not corrected for
+# distortion.
+_MAX_RADIUS = 6e4
+# A distortion counts as invertible where the sky area of a pixel is more than this fraction of the undistorted area.
+_MIN_AREA = 0.1
+# Number of distances from the boresight, besides 0, at which the sky area of a pixel is computed to find out where the
+# distortion is invertible.
+_RINGS = 60
+# Number of directions in which the sky area of a pixel is computed at each distance from the boresight.
+_RAYS = 24
 
 
 def terms(section: str, mission: MissionConfiguration) -> Terms:
-    """Distortion of a camera; () if the mission database has no polynomial or its strength is 0.
+    """Return the polynomial of a camera's optical distortion from the mission database.
+
+    It is () if the database has no distortion of the camera or the strength of the distortion is 0.
 
     Raises
     ------
     BadInput
-        If the polynomial has a term below second order.
+        If the polynomial has a constant or linear term, which would move the boresight or change the scale.
     """
     key = f"{section}.fpa.distortion_polynomial"
     if key not in mission:
         return _radial_terms(section, mission)
     strength = mission.value(f"{section}.fpa.distortion", "")
-    # The polynomial of the database is in degrees.
+    # Convert the coefficients: the polynomial of the mission database is in degrees, `Terms` are in arcsec.
     all_terms = [
         (int(i), int(j), strength * to_x * _ARCSEC ** (1 - i - j), strength * to_y * _ARCSEC ** (1 - i - j))
         for i, j, to_x, to_y in mission.numbers(key)
@@ -56,7 +71,11 @@ def terms(section: str, mission: MissionConfiguration) -> Terms:
 
 
 def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
-    """Return P times k r^n for each even power n in the mission database, with r the radius of P in mm."""
+    """Return a radial distortion from the mission database: the sum of P k r^n for the powers n = 2 and 4.
+
+    P is the focal-plane position, r its distance from the boresight, and k the coefficient of the power n (1 / mm^n in
+    the database). The result is () if the database has no coefficient, or only coefficients of 0.
+    """
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     radial_terms: Terms = ()
@@ -69,14 +88,14 @@ def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
 
 
 def require_invertible(distortion_terms: Terms, radius: float, scale: float, camera: str) -> None:
-    """Raise BadInput if detectors reach farther from the boresight than the distortion can be inverted.
+    """Check that every sky position appears on one pixel only, in the whole field of a camera.
 
     Parameters
     ----------
     distortion_terms : Terms
-        Distortion of the camera.
+        Polynomial of the distortion of the camera.
     radius : float
-        Distance from the boresight to the farthest corner, pixels.
+        Distance from the boresight to the farthest corner of a detector, pixels.
     scale : float
         Arcsec per pixel.
     camera : str
@@ -85,7 +104,7 @@ def require_invertible(distortion_terms: Terms, radius: float, scale: float, cam
     Raises
     ------
     BadInput
-        If `radius` is not below `invertible_radius`.
+        If `radius` is not below `invertible_radius`, the largest distance for which the distortion can be inverted.
     """
     if distortion_terms and radius >= invertible_radius(*sip(distortion_terms, scale * np.eye(2))):
         raise BadInput(
@@ -106,7 +125,7 @@ _RADIAL_TERMS = {2: _terms_r2, 4: _terms_r4}
 
 
 def add_terms(first: Terms, second: Terms) -> Terms:
-    """Return the sum of two distortions."""
+    """Return the sum of two distortion polynomials; coefficients of the same powers are added."""
     total: dict[tuple[int, int], tuple[float, float]] = {}
     for i, j, to_x, to_y in (*first, *second):
         x, y = total.get((i, j), (0.0, 0.0))
@@ -122,12 +141,12 @@ def distort(x: npt.ArrayLike, y: npt.ArrayLike, distortion_terms: Terms) -> tupl
     x, y : array_like
         Focal-plane positions, arcsec.
     distortion_terms : Terms
-        Distortion of the camera.
+        Polynomial D of the distortion of the camera.
 
     Returns
     -------
     (float array, float array)
-        P + D(P), arcsec.
+        Positions P + D(P) for the focal-plane positions P, arcsec.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     to_x, to_y = np.zeros_like(x), np.zeros_like(y)
@@ -139,25 +158,27 @@ def distort(x: npt.ArrayLike, y: npt.ArrayLike, distortion_terms: Terms) -> tupl
 
 
 def sip(distortion_terms: Terms, matrix: Float) -> tuple[Float, Float]:
-    """Convert a distortion to the SIP polynomials in pixels.
+    """Convert a distortion polynomial in arcsec to the SIP polynomials in pixels.
 
     Parameters
     ----------
     distortion_terms : Terms
-        Distortion of the camera.
+        Polynomial of the distortion of the camera, with at least one term.
     matrix : float array, shape (2, 2)
-        Focal-plane steps, in arcsec, of one pixel along columns (u) and rows (v).
+        Matrix that converts pixels (u, v), counted along columns and rows of the image, to focal-plane positions (x, y)
+        in arcsec.
 
     Returns
     -------
     (float array, float array), each of shape (order + 1, order + 1)
-        Coefficients of u^p v^q that are added to columns and to rows.
+        Coefficients of u^p v^q, at index [p, q], of the polynomials that are added to the columns u and to the rows v.
     """
     order = max(i + j for i, j, _, _ in distortion_terms)
     to_x, to_y = np.zeros((2, order + 1, order + 1))
     for i, j, a, b in distortion_terms:
         power = np.zeros((order + 1, order + 1))
-        # Each factor of (m00 u + m01 v)^i (m10 u + m11 v)^j is a homogeneous polynomial: a row of binomials.
+        # Expand x^i y^j for x = m00 u + m01 v and y = m10 u + m11 v, with the elements m of `matrix`. Each factor is a
+        # polynomial of u and v with binomial coefficients.
         across, along = (_binomial(line, n) for line, n in ((matrix[0], i), (matrix[1], j)))
         for p, coefficient in enumerate(across):
             for q, another in enumerate(along):
@@ -169,23 +190,25 @@ def sip(distortion_terms: Terms, matrix: Float) -> tuple[Float, Float]:
 
 
 def area_change(distortion_terms: Terms, matrix: Float) -> Float:
-    """Relative change of the sky area per pixel, as a polynomial.
+    """Return the relative change of the sky area of a pixel by distortion, as a polynomial in the pixel's position.
 
     Parameters
     ----------
     distortion_terms : Terms
-        Distortion of the camera.
+        Polynomial of the distortion of the camera, with at least one term.
     matrix : float array, shape (2, 2)
-        Same as for `sip`.
+        Matrix that converts pixels (u, v), columns and rows of the image, to focal-plane positions (x, y) in arcsec.
 
     Returns
     -------
     float array, shape (n, n)
-        Coefficients of u^p v^q for the sky area of a pixel, divided by its area at the boresight, minus 1.
+        Coefficients of u^p v^q, at index [p, q], of the sky area of a pixel divided by the area at the boresight, minus
+        1. Columns u and rows v are in pixels from the boresight.
 
     Notes
     -----
-    The area is the determinant of the derivative of the mapping by `sip`.
+    With the SIP polynomials a and b, the pixel (u, v) sees the sky at (u + a, v + b). The area is the determinant of
+    the derivative of this position with respect to (u, v).
     """
     a, b = sip(distortion_terms, matrix)
     (au, av), (bu, bv) = ([np.asarray(polynomial.polyder(c, axis=axis), float) for axis in (0, 1)] for c in (a, b))
@@ -207,24 +230,25 @@ _CONSTANT_POLYNOMIAL = np.ones((1, 1))
 
 
 def _binomial(line: Float, n: int) -> Float:
-    """Coefficients of (line[0] u + line[1] v)^n by the power of u."""
+    """Return the coefficients of (line[0] u + line[1] v)^n, by ascending power of u, float[n + 1]."""
     return np.asarray(polynomial.polypow([line[1], line[0]], n), float) if n else np.ones(1)
 
 
 def undo_sip(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
-    """Invert the SIP polynomials by Newton's method.
+    """Remove the SIP distortion from pixel positions, by Newton's method.
 
     Parameters
     ----------
-    u, v : float array, shape (n,)
-        Distorted positions u + a(u, v) and v + b(u, v), pixels from the boresight.
+    u, v : float array, shape (k,)
+        Distorted columns u + a(u, v) and rows v + b(u, v), pixels from the boresight.
     a, b : float array, shape (n, n)
-        SIP coefficients for columns and rows.
+        SIP coefficients of u^p v^q, at index [p, q], for columns and rows.
 
     Returns
     -------
     (float array, float array)
-        Positions u and v to 1e-9 pixels. Positions outside `invertible_radius` are returned unchanged.
+        Undistorted columns u and rows v to 1e-9 pixels. Positions that are farther from the boresight than
+        `invertible_radius`, and NaN, are returned unchanged.
 
     Raises
     ------
@@ -255,9 +279,10 @@ def undo_sip(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
 
 
 def invertible_radius(a: Float, b: Float) -> float:
-    """Distance from the boresight, in pixels, within which each sky position appears on one pixel only.
+    """Return the distance from the boresight, in pixels, within which each sky position appears on one pixel only.
 
-    Parameters `a` and `b` are SIP coefficients [n, n]. The result is at most the largest radius of any camera.
+    `a` and `b` are SIP coefficients [n, n] for columns and rows. The result never exceeds 6e4 pixels, the largest
+    radius of all cameras.
     """
     return _invertible_radius(a.tobytes(), b.tobytes(), a.shape, b.shape)
 
@@ -265,7 +290,8 @@ def invertible_radius(a: Float, b: Float) -> float:
 @lru_cache(maxsize=512)
 def _invertible_radius(a: bytes, b: bytes, shape_a: tuple[int, int], shape_b: tuple[int, int]) -> float:
     polynomials = np.frombuffer(a).reshape(shape_a), np.frombuffer(b).reshape(shape_b)
-    # The factor 2 covers all requested sky positions, also if a detector position maps to a smaller sky radius.
+    # Compute the sky area of pixels up to twice the largest distance of any camera's pixels from the boresight. A pixel
+    # beyond this distance may show sky within it, if the distortion is strong.
     radius = np.linspace(0.0, 2.0 * _MAX_RADIUS, _RINGS + 1)[:, None]
     ray = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
     places = np.stack([radius * np.cos(ray), radius * np.sin(ray)])

@@ -1,4 +1,4 @@
-"""Coverage of sky positions by the footprints of detectors."""
+"""Count the detector footprints on the sky that contain given positions."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from truesky.render.camera import pointing
 
 
 def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """Number of detector footprints that contain each position; gaps between detectors are not covered.
+    """Return how many detector footprints contain each position; gaps between detectors are not covered.
 
     Parameters
     ----------
     tasks : pyarrow.Table
-        Planned detectors, with the columns `ra`, `dec`, `radius` (deg) and `s_region`.
+        One row per detector and exposure, with the columns `ra` and `dec` (centre, deg), `radius` (of a circle around
+        the footprint, deg) and `s_region` (STC-S polygon of the corners). The table may be empty.
     ra, dec : array_like, shape (n,)
         Positions, deg.
 
     Returns
     -------
     int array, shape (n,)
-        Number of footprints.
+        Number of footprints at each position. Positions on the edge of a footprint count as inside.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""Tilt of a grism by its wheel, with its random error, and the vignetting that the tilt causes."""
+"""Tilt of a grism (rotation in its plane) by its wheel, its random error, and the vignetting that it causes."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from lake_schema.mission.configuration import MissionConfiguration
 from truesky.randomness import rng
 from truesky.render.camera import traces
 
-# Largest tilt, deg. Spectra are traced along the columns, and no NISP grism is turned by more.
+# Largest rotation of a grism in its plane from its nominal direction, deg; exposures with a larger one are refused. The
+# simulation follows spectra along the columns of the detector, and NISP turns no grism by more.
 MAX_TILT = 45.0
 
 
 def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) -> float:
-    """Tilt of a grism for spectra at a given angle.
+    """Return the rotation of a grism that gives spectra at a given angle.
 
     Parameters
     ----------
     grism : str
         Name of the grism.
     angle : float
-        Angle of its spectra in the focal plane, deg.
+        Angle of the spectra in the focal plane, from the x axis to the y axis, deg.
     section : str
-        Prefix of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float
-        Rotation from the grism's nominal direction, deg in [-180, 180).
+        Rotation from the grism's nominal direction, in [-180, 180), deg.
 
     Notes
     -----
-    `traces.direction` raises BadInput if the database does not contain the grism.
+    BadInput is raised by `traces.direction` if the mission database does not contain the grism.
     """
     return (angle - traces.direction(grism, section, mission) + 180.0) % 360.0 - 180.0
 
@@ -42,25 +43,25 @@ def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) 
 def tilt_with_error(
     requested_tilt: float, exposure: str, section: str, mission: MissionConfiguration, seed: int
 ) -> float:
-    """Tilt of a grism in an exposure: the requested tilt plus the random error of the wheel.
+    """Return the actual tilt of a grism in an exposure: the requested tilt plus the random error of the wheel.
 
     Parameters
     ----------
     requested_tilt : float
-        Requested tilt, deg.
+        Requested rotation of the grism from its nominal direction, deg.
     exposure : str
-        Identifier of the exposure, from which the error is drawn.
+        Identifier of the exposure, from which the random error is drawn.
     section : str
-        Prefix of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
     seed : int
-        Seed of the request.
+        Seed of the random numbers in the request of the user.
 
     Returns
     -------
     float
-        Tilt, deg.
+        Rotation of the grism from its nominal direction, deg.
     """
     error = mission.value(f"{section}.grism_wheel_error", "deg")
     return requested_tilt + float(rng.stream(seed, "grism_wheel", exposure).normal(0.0, error))
@@ -69,18 +70,19 @@ def tilt_with_error(
 def vignetting_throughput(
     x: Float, y: Float, dispersion_angle: float, requested_tilt: float, section: str, mission: MissionConfiguration
 ) -> Float:
-    """Fraction of the light of sources that a tilted grism transmits.
+    """Return the fraction of the light of sources that a tilted grism transmits; the rest is vignetted.
 
     Parameters
     ----------
     x, y : float array, shape (n,)
-        Focal-plane positions of the undispersed images, arcsec.
+        Focal-plane positions of the undispersed images of the sources, arcsec.
     dispersion_angle : float
-        Angle of the spectra in the focal plane, deg.
+        Angle of the spectra in the focal plane, from the x axis to the y axis, deg.
     requested_tilt : float
-        Tilt of the grism, deg. The loss is proportional to it and lies on the side to which the grism is turned.
+        Rotation of the grism from its nominal direction, deg. The loss is proportional to it, and lies on the side to
+        which the grism is turned.
     section : str
-        Prefix of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
 
@@ -91,11 +93,11 @@ def vignetting_throughput(
 
     Notes
     -----
-    The side, and the scaling to tilts other than the measured ones, are assumptions.
+    On which side the light is lost, and the scaling to tilts other than the measured ones, are assumptions.
 
     References
     ----------
-    Serrano et al. 2024 (10 % at 0.385 deg, none at 0.17 deg).
+    Serrano et al. 2024 (loss of 10 % for a source at 0.385 deg, none at 0.17 deg).
     """
     key = f"{section}.vignetting"
     low, high = (mission.value(f"{key}.angle_{end}", "arcsec") for end in ("low", "high"))

@@ -1,4 +1,4 @@
-"""Names of telescopes and instruments, time scales, and distortion conventions for the files of each camera."""
+"""Conventions for the files of each camera: names of telescope and instrument, time scale, form of the distortion."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Observatory:
-    """Observatory and file conventions of a camera.
+    """Names of a camera's telescope and instrument, and the conventions of its files.
 
     Attributes
     ----------
     telescope, instrument : str
-        Names in its files; "" if unknown.
+        Names in the headers of the camera's files; "" if unknown.
     convention : str
-        Convention of its pipeline for the distortion of the optics, one of `tpv.CONVENTIONS`.
+        How the camera's pipeline writes the distortion of the optics in FITS headers, "sip" or "tpv".
     time_scale : str
-        Scale of the times in its files.
+        Time scale in the camera's files, such as "UTC" or "TAI".
     seconds_ahead_of_utc : float
-        Difference between that scale and UTC, s.
+        Times in the time scale of the files minus times in UTC, s.
     """
 
     telescope: str
@@ -28,10 +28,11 @@ class Observatory:
     seconds_ahead_of_utc: float = 0.0
 
 
-# TAI - UTC since 2017, s.
+# Time in the scale TAI minus time in UTC, s, since 2017.
 _TAI = 37.0
-# The VIS distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model). LSST and
-# HSC share a pipeline that writes SIP. The pipelines of the other cameras use SCAMP and SWarp, which read TPV.
+# The VIS distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model); NISP has
+# the same convention. LSST and HSC share a pipeline that writes SIP. The pipelines of the other ground cameras use
+# SCAMP and SWarp, which read TPV.
 _OBSERVATORIES = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
@@ -45,5 +46,9 @@ _OBSERVATORIES = {
 
 
 def for_camera(camera: str) -> Observatory:
-    """Observatory of a camera; for an unknown camera, only the name of the instrument is set."""
+    """Return the names of a camera's telescope and instrument, and the conventions of its files.
+
+    For an unknown camera, the instrument has the name of the camera and the telescope the name "". Its files have the
+    convention "sip" and times in UTC.
+    """
     return _OBSERVATORIES.get(camera, Observatory("", camera, "sip"))

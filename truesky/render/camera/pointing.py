@@ -1,4 +1,4 @@
-"""Pointing of a camera: the boresight for a target, and positions of the tangent plane on the sky."""
+"""Pointing of a camera: the boresight that puts a detector on a target, and sky positions of focal-plane positions."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from truesky.numerics import matrices
 from truesky.render.camera import distortion
 from truesky.render.camera.detectors import Detector
 
+# One arcsecond in radians.
 ARCSEC = np.pi / 180.0 / 3600.0
 
 
-# ------------------------------------------------------------------------------------------------ pointing
-
-
 def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
-    """Boresight and position angle that put a detector's centre on a target.
+    """Return the boresight and position angle that put a detector's centre on a target.
 
     Parameters
     ----------
     detector : Detector
         The detector.
     ra, dec : float
-        Target, deg.
+        Right ascension and declination of the target, deg.
     position_angle : float
         Angle of the focal plane's y axis *at the target*, deg from north through east.
 
     Returns
     -------
     (float, float, float)
-        Right ascension, declination and position angle of the boresight, deg.
+        Right ascension in [0, 360) and declination of the boresight, and position angle of the y axis at the boresight,
+        deg.
 
     Notes
     -----
-    The two position angles differ because meridians converge. The result is defined everywhere, including the poles.
+    The position angles at the target and at the boresight differ because meridians converge. The result is defined
+    everywhere, including the poles.
     """
-    # Right-handed camera axes: (-x, which points east; y; outward).
+    # Axes of the vector `centre`: minus the focal plane's x axis (east if y points north), its y axis, and outward
+    # along the boresight. They are right-handed.
     x, y = (float(place) for place in distortion.distort(detector.x, detector.y, detector.distortion_terms))
     centre = np.array([-x * ARCSEC, y * ARCSEC, 1.0])
     camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
@@ -57,14 +58,14 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
 def sky_of_plane(
     x: npt.ArrayLike, y: npt.ArrayLike, ra: float, dec: float, position_angle: float
 ) -> tuple[Float, Float]:
-    """Convert focal-plane coordinates on the tangent plane to positions on the sky.
+    """Convert focal-plane coordinates on the tangent plane to right ascension and declination.
 
     Parameters
     ----------
     x, y : array_like
-        Coordinates, arcsec; x points west if the position angle is 0.
+        Focal-plane coordinates relative to the boresight, arcsec; x points west if the position angle is 0.
     ra, dec : float
-        Boresight, deg.
+        Right ascension and declination of the boresight, deg.
     position_angle : float
         Angle of the y axis at the boresight, deg from north through east.
 
@@ -84,9 +85,10 @@ def sky_of_plane(
 
 
 def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
-    """Tangent-plane positions of the centres and corners of detectors, x and y [n, 5] in arcsec.
+    """Return the tangent-plane positions of the centre and corners of n detectors: x and y, each float[n, 5] in arcsec.
 
-    The centre comes first, then the corners in the order of `astrometry.corners`.
+    The centre of each detector comes first, then its corners, in order around the detector. Optical distortion is
+    included.
     """
     column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
     row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
@@ -102,7 +104,7 @@ def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
 
 
 def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """East, north and outward unit vectors [3, ...] at positions on the sky (deg)."""
+    """Return the unit vectors that point east, north and outward at sky positions (deg), each of shape (3, ...)."""
     lon, lat = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     zero = np.zeros_like(lon * lat)
     east = np.stack([-np.sin(lon) + zero, np.cos(lon) + zero, zero])
@@ -112,7 +114,11 @@ def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 
 def _triad(direction: Float, along: Float) -> Float:
-    """Orthonormal columns: the direction, the component of `along` perpendicular to it, and their cross product."""
+    """Return a matrix, float[3, 3], with orthonormal columns.
+
+    The first column is the unit vector along `direction`. The second one is the unit vector along the component of
+    `along` that is perpendicular to `direction`. The third one is the cross product of the first and the second.
+    """
     first = direction / np.sqrt(matrices.matmul(direction, direction))
     second = along - first * matrices.matmul(first, along)
     second = second / np.sqrt(matrices.matmul(second, second))

@@ -1,4 +1,4 @@
-"""Sections of an array, a detector and the mosaic of a camera, as in FITS headers.
+"""Sections (rectangles of pixels) of an array, of a detector and of the mosaic of a camera, as in FITS headers.
 
 References
 ----------
@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 from truesky.render.camera.detectors import Detector
 
-# Rotations, in quarter turns, for which the columns of a detector are columns of the mosaic.
+# Rotations of a detector against the mosaic (image of all detectors of a camera), in turns of 90 deg, for which columns
+# of the detector are columns of the mosaic: not turned, and upside down.
 _ALONG = (0, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Columns x to x + nx and rows y to y + ny of an array, counted from 0."""
+    """Rectangle of an array: columns x to x + nx - 1 and rows y to y + ny - 1, counted from 0."""
 
     x: int
     y: int
@@ -27,33 +28,37 @@ class Section:
 
     @property
     def text(self) -> str:
-        """Text for a FITS header, counted from 1, with inclusive ends."""
+        """Text of the rectangle for a FITS header, "[x1:x2,y1:y2]", counted from 1 and with both ends included."""
         return f"[{self.x + 1}:{self.x + self.nx},{self.y + 1}:{self.y + self.ny}]"
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Slices for an array [rows, columns]."""
+        """Slices (rows, columns) that select the rectangle from an array [rows, columns]."""
         return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
 
     @classmethod
     def from_text(cls, text: str) -> Section:
-        """Read a section from the text of a FITS header."""
+        """Create a rectangle from the text of a FITS header, "[x1:x2,y1:y2]", counted from 1.
+
+        ValueError is raised if the text has another form.
+        """
         (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
         return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Sections of an array that has the orientation of the detector.
+    """Parts of an array, such as the image of an amplifier, that has the orientation of the detector.
 
     Attributes
     ----------
     data : Section
-        Pixels of the detector in the array.
+        Rectangle of the array that contains pixels of the detector (FITS: DATASEC).
     ccd : Section
-        The same pixels on the detector.
+        Rectangle of the detector that contains the same pixels (FITS: CCDSEC).
     bias : Section or None
-        Columns without light, in all rows of the array, that give its bias level; None if it has no such columns.
+        Columns of the array without light that give its bias level, in all rows (FITS: BIASSEC). None if the array has
+        no such columns.
     """
 
     data: Section
@@ -62,28 +67,29 @@ class Sections:
 
     @classmethod
     def full_frame(cls, nx: int, ny: int) -> Sections:
-        """Sections of an array that contains all pixels of a detector and nothing else."""
+        """Return the sections of an array that contains all pixels of a detector and nothing else."""
         section = Section(0, 0, nx, ny)
         return cls(section, section)
 
 
 def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[Detector]) -> str | None:
-    """Convert a section of a detector to the mosaic, whose pixel grid continues across the gaps.
+    """Convert a rectangle of a detector to pixels of the camera's mosaic, whose pixel grid continues across the gaps.
 
     Parameters
     ----------
     detector : Detector
         The detector.
     section : Section
-        Section of its pixels.
+        Rectangle of pixels of the detector.
     detectors : sequence of Detector
-        Detectors of its camera. The mosaic has the orientation of most of them and begins at the first corner.
+        All detectors of the camera. The mosaic has the orientation of most detectors. It begins at the lowest column
+        and row of any detector.
 
     Returns
     -------
     str or None
-        Section in the mosaic, from high to low if the detector is mounted upside down. None if the detector is turned
-        by 90 deg, since its columns are rows of the mosaic.
+        Text "[x1:x2,y1:y2]" for a FITS header, counted from 1. Numbers decrease if the detector is mounted upside down.
+        None if the detector is turned by 90 deg relative to the mosaic, because its columns are rows of the mosaic.
 
     Notes
     -----
@@ -105,7 +111,7 @@ def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[
 
 
 def mosaic_size(detectors: Sequence[Detector]) -> str:
-    """Size of the mosaic of these detectors, as the card DETSIZE."""
+    """Return the size of the mosaic of a camera's detectors as text for the FITS card DETSIZE: "[1:columns,1:rows]"."""
     aligned = _align_to_mosaic(detectors)
     right, top = (
         max(round(_corner(d)[axis] - first) + _sides(d)[axis] for d in aligned)
@@ -115,7 +121,11 @@ def mosaic_size(detectors: Sequence[Detector]) -> str:
 
 
 def _align_to_mosaic(detectors: Sequence[Detector]) -> Sequence[Detector]:
-    """Return the detectors in the focal plane's axes, or in axes turned by 90 deg if most detectors lie along these."""
+    """Return the detectors with positions and rotations in the axes of the mosaic (image of all detectors).
+
+    These are the axes of the focal plane. If the column index of most detectors increases along the y axis of the focal
+    plane, up or down, they are axes turned by 90 deg. Columns of most detectors are then columns of the mosaic.
+    """
     if 2 * sum(_quarter_turns(d) in _ALONG for d in detectors) >= len(detectors):
         return detectors
     return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in detectors]
@@ -126,13 +136,13 @@ def _quarter_turns(detector: Detector) -> int:
 
 
 def _sides(detector: Detector) -> tuple[int, int]:
-    """Columns and rows that the detector covers in the mosaic."""
+    """Return how many columns and rows of the mosaic (image of all detectors of a camera) a detector covers."""
     along = _quarter_turns(detector) in _ALONG
     return (detector.nx, detector.ny) if along else (detector.ny, detector.nx)
 
 
 def _corner(detector: Detector) -> tuple[float, float]:
-    """Position of the detector's first corner, pixels."""
+    """Return the lower left corner (x, y) of a detector in the axes of the mosaic, in pixels from the boresight."""
     nx, ny = _sides(detector)
     return detector.x / detector.pixel_scale - nx / 2, detector.y / detector.pixel_scale - ny / 2
 

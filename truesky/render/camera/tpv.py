@@ -1,8 +1,9 @@
-"""Conversion of world coordinate systems between TAN-SIP and TPV.
+"""Conversion of the distortion in FITS headers between the conventions TAN-SIP and TPV.
 
-SourceExtractor, SCAMP and SWarp read TPV and ignore SIP. SIP distorts pixels (u, v), which the matrix CD maps to the
-tangent plane; TPV distorts the tangent plane. With x = CD (u, v), the SIP polynomials are rewritten in x and CD is
-applied to them. This is an exact linear map of coefficients, and so is its inverse.
+SourceExtractor, SCAMP and SWarp read TPV and ignore SIP. SIP distorts pixel coordinates (u, v), which the matrix CD
+then maps to the tangent plane. TPV distorts coordinates on the tangent plane. With x = CD (u, v), the SIP polynomials
+are rewritten as polynomials of x, and CD is applied to them. This is an exact linear map of the coefficients, and so is
+its inverse.
 
 References
 ----------
@@ -24,18 +25,20 @@ from truesky.render.camera import distortion
 Card = tuple[str, Any, str]
 
 CONVENTIONS = ("sip", "tpv")
-# Number of the first PV card of each order. Within an order, numbers increase with the power of the second coordinate.
-# The numbers between the orders are radial terms, which are not used.
+# Number of the first PV card of each order of the polynomial, 0 to 7. Within an order, the numbers increase with the
+# power of the second coordinate. Numbers between the orders are radial terms, which are not used.
 _FIRST = (0, 1, 4, 7, 12, 17, 24, 31)
 
 
 def from_sip(header: Sequence[Card]) -> tuple[Card, ...]:
-    """Convert the cards of a header from SIP to TPV; a header without SIP is returned unchanged.
+    """Convert the FITS cards (keyword, value, comment) of a header with SIP distortion to TPV.
+
+    A header without SIP is returned unchanged.
 
     Raises
     ------
     BadInput
-        If the order of the polynomial is higher than TPV allows.
+        If the order of the SIP polynomials is more than 7, the highest order of TPV.
     """
     values = {keyword: value for keyword, value, _ in header}
     if not str(values.get("CTYPE1", "")).endswith("-SIP"):
@@ -57,18 +60,27 @@ def from_sip(header: Sequence[Card]) -> tuple[Card, ...]:
 
 
 def to_sip(values: Mapping[str, Any]) -> tuple[Float, Float]:
-    """SIP coefficients [n, n] of u^p v^q, for columns and rows, of a header with PV cards."""
+    """Return the SIP coefficients of a header with TPV distortion, two arrays [n, n] for columns and rows.
+
+    `values` are the values of the header's cards by keyword. Index [p, q] is the coefficient of u^p v^q, with columns u
+    and rows v in pixels from the reference pixel (CRPIX).
+    """
     polynomials = [_pv_coefficients(values, axis) for axis in (1, 2)]
     side = max(len(each) for each in polynomials)
     to_x, to_y = (np.pad(each, (0, side - len(each))) for each in polynomials)
-    # SIP has no identity term, but the linear terms of TPV include it.
+    # Subtract 1 from the linear terms: TPV polynomials include the identity, SIP polynomials are added to it.
     to_x[1, 0] -= 1.0
     to_y[0, 1] -= 1.0
     return _change_basis(to_x, to_y, _cd(values))
 
 
 def _change_basis(to_x: Float, to_y: Float, matrix: Float) -> tuple[Float, Float]:
-    """Write polynomials that are added to a vector in another basis; matrix [2, 2] maps new to old coordinates."""
+    """Return a distortion (a vector as a polynomial of the position) in other coordinates of the plane.
+
+    `to_x` and `to_y` contain the coefficients of x^p y^q, at index [p, q], of the two components of the distortion.
+    `matrix` [2, 2] maps new coordinates to the old ones (x, y). The result are two arrays of coefficients of the new
+    coordinates, for the components of the distortion along the new axes.
+    """
     terms = tuple(
         (int(p), int(q), float(to_x[p, q]), float(to_y[p, q])) for p, q in np.argwhere((to_x != 0) | (to_y != 0))
     )
@@ -85,13 +97,18 @@ def _sip_coefficients(values: Mapping[str, Any], name: str) -> Float:
 
 
 def is_sip(keyword: str) -> bool:
-    """Return True if the card belongs to a SIP distortion."""
+    """Return True if a FITS keyword belongs to a SIP distortion: A_ORDER, B_ORDER, A_p_q or B_p_q."""
     name, *powers = keyword.split("_")
     return name in ("A", "B") and (powers == ["ORDER"] or (len(powers) == 2 and all(p.isdigit() for p in powers)))
 
 
 def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
-    """PV cards of an axis, including the identity, without terms that are 0; the coordinate of the axis comes first."""
+    """Return the PV cards (keyword, value, comment) of one axis of a TPV distortion, without coefficients that are 0.
+
+    `axis` is 1 (xi) or 2 (eta). xi and eta are the coordinates on the tangent plane in degrees. `coefficients` [p, q]
+    belong to xi^p eta^q in the distortion of this axis. The undistorted coordinate itself is added, because TPV
+    polynomials give the whole position.
+    """
     full = np.array(coefficients if axis == 1 else coefficients.T)
     full[1, 0] += 1.0
     first, second = ("xi", "eta") if axis == 1 else ("eta", "xi")
@@ -102,7 +119,10 @@ def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
 
 
 def _pv_coefficients(values: Mapping[str, Any], axis: int) -> Float:
-    """Coefficients [n, n] by the powers of the first and second coordinate."""
+    """Return the coefficients of a header's PV cards for an axis of TPV, 1 or 2, float[n, n]; 0 for missing cards.
+
+    Index [p, q] belongs to xi^p eta^q, with the coordinates xi and eta on the tangent plane in degrees.
+    """
     terms = {
         (order - q, q): float(values[key])
         for order, first in enumerate(_FIRST)

@@ -1,12 +1,13 @@
-"""Traces of grism orders as polynomials: the pixels that receive the light of each wavelength.
+"""Traces of grism spectra: for each spectral order, the pixels that receive the light of each wavelength.
 
-An order m puts light of wavelength lambda at (x0 + X(t), y0 + Y(t)), where (x0, y0) is the undispersed image and
-t = (lambda - first) / (last - first) is exactly linear in wavelength. The polynomials have the form of grismconf::
+For a source whose undispersed image is at (x0, y0), an order puts light of the wavelength lambda at (x0 + X, y0 + Y).
+The parameter t = (lambda - first) / (last - first) is linear in wavelength. X and Y are polynomials in t, as in the
+program grismconf::
 
     X(t; x0, y0) = sum_i t^i (a_i0 + a_i1 x0 + a_i2 y0)
     Y(t; x0, y0) = sum_i t^i (b_i0 + b_i1 x0 + b_i2 y0)
 
-In the mission database the coefficients are along and across the dispersion, over the whole focal plane. They are
+In the mission database the coefficients are along and across the dispersion, for the whole focal plane. They are
 rotated with the grism and converted to the pixels of each detector.
 
 References
@@ -31,16 +32,17 @@ from truesky.render.camera.detectors import Detector, detectors
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Trace of one grism order on a detector.
+    """Trace of one spectral order of a grism on a detector, as polynomials.
 
     Attributes
     ----------
     order : int
         Diffraction order: -1, 0, 1 or 2.
     first, last : float
-        Wavelengths of t = 0 and t = 1, Angstrom.
+        Wavelengths at which the parameter t of the polynomials is 0 and 1, Angstrom.
     x, y : float array, shape (n_powers, 3)
-        Coefficients of t^i and of 1, x0, y0 (0-based pixels) for columns and rows, pixels.
+        Coefficients of the offset in columns (x) and in rows (y), in pixels. Row i belongs to t^i; its three numbers
+        are multiplied by 1, x0 and y0, the undispersed image (0-based pixels).
     """
 
     order: int
@@ -50,14 +52,14 @@ class Trace:
     y: Float
 
     def offsets(self, column: float, row: float, wavelength: npt.ArrayLike) -> tuple[Float, Float]:
-        """Offsets from the undispersed image of a source to its light at given wavelengths.
+        """Return the offsets from the undispersed image of a source to its light at given wavelengths.
 
         Parameters
         ----------
         column, row : float
-            Undispersed image, 0-based pixels.
+            Position of the undispersed image, 0-based pixels.
         wavelength : array_like, shape (n,)
-            Wavelengths, Angstrom.
+            Wavelengths, Angstrom. Values outside `first` to `last` are extrapolated.
 
         Returns
         -------
@@ -70,13 +72,18 @@ class Trace:
         return columns, rows
 
     def polynomials(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
-        """Coefficients of t^i for the trace of a source, for columns and rows, pixels: [i], or [i, n] for n sources."""
+        """Return the coefficients of t^i for the traces of sources: offsets in columns and in rows, pixels.
+
+        `column` and `row` are the positions of the undispersed images in 0-based pixels, one number or n numbers each.
+        The parameter t is 0 at the wavelength `first` and 1 at `last`. Index i of a result belongs to t^i. Its shape is
+        (powers,) for one source, or (powers, n) for n sources.
+        """
         place = np.array([np.ones_like(column, float), column, row])
         return np.asarray(matrices.matmul(self.x, place)), np.asarray(matrices.matmul(self.y, place))
 
 
 def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfiguration) -> tuple[Trace, ...]:
-    """Traces of all orders of a tilted grism on a detector.
+    """Return the traces of all spectral orders of a tilted grism on a detector.
 
     Parameters
     ----------
@@ -100,7 +107,7 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
     """
     rows = _grism_rows(grism, detector.section, mission)
     to_field = _to_field_matrix(detector, mission)
-    # Angle from the detector's columns to the dispersion.
+    # Angle from the direction of increasing column index on the detector to the direction of dispersion.
     turn = np.radians(float(rows[0]["direction_deg"]) + tilt - detector.rotation)
     cosine, sine = float(np.cos(turn)), float(np.sin(turn))
     order_traces = []
@@ -114,27 +121,32 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
 
 
 def direction(grism: str, section: str, mission: MissionConfiguration) -> float:
-    """Direction of the spectra of an untilted grism, deg from the focal plane's x axis to the y axis.
+    """Return the direction of the spectra of an untilted grism in the focal plane.
 
     Parameters
     ----------
     grism : str
         Name of the grism.
     section : str
-        Prefix of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float
-        Direction, deg.
+        Angle from the focal plane's x axis towards the y axis, deg. BadInput is raised if the grism is unknown.
     """
     return float(_grism_rows(grism, section, mission)[0]["direction_deg"])
 
 
 def _grism_rows(grism: str, section: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
-    """Rows of a grism in the table of traces. Raises BadInput if the table does not contain the grism."""
+    """Return the rows of a grism in the mission database's table of traces, at least one.
+
+    Each row has coefficients of one power of the polynomial along or across the dispersion, for one spectral order.
+    `section` is the prefix of the camera's parameters, such as "nisp". BadInput is raised if the grism is not in the
+    table.
+    """
     rows = mission.rows(f"{section}.traces")
     grism_rows = [row for row in rows if row["grism"] == grism]
     if not grism_rows:
@@ -143,7 +155,12 @@ def _grism_rows(grism: str, section: str, mission: MissionConfiguration) -> list
 
 
 def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to_field: Float) -> Float:
-    """Coefficients [highest + 1, 3] of t^i and of (1, x0, y0), pixels."""
+    """Return the coefficients [highest + 1, 3] of a trace "along" or "across" the dispersion (`axis`), in pixels.
+
+    Row i belongs to t^i, where t goes from 0 to 1 along the trace. Its three numbers are multiplied by 1, x0 and y0,
+    the position of the undispersed image in 0-based pixels. Powers without a row in the table are 0. `to_field` [3, 3]
+    converts (1, x0, y0) to (1, x, y) in the field of the camera, for which the table has its coefficients.
+    """
     powers = {int(row["power"]): row for row in rows if row["axis"] == axis}
     out = np.zeros((highest + 1, 3))
     for power, row in powers.items():
@@ -153,7 +170,11 @@ def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to
 
 
 def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float:
-    """Matrix [3, 3] from (1, x0, y0) to 1 and the field coordinates, which run from -1 to 1 between the outer edges."""
+    """Return the matrix [3, 3] that converts (1, column, row) of a detector to (1, x, y) in the field of the camera.
+
+    Columns and rows are 0-based pixels. The coordinates x and y are 0 at the boresight. They are -1 and 1 at the outer
+    edges of the camera's mosaic of detectors, if this is symmetric.
+    """
     all_detectors = detectors(detector.section, mission)
     turn = np.radians(detector.rotation)
     half = np.array([(detector.nx - 1) / 2, (detector.ny - 1) / 2])
@@ -166,7 +187,9 @@ def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float
 
 
 def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration) -> Float:
-    """Light of an order relative to the light that the passband of the first order detects.
+    """Return the detected light of a spectral order relative to that of the first order at the same wavelength.
+
+    The passband of the camera describes the light that the first order detects.
 
     Parameters
     ----------
@@ -177,14 +200,15 @@ def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mi
     wavelength : float array, shape (n,)
         Wavelengths, Angstrom.
     detector : Detector
-        A detector of the camera.
+        Any detector of the camera.
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float array, shape (n,)
-        Relative throughput; 1 if the database has none for this order.
+        Relative throughput. Wavelengths outside the table in the mission database have the value at its end. The result
+        is 1 if the database has no throughput of this order.
     """
     rows = [
         (float(row["wavelength_nm"]) * 10.0, float(row["throughput"]))
@@ -200,25 +224,26 @@ def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mi
 def source_rectangle(
     trace: Trace, nx: int, ny: int, wavelength: tuple[float, float]
 ) -> tuple[float, float, float, float]:
-    """Rectangle that contains all sources whose light of an order falls on a detector.
+    """Return the rectangle of undispersed images of all sources whose light of a spectral order may fall on a detector.
 
     Parameters
     ----------
     trace : Trace
-        Trace of the order.
+        Trace of the spectral order on the detector.
     nx, ny : int
         Columns and rows of the detector.
     wavelength : (float, float)
-        First and last wavelength, Angstrom.
+        First and last wavelength of the light, Angstrom.
 
     Returns
     -------
     (float, float, float, float)
-        Left, right, lower and upper limit of the undispersed images, pixels.
+        Left, right, lower and upper limit of the undispersed images, 0-based pixels. They may be outside the detector.
 
     Notes
     -----
-    The slopes across the field are taken at the corners. Farther out the trace differs by less than 0.01 pixels.
+    The offsets of the trace are taken at the corners of the detector. For sources farther out they differ by less than
+    0.01 pixels.
     """
     waves = np.linspace(*wavelength, 33)
     corners = [(x, y) for x in (0.0, nx - 1.0) for y in (0.0, ny - 1.0)]

@@ -1,1 +1,4 @@
-"""Channels: their effects in order, PSF, readout, sky and measured costs."""
+"""Channels (instrument modes): VIS, NISP-P (filters), NISP-S (grisms) and ground cameras.
+
+Each defines its detector effects in order, its PSF, readout, sky and measured costs.
+"""

@@ -1,4 +1,4 @@
-"""A detector of an exposure with its world coordinate system, passband, channel and effects."""
+"""Define an aim: a detector of an exposure, with its world coordinate system, passband and detector effects."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Aim:
         Row of the table `exposures`.
     detector : Detector
         The detector.
-    wcs : WCS
-        World coordinate system of the detector.
+    wcs : astropy.wcs.WCS
+        World coordinate system of the detector's pixels.
     band : Passband
         Passband of the exposure.
     channel : Channel
-        Channel of the exposure.
+        Channel (instrument mode) of the exposure.
     effects : tuple of Effect
-        Effects of the channel for the image type, in order.
+        Detector effects that the channel defines for the image type, in the order in which they are applied.
     """
 
     exposure: ExposureRow
@@ -53,35 +53,36 @@ class Aim:
         seed: int = 0,
         readout_name: str = "raw",
     ) -> Aim:
-        """Build the aim of a detector for a planned exposure.
+        """Collect everything that defines the view of a detector in a planned exposure.
 
         Parameters
         ----------
         exposure : ExposureRow
             Row of the table `exposures`.
         detector : Detector
-            Detector of its camera.
+            Detector of the camera of the exposure.
         band : Passband, optional
-            Passband; by default the embedded one with the name in the row.
+            Passband; None means the passband of truesky under the name in `exposure`.
         seed : int
-            Seed of the request.
+            Seed of the request, used for the random tilt of the filter.
         readout_name : str
-            Requested format of the files, see `Channel.with_readout`.
+            Format of the image files, such as "raw"; see `Channel.with_readout`.
 
         Returns
         -------
         Aim
-            The aim.
+            The detector with its world coordinate system, passband, channel and detector effects in this exposure.
 
         Notes
         -----
-        `registry.find_channel` raises BadInput if no channel renders the exposure.
+        `registry.find_channel` raises BadInput if truesky cannot render the image type of the exposure.
         """
         kind = exposure.image_type
         channel = registry.find_channel(exposure.channel, kind, f"exposure {exposure.exposure_id}").with_readout(
             readout_name
         )
-        # Exposures that differ only in their noise have the same tilt. A grism is used without a filter.
+        # The tilt of the filter is drawn from the identity of the exposure without the number of its repetition, so
+        # that repetitions have the same tilt. Exposures through a grism use no filter.
         identity = image_types.identity(replace(exposure, realisation=None))
         tilted_detector = (
             filter_wheel.apply_random_tilt(detector, identity, seed) if channel.dispersion is None else detector
@@ -92,15 +93,18 @@ class Aim:
 
     @property
     def sees_sky(self) -> bool:
-        """True if light of astronomical sources reaches the detector."""
+        """True if light of astronomical sources reaches the detector; False for example for a dark."""
         return self.channel.sees_sky(self.exposure.image_type)
 
     @property
     def electrons_per_microjansky(self) -> float:
-        """Expected electrons in the exposure from a source of one microjansky."""
+        """Expected number of electrons during the exposure from a source with a flux density of one microjansky."""
         return electron_rate(self.exposure) * self.exposure.exposure_time_s
 
 
 def electron_rate(exposure: ExposureRow) -> float:
-    """Electrons per second from a source of one microjansky."""
+    """Return the electrons per second from a source with a flux density of one microjansky.
+
+    They follow from the zero point in the row of the exposure: the AB magnitude that gives one electron per second.
+    """
     return float(10.0 ** (0.4 * (exposure.zero_point - units.AB_UJY)))

@@ -1,4 +1,4 @@
-"""Properties of an instrument mode that planning and rendering use."""
+"""Define a channel: the properties of an instrument mode (such as VIS or NISP-S) for planning and rendering."""
 
 from __future__ import annotations
 
@@ -24,23 +24,28 @@ from truesky.render.sky.diffuse_light import SkyBand
 
 @dataclass(frozen=True, slots=True)
 class Dispersion:
-    """Slitless dispersion of the light of sources by a channel.
+    """Functions that describe the slitless spectra of a channel (instrument mode).
+
+    In the signatures below, "exposure" is a row of the table `exposures`, and "mission" the mission database.
 
     Attributes
     ----------
     traces : callable
-        (exposure, detector, mission, seed of the request) -> trace of each order.
+        (exposure, detector, mission, seed of the request) -> trace of each spectral order on the detector.
     throughput : callable
-        (exposure, order, wavelengths [n] in Angstrom, detector, mission) -> light of an order [n], relative to the
-        light that the passband detects.
+        (exposure, spectral order, wavelengths [n] in Angstrom, detector, mission) -> light [n] in this order, relative
+        to the light that the passband detects.
     vignetting : callable
-        (exposure, detector, columns [n] and rows [n] of undispersed images, mission) -> transmitted fraction [n].
+        (exposure, detector, columns [n] and rows [n] of undispersed images in 0-based pixels, mission) -> fraction [n]
+        of the light of each source that the grism transmits, 0 to 1.
     psf : callable
-        (detector, wavelengths [n] in Angstrom, mission, number of positions on the detector) -> PSF.
+        (detector, wavelengths [n] in Angstrom, mission, number of positions on the detector at which the PSF is
+        computed) -> PSF.
     reach : callable
-        (section, mission) -> largest distance from a detector of a source whose first order falls on it, arcsec.
+        (beginning of the camera's parameter names, mission) -> largest distance in arcsec from a detector of a source
+        whose first order falls on it.
     selection_band : str
-        Band of the flux limit for sources, if the mission sets one.
+        Band in which the mission may set a flux limit for the sources that are drawn.
     """
 
     traces: Callable[[ExposureRow, Detector, MissionConfiguration, int], tuple[Trace, ...]]
@@ -53,49 +58,61 @@ class Dispersion:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Everything that distinguishes a channel while a detector is planned and rendered.
+    """Instrument mode (channel), such as VIS, NISP-S or the ground cameras: how it is planned and rendered.
+
+    In the signatures below, "exposure" is a row of the table `exposures`, and "mission" the mission database.
 
     Attributes
     ----------
-    effects : mapping
-        Effects of each image type, in the order of physics.
+    effects : mapping of str to tuple of Effect
+        Effects of telescope, detector and electronics for each image type, in the order in which light and charge pass
+        through them. Image types that are missing cannot be rendered.
     psf : callable
-        (exposure, detector, band, mission, number of positions on the detector) -> PSF.
+        (exposure, detector, passband, mission, number of positions on the detector at which it is computed) -> PSF.
     readout : ReadoutMode
-        Readout of its detectors, and the arrays in its files.
+        Readout of the detectors, which defines the arrays in the image files.
     bands : callable
-        (camera, mission) -> names of the camera's passbands; () if the channel does not use the camera.
+        (name of a camera, mission) -> names of its passbands; () if the camera does not belong to the channel.
     sky : callable
-        (detector, name of a band, mission, its passband or None for the embedded one) -> diffuse sky of the band.
+        (detector, name of a band, mission, passband or None for the passband of truesky) -> diffuse sky.
     cost : Cost
-        Measured costs per detector.
+        Measured costs to render an image of a detector.
     on_ground : bool
-        True if the telescope may point in any direction; a spacecraft must keep its orientation to the Sun.
+        True for ground telescopes, which have no limits on the angle from the Sun.
     sky_types : tuple of str
         Image types in which light of astronomical sources reaches the detectors.
     transfer_effect : Effect or None
-        Effect that is a part of the pixel's transfer function and is applied while sources are drawn.
+        Effect that changes the transfer function (Fourier transform of the PSF) with which sources are drawn, such as
+        a sensitivity that varies inside each pixel; None if there is no such effect.
     diffraction_edges : callable or None
-        (detector, band, mission) -> edges of the pupil whose diffraction is drawn far from stars; None if it is not
-        drawn.
+        (detector, passband, mission) -> edges of the pupil whose diffraction spikes are drawn far from bright stars;
+        None if spikes are not drawn.
     draws_moving_bodies : bool
         True if bodies of the Solar System are drawn.
     non_source_effects : tuple of Effect
-        Effects that fill pixels without light of the sky, such as lamps and injected charge.
+        Effects that fill pixels without astronomical sources, such as lamps, satellite trails and injected charge.
     track_effects : tuple of Effect
-        Effects that leave tracks of charge, also in the dark.
+        Effects that leave tracks of charge, such as cosmic rays; they also act in the dark.
     has_scattered_light : bool
-        True if bright sources scatter light to distant pixels: ghosts and stray light.
+        True if bright sources scatter light to distant pixels (ghosts and stray light).
     ramp_name : str
-        Ramp of the mission with which its detectors are read (`Scene.ramp`); "" if they are read once.
+        Name of the up-the-ramp readout in the mission database, "photometric" or "spectroscopic"; "" if detectors are
+        read once.
     persistence_effect : Effect or None
         Effect that adds the persistence of earlier exposures; None if there is no persistence.
     chromatic_effect : Effect or None
-        Effect that depends on the colours of sources (`Scene.chromatic_light`); None if no effect does.
+        Effect that depends on the colours of sources, because the response of a pixel varies with wavelength. It needs
+        `Scene.chromatic_light`, the light of the sources weighted by functions of wavelength. None if no effect does.
     dispersion : Dispersion or None
-        Dispersion of the light of sources; None for direct images.
-    alternative_readouts : mapping
-        Other formats of the files that a request may choose, by name.
+        Slitless spectra of the sources; None for direct images.
+    alternative_readouts : mapping of str to ReadoutMode
+        Other formats of the image files that a request may choose, by name.
+
+    Raises
+    ------
+    BadInput
+        If the cost of an effect (CPU seconds per million pixels), with which the time of images is forecast, is not
+        positive.
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
@@ -126,7 +143,11 @@ class Channel:
                     raise BadInput(f"{problem}: measure it by python -m benchmarks.effects")
 
     def with_readout(self, readout_name: str) -> Channel:
-        """Return the channel with a requested file format; unchanged if the channel has no alternative of that name."""
+        """Return the channel with another format of the image files, such as "amplifiers" or "electrons".
+
+        A format records the pixels at one stage of the detector simulation; effects after this stage are left out. The
+        channel is unchanged if it has no format of that name.
+        """
         if readout_name not in self.alternative_readouts:
             return self
         mode = self.alternative_readouts[readout_name]
@@ -137,14 +158,20 @@ class Channel:
         return replace(self, readout=mode, effects=effects)
 
     def sees_sky(self, image_type: str) -> bool:
-        """Return True if light of astronomical sources reaches the detectors in this image type."""
+        """Return True if light of astronomical sources reaches the detectors in an image type such as "science".
+
+        The result is False for an unknown image type.
+        """
         return image_type in self.sky_types
 
     def margin(self, section: str, mission: MissionConfiguration) -> float:
-        """Distance beyond a detector up to which all sources are read, arcsec; `section` is the camera's prefix."""
+        """Return the distance beyond a detector, in arcsec, up to which all sources are read from the catalogue.
+
+        For a grism it includes the length of spectra. `section` is the beginning of the camera's parameter names.
+        """
         spread = 0.0 if self.dispersion is None else self.dispersion.reach(section, mission)
         return mission.value("survey.selection_margin", "arcsec") + spread
 
     def sees_bodies(self, image_type: str) -> bool:
-        """Return True if bodies of the Solar System are drawn in this image type."""
+        """Return True if the channel draws Solar System bodies and an image type (such as "science") shows the sky."""
         return self.draws_moving_bodies and self.sees_sky(image_type)

@@ -1,4 +1,4 @@
-"""Measured costs of a detector of a channel: time, memory and file size."""
+"""Define the measured costs (CPU time, memory, file size) to render an image of a detector."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Costs of the detectors of a channel without effects, measured by python -m benchmarks.planner.
+    """Costs to render an image of a detector, without its effects, measured by python -m benchmarks.planner.
+
+    Times are CPU seconds on the reference machine (an Intel Xeon with 2.5 GHz).
 
     Attributes
     ----------
     frame_s : float
-        Time per frame for its task and for writing, s.
+        Seconds per image for the start of its task and for writing the file.
     sky_s : float
-        Additional time if the sky is drawn, s.
+        Additional seconds per image if the sky with its sources is drawn.
     galaxy_s, star_s : float
-        Time per source drawn with the accuracy "survey", s.
+        Seconds per galaxy and per star drawn with the accuracy "survey".
     base_gb : float
-        Memory of a worker before it draws, GB.
+        Memory of a worker process in GB before it draws.
     bytes_per_pixel, sky_bytes_per_pixel : float
-        Memory per pixel while a frame is made, without and with sky.
+        Bytes of memory per pixel while an image is made, without and with the sky.
     file_bytes_per_pixel : float
-        Written bytes per pixel of the image, including pre- and overscan.
+        Bytes of the file per pixel that is read out, including prescan and overscan.
     redraw_s : float
-        Time to draw a sky frame again for its persistence in a later one, s.
+        Seconds to draw an earlier image of the sky again, because it leaves persistence; 0 without persistence.
     """
 
     frame_s: float

@@ -1,4 +1,4 @@
-"""Channel of ground cameras: effects in the order of physics, costs."""
+"""Define the channel of ground cameras: its effects in the order in which light passes through them, and its costs."""
 
 from __future__ import annotations
 
@@ -67,11 +67,12 @@ SKY = (
 
 
 def _effects_from(first: Effect) -> tuple[Effect, ...]:
-    """Return an effect on the sky's light and all later ones."""
+    """Return the effects of an image of the sky (`SKY`, in physical order) from the effect `first` on, inclusive."""
     return SKY[SKY.index(first) :]
 
 
-# Dome flats are taken by day, without sky and stars. The light of the lamp passes through the telescope like starlight.
+# Effects of a dome flat. It is taken by day, without sky and stars. The light of the lamp passes through the telescope
+# like starlight.
 FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_effects_from(pixel_response.EFFECT))
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
@@ -83,8 +84,9 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 }
 
 
-# Measured as for VIS, for one detector of each camera except HSC, with all effects (benchmarks/ext.py; 1.1e4 to 1.4e5
-# sources). Most of sky_s is spent on reading catalogues, on colours of galaxies and on PSFs.
+# Costs of an image (CPU seconds, memory), measured on an Intel Xeon 2.5 GHz for one detector of each camera except HSC,
+# with all effects and 1.1e4 to 1.4e5 sources (benchmarks/ext.py). Most of sky_s (CPU seconds for the sky and its
+# sources, apart from the time per source) is spent on reading catalogues, on colours of galaxies and on PSFs.
 COST = Cost(
     frame_s=0.2,
     sky_s=1.9,

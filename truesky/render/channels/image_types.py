@@ -1,4 +1,4 @@
-"""Image types with sky, and the identity of an exposure from which its random numbers are drawn."""
+"""Properties of image types, and the text that identifies an exposure for its random numbers."""
 
 from __future__ import annotations
 
@@ -8,25 +8,31 @@ from functools import lru_cache
 from lake_schema.mission.parameter import SPACE_CAMERAS
 from lake_schema.tables.exposures import ExposureRow
 
+# Image types in which all channels see the sky.
 SKY_TYPES = ("science", "deep", "self_calibration")
 
-# Prefix, in `settings`, of parameters that belong to a single exposure and are not explored by a request.
+# Prefix of parameter names in the column `settings` of an exposure (JSON of changed parameters). It marks parameters
+# that are set for this exposure alone. The others have values that the request explores for all exposures.
 EXPOSURE_ONLY_PREFIX = "own:"
 
 
 def section(camera: str) -> str:
-    """Prefix of a camera's parameters in the mission database."""
+    """Return the beginning of a camera's parameter names in the mission database.
+
+    It is the name of a Euclid camera ("vis", "nisp"), or "ext." and the name of a ground camera.
+    """
     return camera if camera in SPACE_CAMERAS else f"ext.{camera}"
 
 
 def identity(exposure: ExposureRow) -> str:
-    """Return the text from which an exposure's random numbers are drawn.
+    """Return a text that identifies an exposure and selects its random numbers.
 
     Notes
     -----
-    It depends on pointing, time, band and grism, but not on the position of the exposure in a plan. The grism and its
-    angle are included because the band does not define the direction of spectra. The first of several identical
-    exposures has the same random numbers as a single one.
+    The text has camera, band, pointing, date and grism, but not the number of the exposure, so that an exposure is the
+    same in every request. The angle of the grism is included because the band does not define the direction of spectra.
+    Repetitions of an exposure also have their number from 2 on; the first one has the text of an exposure that is not
+    repeated.
     """
     places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
     grism = () if exposure.grism is None else (exposure.grism, (exposure.grism_angle or 0.0).hex())
@@ -37,9 +43,9 @@ def identity(exposure: ExposureRow) -> str:
 
 @lru_cache(maxsize=1024)
 def shared_settings(settings: str | None) -> str | None:
-    """Settings of an exposure (JSON) without the parameters that belong to it alone; None if none remain.
+    """Return the changed parameters of an exposure (JSON) without those set for it alone; None if none remain.
 
-    The result identifies the variant of an exploration.
+    The result identifies the combination of explored parameter values: exposures with the same text belong together.
     """
     values = json.loads(settings) if settings else {}
     shared = {key: value for key, value in values.items() if not key.startswith(EXPOSURE_ONLY_PREFIX)}

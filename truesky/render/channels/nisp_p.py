@@ -1,7 +1,8 @@
-"""Channel NISP-P of Euclid: effects in the order of physics, costs.
+"""Define channel NISP-P of Euclid (images in filters): its effects in the order in which they act, and its costs.
 
-Light and dark current are expected electrons until they are counted up the ramp. The charge of the ramp's groups is
-then changed by pixels, their neighbours and the readout. Finally the signal and its quality are estimated as on board.
+Pixels have expected (fractional) electrons until noise is drawn for the groups of reads of an up-the-ramp exposure.
+Effects of pixels, of their neighbours and of the readout then change the charge of the groups. Finally the signal and
+its quality are estimated from the groups, as the spacecraft does.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ _LIGHT = (
     background.EFFECT,
     pixel_area.EFFECT,
 )
-# Effects of all channels that use these detectors.
+# Effects that add charge without light (dark current, persistence) to NISP detectors, in both images and spectra.
 CURRENT = (
     dark_map.EFFECT,
     persistence.EFFECT,
 )
+# Effects of NISP detectors that act from the collection of charge, in groups of reads of an up-the-ramp exposure, to
+# the conversion of the estimated signal to ADU. They are the same in images and in spectra.
 RAMP = (
     ramp_cosmic_rays.EFFECT,
     ramp_nonlinearity.EFFECT,
@@ -67,7 +70,7 @@ RAMP = (
 )
 
 SKY = (*_LIGHT, chromatic_response.EFFECT, pixel_response.EFFECT, *CURRENT, *RAMP)
-# Flats are assumed to be taken during slews, without sky and stars.
+# Effects of a flat, which is assumed to be taken during a slew, without sky and stars.
 FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *CURRENT, *RAMP)
 DARK = (*CURRENT, *RAMP)
 
@@ -88,9 +91,10 @@ def _psf(
     return euclid.nisp_psf(detector, band, mission, positions)
 
 
-# Measured for the sky of the demo (1.2e4 predicted sources): 1.5 s of CPU time and 1.2 GB on an AMD EPYC, which needs
-# half the time of the reference machine (forecasting/speed.py). For redraw_s: the last image of a visit with four
-# dithers takes 10.5 s of CPU time there, 0.28 s for each of eleven earlier NISP-P images and 0.6 s for each of four
+# Costs of an image (CPU seconds, memory) on the reference machine, measured for 1.2e4 predicted sources: 1.5 s and 1.2
+# GB on an AMD EPYC, which needs half the time of the reference machine (forecasting/speed.py). The cost redraw_s (to
+# draw an earlier image again, for its persistence) is from the last image of a visit with four dithers. This image
+# takes 10.5 s on the EPYC, of which 0.28 s are for each of eleven earlier NISP-P images, and 0.6 s for each of four
 # NISP-S images.
 COST = Cost(
     frame_s=0.05,

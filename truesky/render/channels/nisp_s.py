@@ -1,6 +1,7 @@
-"""Channel NISP-S of Euclid: light dispersed by a grism, then the effects of NISP-P with a longer ramp.
+"""Define channel NISP-S of Euclid: slitless spectra through a grism, then the effects of the NISP detectors.
 
-Ghosts and stray light of bright sources are not simulated, since their form through a grism is unknown.
+Detectors are read up a longer ramp than in images (NISP-P). Ghosts and stray light of bright sources are not simulated,
+since their form through a grism is unknown.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ SKY = (
     *nisp_p.CURRENT,
     *nisp_p.RAMP,
 )
-# Flats are taken with the grism in the beam. The lamp fills the field, so the orders overlap and every pixel receives
-# the whole spectrum.
+# Effects of a flat, which is taken with the grism in the beam. The lamp fills the field of view, so that spectral
+# orders overlap and every pixel receives light of the whole spectrum.
 FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *nisp_p.CURRENT, *nisp_p.RAMP)
 DARK = (*nisp_p.CURRENT, *nisp_p.RAMP)
 
@@ -55,7 +56,11 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 
 
 def _grism_and_tilt(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
-    """Grism and requested tilt (deg). Raises BadInput if the exposure has no grism or if the tilt is too large."""
+    """Return the name of the grism of an exposure, and the angle in degrees by which the wheel must tilt it.
+
+    The tilt follows from the requested angle of spectra in the focal plane. Raises BadInput if the exposure has no
+    grism or no angle, or if the tilt exceeds `grism_wheel.MAX_TILT`.
+    """
     where = f"exposure {exposure.exposure_id}"
     if exposure.grism is None or exposure.grism_angle is None:
         raise BadInput(f"{where}: a spectrum requires a grism and its angle")
@@ -70,7 +75,8 @@ def _grism_and_tilt(exposure: ExposureRow, section: str, mission: MissionConfigu
 
 def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int) -> tuple[Trace, ...]:
     grism, requested_tilt = _grism_and_tilt(exposure, detector.section, mission)
-    # Exposures that differ only in their noise have the same error of the grism wheel.
+    # The error of the grism wheel is drawn from the identity of the exposure without the number of its repetition, so
+    # that repetitions have the same error.
     identity = image_types.identity(replace(exposure, realisation=None))
     return traces.traces(
         grism, grism_wheel.tilt_with_error(requested_tilt, identity, detector.section, mission, seed), detector, mission
@@ -99,7 +105,11 @@ def _vignetting_throughput(
 
 
 def _reach(section: str, mission: MissionConfiguration) -> float:
-    """Largest distance from a detector, in arcsec, of a source whose first order falls on it, for all grisms."""
+    """Return the largest distance from a detector, in arcsec, of a source whose first-order spectrum may fall on it.
+
+    It is the maximum over all grisms of the camera, without tilt. `section` is the prefix of the camera's parameters in
+    the mission database, such as "nisp".
+    """
     first = detectors(section, mission)[0]
     distances = [
         abs(edge - inside)
@@ -118,22 +128,31 @@ def _reach(section: str, mission: MissionConfiguration) -> float:
 def _psf(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
 ) -> Psf:
-    """PSF at the mean wavelength of a band."""
+    """Return the PSF at the mean wavelength of a band, weighted by its response; `exposure` is not used.
+
+    `positions` is the number of positions on the detector at which the PSF is computed.
+    """
     middle = np.array([np.average(band.wavelength, weights=band.response)])
     return _psf_at(detector, middle, mission, positions)
 
 
 def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int) -> Psf:
-    """PSF by diffraction at the pupil or the double Gaussian of Serrano et al. 2024, as the mission selects."""
+    """Return the PSF at wavelengths `waves` (Angstrom).
+
+    The mission parameter `spectra.psf` selects diffraction at the pupil (0), or the double Gaussian of Serrano et al.
+    2024 (1). For diffraction, `positions` is the number of positions on the detector at which the PSF is computed.
+    """
     if mission.value(f"{detector.section}.spectra.psf", "") < 0.5:
         return euclid.nisp_psf_at(detector, waves, mission, positions)
     return double_gaussian.psf_at(detector, waves, mission)
 
 
-# Measured for the sky of the demo (1.1e4 predicted sources, all drawn): 17.2 s of CPU time, with 1.3 s for spectra, and
-# 1.5 GB on a busy AMD EPYC, which needs half the time of the reference machine (forecasting/speed.py). The forecast is
-# 16.9 s and 1.6 GB. Spark tasks with eight truth maps, four of them orders, use 1.55 to 1.71 GB; darks and flats with
-# four maps use 1.39 to 1.49 GB. For redraw_s, see nisp_p.py.
+# Costs of an image (CPU seconds, memory) on the reference machine, measured for 1.1e4 predicted sources, all of which
+# were drawn. An image takes 17.2 s of CPU time, of which 1.3 s are for spectra, and 1.5 GB on a busy AMD EPYC. That
+# machine needs half the time of the reference machine (forecasting/speed.py). The forecast from these costs is 16.9 s
+# and 1.6 GB for the same image. With eight truth maps (images of the true signals), Spark tasks use 1.55 to 1.71 GB;
+# darks and flats with four maps use 1.39 to 1.49 GB. nisp_p.py explains redraw_s, the cost to draw an earlier image for
+# its persistence.
 COST = Cost(
     frame_s=0.05,
     sky_s=0.5,

@@ -1,8 +1,9 @@
-"""Readout modes of detectors: from the charge in pixels to the arrays of a file, and back from the file.
+"""Readout modes of detectors: convert the simulated pixels to the arrays of an image file, and read them back.
 
-Each array has a unit and FITS cards. The modes are FRAME (one array), RAMP and RAMP_AND_CHI2 (signal of a ramp with a
-quality flag or with chi^2), QUADRANTS (four arrays), AMPLIFIERS (all amplifiers in one array), BY_AMPLIFIER (one array
-per amplifier) and ELECTRONS (charge in the pixels before readout).
+Each array has a unit and FITS cards. The modes of Euclid are QUADRANTS (four arrays of VIS), RAMP and RAMP_AND_CHI2
+(signal of an up-the-ramp readout of NISP with a quality flag or with chi^2). Ground cameras have AMPLIFIERS (all
+amplifiers in one array), BY_AMPLIFIER (one array per amplifier) and ELECTRONS (charge in the pixels before readout).
+FRAME is a single array without amplifiers.
 """
 
 from __future__ import annotations
@@ -29,22 +30,22 @@ from truesky.render.effects.scene import Frame, Scene
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """An array of a readout, with the data type of the file.
+    """One array (FITS extension) of the image file of a detector.
 
     Attributes
     ----------
     name : str
         Name of the extension; "" if it is the only array of its file.
     data : array, shape (ny, nx) or (n, ny, nx)
-        Pixels, or n planes such as the groups of a ramp. The signal of a ramp has 16 bits, its quality 8.
+        Pixels, or n planes such as the groups of a ramp, with the data type that the file has.
     unit : str
         Unit in FITS notation; "" for a flag.
     cards : tuple of Card
-        Cards of this extension.
+        FITS header cards of this extension only.
     amplifier : int or None
-        Number of the amplifier through which the array is read; None for several amplifiers.
+        Number (from 0) of the amplifier through which the array is read; None for several amplifiers.
     sections : Sections or None
-        Section that contains the pixels of the detector; None if it is unknown.
+        Part of the array that contains pixels of the detector, and its place on the detector; None if unknown.
     """
 
     name: str
@@ -57,18 +58,19 @@ class Extension:
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """The arrays of a detector.
+    """All arrays of the image file of a detector.
 
     Attributes
     ----------
     extensions : tuple of Extension
-        Arrays of the file.
+        Arrays of the file in their order.
     raw : array
-        Result of the last effect, in readout order.
+        Pixels after the last effect, with prescan and overscan. The pixels of each amplifier are in the order in which
+        they are read, with one plane per amplifier if there are several.
     pixels : array, shape (ny, nx)
-        Pixels of the detector without pre- and overscan, in its orientation.
+        Pixels of the detector in its own orientation, without prescan and overscan.
     cards : tuple of Card
-        Cards that apply to all arrays.
+        FITS header cards that apply to all arrays.
     """
 
     extensions: tuple[Extension, ...]
@@ -78,31 +80,36 @@ class Readout:
 
     @property
     def unit(self) -> str | None:
-        """Unit of all arrays; None if their units differ."""
+        """Pixel unit of all arrays in FITS notation; None if they have different units."""
         units = {extension.unit for extension in self.extensions}
         return units.pop() if len(units) == 1 else None
 
 
 @dataclass(frozen=True, slots=True)
 class ReadoutMode:
-    """Conversion of a detector's pixels to the arrays of a file, and back.
+    """Functions that convert the pixels of a detector to the arrays of an image file, and back.
+
+    In the signatures below, "scene" is the `Scene` with the properties of the detector and its exposure, and "effects"
+    are the detector effects of the simulation, which are applied one after the other.
 
     Attributes
     ----------
     make_readout : callable
-        (result of the last effect, scene, name of the detector, WCS) -> arrays of the file.
+        (pixels after the last effect, scene, name of the detector, WCS) -> `Readout` with the arrays of the file.
     assemble : callable
-        (array with the axes of any effect's result, scene) -> pixels [ny, nx] of the detector in its orientation.
+        (pixels after any effect, as one array [ny, nx] or one plane per amplifier, scene) -> pixels [ny, nx] of the
+        detector in its own orientation.
     read_pixels : callable
-        (images of a file) -> pixels [ny, nx] as stored.
+        (images of a file) -> pixels [ny, nx] of the detector as stored, without prescan and overscan.
     read_electrons : callable
-        (images of a file) -> pixels [ny, nx] in electrons, with the bias subtracted.
+        (images of a file) -> the same pixels in electrons, with the bias subtracted.
     stop_before : str
-        First effect of a channel that is not applied; "" if all effects are applied.
+        Name of the first effect of the channel that is not applied; "" if all effects are applied.
     file_bytes_per_pixel : int or None
-        Bytes of the file per pixel of the detector; None for the measured value in `Cost`.
+        Bytes of the file per pixel of the detector; None for the measured value in the `Cost` of the channel.
     split : callable
-        (array [ny, nx] of the detector, scene) -> planes that are read at the same time, in readout order.
+        (array [ny, nx] of the detector, scene) -> one plane per amplifier. Pixels at the same place in all planes are
+        read at the same time.
     """
 
     make_readout: Callable[[Frame, Scene, str, WCS], Readout]
@@ -114,11 +121,11 @@ class ReadoutMode:
     split: Callable[[Array, Scene], Array] = lambda array, scene: array
 
 
-# ---------------------------------------------------------------------------------------------- one frame
-
-
 def _frame(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make one array [ny, nx] in ADU, with the data type of the converter."""
+    """Make the file of a detector with one array [ny, nx] in ADU, in the data type of the converter (ADC).
+
+    `frame` has the pixels after the last effect. `detector` and `system` (its WCS) are not used.
+    """
     raw = adc.to_file_type(frame, scene)
     return Readout((Extension("", raw, "adu", sections=Sections.full_frame(*raw.shape[::-1])),), raw, raw)
 
@@ -136,20 +143,22 @@ FRAME = ReadoutMode(
 )
 
 
-# ---------------------------------------------------------------------------------------------- the signal of a ramp
-
-# Largest value of eight bits.
+# Largest chi^2 of the fit to an up-the-ramp exposure that is stored, because its array has eight bits. Larger values of
+# chi^2 are stored as this number.
 _MAX_CHI2 = 255.0
 
 
 def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bool) -> Readout:
-    """Make the signal (uint16, ADU) and the quality (uint8) of a ramp; a ramp of two groups has no quality.
+    """Make the arrays of an up-the-ramp exposure: the signal (uint16, ADU) and its quality (uint8).
 
-    The quality is 1 if the ramp does not fit, or chi^2, rounded and at most 255, if `store_chi2` is set. Correlated
-    reads and the use of the expected noise raise a nominal probability of 1e-3 to up to 8e-3.
+    `frame` has two planes: the signal in ADU, and chi^2 of the fit to the groups of reads. The quality is 1 if the fit
+    is bad, otherwise 0; with `store_chi2` it is chi^2 itself, rounded and at most 255. An exposure of two groups has no
+    quality. A fit is bad if chi^2 exceeds the limit for the probability `quality_chance`, nominally 1e-3. Correlated
+    reads and the use of the expected noise raise this probability to up to 8e-3. Both arrays get a border of reference
+    pixels. The WCS `system` is shifted by the border.
     """
     mode, border = ramp.mode_of_scene(scene), int(scene.value("fpa.reference_border", "pix"))
-    # One number, the signal, is estimated from n differences, which leaves n - 1 degrees of freedom.
+    # The signal is fitted to n = groups - 1 differences, which leaves n - 1 degrees of freedom for chi^2.
     limit = float(scipy.special.chdtri(max(mode.groups - 2, 1), scene.value("quality_chance", "")))
     signal = frame[0].astype(np.uint16)
     level = np.uint16(scene.value("reference_level", "adu"))
@@ -180,7 +189,10 @@ def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bo
 
 
 def _signal(read: Sequence[Image]) -> Array:
-    """Signal without the border of reference pixels, from the first extension after the header."""
+    """Return the signal of a ramp in ADU without the border of reference pixels, from the images of its file.
+
+    The first image has only the header, the second has the signal.
+    """
     border, data = int(_header(read[0])["REFPIX"]), np.asarray(read[1].data)
     return data[border : len(data) - border, border : data.shape[1] - border]
 
@@ -199,11 +211,11 @@ RAMP = ReadoutMode(
 RAMP_AND_CHI2 = replace(RAMP, make_readout=partial(_ramp, store_chi2=True))
 
 
-# ---------------------------------------------------------------------------------------------- quadrants
-
-
 def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make four extensions in ADU, named detector.quadrant, each with its pre- and overscan."""
+    """Make the four arrays (ADU) of a VIS detector, one per quadrant, each with its prescan and overscan.
+
+    Their names are the name of the detector, a dot and that of the quadrant: "3-4.E".
+    """
     raw = adc.to_file_type(frame, scene)
     prescan, overscan, rows, middle = sizes = layout.overscan_sizes(scene)
     scans = (
@@ -214,7 +226,7 @@ def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
     )  # fmt: skip
     extensions = []
     for number, name in enumerate(layout.NAMES):
-        # Position of the detector's first pixel in the extension, counted from 0.
+        # Number of columns and rows to add to a position on the detector to get the position in this quadrant's array.
         across, up = layout.pixel_offset(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shift_pixels(system, across, up))
         cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant name"), *scans, *place)
@@ -236,19 +248,28 @@ def _quadrant_pixels(read: Sequence[Image]) -> Array:
 
 
 def _quadrant_electrons(read: Sequence[Image]) -> Float:
-    """Electrons above the overscan level of each quadrant."""
+    """Return the pixels [ny, nx] of a VIS detector in electrons, from the images of its file.
+
+    The bias of each quadrant is the mean of the second half of its overscan columns, which is read last.
+    """
     raw, sizes = _read_quadrants(read)
-    # GAIN is in the headers of the extensions if the amplifiers have different gains.
+    # Use the card GAIN in the header of each quadrant's extension or, if it has none, in the primary header of the
+    # file.
     headers = [{**_header(read[0]), **_header(unit)} for unit in read[1:]]
     gain = np.array([float(cards["GAIN"]) for cards in headers]).reshape(-1, 1, 1)
     _, overscan, rows, _ = sizes
-    # Only the last half of the overscan columns is used, since the first half contains charge released by traps.
+    # Measure the bias in the half of the overscan columns that is read last: the first half contains charge that traps
+    # have released.
     level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
     return layout.assemble((raw - level) * gain, *sizes)
 
 
 def _read_quadrants(read: Sequence[Image]) -> tuple[Array, tuple[int, int, int, int]]:
-    """Return quadrants in readout order, and (prescan, overscan, overscan rows, rows between the halves)."""
+    """Return the four quadrants of a VIS file, with rows and columns in the order of the readout, and four sizes.
+
+    The sizes are the numbers of prescan columns, overscan columns, overscan rows, and injection rows between the two
+    halves of the detector.
+    """
     header = _header(read[0])
     raw = np.stack([layout.to_detector_axes(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
     prescan, overscan, rows, between = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS"))
@@ -272,11 +293,11 @@ QUADRANTS = ReadoutMode(
 )
 
 
-# ---------------------------------------------------------------------------------------------- amplifiers in one array
-
-
 def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make one array in ADU, with cards for the sections of each amplifier, numbered from 1."""
+    """Make the file of a ground detector with all amplifiers in one array (ADU).
+
+    FITS cards give the section, gain and read noise of each amplifier; their keywords end with its number from 1.
+    """
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
     cards: list[Card] = [
@@ -298,7 +319,7 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
             (f"BSEC{n}", amplifier_layout.amplifier_bias_section(number).text, "bias section of the amplifier"),
             *((f"{key}{n}", float(np.broadcast_to(value, len(raw))[number]), text) for key, value, text in numbers),
         ]
-        # Amplifiers named by letters have the keywords of DECam and MegaCam in addition.
+        # If the amplifier is named by a letter, also write the keywords that DECam and MegaCam use, such as DATASECA.
         if len(amplifier.name) == 1:
             cards += [
                 (
@@ -326,7 +347,11 @@ def _assemble_amplifiers(array: Array, scene: Scene) -> Array:
 
 
 def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make one extension in ADU per amplifier, named like LSST's segments or like the amplifier."""
+    """Make the file of a ground detector with one extension (ADU) per amplifier.
+
+    The name of an extension is that of the amplifier. Amplifiers of LSSTCam have the names in its own files: "C10"
+    becomes "Segment10".
+    """
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
     extensions = []
@@ -345,9 +370,10 @@ def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Rea
 
 
 def _assemble_extensions(read: Sequence[Image], calibrate: Callable[[Array, dict[str, Any]], Array]) -> Array:
-    """Assemble the pixels [ny, nx] of a detector from the extensions of a file.
+    """Assemble the pixels [ny, nx] of a detector from a file with one extension per amplifier.
 
-    `calibrate` is a function (array of an extension, its cards) -> values of the pixels.
+    `read` are the images of the file, of which the first has only the header. `calibrate` converts the array of an
+    extension, given its FITS cards, before its detector pixels are cut out.
     """
     parts = [(unit, {**_header(read[0]), **_header(unit)}) for unit in read[1:]]
     places = [Section.from_text(header["CCDSEC"]) for _, header in parts]
@@ -366,12 +392,16 @@ def _above_bias(array: Array, header: dict[str, Any]) -> Float:
     return np.asarray((array - level) * float(header["GAIN"]))
 
 
-# Names of LSSTCam's amplifiers, which are called segments in its files.
+# Pattern that matches the first letter in the names of LSSTCam's amplifiers, such as "C10". In the files of LSSTCam,
+# the extension of this amplifier has the name "Segment10".
 _SEGMENT = re.compile(r"^C(?=[01][0-7]$)")
 
 
 def _amplifier_pixels(read: Sequence[Image]) -> Array:
-    """Pixels of the detector, or the whole array if the file has no sections."""
+    """Return the pixels [ny, nx] of a ground detector as stored, from the images of its file.
+
+    Without a card DATASEC (files in electrons), the whole array is returned.
+    """
     if read[0].data is None:
         return _assemble_extensions(read, lambda array, header: array)
     header, array = _header(read[0]), np.asarray(read[0].data)
@@ -379,7 +409,10 @@ def _amplifier_pixels(read: Sequence[Image]) -> Array:
 
 
 def _amplifier_electrons(read: Sequence[Image]) -> Float:
-    """Electrons above the level of each amplifier's bias columns, or above the bias card if it has no bias columns."""
+    """Return the pixels [ny, nx] of a ground detector in electrons, from the images of its file.
+
+    The bias of each amplifier is the mean of its bias columns, or the card BIAS if it has no bias columns.
+    """
     if read[0].data is None:
         return _assemble_extensions(read, _above_bias)
     header, array = _header(read[0]), np.asarray(read[0].data)
@@ -403,11 +436,8 @@ AMPLIFIERS = ReadoutMode(
 BY_AMPLIFIER = replace(AMPLIFIERS, make_readout=_by_amplifier)
 
 
-# ---------------------------------------------------------------------------------------------- electrons in the pixels
-
-
 def _electrons(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make one float32 array [ny, nx] of the electrons in the pixels before readout."""
+    """Make the file of a detector with one float32 array [ny, nx]: the electrons in its pixels before readout."""
     pixels = frame.astype(np.float32)
     extension = Extension("", pixels, "electron", sections=Sections.full_frame(*pixels.shape[::-1]))
     return Readout((extension,), pixels, pixels)
@@ -416,18 +446,22 @@ def _electrons(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
 ELECTRONS = replace(AMPLIFIERS, make_readout=_electrons, stop_before=layout.AMPLIFIERS.name, file_bytes_per_pixel=4)
 
 
-# ---------------------------------------------------------------------------------------------- by amplifiers, and back
-
-
 def split_frame(frame: Float, scene: Scene) -> Float:
-    """Split a frame [ny, nx] into planes [amplifier, row, column] in readout order, with 0 in pre- and overscan."""
+    """Split the pixels [ny, nx] of a detector into planes [amplifier, row, column].
+
+    The pixels of each plane are in the order in which they are read. If the detector has a table of amplifiers, planes
+    include prescan and overscan with the value 0. Otherwise planes are four quadrants without prescan and overscan.
+    """
     if scene.layout is not None:
         return scene.layout.split(frame)
     return layout.apply(frame, 0, 0, 0, scene.injection_rows)
 
 
 def assemble_frame(amplifier_planes: Array, scene: Scene) -> Array:
-    """Join planes [amplifier, row, column] of `split_frame` to a frame [ny, nx]; pixels that are not read are 0."""
+    """Join planes [amplifier, row, column], as `split_frame` returns them, to the pixels [ny, nx] of the detector.
+
+    Pixels that no amplifier reads are 0.
+    """
     if scene.layout is not None:
         return scene.layout.assemble(amplifier_planes)
     return layout.assemble(amplifier_planes, 0, 0, 0, scene.injection_rows)

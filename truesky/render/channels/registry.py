@@ -1,4 +1,4 @@
-"""Channels that can be rendered, by their name in the table `exposures`."""
+"""All channels (instrument modes), by the name that they have in the table `exposures`."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ CHANNELS: Mapping[str, Channel] = {
 
 
 def find_channel(name: str, image_type: str, where: str) -> Channel:
-    """Return a channel that renders an image type.
+    """Return the channel of a name, if it can render an image type.
 
     Parameters
     ----------
     name : str
-        Name of the channel.
+        Name of the channel: "VIS", "NISP-P", "NISP-S" or "EXT" (ground).
     image_type : str
-        Type of the images.
+        Image type, such as "science" or "dark".
     where : str
-        Place in the user's input, for the message.
+        Place in the user's input that gives the names, quoted in the error message.
 
     Returns
     -------
@@ -37,7 +37,7 @@ def find_channel(name: str, image_type: str, where: str) -> Channel:
     Raises
     ------
     BadInput
-        If there is no channel of that name, or if it does not render the image type.
+        If there is no channel of that name, or if it cannot render the image type.
     """
     if name not in CHANNELS:
         raise BadInput(f"{where}: channel {name!r} is not one of {', '.join(CHANNELS)}")
@@ -48,30 +48,34 @@ def find_channel(name: str, image_type: str, where: str) -> Channel:
 
 
 def find_effects(name: str, image_type: str, where: str) -> tuple[Effect, ...]:
-    """Return the effects of an image type.
+    """Return the effects of telescope, detector and electronics for an image type of a channel.
 
     Parameters
     ----------
     name : str
-        Name of the channel.
+        Name of the channel: "VIS", "NISP-P", "NISP-S" or "EXT" (ground).
     image_type : str
-        Type of the images.
+        Image type, such as "science" or "dark".
     where : str
-        Place in the user's input, for the message.
+        Place in the user's input that gives the names, quoted in the error message.
 
     Returns
     -------
     tuple of Effect
-        Effects in order.
+        Effects in the order in which they are applied.
 
     Notes
     -----
-    `find_channel` raises BadInput if no channel renders the image type.
+    `find_channel` raises BadInput if the channel is unknown or cannot render the image type.
     """
     return find_channel(name, image_type, where).effects[image_type]
 
 
 def find_effects_or_none(name: str, image_type: str) -> tuple[Effect, ...] | None:
-    """Return the effects of an image type in order, or None if no channel renders it."""
+    """Return the effects of telescope, detector and electronics for an image type of a channel.
+
+    `name` is the name of the channel, such as "NISP-S", and `image_type` for example "science" or "dark". The effects
+    are in the order in which they are applied. The result is None if the channel is unknown or cannot render the type.
+    """
     channel = CHANNELS.get(name)
     return None if channel is None else channel.effects.get(image_type)

@@ -1,7 +1,7 @@
-"""Channel VIS of Euclid: effects in the order of physics, costs.
+"""Define channel VIS of Euclid: its effects in the order in which light and charge pass through them, and its costs.
 
-Light is expected electrons until it is counted; then charge is whole electrons on the detector. The detector is read as
-four quadrants, and the last effects belong to the electronics.
+Pixels have expected (fractional) electrons until photon noise is drawn, then whole electrons. The detector is then read
+in four quadrants, and the last effects are due to the electronics.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ from truesky.render.psf import euclid
 from truesky.render.psf.model import Psf
 from truesky.render.sky import diffuse_light
 
-# Effect of the pixels that is a part of their transfer function and is applied while sources are drawn.
+# Effect that changes the transfer function (Fourier transform of the PSF and the pixel) with which sources are drawn:
+# pixels are more sensitive at their centre.
 TRANSFER_EFFECT = intra_pixel.EFFECT
 
 _LIGHT = (
@@ -88,8 +89,8 @@ _READOUT = (
 )
 
 SKY = (*_LIGHT, illumination.SHUTTER, *_COUNTED, *_CHARGE, *_READOUT)
-# Flats are taken with an open shutter. They contain sky and stars, and the trails of both during readout. The lamp is
-# switched off before the readout, and its brightness does not depend on the exposure time.
+# Effects of a flat. It is taken with an open shutter and contains sky and stars, and the trails of both during readout.
+# The lamp is switched off before the readout, and its brightness does not depend on the exposure time.
 FLAT = (
     *_LIGHT,
     readout_trail.EFFECT,
@@ -101,9 +102,9 @@ FLAT = (
 DARK = (*_CHARGE, *_READOUT)
 _INJECTED = (charge_injection.EFFECT, charge_injection.NOISE)
 INJECTION = (*_INJECTED, bleeding.EFFECT, *_READOUT)
-# Trap pumping takes minutes with a closed shutter, so dark current and cosmic rays accumulate.
+# Effects of trap pumping, which takes minutes with a closed shutter: dark current and cosmic rays accumulate.
 PUMPING = (*_INJECTED, trap_pumping.EFFECT, *_CHARGE, *_READOUT)
-# Other image types with sky, in addition to surveys and self-calibration.
+# Image types of calibration exposures on the sky, which have the same detector effects as science images.
 _CHECKS = ("defocus", "bleeding", "stray_light", "white_dwarf")
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
@@ -125,8 +126,8 @@ def _psf(
     return euclid.vis_psf(detector, band, mission, positions)
 
 
-# CPU time of detector 3-4 of the demo (5.5e3 predicted sources), of detectors with 3e2 and 2.7e4 sources, and of bias,
-# dark and flat frames on an Intel Xeon 2.5 GHz with 2 shared cores.
+# Costs of an image (CPU seconds, memory), measured on an Intel Xeon 2.5 GHz with 2 shared cores: for detectors with
+# 3e2, 5.5e3 and 2.7e4 predicted sources, and for bias, dark and flat frames.
 COST = Cost(
     frame_s=0.05,
     sky_s=1.5,
@@ -145,7 +146,7 @@ CHANNEL = Channel(
     bands=bands.single_camera_bands("vis", "euclid_vis"),
     sky=diffuse_light.starlit_sky,
     cost=COST,
-    # Flats are taken with an open shutter.
+    # Flats belong to the types that see the sky, because they are taken with an open shutter.
     sky_types=(*SKY_TYPES, *_CHECKS, "flat"),
     transfer_effect=TRANSFER_EFFECT,
     diffraction_edges=euclid.vis_edges,

@@ -1,1 +1,1 @@
-"""Effects of a detector and its electronics on light and charge, one effect per file."""
+"""Effects of a detector and its electronics on the pixels of an image: on light, on charge, and during readout."""

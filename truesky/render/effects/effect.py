@@ -1,4 +1,8 @@
-"""Define a detector effect, and apply the effects of a channel in their order."""
+"""The class `Effect`, which describes one detector effect such as dark current, and functions that apply effects.
+
+The effects of a channel (an instrument mode such as Euclid VIS) are applied one after the other to a frame, an array of
+pixels. An effect too small to be noticed in the image is omitted.
+"""
 
 from __future__ import annotations
 
@@ -15,32 +19,35 @@ from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Frame, Scene
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One physical effect.
+    """One physical effect that changes the pixels of an image, such as dark current or read noise.
 
     Attributes
     ----------
     name : str
-        Name of the effect, unique in a channel.
+        Name of the effect, different from the names of all other effects of the channel (the instrument mode).
     apply : callable
-        Function (frame, *parameters, rng) -> new frame. It does not modify its arguments.
+        Function (frame, *parameters, rng) that returns the changed frame. It does not modify its arguments.
     parameters : callable
-        Function scene -> tuple of the parameters of `apply`.
+        Function of a `Scene` (the settings of one detector's exposure) that returns the tuple of the parameters of
+        `apply`.
     contribution : callable
-        Function scene -> largest change of a pixel in electrons; standard deviation for random changes.
+        Function of a `Scene` that returns the largest change of a pixel in electrons. For random changes it is their
+        standard deviation.
     optional : bool
-        False if frames cannot be made without the effect.
+        False if no image can be made without the effect, such as the analogue-to-digital conversion.
     fixed : bool
-        True for a pattern of the detector: its random numbers are the same in every exposure.
+        True if the effect is a fixed pattern of the camera: its random numbers are the same in every exposure.
     shared : bool
-        True if the effect is common to all detectors: its random numbers are the same on every detector.
+        True if the effect is common to all detectors of an exposure: its random numbers are the same on every detector.
     random_stream : str
-        Name of another effect whose random numbers this one uses. By default the effect has separate random numbers.
+        Name of another effect whose sequence of random numbers is used. The default "" gives the effect a separate
+        sequence.
     cost : float
         CPU seconds per million pixels on one core, measured by benchmarks/effects.py. It is more than 0 for every
         effect of a channel.
     systematic : callable, optional
-        Function scene -> part of the contribution that remains in a mean over frames or pixels, in electrons. By
-        default the whole contribution remains.
+        Function of a `Scene` that returns the part of the contribution that does not average out in a mean over many
+        frames or pixels, in electrons. By default the whole contribution does not average out.
     """
 
     name: str
@@ -55,39 +62,56 @@ class Effect:
     systematic: Callable[[Scene], float] | None = None
 
     def margin(self, scene: Scene) -> float:
-        """Return the contribution relative to the noticeable change of a pixel or mean: above 1 it is needed."""
+        """Return the size of the effect divided by the noticeable change. Above 1 the effect is needed.
+
+        The noticeable change of a single pixel is `NOTICEABLE` = 0.1 times its noise. The part of the effect that does
+        not average out is compared with 0.1 times the noise of the mean of `STACK_SIZE` = 1024 pixels. The larger of
+        the two ratios is returned. Without noise the result is infinite, or 0 for an effect of size 0.
+        """
         change = float(self.contribution(scene))
         systematic = change if self.systematic is None else float(self.systematic(scene))
         change = max(change, math.sqrt(STACK_SIZE) * systematic)
         noise = NOTICEABLE * scene.pixel_noise
-        # Without noise every change is noticeable.
+        # Without noise, any change above 0 is noticeable.
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
     def is_needed(self, scene: Scene) -> bool:
-        """Return True if the scene needs the effect, whatever the request forces."""
+        """Return True if the effect is not optional or is noticeable.
+
+        Whether the request switches the effect on or off (`scene.forced`) is ignored.
+        """
         return not self.optional or self.margin(scene) > 1.0
 
     def is_applied(self, scene: Scene) -> bool:
-        """Return True if the effect is applied: as the request forces it, otherwise if the scene needs it."""
+        """Return True if the effect is applied: if the request switches it on, or does not mention it but it is needed.
+
+        The switches of the request are in `scene.forced`.
+        """
         return scene.forced.get(self.name, self.is_needed(scene))
 
 
 def zero_contribution(scene: Scene) -> float:
-    """Return 0: the systematic contribution of pure noise, which averages out."""
+    """Return 0 electrons for any scene.
+
+    Effects that are pure noise use this function as `Effect.systematic`: they average out in a mean over many frames or
+    pixels.
+    """
     return 0.0
 
 
 def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Frame:
-    """Apply a compiled function to the pixels of a frame.
+    """Apply a compiled function to all pixels of a frame, with different parameters for each amplifier if necessary.
 
     Parameters
     ----------
     kernel : callable
-        Compiled function (pixels, out_pixels, *arguments) that fills `out_pixels`. Both arrays are float64, shape (n,).
+        Compiled function (pixels, out_pixels, *arguments) that fills `out_pixels`. Both are flat float64 arrays of the
+        pixels of the frame, or of one of its amplifiers.
     frame : float array, shape (ny, nx) or (q, ...)
-        Input frame. The first axis counts amplifiers if an argument has one value per amplifier.
+        Input frame. If any argument has one value per amplifier, the first axis counts the q amplifiers.
     *arguments : float, uint64 or array, shape (q,)
-        Further arguments of `kernel`: one value for the frame, or one value for each of its q amplifiers.
+        Further arguments of `kernel`, at least one. Each is one value for the whole frame, or an array with one value
+        for each of the q amplifiers.
 
     Returns
     -------
@@ -97,7 +121,7 @@ def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Fr
     Raises
     ------
     BadInput
-        If arguments have values for another number of amplifiers than the frame has.
+        If an argument has q values and the first axis of the frame does not have the length q.
     """
     out = np.empty(frame.shape)
     pixels, out_pixels = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
@@ -116,7 +140,7 @@ def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Fr
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Decision on an effect.
+    """Whether an effect is applied to an exposure, and why.
 
     Attributes
     ----------
@@ -125,9 +149,9 @@ class Decision:
     applied : bool
         True if the effect is applied.
     forced : bool
-        True if the request switches it on or off.
+        True if the request of the user switches the effect on or off explicitly.
     margin : float
-        Contribution relative to the noticeable change, see `Effect.margin`.
+        Size of the effect relative to the change that is noticeable in the image. Above 1 the effect is needed.
     """
 
     name: str
@@ -137,17 +161,18 @@ class Decision:
 
 
 def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
-    """Decide which effects to apply: all that the scene needs or its request forces on.
+    """Decide which effects to apply: the ones that the request switches on, and noticeable ones it does not switch off.
 
-    Names of effects of other channels in `scene.forced` are ignored. Raises BadInput if the request switches off an
-    effect that is not optional.
+    The result has one `Decision` per effect, in the given order. Effects that are not optional are always applied;
+    BadInput is raised if `scene.forced` switches one off. Names in `scene.forced` that are not among `effects` are
+    ignored.
     """
     for effect in effects:
         if not effect.optional and not effect.is_applied(scene):
             raise BadInput(f"effect {effect.name} cannot be switched off")
     decisions = []
     for effect in effects:
-        # The margin is computed only once, because some contributions take as long as the effect.
+        # Compute `margin` only once: for some effects it takes as long as applying the effect.
         margin = effect.margin(scene)
         applied = scene.forced.get(effect.name, not effect.optional or margin > 1.0)
         decisions.append(Decision(effect.name, applied, effect.name in scene.forced, margin))
@@ -161,19 +186,19 @@ def apply_all(
     stream: Callable[[Effect], np.random.Generator],
     callback: Callable[[str, Frame, Frame], None] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
-    """Apply the effects of a channel in their order.
+    """Apply the effects of a channel (an instrument mode), one after the other, if they are noticeable or forced.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Input frame.
     effects : sequence of Effect
-        Effects in the order of the channel.
+        Effects in the order in which they are applied.
     scene : Scene
-        Exposure from which the parameters of the effects are taken.
+        Settings of the exposure, from which the parameters of the effects are computed.
     stream : callable
-        Function effect -> random generator. Each effect has a separate generator, so that switching one effect off does
-        not change the random numbers of the others.
+        Function of an effect that returns its random generator. Each effect has a separate generator, so that switching
+        one effect off does not change the random numbers of the others.
     callback : callable, optional
         Function (name, previous frame, new frame), called after each applied effect.
 
@@ -182,7 +207,12 @@ def apply_all(
     frame : float array
         Frame after all applied effects.
     decisions : tuple of Decision
-        One decision per effect.
+        One decision per effect, also for the effects that were not applied.
+
+    Raises
+    ------
+    BadInput
+        If `scene.forced` switches off an effect that is not optional.
     """
     decisions = decide(effects, scene)
     for effect, decision in zip(effects, decisions, strict=True):
@@ -190,6 +220,6 @@ def apply_all(
             previous, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
             if callback is not None:
                 callback(effect.name, previous, frame)
-            # Free the memory of the previous frame before the next effect allocates one.
+            # Free the previous frame before the next effect allocates a new one, to reduce the peak memory.
             del previous
     return frame, decisions

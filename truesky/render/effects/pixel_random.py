@@ -1,12 +1,13 @@
 """Generate random numbers per pixel in compiled code, so that a change in one pixel affects no other pixel.
 
-Each pixel derives its random bits from the key of the frame and from its index. The functions are called from compiled
-code of effects; a number takes a few ns.
+Each frame (array of pixels) has a random 64-bit key. A pixel derives its random bits from the key of the frame and from
+the index of the pixel in the frame. The functions are called from compiled code of detector effects; a random number
+takes a few ns.
 
 References
 ----------
-Steele, Lea & Flood 2014 (SplitMix64). Marsaglia & Tsang 2000 (ziggurat). Doornik 2005 (separate bits for layer and
-position).
+Steele, Lea & Flood 2014 (SplitMix64, which makes random bits). Marsaglia & Tsang 2000 (ziggurat, a method for normal
+deviates). Doornik 2005 (separate bits for the layer of the ziggurat and the position in it).
 """
 
 from __future__ import annotations
@@ -20,18 +21,30 @@ from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
 from truesky.randomness.rng import GOLDEN, mix_bits
 
-_S11, _LAYER, _SIGN = np.uint64(11), np.uint64(255), np.uint64(256)
-# For 256 layers of equal area under exp(-x^2 / 2): start of the tail, and area of a layer (Doornik 2005).
-_TAIL, _AREA = 3.6541528853610088, 4.92867323399e-3
+# Number of bits by which 64 random bits are shifted right, so that the remaining 53 fit into a float64.
+_S11 = np.uint64(11)
+# Mask of the 8 random bits that select one of the 256 layers of the ziggurat (a method for normal deviates).
+_LAYER = np.uint64(255)
+# Mask of the random bit that selects the sign of a normal deviate.
+_SIGN = np.uint64(256)
+# The ziggurat method covers the curve exp(-x^2 / 2), x > 0, with 256 layers of equal area (Doornik 2005). This is the
+# position x at which the tail in the lowest layer begins.
+_TAIL = 3.6541528853610088
+# Area of each of the 256 layers with which the ziggurat method covers the curve exp(-x^2 / 2), x > 0 (Doornik 2005).
+_AREA = 4.92867323399e-3
 
 
 def draw_key(rng: np.random.Generator) -> np.uint64:
-    """Draw the key of a frame, from which all its pixels derive their random bits."""
+    """Draw the 64-bit key of a frame, from which all of its pixels derive their random bits."""
     return rng.integers(0, 2**64, dtype=np.uint64)
 
 
 def _layers() -> Float:
-    """Right ends of the layers from the lowest, which includes the tail, to 0."""
+    """Return the right end x of each layer of the ziggurat, float64[257], from the lowest layer to 0 at the top.
+
+    The ziggurat covers the curve exp(-x^2 / 2), x > 0, with 256 horizontal layers of equal area. The lowest layer
+    contains the tail of the curve. Its end is the width of a rectangle with the same area and height.
+    """
     ends = [_AREA * math.exp(0.5 * _TAIL**2), _TAIL]
     while len(ends) < 256:
         ends.append(math.sqrt(-2.0 * math.log(_AREA / ends[-1] + math.exp(-0.5 * ends[-1] ** 2))))
@@ -48,30 +61,31 @@ _mix_bits = jit(mix_bits)
 
 @jit
 def pixel_bits(frame_key: Any, pixel: int) -> Any:
-    """Return 64 random bits (uint64) of a pixel, by the key of its frame (uint64) and its index in the frame."""
+    """Return 64 random bits (uint64) of a pixel, from the key of its frame (uint64) and its flat index in the frame."""
     return _mix_bits(frame_key + np.uint64(pixel) * GOLDEN)
 
 
 @jit
 def next_bits(bits: Any) -> Any:
-    """Return the next 64 random bits of a pixel, from its previous bits."""
+    """Return the next 64 random bits (uint64) of a pixel, computed from its previous bits (uint64)."""
     return _mix_bits(bits + GOLDEN)
 
 
 @jit
 def uniform(bits: Any) -> Any:
-    """Return a uniform number in (0, 1], a multiple of 2^-53, from random bits."""
+    """Return a uniform number in (0, 1], a multiple of 2^-53, from 64 random bits (uint64)."""
     return (float(bits >> _S11) + 1.0) * 2.0**-53
 
 
 @jit
 def normal(bits: Any) -> Any:
-    """Return a standard normal deviate from random bits.
+    """Return a standard normal deviate from 64 random bits (uint64), by the ziggurat method.
 
-    In one case of a hundred the ziggurat method uses further bits.
+    In about one of a hundred calls, further bits are derived from the given ones with `next_bits`.
     """
     while True:
-        # Layer, sign and position use different bits.
+        # Take the layer of the ziggurat (bits 0 to 7), the sign (bit 8) and the position in the layer (bits 11 to 63)
+        # from different bits, so that they are independent.
         layer = np.int64(bits & _LAYER)
         part = float(bits >> _S11) * 2.0**-53
         x = part * _ENDS[layer]
@@ -79,7 +93,7 @@ def normal(bits: Any) -> Any:
             sign = bits & _SIGN
             bits = next_bits(bits)
             if layer == 0:
-                # The tail is drawn with Marsaglia's exponential method.
+                # Draw from the tail of the normal distribution with Marsaglia's exponential method.
                 x = -math.log(uniform(bits)) / _TAIL
                 bits = next_bits(bits)
                 y = -2.0 * math.log(uniform(bits))

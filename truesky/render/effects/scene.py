@@ -1,4 +1,7 @@
-"""Properties of one detector's exposure that detector effects depend on."""
+"""The class `Scene`: everything about one detector's exposure that detector effects depend on.
+
+Examples are the exposure time, the sky background, bright sources, and the parameters of the camera.
+"""
 
 from __future__ import annotations
 
@@ -19,38 +22,40 @@ from truesky.request.accuracy import SURVEY, Accuracy
 
 Frame = Float
 
-# An effect is applied if its largest contribution to a pixel exceeds NOTICEABLE times the pixel's noise. A contribution
-# that repeats in every frame or every pixel does not average out: it is compared with the noise of the mean of
-# STACK_SIZE values, such as 32 x 32 pixels of sky or one pixel in 1024 frames.
-NOTICEABLE, STACK_SIZE = 0.1, 1024
+# A detector effect is applied if the largest change of a pixel that it causes exceeds this fraction of the pixel's
+# noise (rms).
+NOTICEABLE = 0.1
+# The part of a detector effect that repeats in every image or every pixel does not average out. It is compared with the
+# noise of the mean of this number of values, such as 32 x 32 pixels of sky or one pixel in 1024 images.
+STACK_SIZE = 1024
 
 # Boltzmann's constant, eV / K (CODATA 2018).
 _BOLTZMANN = 8.617333e-5
 
 
 def dark_current_scaling(temperature: float, reference: float, band_gap: float) -> float:
-    """Dark current relative to the reference temperature.
+    """Return the ratio of the dark current at one temperature to that at a reference temperature.
 
     Parameters
     ----------
     temperature, reference : float
         Temperature of the detector and reference temperature in kelvin, 50 to 400.
     band_gap : float
-        Band gap in eV.
+        Band gap of the detector material in eV.
 
     Returns
     -------
     float
-        Ratio of the dark currents.
+        Dark current at `temperature` divided by dark current at `reference`.
 
     Raises
     ------
     OutOfRange
-        If a temperature is outside its limits.
+        If a temperature is outside 50 to 400 K. The band gap is not checked.
 
     Notes
     -----
-    The dark current is proportional to T^1.5 exp(-E_g / (2 k T)) [1]_.
+    The dark current is proportional to T^1.5 exp(-E_g / (2 k T)) [1]_, with the temperature T and the band gap E_g.
 
     References
     ----------
@@ -65,14 +70,14 @@ def dark_current_scaling(temperature: float, reference: float, band_gap: float) 
 
 @dataclass(frozen=True, slots=True)
 class Lights:
-    """Bright sources on and around a detector, as points.
+    """Bright stars and other bright sources on or near a detector, as points that cause ghosts and stray light.
 
     Attributes
     ----------
     column, row : float64 array, shape (n,)
-        Pixel position, 0-based, also outside the frame.
+        Pixel positions, 0-based. They may be outside the detector.
     electrons : float64 array, shape (n,)
-        Expected electrons in the exposure.
+        Electrons expected from each source during the exposure.
     """
 
     column: Frame = field(default_factory=lambda: np.zeros(0))
@@ -80,7 +85,7 @@ class Lights:
     electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
     def concatenate(self, other: Lights) -> Lights:
-        """Return the sources of `self` followed by those in `other`."""
+        """Return a new object with the sources of `self`, followed by the sources of `other`."""
         return Lights(
             np.append(self.column, other.column),
             np.append(self.row, other.row),
@@ -90,14 +95,15 @@ class Lights:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourCharge:
-    """Charge on other detectors that are read out at the same time, for crosstalk between detectors.
+    """Charge on neighbouring detectors that are read out at the same time, which causes crosstalk between detectors.
 
     Attributes
     ----------
     pixel : int64 array, shape (n,)
-        Pixel index in readout order, counted through all amplifiers of the detector. Values are unique.
+        Flat indices of pixels of this detector, in the order [amplifier, row, column] in which it is read. Values are
+        unique.
     electrons : float64 array, shape (n,)
-        Charge read at the same time as this pixel.
+        Charge of the other detectors that is read at the same time as each of these pixels.
     """
 
     pixel: Int
@@ -106,12 +112,13 @@ class NeighbourCharge:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Exposure of one detector.
+    """Settings of the exposure of one detector, from which detector effects take their parameters.
 
     Attributes
     ----------
     mission : MissionConfiguration
-        Mission database, with the overrides of the request.
+        Mission database (parameters of the telescopes and cameras), with the values that the request of the user
+        overrides.
     section : str
         Prefix of the detector's parameters in the mission database, such as "vis" or "ext.lsstcam".
     exposure_time_s : float
@@ -119,37 +126,44 @@ class Scene:
     sky_rate : float
         Sky background in electrons per second per pixel.
     peak_electrons : float
-        Brightest pixel of the expected image: sources, the light of a lamp or injected charge, without sky.
+        Electrons expected in the brightest pixel, without sky: the brightest pixel of the sources, plus the largest
+        charge by each effect that fills pixels without sources, such as a lamp, satellite trails or injected charge.
     detector : Detector, optional
-        Position in the focal plane. None for a detector at the centre.
+        Detector with its position in the focal plane. None for a detector in the centre of the focal plane.
     lights : Lights
-        Sources of scattered light (ghosts, stray light).
+        Bright sources that cause ghosts and stray light.
     lamp : int
-        Number of a flat's LED, from 1.
+        Number of the calibration lamp (LED) that is switched on in a flat field, from 1.
     accuracy : Accuracy
-        Errors that the request accepts.
+        Largest errors of fluxes, shapes, positions and background that the request accepts.
     forced : mapping of str to bool
-        Effects to switch on or off, by name. All others are applied if the scene needs them.
+        Effects that the request switches on (True) or off (False), by name. All others are applied if they are
+        noticeable.
     band : Passband, optional
-        Passband of the exposure. None for the passband included in the package.
+        Passband of the exposure. None for the first built-in passband of the camera.
     track_electrons : float
-        Brightest pixel that cosmic rays are likely to produce, 0 without cosmic rays.
+        Highest charge in electrons that a cosmic ray leaves in one pixel; 0 without cosmic rays.
     ramp : str
-        Readout mode of an infrared detector, "photometric" or "spectroscopic". Empty if the detector is read once.
+        Readout mode of an infrared detector that is read several times during the exposure (up the ramp), "photometric"
+        or "spectroscopic". Empty if the detector is read once.
     persistence_charge : float array, shape (ny, nx), optional
-        Electrons that earlier exposures release in this one.
+        Electrons that were trapped in each pixel in earlier exposures and are released in this one. None without any.
     chromatic_light : float32 array, shape (2, ny, nx), optional
-        Light of the sources with each photon weighted by f1 and by f2, see `chromatic_response`.
+        Light of the sources in electrons, with each photon weighted by one of two functions of wavelength, f1 and f2,
+        minus their means over the band. Pixel p has the quantum efficiency 1 + s_p f1 + c_p f2 relative to the mean
+        (module `chromatic_response`). None if no source has a noticeable colour.
     chromatic_electrons : float
-        Largest change of a pixel by the colours of sources, see `chromatic_response`, in electrons rms.
+        Largest change of a pixel in electrons rms that arises because the efficiency of pixels depends on the colours
+        of sources.
     sky_change : float array, shape (gy, gx), optional
-        Change of the sky by a grism in electrons, on an even grid over the detector.
+        Difference between the sky background seen through a grism and a uniform background, in electrons per pixel, on
+        an even grid over the detector. None without a grism or without light of the sky.
     neighbour_charge : NeighbourCharge, optional
-        Charge on detectors that are read with this one. None if it is negligible.
+        Charge on neighbouring detectors that are read at the same time. None if it is negligible.
     seeing : float
-        FWHM of the seeing in arcsec, for ground cameras.
+        FWHM of the seeing in arcsec. Only used for ground cameras.
     zero_point : float
-        AB magnitude that gives 1 electron per second, for ground cameras.
+        AB magnitude of a source that gives 1 electron per second. Only used for ground cameras.
     """
 
     mission: MissionConfiguration
@@ -174,21 +188,28 @@ class Scene:
     zero_point: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
-        """Return a parameter of the detector in the given unit."""
+        """Return a parameter of the detector in the given unit.
+
+        `key` is the name without the prefix of the camera, such as "full_well". A parameter without dimension has the
+        unit "". BadInput is raised if the mission database has no such parameter or the unit does not fit.
+        """
         return self.mission.value(f"{self.section}.{key}", unit, DetectorPlace(self._detector_name))
 
     def amplifier_values(self, key: str, unit: str) -> float | Float:
-        """Values of a parameter for the amplifiers of the detector.
+        """Return the value of a parameter for each amplifier of the detector.
 
         Parameters
         ----------
-        key, unit : str
-            Name of the parameter without its section, and unit.
+        key : str
+            Name of the parameter without the prefix of the camera, such as "gain".
+        unit : str
+            Unit of the result.
 
         Returns
         -------
         float, or float64 array, shape (q,)
-            Values in readout order, or one number if all amplifiers have the same value.
+            Values of the q amplifiers, in the order of the planes of a frame that is split into amplifiers. One number
+            if all amplifiers have the same value.
         """
         if self.detector is not None and self.layout is not None:
             return amplifiers.values(key, unit, self.detector, self.mission, self.layout)
@@ -197,12 +218,18 @@ class Scene:
 
     @property
     def layout(self) -> Layout | None:
-        """Amplifiers of a ground camera's detector. None if the detector is read in quadrants or as one frame."""
+        """Pixels that each amplifier of a ground camera's detector reads.
+
+        None if the detector is read in quadrants or as one frame, or if the scene has no detector.
+        """
         return None if self.detector is None else amplifiers.layout(self.detector, self.mission)
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
-        """Segments of every column: first row, last row + 1, and True if the serial register is above the segment."""
+        """Parts of every column whose charge is shifted to the same serial register.
+
+        Each part is (first row, last row + 1, True if the serial register is above the part and False if it is below).
+        """
         if self.layout is not None:
             return self.layout.column_segments
         lower, upper = self.unread_rows
@@ -214,37 +241,40 @@ class Scene:
 
     @property
     def nx(self) -> int:
-        """Number of columns."""
+        """Number of pixel columns of the detector."""
         return self.detector.nx if self.detector is not None else int(self.value("fpa.nx", "pix"))
 
     @property
     def ny(self) -> int:
-        """Number of rows."""
+        """Number of pixel rows of the detector, including rows between its halves that are not read."""
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
     def injection_rows(self) -> int:
-        """Number of rows between the two halves of the detector. They are not read."""
+        """Number of charge-injection rows between the detector's halves, which are not read.
+
+        0 if the scene has no detector.
+        """
         return self.detector.injection_rows if self.detector is not None else 0
 
     @property
     def half_rows(self) -> int:
-        """Number of rows that are read through each of the two registers."""
+        """Number of rows that are read through each of the two serial registers, below and above the detector."""
         return (self.ny - self.injection_rows) // 2
 
     @property
     def unread_rows(self) -> tuple[int, int]:
-        """Range of the rows between the two halves: first row, and first row of the upper half."""
+        """Rows between the two halves, which are not read: (first of these rows, first row of the upper half)."""
         return self.half_rows, self.half_rows + self.injection_rows
 
     @property
     def sky_electrons(self) -> float:
-        """Sky background in electrons per pixel."""
+        """Sky background expected in the whole exposure, in electrons per pixel."""
         return self.sky_rate * self.exposure_time_s
 
     @property
     def brightest_electrons(self) -> float:
-        """Electrons in the brightest pixel, from sources or cosmic rays, and sky.
+        """Electrons in the brightest pixel: sky plus the brightest source or cosmic ray, whichever has more electrons.
 
         Nonlinearity and charge transfer depend on the total charge, whatever its origin.
         """
@@ -252,8 +282,13 @@ class Scene:
 
     @property
     def dark_current_scaling(self) -> float:
-        """Dark current relative to its value in the mission database."""
-        # The values of ground cameras are for their operating temperature.
+        """Dark current at the detector's temperature, divided by the value in the mission database.
+
+        The database gives the value at a reference temperature. The ratio is 1 for cameras for which it has no
+        temperature.
+        """
+        # The mission database has a temperature only for VIS. The dark currents of NISP and of ground cameras are for
+        # the operating temperature.
         if f"{self.section}.detector_temperature" not in self.mission:
             return 1.0
         temperatures = self.value("detector_temperature", "K"), self.value("dark_reference_temperature", "K")
@@ -266,26 +301,29 @@ class Scene:
 
     @property
     def dark_electrons(self) -> float:
-        """Dark current in electrons per pixel."""
+        """Dark current expected in the whole exposure, in electrons per pixel."""
         return self.dark_rate * self.exposure_time_s
 
     @property
     def pixel_noise(self) -> float:
-        """Noise of a pixel without sources in electrons rms: sky, dark current and read noise."""
-        # Mean over the detector.
+        """Noise of a pixel without sources in electrons rms: shot noise of sky and dark current, and read noise."""
+        # Behind a grism the sky background varies over the detector: add its mean difference from a uniform background.
         dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
         return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
 
     @property
     def reading_noise(self) -> float:
-        """Read noise of a pixel in electrons rms; for a ramp, of its signal.
+        """Read noise of a pixel in electrons rms, for the amplifier with the lowest noise.
+
+        For an infrared detector that is read up the ramp, it is the noise of the signal that is estimated from all
+        reads.
 
         Notes
         -----
-        For a ramp this is the noise of the difference between the last and the first group, 4 % below the noise of the
-        estimator that is used.
+        For a ramp (repeated reads) this is the noise of the difference between the last and the first group of averaged
+        reads. It is 4 % below the noise of the estimator with which the signal in the image is measured.
         """
-        # The quietest amplifier decides whether an effect is noticeable.
+        # Use the amplifier with the lowest noise: in its pixels an effect is noticed first.
         read_noise = float(np.min(self.amplifier_values("read_noise", "electron")))
         if not self.ramp:
             return read_noise

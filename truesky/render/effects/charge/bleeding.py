@@ -1,8 +1,8 @@
-"""Full well and bleeding: charge above the full well flows along its column, half in each direction.
+"""Full well and bleeding: charge above the full well of a pixel flows along its column, half in each direction.
 
-A column consists of one segment, or of one segment per amplifier. At one end of a segment is its serial register, where
-charge is lost. At the other end charge is turned back: by the charge-injection rows in VIS, and by the middle of the
-column in cameras that are read at both ends.
+A column of pixels is one segment, or one segment per amplifier. At one end of a segment is the serial register, through
+which the segment is read: charge that arrives there is lost. At the other end charge is turned back. This other end is
+at the charge-injection rows in VIS, and in the middle of the column in cameras that are read at both ends.
 """
 
 from __future__ import annotations
@@ -18,34 +18,41 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
+# Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
+# is above the part and False if it is below).
 Segments = Sequence[tuple[int, int, bool]]
 
 
 def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None) -> Frame:
-    """Limit every pixel to the full well and move the excess along its column.
+    """Limit every pixel to its full well and move the excess charge along its column.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
-        Whole electrons, 0 or more.
+        Electrons, whole numbers of 0 or more.
     capacity : float
         Full well in electrons, 1 or more.
     segments : sequence of (int, int, bool)
-        Same as in `bleed`.
+        Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
+        register is above).
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Whole electrons.
+        Electrons after bleeding, whole numbers. Charge that reaches a serial register is lost.
+
+    Raises
+    ------
+    OutOfRange
+        If `capacity` is less than 1, infinite or NaN, or if a segment is outside the frame.
     """
     return bleed(frame, capacity, segments)[0]
 
 
 def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, float]:
-    """Let charge above the full well bleed, and count the charge that leaves the detector.
+    """Move charge above the full well along its column, and count the charge that leaves the detector.
 
     Parameters
     ----------
@@ -54,20 +61,21 @@ def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, flo
     capacity : float
         Full well in electrons, 1 or more.
     segments : sequence of (int, int, bool)
-        Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
-        Rows outside all segments are unchanged.
+        Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
+        register is above). Rows outside all segments are unchanged.
 
     Returns
     -------
     frame : float array, shape (ny, nx)
         Electrons after bleeding. Whole electrons stay whole.
     lost : float
-        Electrons that left through the serial registers. Frame and lost charge add up to the input exactly.
+        Electrons that left through the serial registers. The sum of `frame` and `lost` equals the sum of the input
+        exactly.
 
     Raises
     ------
     OutOfRange
-        If `capacity` is less than 1 or a segment is outside the frame.
+        If `capacity` is less than 1, infinite or NaN, or if a segment is outside the frame.
     """
     if not 1.0 <= capacity < np.inf:
         raise OutOfRange("full well", capacity, 1.0, np.inf)
@@ -89,7 +97,11 @@ def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, flo
 
 @jit
 def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
-    """Bleed one segment in place, with its serial register below row 0. Return the electrons lost."""
+    """Let charge above the full well flow along the columns of one segment, in place, and return the electrons lost.
+
+    A segment is the part of the columns that is read through one serial register, here below row 0. Charge that reaches
+    the register is lost. Only the columns with the indices `columns` are treated. `full` is the full well in electrons.
+    """
     n = segment.shape[0]
     down = np.empty(n)
     lost = 0.0
@@ -97,7 +109,8 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
         carried = 0.0
         for y in range(n):
             charge = segment[y, x]
-            # A pixel's excess splits evenly. Charge arriving from below continues upwards.
+            # Half of a pixel's charge above full well flows up (away from the serial register), the other half down.
+            # Charge that arrives from below flows on upwards.
             excess = max(charge - full, 0.0)
             upwards = np.ceil(0.5 * excess)
             down[y] = excess - upwards
@@ -105,7 +118,7 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
             over = max(charge - full, 0.0)
             segment[y, x] = charge - over
             carried = over + upwards
-        # The far end turns the remaining upward flow back.
+        # At the end opposite to the register, charge that still flows upwards is turned back.
         for y in range(n - 1, -1, -1):
             charge = segment[y, x] + carried
             over = max(charge - full, 0.0)
@@ -116,7 +129,7 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
 
 
 def saturated_pixels(frame: Frame, capacity: float) -> Bool:
-    """Return a mask of the pixels at full well.
+    """Return a mask of the pixels at or above the full well.
 
     Parameters
     ----------
@@ -128,17 +141,18 @@ def saturated_pixels(frame: Frame, capacity: float) -> Bool:
     Returns
     -------
     bool array, shape (ny, nx)
+        True for pixels with at least `capacity` electrons, rounded down to a whole number.
     """
     return np.asarray(frame >= np.floor(capacity))
 
 
 def full_well(scene: Scene) -> float:
-    """Return the full well of the scene's detector in electrons."""
+    """Return the full well (largest charge of a pixel) of the scene's detector in electrons."""
     return scene.value("full_well", "electron")
 
 
 def _contribution(scene: Scene) -> float:
-    """Return the electrons above full well in the brightest pixel."""
+    """Return the electrons above the full well in the brightest pixel; 0 if it is not full."""
     return max(scene.brightest_electrons - full_well(scene), 0.0)
 
 

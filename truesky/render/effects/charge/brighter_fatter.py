@@ -1,12 +1,13 @@
 """Brighter-fatter effect: charge in a pixel repels charge that arrives later, so that pixel borders move.
 
-The displacement of a border is proportional to the charge around it. Charge in the strip between the old and the new
-border changes pixels; the total is conserved. Displacements grow during the exposure, so on average they are half the
-final ones.
+The displacement of a border is proportional to the charge in the pixels around it. The charge in the strip between the
+old and the new border moves to the neighbouring pixel, so that the total charge is conserved. Displacements grow during
+the exposure, and their mean is half of the final displacement.
 
-In VIS, the charge-injection rows between the two halves are drained and hold no charge. The halves therefore do not
-affect each other, and the last row of each half loses a strip whose width grows with its charge: 1 % of a flat with
-1e5 electrons per pixel. Outside the detector the charge of its outermost pixels is assumed to continue.
+In VIS, the charge-injection rows between the two halves of the detector are drained and hold no charge. The halves
+therefore do not affect each other. The row of each half next to the drained rows loses a strip of its charge to them:
+1 % in a flat with 1e5 electrons per pixel. Pixels outside the detector are assumed to hold the same charge as the
+nearest pixel of it.
 
 References
 ----------
@@ -25,14 +26,18 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels on each side of a border whose charge displaces it.
+# A border between two pixels is displaced by the charge of this number of pixels on each side of it, and of pixels up
+# to this number of pixels farther along the border.
 REACH = 2
-# Pixels per block of a row. Blocks without enough charge are skipped.
+# Number of neighbouring pixels of a row (a block) that are treated together. Blocks are skipped if their charge is too
+# small to move a border noticeably.
 _BLOCK = 64
-# Relative growth of a VIS star's size R^2, per unit of `shift` and per electron in its peak pixel. A Gaussian with an
-# rms of 0.7 pixels and a peak of 2e5 electrons gives 1.0 (mean of 50 realisations); the rest is a safety margin.
+# Relative growth of the squared size R^2 of a star in VIS, divided by the displacement of a border per electron (pixels
+# per electron) and by the electrons of the star's brightest pixel. A Gaussian with an rms of 0.7 pixels and a peak of
+# 2e5 electrons gives 1.0 (mean of 50 realisations). The rest is a safety margin.
 _R2_GROWTH = 1.25
-# Largest fraction of a pixel's charge that can cross one border. The model holds for narrow strips only.
+# Largest fraction of a pixel's charge that can cross one border. More is limited to this, because the model holds only
+# if a border moves by a small part of a pixel.
 MAX_CROSSING = 0.2
 
 
@@ -46,27 +51,29 @@ def apply(
     frame : float array, shape (ny, nx)
         Whole electrons, 0 or more.
     shift : float
-        Displacement, in pixels, of each border of a pixel by one electron in that pixel, 0 to 1e-4.
+        Displacement of each border of a pixel, towards the pixel's centre, by one electron in this pixel, in pixels per
+        electron, 0 to 1e-4.
     softening : float
-        Depth of the stored charge below the borders in pixels, 0 to 100. See `kernel`.
+        Depth of the stored charge below the surface at which borders are measured, in pixels, 0 to 100. See `kernel`.
     capacity : float
-        Full well in electrons, 1 to 1e9. Charge above it does not repel.
+        Full well in electrons, 1 to 1e9. Charge above the full well does not repel.
     threshold : float
-        A border is not moved if all pixels around it hold fewer electrons than this.
+        Electrons below which charge does not matter, 0 or more. The borders of a block of 64 neighbouring pixels of a
+        row do not move if all pixels in this block, in the next one and in the rows around are below it.
     gap : int
-        Number of drained rows between the two halves of the detector.
+        Number of drained rows between the two halves of the detector, 0 or more.
     rng : numpy.random.Generator
-        Random numbers for rounding to whole electrons.
+        Random generator, used to round the moved charge to whole electrons without bias.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Whole electrons with the same sum.
+        Electrons, whole numbers with the same sum as the input.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `shift`, `softening`, `capacity` or `threshold` is outside its limits or NaN.
     """
     for name, value, low, high in (
         ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
@@ -77,7 +84,8 @@ def apply(
     out = np.array(frame, dtype=float, order="C")
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
-    # Single precision is exact for whole electrons below 2^24, and its error of the moved charge is 1e-7.
+    # Use single precision: it is exact for whole electrons below 2^24, and the moved charge has a relative error of
+    # 1e-7.
     charge = np.empty((out.shape[0] + 2 * REACH, out.shape[1] + 2 * REACH), np.float32)
     np.minimum(out, capacity, out=charge[REACH:-REACH, REACH:-REACH], casting="same_kind")
     for padded in (charge, charge.T):
@@ -85,7 +93,8 @@ def apply(
     gap_start = (len(out) - gap) // 2
     charge[REACH + gap_start : REACH + gap_start + gap] = 0.0
     weights = kernel(shift, softening).astype(np.float32)
-    # Highest charge in each block. The extra last column stays 0: it is read as the neighbour of the last block.
+    # Highest charge in each block of `_BLOCK` pixels of a row. A last column of zeros is the neighbour of the last
+    # block.
     block_max = np.zeros((len(charge), -(-charge.shape[1] // _BLOCK) + 1), np.float32)
     _find_block_max(charge.view(np.int32), block_max.view(np.int32))
     for vertical in (False, True):
@@ -94,24 +103,25 @@ def apply(
 
 
 def kernel(shift: float, softening: float) -> Frame:
-    """Displacement of a border by one electron in each pixel around it.
+    """Return the displacement of a pixel border by one electron in each of the pixels around it.
 
     Parameters
     ----------
     shift : float
-        Displacement, in pixels, by one electron in the adjacent pixel.
+        Displacement of a border by one electron in an adjacent pixel, in pixels.
     softening : float
-        Depth of the charge below the border in pixels, 0 to 100.
+        Depth of the charge below the surface at which borders are measured, in pixels, 0 to 100.
 
     Returns
     -------
     float array, shape (2 REACH + 1, REACH)
-        Displacement in pixels by distance along the border (rows, -REACH to REACH) and across it (columns).
+        Displacement in pixels towards the side of the electron, for the pixels on one side of the border. The rows are
+        the distances along the border, -REACH to REACH; the columns are the distances from it, 0.5, 1.5, ... pixels.
 
     Raises
     ------
     OutOfRange
-        If `softening` is outside its limits.
+        If `softening` is outside its limits or NaN.
 
     Notes
     -----
@@ -129,18 +139,20 @@ def kernel(shift: float, softening: float) -> Frame:
 
 
 def variance_slope(shift: float, softening: float) -> float:
-    """Relative loss of variance in a flat field, per electron of its mean.
+    """Return the relative loss of variance in a flat field, per electron of its mean, by the brighter-fatter effect.
 
     Parameters
     ----------
-    shift, softening : float
-        Same as in `kernel`.
+    shift : float
+        Displacement of a border by one electron in an adjacent pixel, in pixels.
+    softening : float
+        Depth of the charge below the surface at which borders are measured, in pixels, 0 to 100.
 
     Returns
     -------
     float
-        The value c (1/electron) in variance = mean (1 - c mean), to first order in the mean. Only the charge of the
-        pixel itself and its four borders contribute.
+        Value c (1/electron) of the formula variance = mean (1 - c mean). It is valid to first order in the mean. Only
+        the charge of the pixel itself contributes, through its four borders.
     """
     return 4.0 * float(kernel(shift, softening)[REACH, 0])
 
@@ -150,17 +162,20 @@ def _move_charge(
     charge: Any, block_max: Any, out: Any, weights: Any, key: Any, vertical: bool, threshold: float, gap_start: int,
     gap: int,
 ) -> None:  # fmt: skip
-    """Move charge across the borders between neighbours in a row (or in a column, if `vertical`) in place.
+    """Move charge in `out` across the borders between neighbours in a row (or in a column, if `vertical`), in place.
 
-    `charge` is the repelling charge with a margin of REACH pixels on each side. The rows from `gap_start` to
-    `gap_start + gap` are drained.
+    `charge` is the charge that repels in electrons, with a margin of REACH pixels on each side. `weights` is the
+    displacement of a border in pixels by one electron, the result of `kernel`. Blocks of `_BLOCK` pixels are skipped if
+    `block_max`, the highest charge in the blocks around, is below `threshold` (electrons). The `gap` rows from
+    `gap_start` on are drained. Random bits for rounding come from `key`.
     """
     ny, nx = out.shape
     n_rows, n_columns = (ny - 1, nx) if vertical else (ny, nx - 1)
     displacements = np.empty(_BLOCK, np.float32)
     for r in range(n_rows):
         for block in range((n_columns + _BLOCK - 1) // _BLOCK):
-            # Borders near the end of a block also depend on pixels of the next one.
+            # Test this block of pixels and the next one: borders near the end of a block also depend on pixels of the
+            # next.
             if block_max[r : r + 2 * REACH + 1 + vertical, block : block + 2].max() < threshold:
                 continue
             first = block * _BLOCK
@@ -170,16 +185,17 @@ def _move_charge(
                 charge[r + REACH, first + REACH :],
                 charge[r + REACH + vertical, first + REACH + 1 - vertical :],
             )
-            # Next to the drained rows, the strip lies in the row that holds charge.
+            # Next to the drained rows, take the charge of the strip from the row that holds charge.
             if vertical and gap and r + 1 == gap_start:
                 side_2 = side_1
             if vertical and gap and r + 1 == gap_start + gap:
                 side_1 = side_2
             giver, taker = out[r, first:], out[r + vertical, first + 1 - vertical :]
             for c in range(len(displacement)):
-                # Mean charge of both pixels (1/2) times the mean displacement during the exposure (1/2).
+                # The strip has the mean charge of both pixels (a factor 1/2), and a width of the mean displacement
+                # during the exposure (half of the final displacement, another factor 1/2).
                 strip = np.float32(0.25) * displacement[c] * (side_1[c] + side_2[c])
-                # Stochastic rounding: whole electrons, correct on average.
+                # Round at random to a whole number of electrons, so that the mean is correct.
                 moved = np.floor(strip + pixel_random.uniform(pixel_random.pixel_bits(key, r * nx + first + c)))
                 limit = np.floor(MAX_CROSSING * (giver[c] if moved > 0.0 else taker[c]))
                 moved = min(max(moved, -limit), limit)
@@ -189,9 +205,10 @@ def _move_charge(
 
 @jit
 def _find_block_max(bits: Any, block_max: Any) -> None:
-    """Find the maximum of each block of pixels in each row.
+    """Fill `block_max` with the highest charge of each block of `_BLOCK` pixels in each row.
 
-    Floats are compared by their bits as integers, which preserves the order of non-negative numbers and is faster.
+    `bits` is the charge of the pixels. Both arrays contain float32 numbers whose bits are read as int32, because
+    comparing integers is faster and non-negative numbers have the same order. Negative numbers count as 0.
     """
     for r in range(len(bits)):
         for block in range(block_max.shape[1] - 1):
@@ -203,11 +220,18 @@ def _find_block_max(bits: Any, block_max: Any) -> None:
 
 @jit
 def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, first: int, displacement: Any) -> None:
-    """Fill `displacement` with the final displacements of the borders in row `r` from column `first`."""
+    """Fill `displacement` with the displacement of pixel borders at the end of the exposure, in pixels.
+
+    The borders are between each pixel of row `r`, from column `first` on, and its neighbour in the next column. If
+    `vertical`, the neighbour is in the next row. A positive displacement makes the pixel smaller and its neighbour
+    larger. `charge` is the charge that repels in electrons, with a margin of REACH pixels on each side. `weights` is
+    the displacement in pixels by one electron, the result of `kernel`.
+    """
     displacement[:] = np.float32(0.0)
     for i in range(2 * REACH + 1):
         for j in range(REACH):
-            # Pixels at distance j + 1/2 on the near and the far side of the border.
+            # Pixels at the distance j + 1/2 from the border, on the side of the pixel itself and on the side of its
+            # neighbour.
             if vertical:
                 side_1, side_2 = charge[r + REACH - j, first + i :], charge[r + REACH + 1 + j, first + i :]
             else:
@@ -219,8 +243,10 @@ def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, fir
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
     shift, softening = scene.value("bfe.shift", "pix / electron"), scene.value("bfe.softening", "pix")
-    # Among pixels with n electrons each, at most sum(kernel) n x 2 n / 4 electrons cross a border; a pixel has four.
-    # The threshold keeps this below the accepted background noise, and the growth of a star below the accepted error.
+    # If all pixels hold n electrons, at most sum(kernel) n x 2 n / 4 electrons cross a border, and a pixel has four
+    # borders. The borders of a block of pixels do not move if all pixels around have less charge than `threshold`. The
+    # threshold is so low that the neglected charge is below the accepted error of the background, and the neglected
+    # growth of a star below the accepted error of shapes.
     max_noise = scene.accuracy.background * scene.pixel_noise / 4.0
     threshold = min(
         np.sqrt(2.0 * max_noise / max(float(kernel(shift, softening).sum()), 1e-30)),
@@ -232,7 +258,8 @@ def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
 def _contribution(scene: Scene) -> float:
     shift, _, capacity, *_ = _parameters(scene)
     peak = min(scene.peak_electrons, capacity) + scene.sky_electrons
-    # Four borders, half the final displacement and two thirds of the peak at a border give 1.2 for a VIS star.
+    # The brightest pixel of a star in VIS loses 1.2 shift peak^2 electrons: four borders, half of the final
+    # displacement, and two thirds of the peak's charge at a border. The factor 1.5 includes a safety margin.
     return 1.5 * shift * peak**2
 
 

@@ -1,4 +1,4 @@
-"""Charge injection: blocks of rows filled electronically, to measure how traps capture and release charge."""
+"""Charge injection: blocks of rows are filled with charge electronically, to measure how traps capture it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float, rng: np.random.Generator) -> Frame:
-    """Add whole electrons to the injected rows.
+    """Add the injected charge, whole electrons, to the injected rows of a frame.
 
-    Starting at each of the two serial registers, `rows_off` empty rows and `rows_on` injected rows alternate.
+    Each half of the detector is read through a serial register at its outer edge. From there to the middle, blocks of
+    `rows_off` empty rows and `rows_on` injected rows alternate.
 
     Parameters
     ----------
@@ -22,11 +23,11 @@ def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float
     level : float
         Mean injected electrons per pixel, 0 to 1e9.
     rows_on, rows_off : int
-        Rows per injected block (1 or more), and empty rows before each block (0 or more).
+        Number of rows in an injected block (1 to 1e6), and number of empty rows before each block (0 to 1e6).
     spread : float
-        Standard deviation between columns as a fraction of `level`.
+        Standard deviation of the injected charge between columns, as a fraction of `level`, 0 to 1e9.
     rng : numpy.random.Generator
-        Random numbers of the columns, the same in every exposure.
+        Random generator of the differences between columns, in the same state in every exposure.
 
     Returns
     -------
@@ -36,7 +37,7 @@ def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `level`, `spread`, `rows_on` or `rows_off` is outside its limits or NaN.
     """
     for name, value in (("charge injection", level), ("injection spread", spread)):
         if not 0.0 <= value <= 1e9:
@@ -48,28 +49,29 @@ def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float
 
 
 def apply_noise(frame: Frame, rows_on: int, rows_off: int, noise: float, rng: np.random.Generator) -> Frame:
-    """Add the noise of the injected charge.
+    """Add random noise to the charge of the injected rows.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons, 0 or more.
     rows_on, rows_off : int
-        Same as in `apply`.
+        Number of rows in an injected block (1 to 1e6), and number of empty rows before each block (0 to 1e6). Blocks
+        are counted from the serial registers at the first and the last row.
     noise : float
-        Standard deviation in electrons per pixel, 0 to 1e9.
+        Standard deviation of the noise in electrons per pixel, 0 to 1e9.
     rng : numpy.random.Generator
-        Random numbers of the pixels.
+        Random generator of the noise of the pixels.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons. The changes are whole electrons; no pixel falls below 0.
+        Electrons. Pixels change by whole electrons, and negative results are set to 0.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `noise`, `rows_on` or `rows_off` is outside its limits or NaN.
     """
     if not 0.0 <= noise <= 1e9:
         raise OutOfRange("injection noise", noise, 0.0, 1e9)
@@ -82,7 +84,7 @@ def _injected_rows(ny: int, rows_on: int, rows_off: int) -> npt.NDArray[np.intp]
     for name, count, lowest in (("injected rows", rows_on, 1), ("rows between injections", rows_off, 0)):
         if not lowest <= count <= 1_000_000:
             raise OutOfRange(name, count, lowest, 1_000_000)
-    # Rows from the nearer serial register.
+    # Distance of each row from the nearer serial register, below the first row or above the last row.
     distance = np.minimum(np.arange(ny), ny - 1 - np.arange(ny))
     return np.flatnonzero(distance % (rows_on + rows_off) >= rows_off)
 
@@ -96,7 +98,7 @@ def _block_rows(scene: Scene) -> tuple[int, int]:
 
 
 def _noise(scene: Scene) -> float:
-    """Return the noise in electrons, 0 if nothing is injected."""
+    """Return the rms noise of injected charge in electrons; 0 if the scene has no charge injection."""
     return scene.value("injection.noise", "electron") * (EFFECT.is_applied(scene) and _parameters(scene)[0] > 0.0)
 
 

@@ -1,9 +1,10 @@
 """Cosmic rays: straight tracks one pixel wide that deposit charge along their length.
 
-Cosmic rays during the integration hit the pixels that collect light. Cosmic rays during the readout hit a detector
-whose rows are being shifted. They are placed in readout coordinates (row 0 is read first), in which later rows are
-exposed for longer. Their charge passes only the traps between the point of impact and the register, after all other
-charge has passed them, and has a separate trail.
+Cosmic rays during the exposure hit the pixels that collect light. Functions of this module also draw the tracks for
+the module `readout_cosmic_rays`: cosmic rays during the readout, which hit a detector whose rows are being shifted
+towards the serial register. That module counts rows from the register (row 0 is read first), and later rows wait for
+longer. The charge of these tracks passes only the traps between the point of impact and the register. As an
+approximation, it is added after the trails of all other charge are computed, and gets a separate trail.
 """
 
 from __future__ import annotations
@@ -18,33 +19,43 @@ from truesky.render.camera import amplifiers
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
+# Square centimetres per square micrometre.
 _SQUARE_CM = 1e-8
-# Mission table with quantiles of a track's length (pixels) and charge (electrons).
+# Name of the table in the mission database with cumulative probability, length (pixels) and charge (electrons) of the
+# tracks of cosmic rays in VIS.
 _TRACKS = "env.cosmic_rays.vis_tracks"
-# Length of a perpendicular track in pixels. It must not be 0, because lengths are interpolated in their logarithm.
+# Shortest length in pixels of a track, projected on the detector: the length for a muon perpendicular to the detector.
+# It must not be 0, because the logarithm of the length is interpolated.
 _SHORTEST = 1e-2
-# Expected number of tracks below which the effect is treated as absent.
+# If the expected number of tracks per exposure is at most this, `median_pixel` returns 0, so that no cosmic rays are
+# drawn unless the user switches them on.
 _NEGLIGIBLE = 1e-3
 
 
 def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
-    """Add the charge of cosmic rays.
+    """Draw the cosmic rays of an exposure, and add their charge to a frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
     expected : float
-        Mean number of tracks, 0 to 1e8.
+        Expected number of tracks on the frame, 0 to 1e8. The number drawn has a Poisson distribution.
     quantiles : float array, shape (q, 3)
-        Same as in `draw_tracks`.
+        Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons. Between
+        rows, the logarithms of length and charge are interpolated linearly.
     rng : numpy.random.Generator
-        Random numbers of the tracks.
+        Random generator of the tracks.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons including cosmic rays.
+        Electrons including cosmic rays, which add whole electrons.
+
+    Raises
+    ------
+    OutOfRange
+        If `expected` is outside its limits or NaN.
     """
     out = np.array(frame, dtype=float, order="C")
     _add_tracks(out, expected, quantiles, rng)
@@ -52,34 +63,34 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
 
 
 def draw_tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
-    """Draw an image of cosmic rays alone.
+    """Draw an image that contains only the charge of random cosmic rays.
 
     Parameters
     ----------
     shape : (int, int)
-        Rows and columns.
+        Number of rows and columns.
     expected : float
-        Mean number of tracks, 0 to 1e8. The number drawn is Poisson.
+        Expected number of tracks on the image, 0 to 1e8. The number drawn has a Poisson distribution.
     quantiles : float array, shape (q, 3)
-        Cumulative probability, length in pixels and charge in electrons. Between rows, the logarithms of length and
-        charge are interpolated linearly.
+        Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons. Between
+        rows, the logarithms of length and charge are interpolated linearly.
     rng : numpy.random.Generator
-        Random numbers of the tracks.
+        Random generator of the tracks.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Whole electrons.
+        Electrons, whole numbers.
 
     Raises
     ------
     OutOfRange
-        If `expected` is outside its limits.
+        If `expected` is outside its limits or NaN.
 
     Notes
     -----
-    A track that leaves the image at one edge enters at the opposite edge. This replaces tracks that start outside the
-    detector, so that the density of tracks is uniform.
+    A track that leaves the image at one edge continues at the opposite edge. These parts replace tracks that start
+    outside the image and enter it, so that the density of tracks is uniform.
     """
     out = np.zeros(shape)
     _add_tracks(out, expected, quantiles, rng)
@@ -96,14 +107,14 @@ def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Ge
 
 @jit
 def add_charge(frame: Any, row: Any, column: Any, charge: Any) -> None:
-    """Add charge to pixels of a frame in place. Coordinates wrap around at the edges.
+    """Add charge to pixels of a frame in place. Positions outside the frame wrap around to the opposite edge.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
     row, column : int array, shape (n,)
-        Pixel positions, also outside the frame.
+        Row and column indices. They may be negative or larger than the frame, and may repeat.
     charge : float array, shape (n,)
         Electrons to add to each pixel.
     """
@@ -113,40 +124,45 @@ def add_charge(frame: Any, row: Any, column: Any, charge: Any) -> None:
 
 
 def draw_event_count(expected: float, rng: np.random.Generator) -> int:
-    """Draw the Poisson number of cosmic rays for a mean of 0 to 1e8."""
+    """Draw the number of cosmic rays from a Poisson distribution with the mean `expected`.
+
+    OutOfRange is raised if the mean is outside 0 to 1e8 or NaN.
+    """
     if not 0.0 <= expected <= 1e8:
         raise OutOfRange("cosmic rays", expected, 0.0, 1e8)
     return int(rng.poisson(expected))
 
 
 def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Generator) -> tuple[Any, ...]:
-    """Draw start, direction, length and charge of tracks.
+    """Draw the start, direction, length and charge of cosmic-ray tracks.
 
     Parameters
     ----------
     count : int
         Number of tracks.
     ny, nx : int
-        Rows and columns in which they start.
+        Number of rows and columns of the area in which tracks start.
     quantiles : float array, shape (q, 3)
-        Same as in `draw_tracks`.
+        Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons. Between
+        rows, the logarithms of length and charge are interpolated linearly.
     rng : numpy.random.Generator
-        Random numbers of the tracks.
+        Random generator of the tracks.
 
     Returns
     -------
     x, y : float array, shape (count,)
-        Start in pixels.
+        Start of each track in pixels, uniform between 0 and nx or ny.
     cosine, sine : float array, shape (count,)
-        Direction.
+        Direction of each track: cosine and sine of the angle from the columns axis x to the rows axis y.
     length : float array, shape (count,)
-        Projected length in pixels.
+        Length of each track, projected on the detector, in pixels.
     electrons : float array, shape (count,)
-        Charge, whole electrons.
+        Charge of each track in electrons, whole numbers.
 
     Notes
     -----
-    Length and charge have the same rank, as in Niemi 2015: a longer path through the silicon leaves more charge.
+    Length and charge of a track have the same quantile, as in Niemi 2015: a longer path through the silicon leaves more
+    charge.
     """
     chance, length, charge = quantiles.T
     angle = 2.0 * np.pi * rng.random(count)
@@ -157,26 +173,27 @@ def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.G
 
 @jit
 def pixels_of_events(events: tuple[Any, ...]) -> Any:
-    """Trace tracks through the pixel grid.
+    """Find the pixels that cosmic-ray tracks cross, and the charge that they leave in each.
 
     Parameters
     ----------
     events : tuple of float arrays, shape (count,)
-        Result of `draw_events`.
+        Start x and y, cosine and sine of the direction, length (pixels) and charge (electrons) of the tracks: the
+        result of `draw_events`. Lengths must be more than 0.
 
     Returns
     -------
     event : int array, shape (n,)
-        Index of the track, for every pixel that a track crosses.
+        Index of the track, for each of the n crossings of a pixel by a track.
     column, row : int array, shape (n,)
-        Position of the pixel on an unbounded grid.
+        Position of the pixel. It may be outside the detector; `add_charge` wraps such positions around.
     charge : float array, shape (n,)
-        Charge left in the pixel, whole electrons.
+        Charge left in the pixel in electrons, whole numbers. Their sum over a track is the charge of the track.
     """
     x, y, cosine, sine, length, electrons = events
     size = 0
     for i in range(len(x)):
-        # Upper limit: at each step a track enters the next column or the next row.
+        # Upper limit on the number of pixels that a track crosses: each step leads to the next column or the next row.
         size += int(length[i] * (abs(cosine[i]) + abs(sine[i]))) + 4
     event, columns, rows = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     charge, n = np.empty(size), 0
@@ -189,7 +206,8 @@ def pixels_of_events(events: tuple[Any, ...]) -> Any:
         previous = 0.0
         while True:
             along = min(min(next_x, next_y), length[i])
-            # Differences of the rounded cumulative charge are whole electrons and add up to the track's total.
+            # The cumulative charge along the track is rounded. Its differences are whole numbers and add up to the
+            # track's charge.
             cumulative = np.rint(electrons[i] * along / length[i])
             event[n], columns[n], rows[n], charge[n] = i, column, row, cumulative - previous
             n += 1
@@ -206,12 +224,13 @@ def pixels_of_events(events: tuple[Any, ...]) -> Any:
 
 
 def event_rate(scene: Scene, pixels: float) -> float:
-    """Cosmic rays per second on an area of the detector.
+    """Return the number of cosmic rays per second that hit an area of the detector.
 
     Parameters
     ----------
     scene : Scene
-        The exposure. A ground camera has the rate of its site; for space the flux is part of the environment.
+        Settings of the exposure. A ground camera has the rate of its site; in space the rate follows from the flux of
+        particles in the mission database.
     pixels : float
         Size of the area in pixels.
 
@@ -228,7 +247,10 @@ def event_rate(scene: Scene, pixels: float) -> float:
 
 
 def track_quantiles(scene: Scene) -> Frame:
-    """Return the quantiles for `draw_tracks`: muons for a ground camera, else the table in the mission database."""
+    """Return the distribution of cosmic-ray tracks, float64[q, 3]: cumulative probability, length (pixels), electrons.
+
+    For a ground camera it is computed for muons, otherwise it is the table in the mission database.
+    """
     if f"{scene.section}.cosmic_rays.rate" in scene.mission:
         deposit = scene.mission.value("env.cosmic_rays.silicon_deposit", "electron / um")
         return muon_quantiles(
@@ -238,24 +260,24 @@ def track_quantiles(scene: Scene) -> Frame:
 
 
 def muon_quantiles(thickness: float, pixel: float, deposit: float) -> Frame:
-    """Quantiles of muon tracks through a horizontal detector.
+    """Return the distribution of the tracks of muons through a horizontal detector.
 
     Parameters
     ----------
     thickness, pixel : float
-        Thickness of the silicon and size of a pixel in micrometres.
+        Thickness of the silicon in micrometres, and size of a pixel in micrometres.
     deposit : float
         Charge per path length in electrons per micrometre.
 
     Returns
     -------
     float array, shape (55, 3)
-        Same as `quantiles` in `draw_tracks`.
+        Cumulative probability (ascending from 0 to 1), projected length in pixels, and charge in electrons.
 
     Notes
     -----
-    The intensity is proportional to cos^2 of the zenith angle, and the flux through the detector to cos^3. Not
-    modelled: fluctuations of the energy loss, electrons from radioactivity, and the tilt of the detector.
+    The intensity of muons is proportional to cos^2 of the zenith angle, and their flux through the detector to cos^3.
+    Not modelled: fluctuations of the energy loss, electrons from radioactivity, and the tilt of the detector.
     """
     cumulative = np.append(np.linspace(0.0, 0.98, 50), [0.99, 0.999, 0.9999, 1.0 - 1e-6])
     cosine = (1.0 - cumulative) ** 0.25
@@ -269,16 +291,20 @@ def _expected_events(scene: Scene) -> float:
 
 
 def brightest_pixel(scene: Scene) -> float:
-    """Return the highest charge in electrons that a track is likely to leave in one pixel.
+    """Return the highest charge in electrons that a cosmic ray leaves in one pixel.
 
-    This is all of its charge if the track is shorter than a pixel, else the charge per pixel of length.
+    It is the maximum over the rows of `track_quantiles`. A track shorter than a pixel leaves its whole charge in one
+    pixel, a longer one the charge per pixel of its length.
     """
     _, length, charge = track_quantiles(scene).T
     return float((charge / np.maximum(length, 1.0)).max())
 
 
 def median_pixel(scene: Scene, expected: float) -> float:
-    """Return the charge per pixel of the median track in electrons, 0 if `expected` tracks are negligible."""
+    """Return the charge per pixel of length of the median cosmic-ray track in electrons.
+
+    It is 0 if the expected number of tracks, `expected`, is not above 1e-3.
+    """
     _, length, charge = track_quantiles(scene).T
     middle = len(length) // 2
     return float(charge[middle] / length[middle]) * (expected > _NEGLIGIBLE)

@@ -1,4 +1,4 @@
-"""Dark current: counted thermal electrons in every pixel, and hot pixels with many more."""
+"""Dark current: random numbers of thermal electrons in every pixel, and hot pixels with many more."""
 
 from __future__ import annotations
 
@@ -14,14 +14,21 @@ from truesky.render.effects.charge import poisson
 from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
-# Upper limit on the mean electrons of a hot pixel in a warm detector. It exceeds every full well by far.
+# Upper limit on the mean dark electrons of a hot pixel in an exposure, far above every full well. Only very warm
+# detectors reach it.
 _MAX_HOT_ELECTRONS = 1e11
-# Means below _BLOCKWISE_BELOW are drawn for _BLOCK pixels together, up to the cumulative probability _CERTAIN.
-_BLOCKWISE_BELOW, _BLOCK, _CERTAIN = 2.0, 512, 1.0 - 2e-16
+# If the mean number of dark electrons per pixel is below this, counts are drawn for blocks of `_BLOCK` pixels together,
+# which is faster.
+_BLOCKWISE_BELOW = 2.0
+# Number of pixels for which counts of dark electrons are drawn together.
+_BLOCK = 512
+# Counts of dark electrons are considered in ascending order, up to the count at which their cumulative probability
+# reaches this number.
+_CERTAIN = 1.0 - 2e-16
 
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
-    """Add a Poisson count of dark electrons to every pixel.
+    """Add a random number of dark electrons to every pixel, with a Poisson distribution.
 
     Parameters
     ----------
@@ -30,7 +37,8 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     electrons : float
         Expected dark electrons per pixel, 0 or more.
     rng : numpy.random.Generator
-        Source of the key from which each pixel derives its own random number.
+        Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
+        index.
 
     Returns
     -------
@@ -40,7 +48,7 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     Raises
     ------
     OutOfRange
-        If `electrons` is negative or infinite.
+        If `electrons` is negative, infinite or NaN.
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
@@ -54,8 +62,8 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
         for i in range(len(frame)):
             out[i] = frame[i] + poisson.draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
         return
-    # For small means it is faster to treat one count at a time for a whole block: each pixel whose uniform number
-    # exceeds P(<= count) gets one more electron.
+    # For small means it is faster to increase the counts of a whole block of pixels one by one: for count = 0, 1, 2,
+    # ... each pixel whose uniform random number exceeds the probability P(<= count) gets one more electron.
     u = np.empty(_BLOCK)
     for first in range(0, len(frame), _BLOCK):
         block, block_before = out[first : first + _BLOCK], frame[first : first + _BLOCK]
@@ -71,28 +79,28 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
 
 
 def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:
-    """Add whole electrons to hot pixels.
+    """Add electrons to randomly chosen hot pixels, which are the same in every exposure.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
     fraction : float
-        Fraction of hot pixels, 0 to 1.
+        Fraction of pixels that are hot, 0 to 1.
     electrons : float
-        Mean electrons of a hot pixel, 0 to 1e12. The distribution is exponential.
+        Mean electrons of a hot pixel, at least 0, below 1e12. The distribution is exponential.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the hot pixels are the same.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons including hot pixels.
+        Electrons. Those added to hot pixels are whole numbers.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `fraction` or `electrons` is outside its limits or NaN.
 
     Notes
     -----
@@ -115,7 +123,7 @@ def _hot_parameters(scene: Scene) -> tuple[float, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Return the root mean square of the added electrons: their mean and shot noise together."""
+    """Return the root mean square of the dark electrons in a pixel, from their mean and shot noise together."""
     return float(np.sqrt(scene.dark_electrons * (1.0 + scene.dark_electrons)))
 
 

@@ -1,6 +1,7 @@
-"""Expected dark current of each pixel, with pixel-to-pixel variation and hot pixels.
+"""Expected dark current of each pixel of an infrared detector, which varies from pixel to pixel, with hot pixels.
 
-This effect is for detectors read up the ramp: it adds to the expected light, and the ramp then draws the counts.
+The effect is for detectors that are read several times during the exposure (up the ramp). It is added to the expected
+electrons of the light, from which the effect `ramp` later draws random counts.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
-# Upper limit on the mean electrons of a hot pixel in a warm detector. It exceeds every full well by far.
+# Upper limit on the mean dark electrons of a hot pixel in an exposure, far above every full well.
 _MAX_HOT_ELECTRONS = 1e11
 
 
 def apply(
     frame: Frame, electrons: float, spread: float, hot_fraction: float, hot_electrons: float, rng: np.random.Generator
 ) -> Frame:
-    """Add the expected dark current.
+    """Add the expected dark current of each pixel to a frame; the pattern is the same in every exposure.
 
     Parameters
     ----------
@@ -31,13 +32,13 @@ def apply(
     electrons : float
         Mean dark current of normal pixels in electrons, 0 to 1e12.
     spread : float
-        Standard deviation of its natural logarithm from pixel to pixel, 0 to 3.
+        Standard deviation of the natural logarithm of the dark current from pixel to pixel, 0 to 3.
     hot_fraction : float
-        Fraction of hot pixels, 0 to 1.
+        Fraction of pixels that are hot, 0 to 1.
     hot_electrons : float
         Mean additional electrons of a hot pixel, 0 to 1e12. The distribution is exponential.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the pattern does not change.
 
     Returns
     -------
@@ -47,7 +48,7 @@ def apply(
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `electrons`, `spread`, `hot_fraction` or `hot_electrons` is outside its limits or NaN.
     """
     for name, value, highest in (
         ("dark electrons", electrons, 1e12), ("spread of the dark current", spread, 3.0),
@@ -55,7 +56,7 @@ def apply(
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
-    # exp(s z) of a standard normal z has the mean exp(s^2 / 2): divide by it to keep the mean at `electrons`.
+    # For a standard normal z, exp(s z) has the mean exp(s^2 / 2). Divide by it, so that the mean is `electrons`.
     out = map_pixels(_add_dark, frame, electrons * np.exp(-0.5 * spread**2), spread, pixel_random.draw_key(rng))
     count = int(rng.binomial(out.size, hot_fraction))
     hot_pixels = rng.integers(0, max(out.size, 1), count)

@@ -1,9 +1,10 @@
 """Inter-pixel capacitance (IPC): the voltage of a pixel also depends on the charge of its neighbours.
 
-A pixel with N electrons reads N (1 - 4 s - 4 d); each of its four side neighbours reads s N more, and each of its four
-diagonal neighbours d N more. At the detector's edge the shares of missing neighbours stay in the pixel, so that the
-total is conserved. The coupling is linear and acts on the charge of every group of a ramp. Photon noise of neighbouring
-pixels is therefore correlated, and read noise, which is added later, is not.
+A pixel with N electrons is read as N (1 - 4 s - 4 d), with the coupling constants s and d. Each of its four side
+neighbours is read with s N electrons more, and each diagonal neighbour with d N more. At the detector's edge the charge
+for missing neighbours stays in the pixel, so that the total is conserved. The coupling is linear. In an up-the-ramp
+exposure (repeated reads), the charge of each group of averaged reads is coupled. The photon noise of neighbouring
+pixels is therefore correlated. Read noise is added later and is not correlated.
 
 References
 ----------
@@ -23,27 +24,29 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, side: float, diagonal: float, rng: np.random.Generator) -> Frame:
-    """Couple each pixel to its eight neighbours.
+    """Move a small fraction of each pixel's charge to its eight neighbours.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
-        Charge in electrons, one plane per group of a ramp.
+        Charge in electrons. For an up-the-ramp exposure there is one plane per group of averaged reads.
     side, diagonal : float
-        Share of a pixel's charge that appears in each side and each diagonal neighbour, 0 to 0.1.
-        At most half of a pixel's charge may appear elsewhere: 4 (side + diagonal) <= 0.5.
+        Fraction of a pixel's charge that is read in each of its four side neighbours, and in each of its four diagonal
+        neighbours, 0 to 0.1. All eight neighbours together may get at most half: 4 (side + diagonal) <= 0.5.
     rng : numpy.random.Generator
         Not used.
 
     Returns
     -------
-    float array, same shape
-        Charge as it is read. The sum of each plane is unchanged.
+    float array, shape of `frame`
+        Charge as it is read, in electrons. The sum of each plane is unchanged.
 
     Raises
     ------
-    OutOfRange, BadInput
-        If a share, or the sum of all shares, exceeds its limit.
+    OutOfRange
+        If `side` or `diagonal` is outside 0 to 0.1 or NaN.
+    BadInput
+        If 4 (side + diagonal) is more than 0.5.
     """
     for name, share in (("side", side), ("diagonal", diagonal)):
         if not 0.0 <= share <= 0.1:
@@ -68,20 +71,21 @@ def _couple_plane(plane: Any, coupled: Any, side: float, diagonal: float) -> Non
                 for dx in range(-1, 2):
                     if 0 <= y + dy < ny and 0 <= x + dx < nx:
                         share = side if dx == 0 or dy == 0 else diagonal
-                        # The pixel itself (dx = dy = 0) contributes a difference of 0.
+                        # The loop includes the pixel itself (dx = dy = 0), which contributes 0.
                         change += share * (float(plane[y + dy, x + dx]) - charge)
             coupled[y, x] = charge + change
 
 
 def _parameters(scene: Scene) -> tuple[float, float]:
-    # A mission may switch the effect on (1) or off (0) for each of its ramps, with the key `ipc_<ramp>`.
+    # The parameter `ipc_<ramp>` of the mission database switches the coupling on (1) or off (0) for a readout mode of
+    # the ramp, "photometric" or "spectroscopic". Without this parameter it is on.
     key = f"ipc_{scene.ramp}"
     scaling = scene.value(key, "") if f"{scene.section}.{key}" in scene.mission else 1.0
     return scaling * scene.value("ipc.side", ""), scaling * scene.value("ipc.diagonal", "")
 
 
 def _contribution(scene: Scene) -> float:
-    """Return the charge that the neighbours of a full pixel receive: a cosmic ray can fill any pixel."""
+    """Return the electrons that a pixel at full well loses to all neighbours: a cosmic ray can fill any pixel."""
     side, diagonal = _parameters(scene)
     return 4.0 * (side + diagonal) * scene.value("full_well", "electron")
 

@@ -1,16 +1,18 @@
-"""Persistence: traps filled in earlier exposures release their charge during this one.
+"""Persistence: traps in a pixel that were filled in earlier exposures release their charge during this one.
 
-A pixel that collected I electrons in an exposure of length T, which began a time dt earlier, releases::
+A pixel collects I electrons in an earlier exposure of length T, which begins a time dt before this one. It releases I_p
+electrons in an exposure of the nominal length T0::
 
     I_p = (p0 + 1e-5 p1 I) (1 - exp(-I / p2)) (T / T0)^soak (dt / t0)^power
 
-electrons in an exposure of the nominal length T0. They are released as a current and are counted up the ramp together
-with the light. A longer exposure receives the integral of the same power law. Contributions of several earlier
-exposures add up. Every pixel has its own p0, p1, p2 and power; p0 and p1 are proportional to its number of traps.
+The parameters p0, p1, p2, T0, t0 (a reference delay), soak and power are in the mission database. The charge is
+released as a current, and is collected together with the light. An exposure of another length than T0 receives the
+integral of the same power law of time. Contributions of several earlier exposures add up. Every pixel has its own p0,
+p1, p2 and power; p0 and p1 are proportional to its number of traps.
 
 References
 ----------
-Serrano et al. 2024: equation, and its dependence on pixel, delay and length of the earlier exposure.
+Serrano et al. 2024: the equation, and how it depends on the pixel, the delay and the length of the earlier exposure.
 Long, Baggett & MacKenty 2013, WFC3 Instrument Science Reports: power law in time; longer exposures fill more traps.
 """
 
@@ -30,28 +32,34 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, SMALL_EXP, small_exp, small_expm1
 
-# Decorrelates a pixel's second random number from its first, of which the ziggurat method may use more than one word.
+# A pixel needs two independent normal deviates, and the ziggurat method may use more than one word of random bits for
+# the first. The bits for the second are combined with this constant (xor), so that they do not repeat those of the
+# first.
 _SECOND_STREAM = np.uint64(0x5851F42D4C957F2D)
 
 
 @dataclass(frozen=True, slots=True)
 class PersistenceModel:
-    """Persistence of a detector. The module docstring defines the symbols.
+    """Parameters of the persistence of a detector, and its equation.
+
+    I_p = (p0 + 1e-5 p1 I) (1 - exp(-I / p2)) (T / T0)^soak (dt / t0)^power are the electrons released in an exposure of
+    the nominal length T0. I are the electrons collected in an earlier exposure of length T, which began a time dt
+    before.
 
     Attributes
     ----------
     p0, p1, p2 : float
-        Parameters of the equation: electrons, dimensionless, electrons.
+        Parameters of the equation for the median pixel: electrons, dimensionless, electrons.
     power : float
-        Exponent of the delay, at most 0.
+        Exponent of the delay dt / t0, at most 0.
     reference : float
         Reference delay t0 in seconds.
     nominal_length : float
         Nominal exposure length T0 in seconds.
     full_well : float
-        Full well in electrons: the highest charge that fills traps.
+        Full well in electrons. A pixel with more charge is treated as a full one.
     soak : float
-        Exponent of the length of the earlier exposure.
+        Exponent of the relative length T / T0 of the earlier exposure.
     """
 
     p0: float
@@ -65,7 +73,7 @@ class PersistenceModel:
 
     @classmethod
     def from_scene(cls, scene: Scene) -> PersistenceModel:
-        """Read the parameters of the scene's detector from the mission database."""
+        """Read the parameters of the scene's detector from the mission database. A missing one raises BadInput."""
 
         def value(name: str, unit: str) -> float:
             return scene.value(f"persistence.{name}", unit)
@@ -84,34 +92,34 @@ class PersistenceModel:
         earlier_seconds: float | None = None,
         variation: PixelVariation | None = None,
     ) -> Frame:
-        """Charge that one earlier exposure releases during a later one.
+        """Return the charge that each pixel releases during an exposure because of one earlier exposure.
 
         Parameters
         ----------
         charge : float array
-            Electrons collected in the earlier exposure.
+            Electrons collected in the earlier exposure. Values are limited to 0 and the full well.
         delay : float
-            Time from the start of the earlier exposure to the start of the later one in seconds, more than 0.
+            Time from the start of the earlier exposure to the start of the later one, in seconds, more than 0.
         seconds : float
             Length of the later exposure in seconds.
         earlier_seconds : float, optional
             Length of the earlier exposure in seconds, by default the nominal length.
         variation : PixelVariation, optional
-            Variation from pixel to pixel. By default all pixels behave like the median pixel.
+            Variation of the parameters from pixel to pixel. By default all pixels behave like the median pixel.
 
         Returns
         -------
-        float array, shape of `charge` (of the detector, with `variation`)
+        float array, shape of `charge`, or of `variation.p2` if it is given
             Electrons released during the later exposure.
 
         Raises
         ------
         OutOfRange
-            If `delay` is not positive.
+            If `delay` is not positive or is NaN.
 
         Notes
         -----
-        The charge released in an exposure longer than nominal is computed with the power law of the median pixel.
+        The effect of an exposure length other than the nominal one is computed with the power law of the median pixel.
         """
         filling = np.clip(charge, 0.0, self.full_well)
         scale = self.time_scaling(delay, seconds, earlier_seconds)
@@ -127,7 +135,7 @@ class PersistenceModel:
                 released.reshape(-1),
             )
             return released
-        # Most pixels hold only sky, all with the same charge: evaluate the exponential once for them.
+        # Most pixels hold only the charge of the sky, which is equal in all pixels: compute its exponential only once.
         lowest = filling.min(initial=self.full_well)
         above = filling > lowest
         released = np.full(filling.shape, self._charge_at_reference(lowest) * scale)
@@ -135,22 +143,27 @@ class PersistenceModel:
         return released
 
     def time_scaling(self, delay: float, seconds: float, earlier_seconds: float | None = None) -> float:
-        """Released charge relative to the reference delay and nominal lengths.
+        """Return the factor by which delay and exposure lengths change the released charge of the median pixel.
 
         Parameters
         ----------
-        delay, seconds, earlier_seconds : float
-            Same as in `released_charge`.
+        delay : float
+            Time from the start of the earlier exposure to the start of the later one, in seconds, more than 0.
+        seconds : float
+            Length of the later exposure in seconds.
+        earlier_seconds : float, optional
+            Length of the earlier exposure in seconds, by default the nominal length.
 
         Returns
         -------
         float
-            Factor to multiply the charge for a delay t0 and lengths T0 by.
+            Released charge, divided by the charge for the reference delay t0 and two exposures of the nominal length
+            T0.
 
         Raises
         ------
         OutOfRange
-            If `delay` is not positive.
+            If `delay` is not positive or is NaN.
         """
         if not delay > 0.0:
             raise OutOfRange("delay of persistence", delay, 0.0, np.inf)
@@ -161,11 +174,18 @@ class PersistenceModel:
         )
 
     def _soak_factor(self, earlier_seconds: float | None) -> float:
-        """Return the traps filled in an exposure relative to one of nominal length: (T / T0)^soak."""
+        """Return the number of traps filled in an earlier exposure, relative to one of the nominal length T0.
+
+        It is (T / T0)^soak, where `earlier_seconds` is the length T in seconds. None gives 1.
+        """
         return 1.0 if earlier_seconds is None else float((earlier_seconds / self.nominal_length) ** self.soak)
 
     def _length_factor(self, delay: float, seconds: float) -> float:
-        """Return the charge released in `seconds` relative to the nominal length: the ratio of integrals of t^power."""
+        """Return the charge released in an exposure of `seconds`, relative to one of the nominal length.
+
+        The released current is proportional to t^power at the time t since the start of the earlier exposure. The
+        result is the ratio of its integrals over the two exposure lengths, both from t = `delay` (seconds).
+        """
         logs, power = (np.log1p(time / delay) for time in (seconds, self.nominal_length)), 1.0 + self.power
         charge, nominal = (x if power == 0.0 else np.expm1(power * x) / power for x in logs)
         return float(charge / nominal)
@@ -176,14 +196,15 @@ class PersistenceModel:
 
 @dataclass(frozen=True, slots=True)
 class PixelVariation:
-    """Variation of persistence from pixel to pixel.
+    """Variation of the persistence parameters p2 and power from pixel to pixel.
 
     Attributes
     ----------
     p2 : float32 array, shape (ny, nx)
-        p2 of each pixel relative to the median.
+        p2 of each pixel divided by p2 of the median pixel. The released charge is proportional to 1 - exp(-I / p2) for
+        I collected electrons.
     power : float32 array, shape (ny, nx)
-        Difference of each pixel's exponent of the delay from the median.
+        Exponent of the time delay of each pixel minus that of the median pixel.
     """
 
     p2: Float32
@@ -193,28 +214,28 @@ class PixelVariation:
 def draw_variation(
     shape: tuple[int, int], p2_spread: float, power_spread: float, rng: np.random.Generator
 ) -> PixelVariation | None:
-    """Draw the variation of persistence from normal distributions.
+    """Draw the variation of the persistence parameters p2 and power from pixel to pixel, from normal distributions.
 
     Parameters
     ----------
     shape : (int, int)
-        Rows and columns of the detector.
+        Number of rows and columns of the detector.
     p2_spread : float
-        Relative standard deviation of p2, 0 to 1. Values below 0.1 of the median are set to 0.1.
+        Standard deviation of p2 relative to its median, 0 to 1. Ratios below 0.1 are set to 0.1.
     power_spread : float
-        Standard deviation of the exponent of the delay, 0 to 1.
+        Standard deviation of `power`, the exponent of the time delay, 0 to 1.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that pixels do not change.
 
     Returns
     -------
     PixelVariation or None
-        None if both standard deviations are 0.
+        For each pixel, p2 divided by its median and `power` minus its median. None if both standard deviations are 0.
 
     Raises
     ------
     OutOfRange
-        If a standard deviation is outside its limits.
+        If `p2_spread` or `power_spread` is outside its limits or NaN.
     """
     for name, value in (("p2", p2_spread), ("time power", power_spread)):
         if not 0.0 <= value <= 1.0:
@@ -227,7 +248,11 @@ def draw_variation(
 
 
 def variation_of_scene(scene: Scene, rng: np.random.Generator) -> PixelVariation | None:
-    """Draw the variation of the scene's detector, with standard deviations from the mission database."""
+    """Draw the pixel-to-pixel variation of the persistence of the scene's detector; None if it has no variation.
+
+    The standard deviations are taken from the mission database. `rng` must be in the same state for every exposure of
+    the detector.
+    """
     p2, power = (scene.value(f"persistence.{name}_spread", "") for name in ("p2", "time_power"))
     return draw_variation((scene.ny, scene.nx), p2, power, rng)
 
@@ -245,11 +270,12 @@ def _release(filling: Any, p2: Any, power: Any, constants: Any, out: Any) -> Non
     offset, slope, median_p2, scale, log_time, max_power = constants
     inverse = 1.0 / median_p2
     for i in range(len(filling)):
-        # Limit the exponent so that released charge never grows with time.
+        # The released charge is proportional to the delay to a power. Limit this exponent to 0, so that the charge
+        # never grows with the delay.
         growth = small_exp(min(power[i], max_power) * log_time)
         out[i] = (offset + slope * filling[i]) * -small_expm1(-filling[i] * inverse / p2[i]) * scale * growth
-    # Replace pixels outside the range of the series. A branch in the first loop would prevent its vectorisation, which
-    # costs more than computing a few pixels twice.
+    # Compute pixels again for which the power series of exp in the first loop is not accurate. An `if` in that loop
+    # would prevent its vectorisation, which costs more than computing a few pixels twice.
     for i in range(len(filling)):
         x, time = filling[i] * inverse / p2[i], min(power[i], max_power) * log_time
         if x > SMALL or abs(time) > SMALL_EXP:
@@ -257,18 +283,19 @@ def _release(filling: Any, p2: Any, power: Any, constants: Any, out: Any) -> Non
 
 
 def apply(frame: Frame, released: Frame | None, spread: float, rng: np.random.Generator) -> Frame:
-    """Add the charge released from earlier exposures.
+    """Add the charge released from traps that were filled in earlier exposures to a frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     released : float array, shape (ny, nx), or None
-        Electrons that pixels with the median number of traps release. None if there are no earlier exposures.
+        Electrons released by each pixel if it had the median number of traps. None if there are no earlier exposures.
     spread : float
-        Relative standard deviation of the number of traps from pixel to pixel, 0 to 10. Negative numbers become 0.
+        Standard deviation of the number of traps per pixel, relative to the median, 0 to 10. Negative numbers of traps
+        are set to 0.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the number of traps is the same.
 
     Returns
     -------
@@ -278,7 +305,7 @@ def apply(frame: Frame, released: Frame | None, spread: float, rng: np.random.Ge
     Raises
     ------
     OutOfRange
-        If `spread` is outside its limits.
+        If `spread` is outside its limits or NaN.
     BadInput
         If the shapes of `frame` and `released` differ.
     """

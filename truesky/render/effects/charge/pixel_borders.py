@@ -1,8 +1,9 @@
 """Displaced pixel borders: lateral electric fields in a thick detector move charge into neighbouring pixels.
 
 The charge that crosses a border is the light in the strip between the nominal and the displaced border, interpolated
-between the pixels. One pass therefore moves sources, changes their shapes and produces the pattern in a flat field,
-and it conserves charge.
+between the pixels. This transfer of charge moves sources, changes their shapes and produces a pattern in a flat field,
+and it conserves charge. The effect `RINGS` describes tree rings (circular variations of the silicon's doping), and
+`EDGES` the fields near the edges of the detector.
 
 References
 ----------
@@ -21,35 +22,38 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Sampling of the table of radial displacements in pixels.
+# Step in pixels of the distance from the axis of the wafer, in the table of displacements of charge by tree rings.
 _STEP = 0.25
-# Largest fraction of a pixel's charge that can cross one border. The model holds for narrow strips only.
+# Largest fraction of a pixel's charge that can cross one border. More is limited to this, because the model holds only
+# if charge moves by a small part of a pixel.
 _MAX_CROSSING = 0.2
-# Distance from an edge, in scale lengths, beyond which its displacement is set to 0.
+# Charge farther than this distance from an edge of the detector is not displaced by its field. The unit is the scale
+# length, over which the displacement falls by a factor of e.
 _EDGE_RANGE = 8.0
-# Change of a pixel relative to a star's peak, per pixel of displacement: the steepest slope of a Gaussian with an rms
-# of one pixel.
+# Largest change of a pixel if the image of a star is displaced, divided by the displacement in pixels and by the peak
+# of the star: the steepest slope of a Gaussian with an rms of one pixel.
 _MAX_SLOPE = 0.6
 
 
 def apply_rings(
     frame: Frame, amplitude: float, inner: float, outer: float, centre: float, rng: np.random.Generator
 ) -> Frame:
-    """Displace charge by tree rings.
+    """Displace charge radially by tree rings: circles of varying doping of the silicon, about the axis of the wafer.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons, without noise.
     amplitude : float
-        Relative amplitude of the rings in a flat field, 0 to 0.1.
+        Relative amplitude of the rings in a flat field, 0 to 0.1. With 0 the charge is not displaced.
     inner, outer : float
-        Period in pixels at the point of the detector nearest to the wafer's axis and farthest from it, 2 to 1e5.
+        Period of the rings in pixels, at the point of the detector nearest to the wafer's axis and at the farthest
+        point, 2 to 1e5. The period is linear in between.
     centre : float
-        Distance in pixels from the detector's centre to the wafer's axis, along rows and along columns. The signs are
-        random.
+        Distance in pixels from the detector's centre to the wafer's axis, both along rows and along columns. The signs
+        of the two distances are random.
     rng : numpy.random.Generator
-        Random numbers of the detector (position of the axis, phase of the rings), the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, for the signs and the phase of the rings.
 
     Returns
     -------
@@ -59,11 +63,11 @@ def apply_rings(
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `amplitude`, `inner` or `outer` is outside its limits or NaN.
 
     Notes
     -----
-    For displacements up to 0.05 pixels, the error is 1e-4 pixels in centroids and 6e-4 in second moments.
+    For displacements up to 0.05 pixels, the error is 1e-4 pixels in centroids and 6e-4 pixels^2 in second moments.
     """
     if not 0.0 <= amplitude <= 0.1:
         raise OutOfRange("amplitude of tree rings", amplitude, 0.0, 0.1)
@@ -78,19 +82,19 @@ def apply_rings(
 
 
 def distance_range(nx: int, ny: int, axis: tuple[float, float]) -> tuple[float, float]:
-    """Smallest and largest distance between a detector and the wafer's axis.
+    """Return the smallest and the largest distance from the wafer's axis to points of a detector.
 
     Parameters
     ----------
     nx, ny : int
-        Columns and rows.
+        Number of columns and rows of the detector.
     axis : (float, float)
         Column and row of the wafer's axis in pixels.
 
     Returns
     -------
     r_min, r_max : float
-        Distances in pixels.
+        Distances in pixels. `r_min` is 0 if the axis is on the detector.
     """
     sides = list(zip((nx, ny), axis, strict=True))
     r_min = [max(-0.5 - at, at - n + 0.5, 0.0) for n, at in sides]
@@ -101,28 +105,28 @@ def distance_range(nx: int, ny: int, axis: tuple[float, float]) -> tuple[float, 
 def radial_displacement(
     amplitude: float, periods: tuple[float, float], phase: float, r_min: float, r_max: float
 ) -> Frame:
-    """Radial displacement of charge by tree rings.
+    """Return a table of the displacement of charge by tree rings, away from the wafer's axis.
 
     Parameters
     ----------
     amplitude : float
-        Relative amplitude of the rings in a flat field.
+        Relative amplitude of the rings in a flat field. Not checked.
     periods : (float, float)
-        Periods in pixels at `r_min` and `r_max`, 2 to 1e5; linear between them.
+        Periods of the rings in pixels at `r_min` and `r_max`, 2 to 1e5; linear between them.
     phase : float
-        Phase at `r_min` in radians.
+        Phase of the rings in radians, 0.25 pixels before `r_min`.
     r_min, r_max : float
-        Distances from the wafer's axis in pixels.
+        Smallest and largest distance from the wafer's axis in pixels.
 
     Returns
     -------
-    float array
+    float array, shape (n,)
         Outward displacement in pixels at the distances r_min, r_min + 0.25, ... up to at least r_max.
 
     Raises
     ------
     OutOfRange
-        If a period is outside its limits.
+        If a period is outside its limits or NaN.
 
     Notes
     -----
@@ -139,14 +143,14 @@ def radial_displacement(
 
 
 def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Generator | None = None) -> Frame:
-    """Displace charge towards the edges of the detector, or away from them if `shift` is negative.
+    """Displace charge towards the nearest edges of the detector, or away from them if `shift` is negative.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     shift : float
-        Displacement at the edge in pixels, -0.5 to 0.5.
+        Displacement of the charge at the edge in pixels, -0.5 to 0.5, positive towards the edge.
     length : float
         Distance in pixels over which the displacement falls by a factor of e, 0.01 to 1000.
     rng : numpy.random.Generator, optional
@@ -160,7 +164,7 @@ def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Genera
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `shift` or `length` is outside its limits or NaN.
     """
     if not -0.5 <= shift <= 0.5:
         raise OutOfRange("displacement at the edge", shift, -0.5, 0.5)
@@ -173,7 +177,11 @@ def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Genera
 
 
 def _edge_displacement(n: int, shift: float, length: float) -> Frame:
-    """Return the displacement at the upper border of each of n pixels along an axis."""
+    """Return by how many pixels charge is displaced at the border between each of n pixels along an axis and the next.
+
+    The result is positive towards higher pixel indices. `shift` is the displacement at both edges of the detector in
+    pixels, positive towards the nearer edge. `length` is the distance in pixels over which it falls by a factor of e.
+    """
     border = np.arange(n) + 0.5
     to_start, to_end = border + 0.5, n - 0.5 - border
     displacement = shift * (np.exp(-to_end / length) - np.exp(-to_start / length))
@@ -182,10 +190,11 @@ def _edge_displacement(n: int, shift: float, length: float) -> Frame:
 
 @jit
 def _cross_borders(frame: Any, table: Any, r_min: float, axis: Any, columns: Any, rows: Any, out: Any) -> None:
-    """Add the charge that crosses the borders of `frame` to `out`.
+    """Move charge of `frame` across the borders of pixels, and add the changes (electrons) to `out` in place.
 
-    `table` contains radial displacements from the distance `r_min`; `columns` and `rows` contain additional
-    displacements at the upper border of each column and row.
+    `table` contains displacements of charge away from `axis` (column, row) in pixels, at distances from `r_min` in
+    steps of `_STEP` pixels. `columns` and `rows` contain additional displacements in pixels, at the border of each
+    column or row with the next one, positive towards the next one.
     """
     ny, nx = frame.shape
     rings = table.min() != table.max()
@@ -210,7 +219,11 @@ def _cross_borders(frame: Any, table: Any, r_min: float, axis: Any, columns: Any
 
 @jit
 def _component(table: Any, r_min: float, along: float, across: float) -> Any:
-    """Return the component in direction `along` of the radial displacement at (along, across) from the axis."""
+    """Return the component along one axis of the detector of a displacement away from the axis of the wafer, in pixels.
+
+    The position is `along` this axis of the detector and `across` it, in pixels from the axis of the wafer. The
+    displacement is interpolated in `table`, from the distance `r_min` in steps of `_STEP` pixels.
+    """
     distance = math.sqrt(along * along + across * across)
     position = (distance - r_min) / _STEP
     i = min(max(int(position), 0), len(table) - 2)
@@ -220,20 +233,21 @@ def _component(table: Any, r_min: float, along: float, across: float) -> Any:
 
 @jit
 def _strip_charge(d: float, q0: float, q1: float, q2: float, q3: float, inside: bool) -> float:
-    """Return the charge that moves across the border between q1 and q2, displaced by d pixels; negative if d is.
+    """Return the charge that moves from one pixel to the next if charge at their border is displaced by d pixels.
 
-    q0 to q3 are the charges of four successive pixels. At the edge of the detector (`inside` is False) q0 and q3 are
-    not used.
+    q0 to q3 are the charges of four successive pixels in electrons, and the border is between q1 and q2. `d` and the
+    result are positive from q1 to q2. At the edge of the detector (`inside` is False) q0 and q3 are not used. At most a
+    fifth of the charge of a pixel moves.
     """
-    # Value at the border, interpolated from four pixels (from two at the edges of the detector).
+    # Electrons per pixel at the border, interpolated from four pixels, or from two at the edges of the detector.
     level = (7.0 * (q1 + q2) - q0 - q3) / 12.0 if inside else 0.5 * (q1 + q2)
     moved = d * (level - 0.5 * d * (q2 - q1))
-    # The interpolation overshoots next to a sharp peak.
+    # Limit the moved charge, because the interpolation overshoots next to a sharp peak.
     return min(max(moved, -_MAX_CROSSING * max(q2, 0.0)), _MAX_CROSSING * max(q1, 0.0))
 
 
 def _value_or_zero(scene: Scene, key: str, unit: str) -> float:
-    """Return a parameter of the detector, or 0 for cameras without it."""
+    """Return a parameter of the detector in the given unit, or 0 for cameras that have no such parameter."""
     return scene.value(key, unit) if f"{scene.section}.{key}" in scene.mission else 0.0
 
 

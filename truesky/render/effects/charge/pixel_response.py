@@ -1,4 +1,4 @@
-"""Pixel response: sensitivity variations (PRNU), dead pixels, dark columns, and dust on the detector."""
+"""Pixel response: sensitivity variations from pixel to pixel (PRNU), dead pixels, dark columns, and dust shadows."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
+# Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
+# is above the part and False if it is below).
 Segments = Sequence[tuple[int, int, bool]]
-# Arguments of `response` from `rms` to `segments`.
+# Parameters of the function `response`: standard deviation of the sensitivity between pixels, fraction of dead pixels,
+# mean number of dark columns, three numbers for dust (grains per pixel, mean radius of shadows in pixels, absorbed
+# fraction of the light), and parts of the columns (`Segments`).
 Parameters = tuple[float, float, float, tuple[float, float, float], Segments]
 
-# Highest sensitivity of a dead pixel.
+# Highest sensitivity of a dead pixel, relative to a normal pixel. It is uniform between 0 and this.
 _MAX_DEAD = 0.5
-# Radius in standard deviations to which a dust shadow is drawn.
+# The Gaussian shadow of a dust grain is drawn up to this distance from its centre, in standard deviations.
 _SHADOW_RANGE = 4.0
 
 
@@ -33,25 +36,37 @@ def apply(
     segments: Segments,
     rng: np.random.Generator,
 ) -> Frame:
-    """Multiply a frame by the pixel response.
+    """Multiply a frame by the sensitivity of each pixel, which is the same in every exposure.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
-    rms, dead, dark_columns : float
-        Same as in `response`.
+    rms : float
+        Standard deviation of the sensitivity between pixels, 0 to 1.
+    dead : float
+        Fraction of dead pixels, 0 to 1.
+    dark_columns : float
+        Mean number of dark columns, 0 to 1e4. A dark column has no signal on the far side of a defect, as seen from the
+        serial register.
     dust : (float, float, float)
-        Same as in `response`.
+        Dust grains per pixel (0 to 0.1), mean radius (Gaussian sigma) of their shadows in pixels (0 to 1000), and
+        fraction of light absorbed at the centre of a shadow (0 to 1).
     segments : sequence of (int, int, bool)
-        Same as in `response`.
+        Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
+        register is above).
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the sensitivity does not change.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons.
+        Detected electrons.
+
+    Raises
+    ------
+    OutOfRange
+        If a number is outside its limits or NaN.
     """
     out = response(frame.shape, rms, dead, dark_columns, dust, segments, rng)
     out *= frame
@@ -67,36 +82,38 @@ def response(
     segments: Segments,
     rng: np.random.Generator,
 ) -> Frame:
-    """Relative sensitivity of every pixel.
+    """Return the sensitivity of every pixel relative to the mean, with dead pixels, dark columns and dust shadows.
 
     Parameters
     ----------
     shape : (int, int)
-        Rows and columns.
+        Number of rows and columns.
     rms : float
         Standard deviation of the sensitivity between pixels, 0 to 1.
     dead : float
         Fraction of dead pixels, 0 to 1. Their sensitivity is uniform between 0 and 0.5.
     dark_columns : float
-        Mean number of dark columns, 0 to 1e4. A dark column has a defect in a random row; pixels on the far side of
-        the defect, as seen from the serial register, have no signal.
+        Mean number of dark columns, 0 to 1e4. Their number has a Poisson distribution. A dark column has a defect in a
+        random row. Pixels on the far side of the defect, as seen from the serial register, have a sensitivity of 0.
     dust : (float, float, float)
-        Dust grains per pixel, 0 to 0.1; mean radius (Gaussian sigma) of their shadows in pixels, 0 to 1000,
-        exponentially distributed; and fraction of light absorbed at the centre of a shadow, 0 to 1.
+        Mean number of dust grains per pixel (0 to 0.1), mean radius of their shadows in pixels (0 to 1000), and
+        fraction of light absorbed at the centre of a shadow (0 to 1). A radius is the standard deviation of a Gaussian
+        shadow; the radii have an exponential distribution.
     segments : sequence of (int, int, bool)
-        Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
+        Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
+        register is above).
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the sensitivity does not change.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Sensitivity, 0 or more. The mean is 1 apart from defects and dust.
+        Sensitivity, 0 or more. Its mean is 1 apart from dead pixels, dark columns and dust.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `rms`, `dead`, `dark_columns` or a number of `dust` is outside its limits or NaN.
     """
     grains, radius, depth = dust
     for name, value, highest in (
@@ -113,7 +130,7 @@ def response(
     out[..., rows, columns] = _MAX_DEAD * rng.random(count)
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
         row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx))
-        # Charge from beyond the defect cannot pass it on its way to the serial register.
+        # Charge from pixels beyond the defect cannot pass the defect on its way to the serial register.
         for first, past, register_above in segments:
             if first <= row < past:
                 out[..., slice(first, row + 1) if register_above else slice(row, past), column] = 0.0
@@ -125,7 +142,11 @@ def response(
 
 
 def _multiply_shadow(out: Frame, y: float, x: float, sigma: float, depth: float) -> None:
-    """Multiply by the Gaussian shadow of a dust grain, in place."""
+    """Multiply sensitivities by the Gaussian shadow of one dust grain, in place.
+
+    `x`, `y` and `sigma` are its centre and standard deviation in pixels, and `depth` is the fraction of light absorbed
+    at the centre. Nothing changes if `sigma` is 0.
+    """
     if sigma == 0.0:
         return
     (rows, up), (columns, across) = (
@@ -143,7 +164,12 @@ def _draw_sensitivity(out: Any, rms: float, key: Any) -> None:
 
 
 def parameters(scene: Scene) -> Parameters:
-    """Return the arguments of `response` from `rms` to `segments` for a scene."""
+    """Return the parameters of `response` for the detector of a scene, from the mission database.
+
+    They are the standard deviation of the sensitivity between pixels, the fraction of dead pixels, the mean number of
+    dark columns, three numbers for dust, and the parts of the columns that are read through one serial register. Dust
+    has grains per pixel, the mean radius of their shadows in pixels, and the fraction of light absorbed at the centre.
+    """
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
     return rms, dead, dark_columns, dust, scene.column_segments

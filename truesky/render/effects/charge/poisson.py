@@ -12,24 +12,25 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, map_pixels, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Mean below which the cumulative probabilities are summed exactly; above it an asymptotic series is used.
+# For means below this number the cumulative probabilities are summed exactly. Above it an asymptotic series is used.
 _EXACT_BELOW = 10.0
 
 
 def apply(frame: Frame, rng: np.random.Generator) -> Frame:
-    """Draw a Poisson count for each pixel.
+    """Draw a random count of electrons for each pixel from a Poisson distribution.
 
     Parameters
     ----------
     frame : float array, any shape
-        Expected electrons. Negative values (ringing of Fourier transforms) count as 0.
+        Expected electrons. Negative values, which ringing of Fourier transforms causes, are treated as 0.
     rng : numpy.random.Generator
-        Source of the key from which each pixel derives its own random number.
+        Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
+        index.
 
     Returns
     -------
-    float array, same shape
-        Whole electrons.
+    float array, shape of `frame`
+        Electrons, whole numbers.
 
     Notes
     -----
@@ -54,21 +55,21 @@ def _draw_counts(means: Any, counts: Any, key: Any) -> None:
 
 @jit
 def draw_count(mean: float, p_zero: float, bits: Any) -> Any:
-    """Draw a Poisson count from given random bits.
+    """Draw a count from a Poisson distribution with given random bits.
 
     Parameters
     ----------
     mean : float
         Expected count, 0 or more.
     p_zero : float
-        exp(-mean), computed once by the caller; used only if `mean` < 10.
+        exp(-mean), which the caller computes once for many pixels. It is used only if `mean` < 10.
     bits : uint64
         Random bits of the pixel.
 
     Returns
     -------
     float
-        The count, a whole number.
+        The count, a whole number. For `mean` < 10 it is at most 200.
     """
     if mean < _EXACT_BELOW:
         u, term, count = pixel_random.uniform(bits), p_zero, 0.0

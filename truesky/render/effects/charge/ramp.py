@@ -1,26 +1,32 @@
-"""Up-the-ramp readout: an infrared detector is read without being reset, and groups of reads are averaged.
+"""Up-the-ramp readout: an infrared detector is read many times during an exposure without being reset.
+
+A ramp is this series of reads, and each read of the detector is a frame. Successive frames are averaged in groups.
 
 A ramp has n_g groups of r reads, with d dropped frames between two groups: r n_g + d (n_g - 1) frames after the reset.
-The signal of a pixel is measured from the n = n_g - 1 differences D_i of successive groups; a group G_i is the mean
-charge of its r reads. The counts of all frames are Poisson with f expected electrons per frame. An electron that
-arrives in the j-th frame of a group has the weight (r - j + 1) / r in that group. Therefore::
+The signal of a pixel is measured from the n = n_g - 1 differences D_i of successive groups. A group G_i is the mean
+charge of its r reads. The number of electrons that arrive in each frame has a Poisson distribution with the mean f. An
+electron that arrives in the j-th frame of a group has the weight (r - j + 1) / r in that group. The moments, three of
+which are called a, b and v, are therefore::
 
     mean D_i            = f (r + d)
-    var D_i         a   = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
-    cov(D_i, D_i+1) b   = f (r^2 - 1) / (6 r),        all others 0
-    var G_1         v   = f (r + 1) (2 r + 1) / (6 r), cov(G_1, D_1) = b
+    var D_i         = a = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
+    cov(D_i, D_i+1) = b = f (r^2 - 1) / (6 r),        all other covariances of differences are 0
+    var G_1         = v = f (r + 1) (2 r + 1) / (6 r),    cov(G_1, D_1) = b
 
-Drawing a count for every frame is slow. A first-order moving average has the same moments: with
-c0, c1 = (sqrt(a + 2 b) +- sqrt(a - 2 b)) / 2 and standard normal e_i::
+Drawing a count for every frame is slow. A first-order moving average has the same moments. It consists of independent
+standard normal deviates e_0, e_1, ..., e_n and e::
 
-    D_i = mean + c1 e_i + c0 e_i-1,    G_1 = f (r + 1) / 2 + c1 e_0 + sqrt(v - c1^2) e.
+    D_i = f (r + d) + c1 e_i + c0 e_i-1,                c0 = (sqrt(a + 2 b) + sqrt(a - 2 b)) / 2
+    G_1 = f (r + 1) / 2 + c1 e_0 + sqrt(v - c1^2) e,    c1 = (sqrt(a + 2 b) - sqrt(a - 2 b)) / 2
 
 It needs n + 2 random numbers. (e_0 must have the smaller coefficient in G_1, because c0^2 > v.)
 
-The third moments of the Poisson distribution are added to the sum T of the differences. Let h_k be the weight of an
-electron of frame k in D_i, H = sum_i h and g = sum_i h^2 - H^2 / n. T and the sum of squares SS = sum (D - mean D)^2
-have the joint cumulants K3 f = f sum H^3 and C = f sum H g, and var SS = V_S = V_G + f C4 with C4 = sum g^2, where V_G
-is the variance for normal deviates. The transformation::
+The third moments of the Poisson distribution are added to T, the sum of the differences minus its mean n f (r + d).
+Below, the D_i are also without their means. Let h_ik be the weight of an electron of frame k in D_i, H_k = sum_i h_ik
+and g_k = sum_i h_ik^2 - H_k^2 / n. The sum of squares is SS = sum_i (D_i - T / n)^2, and its expectation is E SS. The
+third cumulant of T is K3 f with K3 = sum_k H_k^3. The covariance of T and SS is C = f sum_k H_k g_k. The variance of T
+is V_T. The variance of SS is V_S = V_G + f C4 with C4 = sum_k g_k^2, where V_G is the variance for normal deviates. The
+transformation::
 
     T -> T sqrt(1 - C^2 V_G / (V_T V_S^2)) + C / V_S (SS - E SS) + K3 f (z^2 - 1) / (6 V_T),    z = T / sqrt(V_T)
 
@@ -30,9 +36,9 @@ is the variance for normal deviates. The transformation::
 preserves the variance of T. It reproduces the fraction V_G / V_S of the covariance C. The fraction is below 0.9 only
 for pixels with fewer than about ten electrons, in which read noise dominates.
 
-Every frame is drawn for pixels in which the charge is not linear in the counts: with a cosmic ray, near full well, or
-with enough charge for the nonlinearity to change the noise. Full well and nonlinearity act on the charge of each frame,
-before groups are averaged.
+For most pixels the moving average is used. The count of every frame is drawn for pixels in which the charge is not
+proportional to the counts. These are pixels with a cosmic ray, near full well, or with enough charge for the
+nonlinearity to change the noise. Full well and nonlinearity act on the charge of each frame, not on averaged groups.
 
 References
 ----------
@@ -58,29 +64,41 @@ from truesky.render.effects.charge import poisson
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Electrons at the end of a ramp above which every frame is drawn. There the nonlinearity changes the noise by
+# Pixels with more electrons than this at the end of a ramp, with a cosmic ray or near full well get a random count of
+# electrons for every frame (read of the detector), which is slow. All other pixels get random groups of averaged
+# frames. At this number N the nonlinearity, with which N electrons are read as N (1 - b N), changes the noise by
 # 2 b N = 0.4 %.
 LINEAR_BELOW = 3000.0
-# Largest relative difference between the frame time that gives the requested exposure time and that of the mission.
+# Largest relative difference between the frame time (time between two reads of the detector) that gives the requested
+# exposure time and the frame time in the mission database. `find_mode` raises BadInput if more is needed.
 FRAME_TOLERANCE = 0.02
-# Difference in the number of drops below which an exposure time counts as nominal.
+# The number of dropped frames between two groups that gives an exposure time exactly is not always an integer. If it
+# differs from the number in the mission database by less than this constant, the number in the database is used.
 _DROPS_TOLERANCE = 1e-6
-# Limit on the number of groups, of reads per group and of drops.
+# Largest number of groups of a ramp, of reads per group and of dropped frames between two groups. `Mode` raises
+# OutOfRange above it.
 _MAX_COUNT = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """Readout of a ramp, MACC(groups, reads, drops) (multi-accumulation).
+    """Readout mode of a ramp (a series of reads without reset): MACC(groups, reads, drops), "multi-accumulation".
 
     Attributes
     ----------
     groups : int
-        Number of averaged groups, 2 to 1000.
+        Number of groups of averaged reads, 2 to 1000.
     reads : int
-        Frames per group, 1 to 1000.
+        Number of frames (reads of the detector) per group, 1 to 1000.
     drops : int
-        Dropped frames between two groups, 0 to 1000.
+        Number of unused frames between two groups, 0 to 1000.
+
+    Raises
+    ------
+    OutOfRange
+        If a number is outside its limits.
+    BadInput
+        If the ramp has more than `MAX_FRAMES` = 4000 frames from the reset to the last read.
     """
 
     groups: int
@@ -99,34 +117,50 @@ class Mode:
 
     @property
     def differences(self) -> int:
-        """Number of differences of successive groups."""
+        """Number of differences between successive groups of averaged reads: one less than the number of groups."""
         return self.groups - 1
 
     @property
     def frames(self) -> int:
-        """Number of frames from the reset to the last read."""
+        """Number of frames (reads of the detector, used or dropped) from the reset to the last read."""
         return ramps.frame_count(self.groups, self.reads, self.drops)
 
     @property
     def integration_frames(self) -> int:
-        """Number of frames from the first group to the last, the integration time of the signal."""
+        """Number of frames from the first read of the first group to the first read of the last group.
+
+        The measured signal of a pixel is the charge that arrives in these frames.
+        """
         return self.differences * (self.reads + self.drops)
 
     @property
     def alpha(self) -> float:
-        """Relative excess of the variance of a difference of groups over its mean count, 0 or negative."""
+        """Variance of the difference between two successive groups of reads, divided by the mean difference, minus 1.
+
+        A group is the mean of its reads, in electrons. Only shot noise is included. The value is 0 for one read per
+        group, otherwise negative.
+        """
         return (1.0 - self.reads**2) / (3.0 * self.reads * (self.reads + self.drops))
 
     def weights(self) -> Float:
-        """Weight of an electron of each frame in each difference of groups, shape (differences, frames)."""
+        """Return by how much one electron increases each difference of successive groups, by the frame of its arrival.
+
+        A group is the mean of several reads. The result is float64[differences, frames] in electrons, 0 to 1. Frames
+        (reads of the detector, used or dropped) are counted from the reset.
+        """
         frame = np.arange(self.frames)
         first = np.arange(self.groups)[:, None] * (self.reads + self.drops)
-        # An electron is present in the reads of a group from its own frame on.
+        # An electron is present in the read of the frame in which it arrives, and in all later reads.
         in_group = np.clip(first + self.reads - frame[None, :], 0, self.reads) / self.reads
         return np.diff(in_group, axis=0)
 
     def third_moments(self) -> tuple[float, float, float]:
-        """Return the cumulants (K3, C / f, C4) of the module docstring."""
+        """Return three constants of the readout mode, with which groups of reads get the skewness of Poisson counts.
+
+        Let h_ik be the amount by which an electron that arrives in frame k increases the difference i of the n
+        differences of successive groups. With H_k = sum_i h_ik and g_k = sum_i h_ik^2 - H_k^2 / n, the constants are
+        the sums over k of H_k^3, H_k g_k and g_k^2. The module docstring explains their use.
+        """
         h = self.weights()
         total = h.sum(axis=0)
         g = (h**2).sum(axis=0) - total**2 / self.differences
@@ -134,33 +168,39 @@ class Mode:
 
 
 def mode_of_scene(scene: Scene) -> Mode:
-    """Return the readout mode of a scene, see `find_mode`."""
+    """Return the readout mode (numbers of groups, reads and dropped frames) for the exposure time of a scene.
+
+    BadInput is raised if no mode fits the exposure time, see `find_mode`.
+    """
     return find_mode(scene.ramp, scene.exposure_time_s, scene.section, scene.mission)
 
 
 def find_mode(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> Mode:
-    """Readout mode for an exposure time: the mission's mode with the number of drops adjusted.
+    """Return the readout mode of a ramp for an exposure time.
+
+    It has the groups and reads of the mode in the mission database, and the number of dropped frames that fits best.
 
     Parameters
     ----------
     kind : {"photometric", "spectroscopic"}
-        Ramp of the mission.
+        Name of the ramp in the mission database.
     seconds : float
         Exposure time in seconds.
     section : str
-        Section of the camera in the mission database, such as "nisp".
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     Mode
+        Numbers of groups, reads per group and dropped frames between groups.
 
     Raises
     ------
     BadInput
-        If the reads alone take longer, there would be too many frames, or the best number of drops needs a frame time
-        that differs from the mission's by more than `FRAME_TOLERANCE`.
+        If the exposure time is too short even without dropped frames, or too long for the allowed number of frames.
+        Also if it needs a frame time that differs from the mission's by more than `FRAME_TOLERANCE` = 2 %.
     """
     key = f"{section}.macc.{kind}"
     groups, reads, drops = (int(mission.value(f"{key}.{name}")) for name in ("groups", "reads", "drops"))
@@ -183,52 +223,55 @@ def find_mode(kind: str, seconds: float, section: str, mission: MissionConfigura
 
 
 def duration(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
-    """Time from the reset to the last read of an exposure.
+    """Return the time from the reset of the detector to the last read of an exposure.
 
     Parameters
     ----------
     kind : {"photometric", "spectroscopic"}
-        Ramp of the mission.
+        Name of the ramp (readout mode) in the mission database.
     seconds : float
         Exposure time in seconds.
     section : str
-        Section of the camera in the mission database, such as "nisp".
+        Prefix of the camera's parameters in the mission database, such as "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float
-        Time in seconds.
+        Time in seconds. It is longer than the exposure time, which begins with the first group of reads.
 
     Raises
     ------
     BadInput
-        If `find_mode` finds no readout mode.
+        If no readout mode fits the exposure time, see `find_mode`.
     """
     mode = find_mode(kind, seconds, section, mission)
     return seconds * mode.frames / mode.integration_frames
 
 
 def frame_time(scene: Scene) -> float:
-    """Return the frame time in seconds: the mission's, adjusted by up to `FRAME_TOLERANCE` to the exposure time."""
+    """Return the time between two frames of a ramp in seconds, adjusted to the exposure time of the scene.
+
+    It differs by up to `FRAME_TOLERANCE` = 2 % from the frame time in the mission database.
+    """
     return scene.exposure_time_s / mode_of_scene(scene).integration_frames
 
 
 def with_planes(frame: Frame, count: int) -> Frame:
-    """Extend an input of `apply` to a number of planes.
+    """Copy an array of pixels, and add planes of zeros until it has a given number of planes.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx) or (n, ny, nx)
-        Input of `apply`, with at most `count` planes.
+        One plane, or n planes. n must not exceed `count`, which is not checked.
     count : int
-        Number of planes.
+        Number of planes of the result.
 
     Returns
     -------
     float32 array, shape (count, ny, nx)
-        A copy of `frame`, followed by planes of zeros.
+        The planes of `frame`, followed by planes of zeros.
     """
     out = np.empty((count, *frame.shape[-2:]), np.float32)
     planes = frame.reshape(-1, *frame.shape[-2:])
@@ -237,42 +280,45 @@ def with_planes(frame: Frame, count: int) -> Frame:
 
 
 def signal_at_full_well(scene: Scene, charge_b: float = 0.0, signal_b: float = 0.0) -> float:
-    """Signal of a pixel that reaches full well at the end of the ramp.
+    """Return the signal that is measured in a pixel that reaches full well exactly at the end of the ramp.
 
     Parameters
     ----------
     scene : Scene
-        The exposure.
+        Settings of the exposure: readout mode and full well.
     charge_b, signal_b : float
-        Coefficient b of the nonlinearity N (1 - b N) in 1/electron, of the charge of a frame and of the signal.
+        Coefficients b in 1/electron of the nonlinearity, with which N electrons are read as N (1 - b N). `charge_b` is
+        for the charge of each read, `signal_b` for the measured signal. With 0 there is no nonlinearity.
 
     Returns
     -------
     float
-        Electrons measured in the integration time.
+        Signal in electrons: the increase of the charge from the first to the last group of averaged reads.
     """
     mode, full = mode_of_scene(scene), scene.value("full_well", "electron")
     signal = full * (1.0 - charge_b * full) * mode.integration_frames / mode.frames
-    # N (1 - b N) has its maximum at 1 / (2 b). Larger signals are set to it.
+    # The measured signal N (1 - b N) has its maximum at N = 1 / (2 b). Larger N are set to 1 / (2 b).
     signal = min(signal, 0.5 / signal_b) if signal_b > 0.0 else signal
     return signal * (1.0 - signal_b * signal)
 
 
 def full_pixels(frame: Frame, mode: Mode, full_well: float) -> Bool:
-    """Mask of the pixels that are expected to reach full well by the end of the ramp.
+    """Return a mask of the pixels that are expected to reach full well by the end of the ramp.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx) or (n, ny, nx)
-        Input of `apply`.
+        Electrons expected in the integration time, from the first to the last group of reads. With n planes (2 or
+        more), these are in plane 0, and plane 1 contains the charge of cosmic rays in electrons.
     mode : Mode
-        Readout of the ramp.
+        Readout mode of the ramp.
     full_well : float
         Full well in electrons.
 
     Returns
     -------
     bool array, shape (ny, nx)
+        True for pixels whose expected charge at the end of the ramp is at least `full_well`.
     """
     light, charge = (frame[0], frame[1]) if frame.ndim == 3 else (frame, 0.0)
     return np.asarray(light * (mode.frames / mode.integration_frames) + charge >= full_well)
@@ -286,32 +332,37 @@ def apply(
     *,
     rng: np.random.Generator,
 ) -> Frame:
-    """Draw the charge of the groups of a ramp.
+    """Draw the charge of each group of a ramp (averaged reads without reset), with shot noise.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx), (3, ny, nx) or (4, ny, nx)
-        Plane 0: electrons expected in the integration time. Planes 1 and 2: charge of cosmic rays in electrons, and
-        the time at which it arrives as a fraction of the ramp, 0 <= time < 1. Plane 3: coefficient b of the
-        nonlinearity N (1 - b N) in 1/electron.
+        Plane 0: electrons expected in the integration time, from the first to the last group. Planes 1 and 2: charge of
+        cosmic rays in electrons, and the time at which it arrives, 0 <= time < 1, in units of the time from the reset
+        to the last read. Plane 3: coefficient b in 1/electron of the nonlinearity, with which N electrons are read as
+        N (1 - b N).
     mode : Mode
-        Readout of the ramp.
+        Readout mode of the ramp.
     full_well : float
-        Highest charge of a pixel in electrons, 0 to 1e9.
+        Highest charge of a pixel in electrons, more than 0, below 1e9.
     linear_below : float, optional
-        Electrons at the end of the ramp up to which the moving average is used. With 0, every frame is drawn.
+        Number of electrons at the end of the ramp. Pixels with at most this number of expected electrons are drawn with
+        a fast method that has the correct means and covariances of the groups, unless a cosmic ray hits them or they
+        may reach full well. In all others the count of every frame (read of the detector) is drawn; with 0 this is done
+        in all pixels with light.
     rng : numpy.random.Generator
-        Source of the keys from which each pixel derives its random numbers.
+        Random generator from which two 64-bit keys are drawn. Each pixel derives its random numbers from the keys and
+        its index.
 
     Returns
     -------
     float32 array, shape (groups, ny, nx)
-        Electrons.
+        Mean charge of the reads of each group in electrons, without read noise.
 
     Raises
     ------
     OutOfRange
-        If `full_well` is outside its limits.
+        If `full_well` is outside its limits or NaN.
     """
     if not 0.0 < full_well < 1e9:
         raise OutOfRange("full well", full_well, 0.0, 1e9)
@@ -350,7 +401,8 @@ def _draw_ramps(
     frames = groups * reads + (groups - 1) * drops
     e, group = np.empty(groups + 1), np.empty(groups)
     size = len(light)
-    # Mean of k^2 over the reads of each group, for the nonlinearity of a ramp with constant flux.
+    # Mean of k^2 over the reads of each group, where k is the number of frames since the reset. For f electrons per
+    # frame, the nonlinearity N (1 - b N) reduces a group by b f^2 times this mean.
     squares = np.empty(groups)
     for i in range(groups):
         squares[i] = 0.0
@@ -376,7 +428,12 @@ def _draw_ramps(
 
 @jit
 def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
-    """Compute the groups of a pixel from `groups` + 1 normal deviates e, with the moving average (module docstring)."""
+    """Fill `group` with the electrons of the groups (averaged reads) of a pixel, from groups + 1 normal deviates `e`.
+
+    `f` is the number of expected electrons per frame (read of the detector). `shape` has the number of groups, of reads
+    per group and of dropped frames between groups. `cumulants` is the result of `Mode.third_moments`, three constants
+    for the skewness of the counts. The method is the moving average that the module docstring describes.
+    """
     groups, reads, drops = shape
     n = groups - 1
     r = float(reads)
@@ -384,7 +441,8 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
     b = f * (r * r - 1.0) / (6.0 * r)
     v = f * (r + 1.0) * (2.0 * r + 1.0) / (6.0 * r)
     high, low = math.sqrt(a + 2.0 * b), math.sqrt(max(a - 2.0 * b, 0.0))
-    # c1 = (high - low) / 2 would lose its digits for small b. The product of c0 and c1 is b.
+    # c0 and c1 are the coefficients of the moving average, and b is the covariance of successive differences. The
+    # formula c1 = (high - low) / 2 would lose digits for small b. Use c0 c1 = b instead.
     c0 = 0.5 * (high + low)
     c1 = b / c0 if c0 > 0.0 else 0.0
     total, square = 0.0, 0.0
@@ -404,7 +462,7 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
             v_s = v_g + f * c4
             mixed = k_mixed * f
             fraction = mixed / v_t * (v_g / v_s) * (mixed / v_s)
-            # sqrt(1 - fraction) - 1, without cancellation.
+            # The factor of `total` is sqrt(1 - fraction) - 1, written without cancellation of digits.
             shift += total * (-fraction / (1.0 + math.sqrt(1.0 - fraction)))
             shift += mixed / v_s * (square - (n * a - v_t / n))
     group[0] = 0.5 * f * (r + 1.0) + c1 * e[0] + math.sqrt(max(v - c1 * c1, 0.0)) * e[groups]
@@ -416,7 +474,13 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
 def _draw_frames(
     f: float, hit: float, hit_frame: int, shape: Any, full_well: float, b: float, key: Any, pixel: int, group: Any
 ) -> None:
-    """Compute the groups of a pixel by drawing the count of every frame."""
+    """Fill `group` with the electrons of the groups (averaged reads) of a pixel, by drawing the count of every frame.
+
+    `f` is the number of expected electrons per frame (read of the detector). `shape` has the number of groups, of reads
+    per group and of dropped frames between groups. The charge `hit` of a cosmic ray (electrons) arrives in the frame
+    `hit_frame`, counted from the reset. Charge above `full_well` (electrons) is lost. A charge of N electrons is read
+    as N (1 - b N), with `b` in 1/electron. Random bits come from `key` and the index `pixel`.
+    """
     groups, reads, drops = shape
     frames = groups * reads + (groups - 1) * drops
     p_zero = math.exp(-f) if f < poisson._EXACT_BELOW else 0.0

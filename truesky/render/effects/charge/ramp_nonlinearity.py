@@ -1,8 +1,9 @@
 """Nonlinearity of a pixel's capacitance: N electrons are read as N (1 - b N), with a different b for each pixel.
 
-The effect acts either on the charge of every frame of a ramp or, as in Serrano et al. 2024, on the signal estimated
-from the ramp. The mission parameter `nonlinearity_of_signal` (0 or 1) selects one. They differ because charge is
-counted from the reset, but the signal only from the first to the last group.
+An infrared detector is read many times during an exposure (a ramp), without reset. The effect acts on the charge of
+every frame (`EFFECT`), or on the signal estimated from the ramp (`SIGNAL`), as in Serrano et al. 2024. The mission
+parameter `nonlinearity_of_signal` selects the first (0) or the second (1). They differ because charge is counted from
+the reset, but the signal only from the first to the last group of averaged frames.
 """
 
 from __future__ import annotations
@@ -20,28 +21,33 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
-    """Add the plane of nonlinearity coefficients to the input of `ramp.apply`.
+    """Draw the nonlinearity coefficient b of each pixel, and add it to the frame as an additional plane.
+
+    The effect `ramp`, which simulates the repeated reads of the detector, later uses this plane: N electrons are read
+    as N (1 - b N).
 
     Parameters
     ----------
     frame : float array, shape (ny, nx) or (3, ny, nx)
-        Input of `ramp.apply` without coefficients.
+        Expected electrons; with three planes also the charge of cosmic rays (electrons), and the time at which it
+        arrives in units of the time from the reset to the last read.
     mean : float
-        Mean of b in 1/electron, 0 to 1e-3.
+        Mean over pixels of the coefficient b of N (1 - b N), in 1/electron, 0 to 1e-3.
     spread : float
-        Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10.
+        Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10. Negative values of b are set to 0.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that b does not change.
 
     Returns
     -------
     float32 array, shape (4, ny, nx)
-        Input of `ramp.apply` with b in the last plane.
+        The planes of `frame`, and b in 1/electron in the last plane. Planes 1 and 2 are 0 if `frame` does not have
+        them.
 
     Raises
     ------
     OutOfRange
-        If `mean` or `spread` is outside its limits.
+        If `mean` or `spread` is outside its limits or NaN.
     """
     out = ramp.with_planes(frame, 4)
     _draw_coefficients(out[3].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
@@ -49,16 +55,18 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
 
 
 def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
-    """Apply the nonlinearity to the signal of a ramp.
+    """Apply the nonlinearity N (1 - b N) to the signal N that was estimated from a ramp (repeated reads).
 
     Parameters
     ----------
     frame : float array, shape (2, ny, nx)
-        Signal in electrons, and chi^2 of the ramp fit.
-    mean, spread : float
-        Same as in `apply`.
+        Signal in electrons, and chi^2 of the fit to the ramp.
+    mean : float
+        Mean over pixels of the coefficient b in 1/electron, 0 to 1e-3.
+    spread : float
+        Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10. Negative values of b are set to 0.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that b does not change.
 
     Returns
     -------
@@ -68,11 +76,12 @@ def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Genera
     Raises
     ------
     OutOfRange
-        If `mean` or `spread` is outside its limits.
+        If `mean` or `spread` is outside its limits or NaN.
 
     Notes
     -----
-    N (1 - b N) has its maximum at N = 1 / (2 b). Larger signals are set to this maximum.
+    N (1 - b N) has its maximum at N = 1 / (2 b). Larger signals are set to this maximum. Negative signals are
+    unchanged.
     """
     out = np.array(frame, dtype=float, order="C")
     _bend_signal(out[0].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
@@ -113,7 +122,10 @@ def _acts_on_signal(scene: Scene) -> bool:
 
 
 def _change_at_full_well(scene: Scene) -> float:
-    """Return the change of a full pixel: a hot pixel or a cosmic ray can fill any pixel, even without light."""
+    """Return by how many electrons the nonlinearity reduces the charge that is read in a pixel at full well.
+
+    Any pixel may be at full well, also without light, because it may be hot or hit by a cosmic ray.
+    """
     return _parameters(scene)[0] * scene.value("full_well", "electron") ** 2
 
 

@@ -1,1 +1,1 @@
-"""Effects of the optics and of the pixels' response on light before it becomes charge."""
+"""Effects on the expected light of each pixel, before it becomes charge: optics, sky and the response of pixels."""

@@ -1,4 +1,4 @@
-"""Add the diffuse sky: the same expected electrons in every pixel."""
+"""Add the diffuse sky background to an image: the same number of expected electrons in every pixel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from truesky.render.effects.scene import Frame
 
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None) -> Frame:
-    """Add a constant to a frame.
+    """Add the sky background, a constant, to all pixels of a frame.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None
     Raises
     ------
     OutOfRange
-        If `electrons` is negative or infinite.
+        If `electrons` is negative, infinite or NaN.
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)

@@ -1,7 +1,9 @@
-"""Light of flats: one LED of the calibration unit, or the lamp of a dome, illuminates the detector unevenly.
+"""Light of flat fields: a lamp illuminates the detector unevenly.
 
-LEDs have different wavelengths, so that a band detects different fractions of their photons. A dome has one lamp, which
-has the same signal in all bands.
+In VIS and NISP it is one of the LEDs of the calibration unit, in ground cameras the lamp of the dome.
+
+LEDs have different wavelengths, so that a passband detects different fractions of their photons. A dome has one lamp,
+which gives the same signal in all passbands.
 """
 
 from __future__ import annotations
@@ -21,23 +23,23 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.light import illumination
 from truesky.render.effects.scene import Frame, Scene
 
-# Full width at half maximum of a Gaussian in standard deviations.
+# Full width at half maximum of a Gaussian, divided by its standard deviation.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """Add the light of a lamp.
+    """Add the uneven light of a calibration lamp to a frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     level : float
-        Expected electrons of the lamp where its pattern is 1, 0 to 1e9.
+        Expected electrons of the lamp in a pixel in which its illumination pattern is 1, from 0 to 1e9.
     columns : float array, shape (nx,)
-        Term of the pattern that depends on the column.
+        Term of the illumination pattern that depends on the column, relative to the nominal illumination.
     rows : float array, shape (ny,)
-        Term of the pattern that depends on the row. The pattern is 1 + columns + rows.
+        Term that depends on the row, relative to the nominal illumination. The pattern is 1 + columns + rows.
     rng : numpy.random.Generator, optional
         Not used.
 
@@ -49,7 +51,9 @@ def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.rando
     Raises
     ------
     OutOfRange
-        If `level` is outside its limits.
+        If `level` is outside its limits or NaN, or if the pattern is negative or infinite.
+    BadInput
+        If the lengths of `columns` and `rows` do not match the shape of the frame.
     """
     if not 0.0 <= level <= 1e9:
         raise OutOfRange("lamp", level, 0.0, 1e9)
@@ -57,14 +61,16 @@ def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.rando
 
 
 def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
-    """Illumination by an LED: a paraboloid and a slope whose direction depends on the LED's position in the unit.
+    """Return the illumination of a detector by an LED: a paraboloid plus a slope.
+
+    The direction of the slope depends on the position of the LED in the calibration unit.
 
     Parameters
     ----------
     scene : Scene
-        The exposure, with the parameters of the calibration unit.
+        Settings of the exposure, from which the parameters of the calibration unit are taken.
     led : int
-        Number of the LED, from 1.
+        Number of the LED, from 1. A ground camera has one lamp with the number 1.
     nx, ny : int
         Columns and rows of the detector.
 
@@ -78,7 +84,7 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
     Raises
     ------
     OutOfRange
-        If the camera has no LED with this number.
+        If the camera has no LED with the number `led`.
     """
     leds = lamps.count(scene.section)
     if not 1 <= led <= leds:
@@ -90,38 +96,43 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
 
 def efficiency_of_scene(scene: Scene, led: int) -> float:
-    """Return the efficiency of an LED in the band of the scene, see `led_efficiency`."""
+    """Return the fraction of an LED's photons that the passband of an exposure detects, relative to a common scale.
+
+    The scale is the highest response of the camera's built-in passbands, see `led_efficiency`. An exposure without
+    passband uses the camera's first built-in one. OutOfRange is raised if the camera has no LED with the number `led`.
+    """
     band = scene.band or passbands.load(LAMPS[scene.section][1][0])
     return led_efficiency(band, led, scene.section, scene.mission)
 
 
 def led_efficiency(band: Passband, led: int, section: str, mission: MissionConfiguration) -> float:
-    """Fraction of an LED's photons that a band detects, relative to the highest response of the embedded bands.
+    """Return the fraction of an LED's photons that a passband detects, relative to the camera's highest response.
 
     Parameters
     ----------
     band : Passband
-        Passband.
+        Passband of the exposure.
     led : int
         Number of the LED, from 1.
     section : str
-        Camera in the mission database, "vis" or "nisp".
+        Name of the camera in the mission database, "vis" or "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float
-        Relative efficiency, dimensionless.
+        Detected fraction of the photons, divided by the highest response of the camera's built-in passbands;
+        dimensionless.
 
     Raises
     ------
     OutOfRange
-        If the camera has no LED with this number.
+        If the camera has no LED with the number `led`.
 
     Notes
     -----
-    The spectrum of an LED is a Gaussian with its central wavelength and width.
+    The spectrum of an LED is a Gaussian. The mission database contains its central wavelength and its width.
     """
     width = _width(section, mission)
     detected = float(np.sum(detected_photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
@@ -130,33 +141,33 @@ def led_efficiency(band: Passband, led: int, section: str, mission: MissionConfi
 
 @cache
 def _best_response(section: str) -> float:
-    """Return the highest response of the embedded bands of a camera."""
+    """Return the highest response (detected photons per arriving photon) of the built-in passbands of a camera."""
     return max(float(passbands.load(name).response.max()) for name in LAMPS[section][1])
 
 
 def detected_photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
-    """Relative number of an LED's photons that a band detects, by wavelength.
+    """Return the photons of an LED that a passband detects at each wavelength, in arbitrary units.
 
     Parameters
     ----------
     band : Passband
-        Passband.
+        Passband of the exposure.
     led : int
         Number of the LED, from 1.
     section : str
-        Camera in the mission database, "vis" or "nisp".
+        Name of the camera in the mission database, "vis" or "nisp".
     mission : MissionConfiguration
         Mission database.
 
     Returns
     -------
     float64 array, shape (n,)
-        Detected photons at the wavelengths of `band` (steps of 1 Angstrom), in arbitrary units.
+        Detected photons at the wavelengths of `band` (steps of 1 Angstrom). The peak of the LED's own spectrum is 1.
 
     Raises
     ------
     OutOfRange
-        If the camera has no LED with this number.
+        If the camera has no LED with the number `led`.
     """
     leds, _ = LAMPS[section]
     if not 1 <= led <= leds:
@@ -166,7 +177,7 @@ def detected_photons(band: Passband, led: int, section: str, mission: MissionCon
 
 
 def _width(section: str, mission: MissionConfiguration) -> float:
-    """Standard deviation of an LED's spectrum in Angstrom."""
+    """Return the standard deviation of the Gaussian spectrum of an LED in Angstrom."""
     return float(10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM)
 
 

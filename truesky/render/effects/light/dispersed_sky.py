@@ -1,8 +1,8 @@
-"""Diffuse sky through a grism: the change by its orders relative to the uniform background of the passband.
+"""Diffuse sky seen through a grism: its difference from the uniform background of the undispersed passband.
 
-A pixel receives light of each wavelength from a different point of the sky, by each order. For a uniform sky the result
-is the undispersed background, with two differences: other orders than the first add light, and points outside the field
-stop contribute none.
+A pixel receives light of each wavelength from a different point of the sky, in each spectral order of the grism. For a
+uniform sky the sum is the undispersed background, with two differences. Orders other than the first add light, and
+points of the sky outside the field stop contribute none.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = None) -> Frame:
-    """Add values at nodes, interpolated linearly between them.
+    """Add the difference between the dispersed and the undispersed sky, given at nodes of a grid, to a frame.
+
+    Between the nodes the difference is interpolated linearly.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     nodes : float array, shape (gy, gx), or None
-        Electrons on an even grid over the frame that includes its corners. None to add nothing.
+        Difference in electrons per pixel on an even grid. The outer nodes lie on the corner pixels of the frame. None
+        to add nothing.
     rng : numpy.random.Generator, optional
         Not used.
 
@@ -34,7 +37,7 @@ def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = N
     Raises
     ------
     BadInput
-        If the grid has fewer than two nodes along a side or values that are not finite.
+        If the grid has fewer than two nodes along a side, or values that are infinite or NaN.
     """
     if nodes is None:
         return np.array(frame, dtype=float)
@@ -51,7 +54,11 @@ def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = N
 
 
 def _node_fractions(nodes: int, pixels: int) -> tuple[Frame, np.ndarray[tuple[int], np.dtype[np.int64]]]:
-    """Return (fraction of the distance to the next node, index of the previous node) for each pixel."""
+    """Return, for each pixel along an axis, (fraction of the way to the next node, index of the previous node).
+
+    The nodes are grid points, at which the sky is given, evenly spaced from the first to the last pixel. `nodes` and
+    `pixels` are their numbers along the axis.
+    """
     position = np.linspace(0.0, nodes - 1.0, pixels)
     node = np.minimum(position.astype(np.int64), nodes - 2)
     return position - node, node

@@ -1,8 +1,8 @@
-"""Fringes: red emission lines of the sky interfere between the two faces of a detector.
+"""Fringes: light of red emission lines of the sky interferes with its reflection between the two faces of a detector.
 
 The thickness of the silicon varies by several wavelengths over a detector, and fringes follow lines of equal thickness.
-A band contains a few lines of hydroxyl. The contrast is high where their fringes coincide and low elsewhere. Sources
-have no fringes because their light has a continuous spectrum.
+A passband contains a few emission lines of hydroxyl. The contrast is high where the fringes of these lines coincide,
+and low elsewhere. Sources have no fringes because their light has a continuous spectrum.
 """
 
 from __future__ import annotations
@@ -19,30 +19,39 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Relative wave numbers and intensities of four groups of lines, as in the z and y bands (assumed).
+# (Relative wave number, relative intensity) of four groups of emission lines, as in the z and y bands (assumed).
 _LINES = ((0.965, 0.2), (0.99, 0.35), (1.0, 0.25), (1.03, 0.2))
-# Number of wavelengths in the path through the detector and back. The thickness varies with up to _MODES half waves
-# along each side, whose amplitudes fall with this exponent of the number.
-_ORDERS, _MODES, _STEEPNESS = 120.0, 4, 1.5
-# Node spacing of the thickness map in pixels, and samples per fringe cycle in the lookup table.
-_NODE_SPACING, _STEPS_PER_CYCLE = 8, 64
+# Mean path difference between light and its reflection (twice the thickness of the detector), in wavelengths.
+_ORDERS = 120.0
+# The thickness of the detector varies as a sum of cosines of the position. The cosines have 0 to this number of half
+# waves along each side of the detector.
+_MODES = 4
+# The thickness of the detector is a sum of cosines of the position with random amplitudes. Their rms is proportional to
+# (1 + k) to the minus this power. k^2 is the sum of the squared numbers of half waves of a cosine along both sides of
+# the detector.
+_STEEPNESS = 1.5
+# Distance in pixels between the points of the detector at which the path difference of interfering rays is computed. It
+# is interpolated between them.
+_NODE_SPACING = 8
+# Number of samples per fringe (one wavelength of path difference) of the lookup table with the brightness of fringes.
+_STEPS_PER_CYCLE = 64
 
 
 def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: np.random.Generator) -> Frame:
-    """Add fringes of the sky: a fixed pattern of the detector.
+    """Add fringes of the sky background to a frame: a pattern of the detector that is the same in every exposure.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     electrons : float
-        Electrons of the sky per pixel.
+        Electrons of the sky background per pixel.
     amplitude : float
-        Amplitude of the strongest fringes as a fraction of the sky, 0 to 1.
+        Amplitude of the strongest fringes as a fraction of the sky background, 0 to 1. With 0 the frame is unchanged.
     period : float
-        Mean distance of fringes in pixels, 4 to 1e5.
+        Mean distance between neighbouring fringes in pixels, 4 to 1e5.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the fringes do not change.
 
     Returns
     -------
@@ -52,11 +61,12 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
     Raises
     ------
     OutOfRange
-        If `amplitude` or `period` is outside its limits.
+        If `amplitude` or `period` is outside its limits or NaN.
 
     Notes
     -----
-    The lookup table and the interpolation of the thickness have an error of 1e-3 of the amplitude.
+    The brightness of the fringes is read from a lookup table, and the thickness of the detector is interpolated. Both
+    together have an error of 1e-3 of the amplitude.
     """
     if not 0.0 <= amplitude <= 1.0:
         raise OutOfRange("fringes", amplitude, 0.0, 1.0)
@@ -74,31 +84,35 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
 
 
 def contrast(cycles: Float) -> Float:
-    """Return the contrast of fringes, -1 to 1, for a path difference in cycles of the mean wave number."""
+    """Return the relative brightness of the fringes, -1 to 1, at given path differences.
+
+    `cycles`, shape (n,), is the path difference in wavelengths of the emission line with the relative wave number 1.
+    The result has the same shape.
+    """
     waves, light = np.array(_LINES).T
     terms = np.cos(2.0 * np.pi * np.multiply.outer(cycles, waves)) * (light / light.sum())
     return np.asarray(terms.sum(axis=1))
 
 
 def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
-    """Draw a smooth map of the path difference in cycles.
+    """Draw a smooth random map of the path difference between interfering rays, in wavelengths.
 
     Parameters
     ----------
     nx, ny : int
         Columns and rows of the detector.
     period : float
-        Mean distance of cycles in pixels.
+        Mean distance between neighbouring fringes in pixels: the path difference changes by one wavelength.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the map does not change.
 
     Returns
     -------
     float array, shape (n, m)
-        Cycles at nodes that are `_NODE_SPACING` pixels apart, from pixel 0.
+        Path difference in wavelengths, at nodes that are `_NODE_SPACING` = 8 pixels apart. The first node is pixel 0.
     """
     across, up = (np.arange((n - 1) // _NODE_SPACING + 2) * float(_NODE_SPACING) for n in (nx, ny))
-    # The longer side sets the scale of both directions, so that fringes are isotropic.
+    # Scale both directions by the longer side of the detector, so that the pattern of fringes is isotropic.
     side = float(max(nx, ny, 4 * _NODE_SPACING))
     number = np.arange(_MODES + 1)
     strength = rng.standard_normal((_MODES + 1, _MODES + 1)) / (1.0 + np.hypot.outer(number, number)) ** _STEEPNESS
@@ -115,7 +129,12 @@ def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
 
 @jit
 def _add_fringes(frame: Any, nodes: Any, table: Any, first: float) -> None:
-    """Add the lookup table at the phase of each pixel, which is bilinear between the nodes."""
+    """Add the brightness of the fringes to each pixel of a frame, in place.
+
+    `nodes` is the path difference in wavelengths at points `_NODE_SPACING` = 8 pixels apart; between them it is
+    interpolated. `table` contains the brightness in electrons for path differences from `first` (wavelengths) on, in
+    steps of 1 / `_STEPS_PER_CYCLE` wavelengths.
+    """
     ny, nx = frame.shape
     line = np.empty(nodes.shape[1])
     for r in range(ny):
@@ -130,9 +149,10 @@ def _add_fringes(frame: Any, nodes: Any, table: Any, first: float) -> None:
 
 
 def parameters(scene: Scene) -> tuple[float, float, float]:
-    """Return the electrons of the sky, and amplitude and period of the fringes.
+    """Return the parameters of `apply`: electrons of the sky per pixel, amplitude, and distance of fringes (pixels).
 
-    The amplitude is 0 if the mission database has none for the band, or if the band is not known.
+    The amplitude is a fraction of the sky background. It is 0 if the scene has no passband, or if the mission database
+    has no fringes for its passband.
     """
     key = "" if scene.band is None else f"{scene.section}.{scene.band.name}.fringes"
     amplitude = scene.mission.value(key) if key in scene.mission else 0.0

@@ -1,7 +1,7 @@
 """Ghosts: light that is reflected twice in a plate forms a defocused image of the pupil near each bright star.
 
-A ghost is an annulus of uniform surface brightness, with gaps for the three arms that hold the secondary mirror.
-`EFFECT` are ghosts of the dichroic, `FILTER` ghosts of the filter.
+A ghost is an annulus of uniform surface brightness, with gaps for the three arms that hold the secondary mirror of the
+telescope. The plate is the dichroic in the effect `EFFECT`, and the filter in the effect `FILTER`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
-# Samples along each side of a pixel, for pixels at the border.
+# Number of samples along each side of a pixel, to compute the part of the pixel that a ghost covers.
 _SUBSAMPLES = 4
 
 
 class Pupil(NamedTuple):
-    """Image of the pupil in pixels.
+    """Shape of a ghost: the defocused image of the telescope's pupil, an annulus with gaps, in pixels.
 
     Attributes
     ----------
@@ -30,9 +30,10 @@ class Pupil(NamedTuple):
     hole : float
         Inner radius relative to the outer radius, 0 to 0.99.
     arms : tuple of (float, float, float, float)
-        For each arm: column and row of its middle relative to the centre, angle from x to y in degrees, half length.
+        For each arm that holds the secondary mirror: column and row of its middle relative to the centre of the ghost
+        (pixels), angle from the x axis towards the y axis (degrees), and half of its length (pixels).
     width : float
-        Width of all arms, 0 to `radius`.
+        Width of each arm, 0 to `radius`.
     """
 
     radius: float
@@ -45,18 +46,18 @@ def apply(
     frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
     rng: np.random.Generator | None = None,
 ) -> Frame:  # fmt: skip
-    """Add the ghost of every light, also of lights outside the frame.
+    """Add the ghost of every star in `lights` to a frame, also of stars outside the frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     lights : Lights
-        Positions and electrons of stars.
+        Positions (columns and rows) and electrons of the stars.
     ratio : float
         Flux of a ghost relative to its star, 0 to 1.
     offset : (float, float)
-        Columns and rows from a star to its ghost.
+        Position of the centre of a ghost minus the position of its star, in columns and rows.
     pupil : Pupil
         Shape of a ghost.
     rng : numpy.random.Generator, optional
@@ -70,7 +71,7 @@ def apply(
     Raises
     ------
     OutOfRange
-        If `ratio` or a value of `pupil` is outside its limits.
+        If `ratio` or a value of `pupil` is outside its limits. The values of the arms are not checked.
     """
     radius, hole, arms, width = pupil
     for name, value, lowest, highest in (
@@ -90,7 +91,12 @@ def apply(
 
 @jit
 def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
-    """Return the illuminated fraction of each pixel, shape (n, n) with n odd and the centre in the middle pixel."""
+    """Return the fraction of each pixel that the pupil image of a ghost covers, a square array with an odd side.
+
+    The centre of the pupil is in the middle of the middle pixel. `radius` is the outer radius of the annulus in pixels,
+    and `hole` the inner radius relative to it. `arms` [n, 4] are the shadows of the arms: column and row of the middle
+    relative to the centre (pixels), angle (degrees) and half of the length (pixels). `width` is their width in pixels.
+    """
     half = int(np.ceil(radius)) + 1
     stamp = np.zeros((2 * half + 1, 2 * half + 1))
     for r in range(2 * half + 1):
@@ -112,7 +118,11 @@ def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
 
 @jit
 def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
-    """Add shifted stamps with bilinear interpolation."""
+    """Add a ghost at each position to a frame, in place. Fractional positions are interpolated bilinearly.
+
+    `column` and `row` are the centres of the ghosts in pixels, and `electrons` their total fluxes. The image of a ghost
+    is `stamp`, a square array with an odd side and a sum of 1.
+    """
     ny, nx = frame.shape
     half = len(stamp) // 2
     for i in range(len(column)):
@@ -132,10 +142,12 @@ def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -
 
 
 def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
-    """Return the parameters of `apply` from the mission database, for ghosts of a plate.
+    """Return the parameters of `apply` for the ghosts of a plate: stars, flux ratio, offset and shape of their ghosts.
 
-    `plate` is the prefix of their parameters. The offset is along the y axis of the focal plane, and the arms are those
-    of the telescope's pupil.
+    `plate` is the prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the
+    filter. Stars (`Lights`) whose ghosts are not noticeable are left out. The ratio is the flux of a ghost divided by
+    the flux of its star. The offset (columns, rows) from a star to its ghost is along the y axis of the focal plane.
+    The shape (`Pupil`) has gaps where the arms in the telescope's pupil block the light.
     """
     rotation = scene.detector.rotation if scene.detector is not None else 0.0
     cosine, sine = float(np.cos(np.radians(rotation))), float(np.sin(np.radians(rotation)))
@@ -149,7 +161,7 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
     scale = radius / aperture
     reach = scale * pupil_value("spider_half_length", "mm")
     places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
-    # Rotate from the axes of the focal plane to the axes of the detector.
+    # Rotate the arms from the axes of the focal plane to the axes of the detector.
     arms = tuple(
         (x * cosine + y * sine, y * cosine - x * sine, pupil_value(f"spider{number}.angle", "deg") - rotation, reach)
         for number, (x, y) in enumerate(places, start=1)
@@ -165,21 +177,21 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
 
 
 def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
-    """Lights whose ghost as a whole exceeds the noise of its pixels.
+    """Return the stars whose ghost, summed over its area, exceeds a tenth of the noise of the same area.
 
     Parameters
     ----------
     scene : Scene
-        The exposure.
+        Settings of the exposure, with the bright stars and the noise of a pixel.
     ratio : float
         Flux of a ghost relative to its star.
     plate : str, optional
-        Prefix of the parameters of ghosts.
+        Prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the filter.
 
     Returns
     -------
     Lights
-        Selected lights.
+        Selected stars, in their original order.
     """
     area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
     lights = scene.lights
@@ -188,14 +200,21 @@ def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Light
 
 
 def _contribution(scene: Scene, plate: str = "ghost") -> float:
-    """Return the electrons per pixel times the square root of the number of pixels: a ghost is noticed as a whole."""
+    """Return the strength of the brightest star's ghost: electrons per pixel times the root of its number of pixels.
+
+    The square root is included because the eye, or a fit, detects a ghost in all of its pixels together.
+    """
     ratio, radius = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_out", "pix")
     brightest = float(scene.lights.electrons.max(initial=0.0))
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
 def _mean_contribution(scene: Scene, plate: str = "ghost") -> float:
-    """Return the electrons per pixel. `_contribution` already includes the mean over the pixels of a ghost."""
+    """Return the electrons per pixel of the brightest star's ghost.
+
+    `Effect.margin` compares this number with the noise of a mean over many pixels. The result of `_contribution` cannot
+    be used for this comparison, because it already takes the mean over the pixels of the ghost into account.
+    """
     return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
 
 

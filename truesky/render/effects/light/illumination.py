@@ -1,7 +1,8 @@
-"""Illumination of the focal plane by the optics (vignetting), and differences of the exposure time by the shutter.
+"""Uneven illumination of the focal plane by the optics (vignetting), and uneven exposure times by the shutter.
 
-Every map is 1 + f(column) + g(row): a paraboloid and a slope across the focal plane, for any rotation of the detector.
-The blades of the shutter open on one side of the focal plane first, and close on the other side first.
+Every map of the illumination is 1 + f(column) + g(row), also on a rotated detector: a paraboloid plus a slope across
+the focal plane. The optics have the paraboloid only, and the shutter the slope only. The blades of the shutter open on
+one side of the focal plane first, and close on the other side first.
 """
 
 from __future__ import annotations
@@ -15,30 +16,30 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """Multiply a frame by 1 + columns + rows.
+    """Multiply a frame by the illumination 1 + columns + rows.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
         Expected electrons.
     columns : float array, shape (nx,)
-        Term that depends on the column.
+        Term of the illumination that depends on the column, relative to the nominal illumination.
     rows : float array, shape (ny,)
-        Term that depends on the row.
+        Term of the illumination that depends on the row, relative to the nominal illumination.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape of `frame`
-        Expected electrons.
+        Expected electrons with the illumination.
 
     Raises
     ------
     BadInput
-        If the shapes do not match.
+        If the last two axes of the frame do not have the lengths of `rows` and `columns`.
     OutOfRange
-        If the illumination is negative or infinite.
+        If the illumination of a pixel is negative, infinite or NaN.
     """
     if frame.shape[-2:] != (len(rows), len(columns)):
         raise BadInput(f"illumination has the shape {(len(rows), len(columns))}, must be {frame.shape[-2:]}")
@@ -50,18 +51,22 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
-    """Map 1 - bowl r^2 + slope . (x, y) on a detector, as terms of columns and rows.
+    """Return the illumination of a detector, a paraboloid plus a slope, as one term for columns and one for rows.
+
+    It is 1 - bowl r^2 + slope[0] x + slope[1] y at each pixel of the detector. The position (x, y) in the focal plane
+    is relative to its centre, with x = 1 at the right edge and y = 1 at the upper edge. The distance r from the centre
+    is 1 in the corners.
 
     Parameters
     ----------
     scene : Scene
-        The exposure, with the position of the detector in the field.
+        Settings of the exposure, with the position of the detector in the focal plane.
     nx, ny : int
         Columns and rows of the detector.
     bowl : float
-        Loss at the corners of the field as a fraction. The radius r is 1 at the corners.
+        Relative loss of light in the corners of the focal plane, where the radius r is 1.
     slope : (float, float)
-        Changes at the edges of the field as fractions. The coordinates x and y are 1 at the edges.
+        Relative changes of light at the right and at the upper edge of the focal plane.
 
     Returns
     -------
@@ -79,7 +84,9 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
     along, up = scale * (np.arange(nx) - (nx - 1) / 2), scale * (np.arange(ny) - (ny - 1) / 2)
     cosine, sine = np.cos(turn), np.sin(turn)
     sx, sy = slope[0] / half_x, slope[1] / half_y
-    # |c + R d|^2 = |c|^2 + 2 c . R d + |d|^2 contains no product of column and row.
+    # A pixel at the offset d from the detector's centre c has the squared distance |c + R d|^2 = |c|^2 + 2 c . R d +
+    # |d|^2 from the centre of the focal plane, with the rotation R of the detector. This is a sum of a function of the
+    # column and a function of the row.
     columns = -bowl * (2 * along * (x0 * cosine + y0 * sine) + along**2) / corner**2
     rows = -bowl * (2 * up * (y0 * cosine - x0 * sine) + up**2) / corner**2
     columns += along * (sx * cosine + sy * sine)
@@ -88,7 +95,7 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
 
 
 def _half_sides(scene: Scene) -> tuple[float, float]:
-    """Half the sides of the focal plane in arcsec."""
+    """Return half the width and half the height of the camera's focal plane in arcsec, including all detectors."""
     detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], scene.mission)
     scale, nx, ny = detectors[0].pixel_scale, detectors[0].nx, detectors[0].ny
     return (
@@ -106,7 +113,11 @@ def _shutter_pattern(scene: Scene) -> tuple[Frame, Frame]:
 
 
 def _shutter_excess(scene: Scene) -> float:
-    """Relative excess of the exposure time at the edge of the focal plane, for a fixed speed of the blades."""
+    """Return the relative excess of the exposure time at the upper edge of the focal plane, between -1 and 1.
+
+    It is proportional to 1 / exposure time, because the blades of the shutter have a fixed speed. It is 0 for an
+    exposure of 0 seconds.
+    """
     time = scene.exposure_time_s
     return float(np.clip(scene.value("shutter_map", "s") / time, -1.0, 1.0)) if time > 0.0 else 0.0
 

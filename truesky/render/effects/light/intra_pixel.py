@@ -1,8 +1,9 @@
 """Intra-pixel response: the centre of a pixel is more sensitive than its corners, so that sources are slightly sharper.
 
-The response is 1 - a (u^2 + v^2) over the pixel, with u and v from -1 to 1. Its mean is part of the quantum efficiency.
-The response belongs to the pixel's transfer function, with which sources are drawn: it cannot be applied after light is
-summed in pixels. A filter on the final image would correct at most half of it.
+The response at the position (u, v) in a pixel is 1 - a (u^2 + v^2), with u and v from -1 to 1 between the edges and a
+constant a of the detector. The mean of the response over the pixel is part of the quantum efficiency. The response
+belongs to the pixel's transfer function, with which sources are drawn. It cannot be applied after light is summed in
+pixels: a filter on the final image would correct at most half of it.
 """
 
 from __future__ import annotations
@@ -14,29 +15,30 @@ from lake_schema.errors import OutOfRange
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Below this phase the closed form loses digits by cancellation; the series of four terms has an error of 1e-12 there.
+# Below this value of pi times the spatial frequency (cycles per pixel), the closed form of `_second_moment` loses
+# digits by cancellation. A series of five terms is used there, with an error below 1e-12.
 _SMALL = 0.15
 
 
 def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
-    """Transfer function of a pixel, normalised to 1 at 0.
+    """Return the transfer function of a pixel (Fourier transform of its response to light), normalised to 1 at 0.
 
     Parameters
     ----------
     x, y : float array
         Spatial frequencies along columns and rows in cycles per pixel.
     strength : float
-        Parameter a of the response, 0 to 0.5. With 0 the result is sinc x sinc y.
+        Parameter a of the response 1 - a (u^2 + v^2) inside a pixel, 0 to 0.5. With 0 the result is sinc x sinc y.
 
     Returns
     -------
     float array
-        Transfer function, in the common shape of `x` and `y`.
+        Transfer function, in the shape to which `x` and `y` are broadcast.
 
     Raises
     ------
     OutOfRange
-        If `strength` is outside its limits.
+        If `strength` is outside its limits or NaN.
     """
     if not 0.0 <= strength <= 0.5:
         raise OutOfRange("intra-pixel strength", strength, 0.0, 0.5)
@@ -47,7 +49,10 @@ def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
 
 
 def _second_moment(x: Frame) -> Frame:
-    """Return the mean of u^2 cos(pi x u) for u from -1 to 1."""
+    """Return the mean of u^2 cos(pi x u) over u from -1 to 1, for spatial frequencies x in cycles per pixel.
+
+    It is the Fourier transform of the term u^2 of the response inside a pixel, whose edges are at u = -1 and 1.
+    """
     phase = np.pi * np.abs(x)
     q = np.where(phase < _SMALL, 1.0, phase)
     closed = np.sin(q) / q + 2.0 * np.cos(q) / q**2 - 2.0 * np.sin(q) / q**3
@@ -62,7 +67,8 @@ def _strength(scene: Scene) -> float:
     return scene.value("intra_pixel_response", "")
 
 
-# Relative change of the brightest pixel of a VIS star per unit of a.
+# Relative change of the brightest pixel of a star in a VIS image, divided by the parameter a of the response
+# 1 - a (u^2 + v^2) inside a pixel.
 _CHANGE = 0.07
 EFFECT = Effect(
     "intra_pixel",

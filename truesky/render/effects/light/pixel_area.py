@@ -1,7 +1,7 @@
-"""Area of the sky per pixel: distortion changes the light of the diffuse sky in a pixel.
+"""Area of the sky that a pixel covers: optical distortion changes it, and with it the sky background in the pixel.
 
-The projection on a tangent plane also changes the area. Sources keep their flux at any position, because their images
-are drawn through the same Jacobian.
+The projection of the sky on a tangent plane also changes the area. Sources keep their flux at any position, because
+their images are drawn with the same local scale of the sky.
 """
 
 from __future__ import annotations
@@ -16,35 +16,40 @@ from truesky.render.camera.pointing import ARCSEC
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels between samples for the largest change, which is a smooth polynomial.
+# The largest change of the sky area on a detector is found from pixels that are this number of pixels apart. The change
+# is a smooth polynomial of the position.
 _SAMPLE_STEP = 64
 
 
 def apply(
     frame: Frame, electrons: float, u: Frame, v: Frame, stretch: Frame, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Add the difference of the sky by the area of pixels.
+    """Add the change of the sky background that is caused by the different sky areas of pixels.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
-        Expected electrons with the sky of a pixel at the boresight.
+        Expected electrons, including the sky background of a pixel at the boresight.
     electrons : float
-        Electrons of the sky in a pixel at the boresight, 0 or more.
-    u, v, stretch : float array
-        Same as in `area_change`.
+        Sky background of a pixel at the boresight in electrons, 0 or more.
+    u : float array, shape (nx,)
+        Columns relative to the boresight in pixels.
+    v : float array, shape (ny,)
+        Rows relative to the boresight in pixels.
+    stretch : float array, shape (n, m)
+        Coefficients of u^p v^q, at index [p, q], of the sky area of a pixel relative to the boresight, minus 1.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Expected electrons.
+        Expected electrons with the sky background of each pixel's area.
 
     Raises
     ------
     OutOfRange
-        If `electrons` is negative or infinite.
+        If `electrons` is negative, infinite or NaN.
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
@@ -54,7 +59,7 @@ def apply(
 
 
 def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
-    """Area of each pixel relative to a pixel at the boresight, minus 1.
+    """Return the sky area of each pixel divided by that of a pixel at the boresight, minus 1.
 
     Parameters
     ----------
@@ -62,8 +67,8 @@ def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
         Columns relative to the boresight in pixels.
     v : float array, shape (ny,)
         Rows relative to the boresight in pixels.
-    stretch : float array, shape (p, q)
-        Coefficients of u^p v^q.
+    stretch : float array, shape (n, m)
+        Coefficients of u^p v^q, at index [p, q], of the relative change of the area, with u and v in pixels.
 
     Returns
     -------
@@ -72,14 +77,19 @@ def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
 
     Notes
     -----
-    The error is 1e-4, because the product of distortion and projection is neglected.
+    The error is 1e-4, because the product of the changes by distortion and by projection is neglected.
     """
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
     return np.asarray(matrices.matmul(along, matrices.matmul(stretch.T, across.T)))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
-    """Return the parameters of `apply`. Without a detector, the area of pixels does not change."""
+    """Return the parameters of `apply` for a scene: sky electrons, columns u, rows v, and coefficients of the area.
+
+    The sky electrons are for a pixel at the boresight. u [nx] and v [ny] are the columns and rows of the detector
+    relative to the boresight in pixels. The coefficients [p, q] of u^p v^q give the sky area of a pixel divided by
+    the area at the boresight, minus 1. For a scene without detector, u, v and the coefficients are 0.
+    """
     d = scene.detector
     if d is None:
         return scene.sky_electrons, np.zeros(scene.nx), np.zeros(scene.ny), np.zeros((1, 1))
@@ -90,7 +100,8 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     stretch = np.zeros((3, 3))
     if d.distortion_terms:
         stretch = distortion.area_change(d.distortion_terms, matrix)
-    # An area on the tangent plane covers (1 + r^2)^(-3/2) of this area on the sky.
+    # An area on the tangent plane, at the distance r (rad) from the boresight, covers (1 + r^2)^(-3/2) of it on the
+    # sky.
     flat = -1.5 * (d.pixel_scale * ARCSEC) ** 2
     stretch[2, 0] += flat
     stretch[0, 2] += flat

@@ -1,7 +1,7 @@
-"""Satellite trails: straight lines over the field, blurred by the seeing and by the defocused pupil.
+"""Trails of artificial satellites: straight lines over the field, blurred by seeing and by the defocused pupil.
 
-The rate of satellites is a parameter, by default 0. All detectors of an exposure have the same satellites, and each
-receives the piece of a trail that crosses it.
+The rate of satellites is a parameter of the mission database, by default 0. All detectors of an exposure see the same
+satellites: each receives the part of a trail that crosses it.
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels between points of a trail. The trail is straight between them.
+# Distance in pixels between computed points of a satellite trail, which is drawn as a straight line between them.
 _STEP = 64.0
-# Length of a trail beyond the field, in radii of the field: distortion may show slightly more of the sky.
+# A trail is followed to this multiple of the field's radius from the boresight, because with optical distortion a
+# detector may show slightly more of the sky.
 _TRAIL_EXTENT = 1.1
-# Half diagonals of a detector that it may cover to each side with distortion.
+# With optical distortion, a detector may show the sky up to this multiple of half its diagonal from its centre.
 _DETECTOR_EXTENT = 1.3
-# Samples per pixel of a trail's profile, and its extent in widths of the seeing.
-_SUBSAMPLES, _SEEING_RANGE = 8, 8.0
-# Limit on the difference between magnitudes of satellites and their mean, in standard deviations.
+# Number of samples per pixel of the profile across a trail.
+_SUBSAMPLES = 8
+# The profile across a trail includes the wings of the seeing up to this multiple of the FWHM of the seeing.
+_SEEING_RANGE = 8.0
+# A satellite's magnitude differs from the mean by at most this number of standard deviations; larger random differences
+# are set to this limit.
 _MAX_SIGMA = 3.0
 # Exponent of the Moffat profile of the seeing.
 _BETA = 3.0
@@ -36,16 +40,16 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 
 
 class Satellites(NamedTuple):
-    """Satellites of a field.
+    """Number and brightness of the satellites that cross a field.
 
     Attributes
     ----------
     number : float
-        Mean number of satellites that cross the circle around the field during the exposure, 0 to 1e4.
+        Mean number of satellites that cross the circle around the field during the exposure, at least 0, below 1e4.
     electrons : float
-        Electrons of a mean satellite per pixel of trail length.
+        Electrons that a satellite of mean brightness leaves per pixel of trail length.
     spread : float
-        Standard deviation of the magnitudes.
+        Standard deviation of the magnitudes of satellites in mag.
     """
 
     number: float
@@ -54,14 +58,14 @@ class Satellites(NamedTuple):
 
 
 class Blur(NamedTuple):
-    """Blur of a trail.
+    """Blur across a satellite trail, by the atmosphere and because a near satellite is out of focus.
 
     Attributes
     ----------
     seeing : float
         FWHM of the seeing in pixels.
     outer, inner : float
-        Radii of the defocused pupil in pixels.
+        Outer and inner radius of the defocused image of the telescope's pupil, a ring, in pixels.
     """
 
     seeing: float
@@ -72,22 +76,22 @@ class Blur(NamedTuple):
 def apply(
     frame: Frame, satellites: Satellites, blur: Blur, detector: Detector | None, radius: float, rng: np.random.Generator
 ) -> Frame:
-    """Add the trails that cross a frame.
+    """Draw the random satellites of an exposure, and add the trails that cross a frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     satellites : Satellites
-        Number and brightness of satellites.
+        Mean number and brightness of satellites.
     blur : Blur
-        Blur of their trails.
+        Blur of their trails by seeing and defocus.
     detector : Detector or None
         Detector of the frame. None for a detector in the middle of the field with pixels of 1 arcsec.
     radius : float
         Radius of the circle around the field in arcsec.
     rng : numpy.random.Generator
-        Random numbers of the exposure, the same for all its detectors.
+        Random generator of the exposure, in the same state for all detectors, so that they see the same satellites.
 
     Returns
     -------
@@ -97,12 +101,12 @@ def apply(
     Raises
     ------
     OutOfRange
-        If the number of satellites is outside its limits.
+        If `satellites.number` is negative, 1e4 or more, or NaN.
 
     Notes
     -----
-    The profile is sampled at eighths of a pixel, with an error of 1e-3 of its height. Not modelled: satellites that
-    tumble or flare.
+    The profile across a trail is sampled in steps of 1/8 pixel, with an error of 1e-3 of its height. Satellites that
+    tumble or flare are not modelled.
     """
     if not 0.0 <= satellites.number < 1e4:
         raise OutOfRange("satellites of an exposure", satellites.number, 0.0, 1e4)
@@ -123,14 +127,16 @@ def apply(
 
 
 def _may_touch(direction: float, offset: float, detector: Detector | None, width: float) -> bool:
-    """Return False if a trail cannot touch a detector.
+    """Return False if a satellite trail certainly does not touch a detector.
 
-    `direction` and `offset` are as in `_path`; `width` is the half width of a trail in pixels.
+    `direction` is the angle of the trail in radians, from the x axis of the focal plane towards the y axis. `offset` is
+    its smallest distance to the boresight in arcsec, positive on the left of this direction, and `width` its half width
+    in pixels. Without a detector the result is True.
     """
     if detector is None:
         return True
     x, y = (float(place) for place in distortion.distort(detector.x, detector.y, detector.distortion_terms))
-    # With distortion, a detector may show more of the sky than the size of its pixels implies.
+    # With distortion, a detector may show more of the sky than its size in pixels implies.
     reach = _DETECTOR_EXTENT * detector.half_diagonal + detector.pixel_scale * width
     return bool(abs(np.cos(direction) * y - np.sin(direction) * x - offset) < reach)
 
@@ -138,15 +144,16 @@ def _may_touch(direction: float, offset: float, detector: Detector | None, width
 def _path(
     direction: float, offset: float, radius: float, detector: Detector | None, shape: tuple[int, ...]
 ) -> tuple[Float, Float]:
-    """Return the columns and rows of points of a trail over the whole field.
+    """Return the columns and rows of points along a satellite trail over the whole field, in pixels of the detector.
 
-    `direction` is in radians. `offset`, the smallest distance to the boresight, and `radius`, the radius of the
-    field, are in arcsec.
+    `direction` is the angle of the trail in radians, from the x axis of the focal plane towards the y axis. `offset` is
+    its smallest distance to the boresight in arcsec, positive on the left of this direction. `radius` is the radius of
+    the field in arcsec. `shape` (rows, columns) is used only without a detector, whose pixels are then 1 arcsec wide.
     """
     scale = 1.0 if detector is None else detector.pixel_scale
     reach = float(np.sqrt((_TRAIL_EXTENT * radius) ** 2 - offset**2))
     at = np.arange(-reach, reach + _STEP * scale, _STEP * scale)
-    # Great circles are straight on the tangent plane.
+    # Satellites move along great circles, which are straight lines on the tangent plane.
     u, v = (
         (offset * f + at * g) / scale
         for f, g in ((-np.sin(direction), np.cos(direction)), (np.cos(direction), np.sin(direction)))
@@ -162,16 +169,18 @@ def _path(
 
 
 def profile(blur: Blur) -> Float:
-    """Return the light per pixel at distances of n / `_SUBSAMPLES` pixels from a trail, with a sum of 1 across it.
+    """Return the profile across a satellite trail: light per pixel at n / `_SUBSAMPLES` pixels from it, n = 0, 1, ...
 
-    The profile is the Moffat profile of the seeing integrated along the trail, convolved with the chords of the ring of
-    the pupil and with a pixel.
+    The light is relative to the light per pixel of trail length, so that the sum over pixels across the trail is 1. The
+    Moffat profile of the seeing is integrated along the trail. It is convolved with a pixel and with the chords of the
+    ring-shaped pupil (out of focus), whose lengths are proportional to the light.
     """
     reach = blur.outer + _SEEING_RANGE * blur.seeing + 2.0
     x = np.arange(-int(reach * _SUBSAMPLES), int(reach * _SUBSAMPLES) + 1) / _SUBSAMPLES
     core = 0.5 * blur.seeing / np.sqrt(2.0 ** (1.0 / _BETA) - 1.0)
     seeing = (1.0 + (x / core) ** 2) ** (0.5 - _BETA)
-    # Mean chord of the ring in each step: differences of its area on one side of a line at x.
+    # Area of the ring-shaped image of the pupil in each step of 1 / `_SUBSAMPLES` pixels across the trail: the
+    # difference between its areas on the left of the two edges of the step.
     edges = np.append(x - 0.5 / _SUBSAMPLES, x[-1] + 0.5 / _SUBSAMPLES)
     ring = np.diff(_area_left_of(edges, blur.outer))
     if blur.inner > 0.0:
@@ -181,13 +190,17 @@ def profile(blur: Blur) -> Float:
     for part in (seeing, ring, pixel):
         centred = np.zeros(4 * len(x))
         centred[: half + 1], centred[-half:] = part[half:], part[:half]
-        # All three functions are even, so that their transforms are real.
+        # The seeing, the ring and the pixel are even functions, so that their Fourier transforms are real.
         transform *= scipy.fft.rfft(centred / part.sum()).real
     return np.asarray(np.maximum(scipy.fft.irfft(transform, 4 * len(x))[: half + 1] * _SUBSAMPLES, 0.0))
 
 
 def _area_left_of(x: Float, radius: float) -> Float:
-    """Area of a disc to the left of a line at x, minus half its area; a step of height 1 for a radius of 0."""
+    """Return the area of a disc on the left of a vertical line, minus half the area of the disc.
+
+    `x` is the position of the line relative to the centre of the disc. A disc with a radius of 0 or less is a point:
+    the result is a step from 0 to 1 at x = 0.
+    """
     if radius <= 0.0:
         return np.where(x > 0.0, 1.0, 0.0)
     t = np.clip(x / radius, -1.0, 1.0)
@@ -196,7 +209,11 @@ def _area_left_of(x: Float, radius: float) -> Float:
 
 @jit
 def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
-    """Add a trail with the profile `table`. Its second coordinate is a function of its first, which ascends."""
+    """Add a satellite trail with the profile `table` to a frame, in place.
+
+    `along` (ascending, pixels on the second axis of the frame) and `across` (pixels on its first axis) are points of
+    the trail. `table` contains electrons per pixel at distances of 0, 1, 2, ... / `_SUBSAMPLES` pixels from the trail.
+    """
     ny, nx = frame.shape
     k = 0
     for c in range(max(0, int(np.ceil(along[0]))), min(nx, int(along[-1]) + 1)):
@@ -204,7 +221,7 @@ def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
             k += 1
         slope = (across[k + 1] - across[k]) / (along[k + 1] - along[k])
         middle = across[k] + slope * (c - along[k])
-        # Ratio of the distance from the line to the difference in the second coordinate.
+        # Shortest distance between a pixel and the trail, divided by their distance along the first axis of the frame.
         shorter = 1.0 / np.sqrt(1.0 + slope * slope)
         reach = (len(table) - 2) / (_SUBSAMPLES * shorter)
         for r in range(max(0, int(np.ceil(middle - reach))), min(ny, int(np.floor(middle + reach)) + 1)):
@@ -215,7 +232,12 @@ def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
 
 
 def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
-    """Return the parameters of `apply`, without satellites if the rate is 0 in the mission database (the default)."""
+    """Return the parameters of `apply` for a scene, from the mission database.
+
+    They are the mean number and brightness of satellites, the blur of their trails, the detector, and the radius of the
+    circle around all detectors (arcsec). The mean number is 0 if the database has a rate of 0 (the default), or if the
+    scene has no detector.
+    """
     mission, d = scene.mission, scene.detector
     rate = mission.value("survey.satellites.rate", "1 / (deg s)")
     if rate == 0.0 or d is None:
@@ -223,7 +245,7 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
     all_detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], mission)
     radius = max(float(np.hypot(detector.x, detector.y)) + detector.half_diagonal for detector in all_detectors)
     magnitude, spread = (mission.value(f"survey.satellites.{key}", "mag") for key in ("magnitude", "magnitude_spread"))
-    # Time in which a satellite crosses the length of a pixel.
+    # Time in seconds in which a satellite moves by one pixel.
     seconds = d.pixel_scale / mission.value("survey.satellites.speed", "arcsec / s")
     electrons = 10.0 ** (0.4 * (scene.zero_point - magnitude)) * seconds
     outer = 0.5 * scene.value("aperture_diameter", "m") / mission.value("survey.satellites.distance", "m") / _ARCSEC
@@ -234,14 +256,15 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Return the electrons in the brightest pixel of the brightest satellite that is drawn."""
+    """Return the electrons in the brightest pixel of the brightest possible satellite trail; 0 without satellites."""
     satellites, blur, *_ = parameters(scene)
     if satellites.number == 0.0:
         return 0.0
     return float(satellites.electrons * 10.0 ** (0.4 * _MAX_SIGMA * satellites.spread) * profile(blur).max())
 
 
-# Trails average out: the next exposure has different satellites.
+# `systematic` (the part of the effect that remains in a mean of exposures) is 0, because each exposure has different
+# satellites.
 EFFECT = Effect(
     "satellite_trails", apply, parameters, _contribution, shared=True, cost=3e-3, systematic=zero_contribution
 )

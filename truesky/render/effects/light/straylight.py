@@ -1,6 +1,7 @@
-"""In-field stray light: a wide faint halo around every bright star.
+"""Stray light from bright stars in or near the field: a wide faint halo around every star.
 
-For a star with the flux F, the fraction f in the halo and the scale s of the halo::
+The surface brightness I at the distance r from a star is given below. F is the flux of the star, f the fraction of it
+in the halo, and s the scale length of the halo::
 
     I(r) = F f / (2 pi s^2) (1 + (r / s)^2)^(-3/2)
 """
@@ -16,24 +17,27 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
-# Spacing of nodes in units of the scale. Linear interpolation between nodes has a relative error of 2e-3.
+# Distance between nodes of the grid on which halos are computed, in units of the halo's scale length. Linear
+# interpolation between the nodes has a relative error of at most 3e-3.
 _NODE_SPACING = 1.0 / 16.0
+# Largest distance in pixels between nodes of the grid on which halos are computed. It replaces `_NODE_SPACING` for
+# halos with a scale length above 4096 pixels.
 _MAX_STEP = 256
 
 
 def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.random.Generator | None = None) -> Frame:
-    """Add the halos of all lights, also of lights outside the frame.
+    """Add the halo of every star in `lights` to a frame, also of stars outside the frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
     lights : Lights
-        Positions and electrons of stars.
+        Positions (columns and rows) and electrons of the stars.
     fraction : float
-        Fraction of a star's flux in its halo, 0 to 1.
+        Fraction of a star's flux that is in its halo, 0 to 1.
     scale : float
-        Scale of the halo in pixels, 1 to 1e6.
+        Scale length of the halo in pixels, 1 to 1e6.
     rng : numpy.random.Generator, optional
         Not used.
 
@@ -45,7 +49,7 @@ def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.r
     Raises
     ------
     OutOfRange
-        If `fraction` or `scale` is outside its limits.
+        If `fraction` or `scale` is outside its limits or NaN.
     """
     if not 0.0 <= fraction <= 1.0:
         raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)
@@ -89,7 +93,7 @@ def _interpolate(frame: Any, nodes: Any, step: int) -> None:
 
 
 def _halo_parameters(scene: Scene) -> tuple[float, float]:
-    """Return the fraction of the flux in a halo, and its scale in pixels."""
+    """Return the fraction of a star's flux that is in its halo, and the scale length of the halo in pixels."""
     pixel_scale = scene.value("fpa.pixel_scale", "arcsec / pix")
     return scene.value("halo.fraction", ""), scene.value("halo.radius", "arcsec") / pixel_scale
 
@@ -97,7 +101,8 @@ def _halo_parameters(scene: Scene) -> tuple[float, float]:
 def _parameters(scene: Scene) -> tuple[Any, ...]:
     fraction, scale = _halo_parameters(scene)
     lights = scene.lights
-    # Omit halos whose peak is below a thousandth of the noticeable change: even a thousand of them are not noticeable.
+    # Omit halos whose peak is at most a thousandth of the noticeable change, which is 0.1 times the noise of a pixel.
+    # Even a thousand of them at the same place are not noticeable.
     height = fraction * lights.electrons / (2.0 * np.pi * scale**2)
     bright = height > 1e-3 * NOTICEABLE * scene.pixel_noise
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright]), fraction, scale

@@ -1,1 +1,1 @@
-"""Effects of charge transfer, amplifiers and analogue-to-digital converters."""
+"""Effects of the readout: charge transfer to the amplifiers, the amplifiers, and analogue-to-digital conversion."""

@@ -1,4 +1,4 @@
-"""Convert electrons to digital numbers: gain, bias, rounding and range of the converter."""
+"""Convert electrons to the digital numbers of an analogue-to-digital converter (ADC): gain, bias, rounding, range."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def apply(
     largest: float | Float,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """Convert electrons to ADU.
+    """Convert electrons to digital numbers (ADU), with clipping to the range of the converter.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ def apply(
     Returns
     -------
     float array, shape of `frame`
-        Whole ADU, 0 to `largest`.
+        ADU, whole numbers from 0 to `largest`. Halves are rounded up.
 
     Raises
     ------
     OutOfRange
-        If a gain is not positive and finite.
+        If a gain is 0, negative, infinite or NaN. Bias and range are not checked.
     """
     if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)
@@ -53,21 +53,30 @@ def apply(
 def apply_signal(
     frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Convert the signal of a ramp to ADU and leave its chi^2 unchanged.
+    """Convert the signal that was estimated from an up-the-ramp exposure to digital numbers (ADU); chi^2 is unchanged.
 
     Parameters
     ----------
     frame : float array, shape (2, ny, nx)
-        Signal in electrons, and chi^2 of the ramp fit.
-    gain, bias, largest : float
-        Same as in `apply`.
+        Signal in electrons, and chi^2 of the fit to the ramp.
+    gain : float
+        Electrons per ADU, more than 0.
+    bias : float
+        Bias level in ADU.
+    largest : float
+        Highest output of the converter in ADU.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape (2, ny, nx)
-        Signal in whole ADU, and chi^2.
+        Signal in ADU, whole numbers from 0 to `largest`, and chi^2.
+
+    Raises
+    ------
+    OutOfRange
+        If the gain is 0, negative, infinite or NaN.
     """
     return np.stack([apply(frame[0], gain, bias, largest), frame[1]])
 
@@ -84,18 +93,22 @@ def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Flo
 
 
 def pixel_type(scene: Scene) -> type[np.uint16] | type[np.int32]:
-    """Return the integer type of pixels in a file: uint16, or int32 if a converter has more than 16 bits."""
+    """Return the integer type of an image file's pixels: uint16, or int32 if a converter's range exceeds 65535 ADU."""
     largest = float(np.max(scene.amplifier_values("adc_max", "adu")))
     return np.uint16 if largest <= np.iinfo(np.uint16).max else np.int32
 
 
 def to_file_type(numbers: Frame, scene: Scene) -> Array:
-    """Convert whole ADU, as returned by `apply`, to the integer type of a file."""
+    """Convert digital numbers (whole ADU, as returned by `apply`) to the integer type of an image file."""
     return numbers.astype(pixel_type(scene))
 
 
 def convert_groups(groups: Frame, scene: Scene) -> Array:
-    """Convert the groups of a ramp, shape (groups, ny, nx), from electrons to ADU in the integer type of a file."""
+    """Convert the groups of an up-the-ramp exposure from electrons to ADU, in the integer type of an image file.
+
+    A group is the mean of several reads. The array `groups` has the shape (groups, ny, nx), and so has the result. Its
+    values are whole numbers from 0 to the highest output of the converter, including the bias level.
+    """
     numbers = _parameters(scene)
     return np.stack([to_file_type(apply(group, *numbers), scene) for group in groups])
 

@@ -1,4 +1,8 @@
-"""Add the structure of the bias: amplifier offsets, settling in the first columns, and column stripes."""
+"""Structure of the bias level: offsets of amplifiers, settling in the first columns, and stripes along columns.
+
+Settling is an additional offset that decays exponentially from the first column that is read. Stripes are random
+offsets of single columns. The whole pattern is the same in every row and in every exposure.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +19,32 @@ Number = float | Float
 def apply(
     frame: Frame, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """Add the bias pattern to every row.
+    """Add the bias pattern to a frame. It is the same in every row and in every exposure.
 
     Parameters
     ----------
     frame : float array, shape (q, ny, nx)
-        Electrons of each quadrant or amplifier in readout order.
-    offset, settling, length, stripes : float or array, shape (q,)
-        Same as in `structure`.
+        Electrons of each of the q quadrants or amplifiers, with the pixel at [0, 0] read first.
+    offset : float or array, shape (q,)
+        Standard deviation of the offsets of amplifiers in electrons, 0 or more.
+    settling : float or array, shape (q,)
+        Additional offset of the first column that is read, in electrons.
+    length : float or array, shape (q,)
+        Number of columns in which the additional offset falls by a factor of e, 1e-3 or more.
+    stripes : float or array, shape (q,)
+        Standard deviation of the random offsets of single columns in electrons, 0 or more.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the pattern does not change.
 
     Returns
     -------
     float array, shape of `frame`
         Electrons including the bias pattern.
+
+    Raises
+    ------
+    OutOfRange
+        If `offset`, `stripes` or `length` is outside its limits, infinite or NaN.
     """
     shape = frame.reshape(-1, *frame.shape[-2:]).shape
     pattern = structure(shape[0], shape[2], offset, settling, length, stripes, rng)
@@ -39,7 +54,7 @@ def apply(
 def structure(
     quadrants: int, nx: int, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """Draw the bias pattern of every amplifier.
+    """Draw the bias pattern of every amplifier, one value per column.
 
     Parameters
     ----------
@@ -50,23 +65,23 @@ def structure(
     offset : float or array, shape (quadrants,)
         Standard deviation of the offsets of amplifiers in electrons, 0 or more.
     settling : float or array, shape (quadrants,)
-        Offset of the first column in electrons.
+        Additional offset of the first column that is read, in electrons.
     length : float or array, shape (quadrants,)
-        Number of columns in which the settling offset falls by a factor of e, 1e-3 or more.
+        Number of columns in which the additional offset falls by a factor of e, 1e-3 or more.
     stripes : float or array, shape (quadrants,)
-        Standard deviation between columns in electrons, 0 or more.
+        Standard deviation of the random offsets of single columns in electrons, 0 or more.
     rng : numpy.random.Generator
-        Random numbers of the detector, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the pattern does not change.
 
     Returns
     -------
     float array, shape (quadrants, nx)
-        Electrons to add to each column.
+        Electrons to add to each column, in the order in which columns are read.
 
     Raises
     ------
     OutOfRange
-        If `offset`, `stripes` or `length` is outside its limits.
+        If `offset`, `stripes` or `length` is outside its limits, infinite or NaN.
     """
     for name, value, lowest in (
         ("bias offset", offset, 0.0), ("bias stripes", stripes, 0.0), ("bias settling length", length, 1e-3)

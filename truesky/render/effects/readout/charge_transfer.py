@@ -1,8 +1,9 @@
 """Charge transfer inefficiency: traps in the silicon capture and release charge while it is shifted to the output.
 
-Charge moves down the columns into the serial register (parallel), and along the register to the amplifier (serial).
-For detectors with known traps, `PARALLEL` and `SERIAL` follow the charge of the traps. For cameras of which only the
-loss per transfer is known, `PARALLEL_LOSS` and `SERIAL_LOSS` defer this fraction of each packet.
+Charge moves down the columns into the serial register (parallel transfer), and along the register to the amplifier
+(serial transfer). For detectors with known traps, the effects `PARALLEL` and `SERIAL` follow the charge in the traps.
+For cameras of which only the loss per transfer is known, the effects `PARALLEL_LOSS` and `SERIAL_LOSS` leave this
+fraction of each charge packet behind, in the next packet.
 """
 
 from __future__ import annotations
@@ -20,17 +21,26 @@ from truesky.render.effects.readout.traps import Sweeps, Traps
 from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 from truesky.request.accuracy import DRAFT, Accuracy
 
-# Highest fraction of a packet that a transfer may lose. All detectors in use lose less.
+# Highest allowed fraction of a charge packet that one transfer from pixel to pixel leaves behind. OutOfRange is raised
+# above it. All detectors in use have a lower fraction.
 _MAX_LOSS = 1e-3
-# Number of trap species in the mission database.
+# Number of trap species (with different release times) in the mission database.
 _SPECIES = 3
-# Number of traps on the longest path at the end of the mission: one in each of 2066 pixels.
+# Number of traps that the charge of the pixel farthest from the amplifier passes at the end of the mission: one in each
+# of 2066 pixels.
 _END_OF_LIFE = 2066.0
-# At the end of the mission, changes of a source at the far end: relative flux, position in pixels, and ellipticity.
-_FLUX, _SHIFT, _SHAPE = 0.05, 0.036, 0.01
-# Error of these changes at the end of the mission as a fraction, exponent of the damage that it grows with, and method:
-# trap levels, one sweep, Heun's method, and four steps of Heun's method. Tests measure the errors with arCTIc as the
-# reference, and with small steps as the reference for trap levels.
+# Relative change of the flux of a source by traps, in the pixel farthest from the amplifier, at the end of the mission.
+_FLUX = 0.05
+# Change of the position of a source by traps, in the pixel farthest from the amplifier, at the end of the mission, in
+# pixels.
+_SHIFT = 0.036
+# Change of the ellipticity of a source by traps, in the pixel farthest from the amplifier, at the end of the mission.
+_SHAPE = 0.01
+# Numerical methods to follow charge over traps, from the fastest to the slowest: nine groups of traps by the charge
+# that reaches them, one sweep over all pixels, Heun's method, and four steps of Heun's method. Each row is (error e,
+# exponent p, method). Let d be the number of traps divided by that at the end of the mission. The error of a method is
+# e d^p times the changes that traps cause in sources at the end of the mission. Tests measure e by comparison with the
+# program arCTIc, and for the fastest method by comparison with a calculation in small steps.
 _SWEEPS = (
     (0.75, 1, Sweeps(1, 1, 9)),
     (0.016, 2, Sweeps(1, 1)),
@@ -42,25 +52,25 @@ _SWEEPS = (
 def apply_parallel(
     frame: Frame, silicon: Traps, sweeps: Sweeps, rows: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Shift charge down the columns, over traps.
+    """Shift charge down the columns to the serial register, over traps that capture and release electrons.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
-        Electrons of each quadrant in readout order.
+        Electrons of each quadrant, 0 or more. Row 0 is read first.
     silicon : Traps
-        Traps along the columns.
+        Density and release times of the traps along the columns, and the volume of a pixel that charge fills.
     sweeps : Sweeps
-        Method to follow the charge.
+        Numerical method to follow the charge.
     rows : int
-        Number of rows that are pixels; the others are overscan.
+        Number of rows that are pixels of the detector; the others are overscan. Larger numbers mean all rows.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape of `frame`
-        Electrons in the packets after the transfer.
+        Electrons of each pixel after the transfer. Charge that is still trapped after the last row is lost.
     """
     return traps.shift_charge(frame, silicon, sweeps, -2, min(rows, frame.shape[-2]))[0]
 
@@ -68,41 +78,46 @@ def apply_parallel(
 def apply_serial(
     frame: Frame, silicon: Traps, sweeps: Sweeps, columns: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Shift charge along the serial register, over traps.
+    """Shift charge along the serial register to the amplifier, over traps that capture and release electrons.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
-        Electrons of each quadrant in readout order.
+        Electrons of each quadrant, 0 or more. Column 0 is read first.
     silicon : Traps
-        Traps of the serial register.
+        Density and release times of the traps in the serial register, and the volume of a pixel that charge fills.
     sweeps : Sweeps
-        Method to follow the charge.
+        Numerical method to follow the charge.
     columns : int
-        Number of columns that are pixels of the register; the others are overscan.
+        Number of columns that start in a pixel of the register; the others are overscan. Larger numbers mean all
+        columns.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape of `frame`
-        Electrons in the packets after the transfer.
+        Electrons of each pixel after the transfer. Charge that is still trapped after the last column is lost.
     """
     return traps.shift_charge(frame, silicon, sweeps, -1, min(columns, frame.shape[-1]))[0]
 
 
 def choose_sweeps(accuracy: Accuracy, traps_passed: float) -> Sweeps:
-    """Choose the fastest method whose error in sources is accepted, for a number of traps on the longest path.
+    """Return the fastest numerical method to follow charge over traps that is accurate enough for all sources.
 
-    The loss grows with the number of traps, and so does the error: it is of the next order in the number of traps.
+    `accuracy` has the accepted errors of the flux, position and shape of a source. `traps_passed` counts the traps
+    on the longest path to the amplifier. The fastest method has an error proportional to this number; the other methods
+    have errors proportional to its square. If no method is accurate enough, the result is the most accurate one.
     """
     return _best_sweeps(accuracy, traps_passed)[1]
 
 
 def source_errors(scene: Scene, name: str) -> dict[str, float]:
-    """Return the errors that the chosen method leaves in a source at the far end, or {} for other effects' names.
+    """Return the errors of a source farthest from the amplifier that the approximate simulation of traps causes.
 
-    The keys are names of accuracies: "flux" (fraction), "shape" (reduced shear) and "position" (pixels).
+    The keys are "flux" (relative), "shape" (reduced shear) and "position" (pixels). They are due to the
+    numerical method that the accuracy of the scene selects. `name` is the name of a detector effect; the result is {}
+    unless it is "parallel_cti" or "serial_cti", the shift of charge over traps in one direction.
     """
     if name == PARALLEL.name:
         direction, transfers = "parallel", scene.half_rows
@@ -115,7 +130,12 @@ def source_errors(scene: Scene, name: str) -> dict[str, float]:
 
 
 def _best_sweeps(accuracy: Accuracy, traps_passed: float) -> tuple[float, Sweeps]:
-    """Return the error as a fraction of the damage at the end of the mission, and the method."""
+    """Return the error and the method: the fastest numerical method to follow charge that is accurate enough.
+
+    `accuracy` has the accepted errors of sources, and `traps_passed` is the number of traps on the longest path to the
+    amplifier. The error is a fraction of the changes that traps cause in sources at the end of the mission. If no
+    method is accurate enough, the most accurate one is returned.
+    """
     damage = traps_passed / _END_OF_LIFE
     allowed = min(accuracy.flux / _FLUX, accuracy.position / _SHIFT, accuracy.shape / _SHAPE)
     candidates = [(error * damage**power, sweeps) for error, power, sweeps in _SWEEPS]
@@ -123,9 +143,11 @@ def _best_sweeps(accuracy: Accuracy, traps_passed: float) -> tuple[float, Sweeps
 
 
 def silicon_traps(scene: Scene, direction: str) -> Traps:
-    """Return the traps of a direction, "parallel" or "serial".
+    """Return the traps for one direction of transfer, "parallel" or "serial", from the mission database.
 
-    Densities are those at the end of the mission times the damage since launch.
+    The density is that at the end of the mission times the parameter `cti.age`. This is the radiation damage since
+    launch, divided by the damage at the end of the mission. For the serial direction, the density is also multiplied by
+    the parameter `cti.serial_ratio`.
     """
     damage = scene.value("cti.age", "")
     if direction == "serial":
@@ -141,12 +163,12 @@ def silicon_traps(scene: Scene, direction: str) -> Traps:
 
 
 def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
-    """Defer a fraction of each packet to the next one, at each transfer down the columns.
+    """Leave a fraction of each charge packet behind in the next packet, at each transfer down the columns.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
-        Electrons of each amplifier in readout order.
+        Electrons of each amplifier. Row 0 is read first.
     loss : float
         Fraction of a packet that each transfer leaves to the next packet, 0 to 1e-3.
     rng : numpy.random.Generator, optional
@@ -155,41 +177,46 @@ def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | No
     Returns
     -------
     float array, shape of `frame`
-        Electrons after the transfer. Charge left behind the last packets is not read.
+        Electrons after the transfer. Charge left behind the last packet of a column is not read.
 
     Raises
     ------
     OutOfRange
-        If `loss` is outside its limits.
+        If `loss` is outside its limits or NaN.
 
     Notes
     -----
-    Charge that is deferred more than twice is added to the second packet behind. The error is 2e-8 of a packet.
+    As an approximation, charge that falls back by more than two packets is added to the second packet behind. For a
+    loss of 1e-6 and a few thousand transfers, the error is 2e-8 of a packet. It grows with the third power of the loss.
     """
     return _defer_charge(frame, loss, along=False)
 
 
 def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
-    """Defer a fraction of each packet to the next one, at each transfer along the register.
+    """Leave a fraction of each charge packet behind in the next packet, at each transfer along the serial register.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
-        Electrons of each amplifier in readout order.
+        Electrons of each amplifier. Column 0 is read first.
     loss : float
-        Same as in `apply_parallel_loss`.
+        Fraction of a packet that each transfer leaves to the next packet, 0 to 1e-3.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape of `frame`
-        Electrons after the transfer.
+        Electrons after the transfer. Charge left behind the last packet of a row is not read.
 
     Raises
     ------
     OutOfRange
-        If `loss` is outside its limits.
+        If `loss` is outside its limits or NaN.
+
+    Notes
+    -----
+    As an approximation, charge that falls back by more than two packets is added to the second packet behind.
     """
     return _defer_charge(frame, loss, along=True)
 
@@ -209,9 +236,11 @@ def _defer_charge(frame: Frame, loss: float, along: bool) -> Frame:
 
 @jit
 def _defer_packets(frame: Any, staying: Any, to_next: Any, to_second: Any, along: bool, out: Any) -> None:
-    """Fill `out` with the charge of each packet.
+    """Fill `out` with the charge of each packet after all transfers along the rows (if `along`) or down the columns.
 
-    `staying`, `to_next` and `to_second` are the fractions that remain in a packet and that join the next two.
+    `frame` and `out` have the axes [amplifier, row, column], in electrons, with the pixel at [0, 0] read first.
+    `staying`, `to_next` and `to_second` are the fractions of a packet that remain in it, that join the packet read
+    next, and that join the one after it. Their index is the column (if `along`) or row in which the packet starts.
     """
     for q in range(len(frame)):
         for r in range(frame.shape[1]):
@@ -230,7 +259,11 @@ def _transfer_loss(scene: Scene, direction: str) -> float:
 
 
 def _max_deferred(scene: Scene, direction: str) -> float:
-    """Electrons that the brightest packet leaves behind on the longest path."""
+    """Return the electrons that the brightest packet leaves behind on the longest path to the amplifier.
+
+    `direction` is "parallel" (down the columns) or "serial" (along the register). The result is 0 for detectors without
+    a table of amplifiers in the mission database.
+    """
     if scene.layout is None:
         return 0.0
     layout = scene.layout
@@ -244,22 +277,32 @@ def _register_columns(scene: Scene) -> int:
 
 
 def _max_loss(scene: Scene, direction: str, transfers: int) -> float:
-    """Electrons that the brightest packet loses on the longest path if all traps that it reaches are empty.
+    """Return the electrons that the brightest packet loses on the longest path if all traps that it reaches are empty.
 
-    The value is reduced if sources change by less than the accepted errors: the ratio then gives the margin.
+    `direction` is "parallel" (down the columns) or "serial", and `transfers` the number of pixels on the longest path.
+    If traps change sources by less than the errors that the request accepts, the result is limited to the noticeable
+    change of a pixel times (change of sources / accepted error). The effect then counts as too small to be applied.
     """
     lost, excess = _loss_and_excess(scene, direction, transfers)
     return lost if excess > 1.0 else min(lost, excess * NOTICEABLE * scene.pixel_noise)
 
 
 def _systematic_loss(scene: Scene, direction: str, transfers: int) -> float:
-    """Loss in a mean of frames: the whole loss, or 0 if sources change by less than the accepted errors."""
+    """Return the electrons that the brightest packet loses to traps on the longest path, which repeats in every frame.
+
+    `direction` is "parallel" (down the columns) or "serial", and `transfers` the number of pixels on the longest path.
+    The result is 0 if traps change sources by less than the errors that the request accepts.
+    """
     lost, excess = _loss_and_excess(scene, direction, transfers)
     return lost if excess > 1.0 else 0.0
 
 
 def _loss_and_excess(scene: Scene, direction: str, transfers: int) -> tuple[float, float]:
-    """Lost electrons, and the change of sources relative to the accepted errors."""
+    """Return the electrons that the brightest packet loses to traps, and the change of sources / accepted error.
+
+    `direction` is "parallel" (down the columns) or "serial", and `transfers` the number of pixels on the longest path.
+    The second number is the largest of the changes of flux, position and shape, each divided by its accepted error.
+    """
     silicon = silicon_traps(scene, direction)
     traps_passed = transfers * sum(silicon.density)
     return traps_passed * float(silicon.volume(scene.brightest_electrons)), _accuracy_excess(
@@ -268,9 +311,11 @@ def _loss_and_excess(scene: Scene, direction: str, transfers: int) -> tuple[floa
 
 
 def _accuracy_excess(accuracy: Accuracy, traps_passed: float) -> float:
-    """Change of a source by traps relative to the accepted errors, which are at most those of a draft.
+    """Return the largest change of a source by traps (flux, position or shape) divided by the accepted error.
 
-    A quicklook therefore omits no effect that a draft includes.
+    `traps_passed` is the number of traps on the longest path to the amplifier. The accepted errors are the values of
+    `accuracy`, or the values of the accuracy preset "draft" if these are smaller.
+    The coarser preset "quicklook" therefore omits no effect that "draft" includes.
     """
     flux, shift, shape = (
         min(accuracy.flux, DRAFT.flux), min(accuracy.position, DRAFT.position), min(accuracy.shape, DRAFT.shape)
@@ -279,7 +324,10 @@ def _accuracy_excess(accuracy: Accuracy, traps_passed: float) -> float:
 
 
 def _scene_before_readout(scene: Scene) -> Scene:
-    """Scene at the start of the readout: no cosmic ray has hit the pixels if the exposure time is 0."""
+    """Return the scene without cosmic rays if its exposure time is 0, because none hits the pixels before the readout.
+
+    Otherwise the scene is returned unchanged.
+    """
     return scene if scene.exposure_time_s > 0.0 else replace(scene, track_electrons=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Crosstalk between amplifiers of a detector: they are read at the same time, and each signal appears in the others."""
+"""Crosstalk between the amplifiers of a detector: they are read at the same time, and each signal appears in others."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from truesky.render.camera import amplifiers
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Coupling across the diagonal as a fraction of the coupling between neighbours (assumed).
+# Crosstalk coefficient of diagonally opposite quadrants of a detector, divided by that of quadrants with a common side
+# (assumed).
 _DIAGONAL = 0.5
+# Number of pixels of each amplifier that are treated together, so that they fit into the cache of the processor.
 _BLOCK = 1024
-# Each iteration multiplies the error by the sum of an amplifier's coefficients, which is 0.01 or less.
+# Number of iterations of `remove`. Each multiplies the remaining crosstalk by the sum of the crosstalk coefficients of
+# an amplifier, which is at most 0.01 for real detectors.
 _ITERATIONS = 3
 
 
 def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """Add to each amplifier a share of the signals of all others.
+    """Add to the signal of each amplifier a share of the signals of all other amplifiers.
 
     Parameters
     ----------
     frame : float array, shape (q, ny, nx)
-        Electrons of each amplifier in readout order.
+        Electrons of each of the q amplifiers, with the pixel at [0, 0] read first.
     coefficients : float array, shape (q, q)
-        Share of the signal of the second index that appears in the first, -1 to 1; 0 on the diagonal.
+        Element [i, j] is the share of the signal of amplifier j that appears in amplifier i, -1 to 1. Elements on the
+        diagonal are ignored.
     rng : numpy.random.Generator, optional
         Not used.
 
@@ -39,9 +43,9 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
     Raises
     ------
     BadInput
-        If the number of coefficients does not match the number of amplifiers.
+        If the shape of `coefficients` is not (q, q).
     OutOfRange
-        If a coefficient is outside its limits.
+        If a coefficient is outside its limits or NaN.
     """
     count = len(frame)
     if coefficients.shape != (count, count):
@@ -55,9 +59,11 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
 
 
 def remove(frame: Frame, coefficients: Frame) -> Frame:
-    """Remove crosstalk from frames: the inverse of `apply`, for calibration.
+    """Remove crosstalk between amplifiers from a frame (q, ny, nx) for calibration: the inverse of `apply`.
 
-    The relative error is the fourth power of the sum of an amplifier's coefficients: 1e-8 of the light of the others.
+    Element [i, j] of `coefficients`, shape (q, q), is the share of the signal of amplifier j that appears in amplifier
+    i. The remaining error is the light of the other amplifiers times the fourth power of the sum of an amplifier's
+    coefficients, or 1e-8 for a sum of 0.01.
     """
     out = apply(frame, -coefficients)
     for _ in range(_ITERATIONS - 1):
@@ -67,7 +73,8 @@ def remove(frame: Frame, coefficients: Frame) -> Frame:
 
 @jit
 def _mix(frame: Any, coefficients: Any, out: Any) -> None:
-    # Blocks of pixels are small enough for the cache of the processor.
+    # Add the crosstalk to `_BLOCK` pixels of all amplifiers before the next pixels: these fit into the processor's
+    # cache.
     for start in range(0, frame.shape[1], _BLOCK):
         for victim in range(len(frame)):
             line = out[victim, start : start + _BLOCK]
@@ -80,17 +87,18 @@ def _mix(frame: Any, coefficients: Any, out: Any) -> None:
 
 
 def coefficients(scene: Scene) -> Frame:
-    """Return the crosstalk coefficients of a scene's detector, shape (q, q).
+    """Return the crosstalk coefficients of a scene's detector, shape (q, q) for q amplifiers.
 
-    Detectors that are read in quadrants have the mission's value for neighbours, and half of it across the diagonal.
-    Ground cameras have coefficients for each pair of amplifiers.
+    Element [i, j] is the share of the signal of amplifier j that appears in amplifier i. Detectors that are read in
+    quadrants have the coefficient of the mission database for neighbours, and half of it for diagonally opposite
+    quadrants. Ground cameras have a coefficient for each pair of amplifiers.
     """
     if scene.layout is not None and scene.detector is not None:
         largest = scene.value("crosstalk_max", "")
         return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
     row_neighbour = column_neighbour = scene.value("crosstalk", "")
     diagonal = _DIAGONAL * row_neighbour
-    # E F G H: upper left, upper right, lower right, lower left.
+    # The order of the quadrants is upper left (E), upper right (F), lower right (G), lower left (H).
     return np.array(
         [
             [0, row_neighbour, diagonal, column_neighbour],

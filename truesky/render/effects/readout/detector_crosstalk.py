@@ -1,6 +1,7 @@
-"""Crosstalk between detectors that share a readout board: faint copies of the other detectors' bright stars appear.
+"""Crosstalk between detectors that are connected to the same readout board: faint copies of bright stars appear.
 
-Amplifiers with the same number are coupled, pixel by pixel in readout order.
+The signal of an amplifier of one detector appears in the amplifier with the same number of each other detector on the
+board. The pixels that are read at the same time are coupled.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 def apply(
     frame: Frame, neighbour_charge: NeighbourCharge | None, coefficient: float, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Add the crosstalk from detectors on the same board.
+    """Add the crosstalk from the other detectors on the same readout board to a frame.
 
     Parameters
     ----------
     frame : float array, shape (q, ny, nx)
-        Electrons of each amplifier in readout order.
+        Electrons of each of the q amplifiers, with the pixel at [0, 0] read first.
     neighbour_charge : NeighbourCharge or None
-        Charge of the other detectors. None if it is negligible.
+        Pixels of this detector, and the electrons that the other detectors read at the same time as each of them. None
+        if this charge is negligible.
     coefficient : float
         Share of the signal of one detector that appears in another, -1 to 1.
     rng : numpy.random.Generator, optional
@@ -36,19 +38,23 @@ def apply(
     Raises
     ------
     OutOfRange
-        If `coefficient` is outside its limits.
+        If `coefficient` is outside its limits or NaN.
     """
     if not abs(coefficient) <= 1.0:
         raise OutOfRange("crosstalk between detectors", coefficient, -1.0, 1.0)
     out = np.array(frame, dtype=float, order="C")
     if neighbour_charge is not None:
-        # The assignment is correct because indices of pixels are unique.
+        # numpy adds only one value to an element whose index occurs several times in such a sum. This is no danger
+        # here, because each pixel occurs only once in `neighbour_charge.pixel`.
         out.reshape(-1)[neighbour_charge.pixel] += coefficient * neighbour_charge.electrons
     return out
 
 
 def coefficient(scene: Scene) -> float:
-    """Return the coefficient from the mission database, or 0 for cameras without it."""
+    """Return the fraction of a detector's signal that appears in each other detector on its readout board.
+
+    It is 0 for cameras for which the mission database has no such parameter.
+    """
     key = f"{scene.section}.crosstalk_detectors"
     return scene.mission.value(key) if key in scene.mission else 0.0
 
@@ -58,7 +64,8 @@ def _contribution(scene: Scene) -> float:
     return abs(coefficient(scene)) * brightest
 
 
-# The contribution averages out: a copy of a star covers few pixels, and different ones in the next exposure.
+# `systematic` (the change of a pixel that remains in the mean of many exposures) is 0, because copies of stars are on
+# other pixels in the next exposure.
 EFFECT = Effect(
     "detector_crosstalk",
     apply,

@@ -1,8 +1,11 @@
-"""Nonlinearity of the output amplifier: its gain falls towards saturation, and for the first electrons.
+"""Nonlinearity of the output amplifiers: their gain is lower near saturation, and for the first electrons.
 
-For n electrons, with the parameters a (`high`), b (`low`) and n0 (`knee`)::
+For n electrons in a pixel, the output in electrons is::
 
     measured = s - b n0 (1 - exp(-s / n0)),    s = n / (1 + a n / saturation)
+
+The parameter a (`high`) is the approximate relative loss of signal near `saturation` (electrons). The fraction b
+(`low`) of the first electrons is missing in the output. This loss ends over n0 (`knee`) electrons.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, small_expm1
 
-# Newton's method doubles the number of correct digits. The function is smooth with slopes between 1 - b and 1.
+# Number of steps of Newton's method in `linearise`. Each doubles the number of correct digits, because the function
+# that is inverted is smooth: its slope increases from 1 - `low` (at least 0.01) for no signal to 1 for strong signals.
 _ITERATIONS = 6
 
 
@@ -28,32 +32,33 @@ Number = float | Float
 def apply(
     frame: Frame, high: Number, saturation: Number, low: Number, knee: Number, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Apply the nonlinearity of the amplifiers.
+    """Convert the electrons of pixels to the output of their nonlinear amplifiers.
 
     Parameters
     ----------
     frame : float array, any shape, or (q, ...) for q amplifiers
-        Electrons. Negative values are unchanged.
+        Electrons. Negative values are unchanged. The first axis counts amplifiers if parameters are arrays.
     high : float or array, shape (q,)
-        Parameter a: relative loss of signal at `saturation`, 0 to 10.
+        Parameter a: relative loss of signal near `saturation`, 0 to 10. With the loss, n electrons give n / (1 + a n /
+        saturation).
     saturation : float or array, shape (q,)
         Saturation of the amplifier in electrons, 1 to 1e9.
     low : float or array, shape (q,)
-        Parameter b: missing fraction of the first electrons, 0 to 0.99.
+        Parameter b: fraction of the first electrons that is missing in the output, 0 to 0.99.
     knee : float or array, shape (q,)
-        Scale n0 of the loss of the first electrons, in electrons, 1e-3 to 1e9.
+        Scale n0 in electrons over which the loss of the first electrons ends, 1e-3 to 1e9.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape of `frame`
-        Output of the amplifier in electrons. It increases monotonically with the input.
+        Output of the amplifier in electrons. It increases with the input everywhere.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `high`, `saturation`, `low` or `knee` is outside its limits or NaN.
     """
     _check_parameters(high, saturation, low, knee)
     return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee)
@@ -61,12 +66,16 @@ def apply(
 
 @jit
 def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -> None:
-    """Fill `signal`. `high` is per electron, `low` in electrons, and `inverse` is 1 / knee."""
+    """Fill `signal` with the output of an amplifier for `light` in electrons.
+
+    `high` is the relative loss of signal per electron in the pixel, due to saturation. `low` is the number of electrons
+    that are missing in any strong signal. `inverse` is 1 / (scale in electrons over which this loss is reached).
+    """
     for i in range(len(light)):
         response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
         signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
-    # Replace pixels outside the range of the series. A branch in the first loop would prevent its vectorisation, which
-    # costs more than computing a few pixels twice.
+    # Compute the brighter pixels, for which the power series in `small_expm1` is not accurate, again. An `if` in the
+    # first loop would prevent its vectorisation, which costs more than computing a few pixels twice.
     for i in range(len(light)):
         if light[i] * inverse > SMALL:
             response = light[i] / (1.0 + high * light[i])
@@ -74,24 +83,30 @@ def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -
 
 
 def linearise(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
-    """Invert `apply`, for calibration.
+    """Convert the output of nonlinear amplifiers back to electrons, for calibration: the inverse of `apply`.
 
     Parameters
     ----------
     measured : float array, any shape, or (q, ...) for q amplifiers
-        Output of the amplifier in electrons.
-    high, saturation, low, knee : float or array, shape (q,)
-        Same as in `apply`.
+        Output of the amplifiers in electrons. Negative values are unchanged.
+    high : float or array, shape (q,)
+        Relative loss of signal near `saturation`, 0 to 10.
+    saturation : float or array, shape (q,)
+        Saturation of the amplifier in electrons, 1 to 1e9.
+    low : float or array, shape (q,)
+        Fraction of the first electrons that is missing in the output, 0 to 0.99.
+    knee : float or array, shape (q,)
+        Scale in electrons over which the loss of the first electrons ends, 1e-3 to 1e9.
 
     Returns
     -------
     float array, shape of `measured`
-        Electrons before the amplifier; infinite for values above the highest possible output.
+        Electrons before the amplifier. Values above the highest possible output give infinity.
 
     Raises
     ------
     OutOfRange
-        If a parameter is outside its limits.
+        If `high`, `saturation`, `low` or `knee` is outside its limits or NaN.
     """
     _check_parameters(high, saturation, low, knee)
     high, saturation, low, knee = (
@@ -120,7 +135,12 @@ def _check_parameters(high: Number, saturation: Number, low: Number, knee: Numbe
 
 
 def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
-    """Return high, saturation, low and knee of a scene. The amplifier saturates at the end of the converter's range."""
+    """Return the parameters of nonlinearity, (high, saturation, low, knee), of the amplifiers of a scene's detector.
+
+    `high` is the relative loss of signal near saturation. `saturation` (electrons) is the highest output of the
+    analogue-to-digital converter times the gain. `low` is the fraction of the first electrons that is missing in the
+    output, and `knee` the scale in electrons over which this loss ends. Each is one number, or one per amplifier.
+    """
     saturation = scene.amplifier_values("adc_max", "adu") * scene.amplifier_values("gain", "electron / adu")
     return (
         scene.amplifier_values("nonlinearity.high", ""),

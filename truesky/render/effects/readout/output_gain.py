@@ -1,7 +1,8 @@
 """Gain differences between the outputs of a detector.
 
-Signals and headers use one gain for all outputs. The differences remain as stripes of neighbouring columns, in flats
-and images.
+An infrared detector has 32 outputs, each of which reads neighbouring columns. The conversion to digital numbers and the
+headers of files use one gain for all outputs. The differences therefore remain as stripes of neighbouring columns in
+flats and images.
 
 References
 ----------
@@ -19,16 +20,16 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, spread: float, rng: np.random.Generator) -> Frame:
-    """Multiply the columns of each output by its relative gain.
+    """Multiply the columns that each output of the detector reads by the relative gain of the output.
 
     Parameters
     ----------
     frame : float array, shape (..., ny, nx)
         Electrons.
     spread : float
-        Difference between the lowest and the highest possible gain as a fraction, 0 to 1. Gains are uniform in between.
+        Width of the range of gains, 0 to 1. Gains are drawn uniformly between 1 - spread / 2 and 1 + spread / 2.
     rng : numpy.random.Generator
-        Random numbers of the outputs, the same in every exposure.
+        Random generator of the detector, in the same state in every exposure, so that the gains do not change.
 
     Returns
     -------
@@ -38,7 +39,7 @@ def apply(frame: Frame, spread: float, rng: np.random.Generator) -> Frame:
     Raises
     ------
     OutOfRange
-        If `spread` is outside its limits.
+        If `spread` is outside its limits or NaN.
     """
     if not 0.0 <= spread <= 1.0:
         raise OutOfRange("spread of the outputs' gains", spread, 0.0, 1.0)
@@ -52,7 +53,10 @@ def _parameters(scene: Scene) -> tuple[float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Change of a full pixel: a hot pixel or a cosmic ray can fill any pixel, even without light."""
+    """Return the largest change of a full pixel by gain differences in electrons.
+
+    Any pixel may be full, because it may be hot or hit by a cosmic ray.
+    """
     return 0.5 * _parameters(scene)[0] * scene.value("full_well", "electron")
 
 

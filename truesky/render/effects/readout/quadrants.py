@@ -1,11 +1,12 @@
-"""Split a detector into quadrants or amplifiers in readout order, with prescan and overscan.
+"""Split a detector into quadrants or amplifiers, in the order in which pixels are read, with prescan and overscan.
 
-A detector is read through its four corners. Between its halves are rows for charge injection. They are not read: light
-and cosmic rays that fall there are lost.
+A VIS detector is read through its four corners. Between its halves are rows for charge injection, which are not read:
+light and cosmic rays that fall there are lost.
 
-Readout order is [E, F, G, H][row, column], where [0, 0] is read first. E is the upper left quadrant, F the upper right,
-G the lower right and H the lower left (Euclid Data Product Description Document, LE1 VIS). Columns are prescan, pixels,
-overscan; rows are pixels, overscan. Amplifiers of a ground camera follow the table of the detector.
+In readout order the axes are [quadrant, row, column], and the pixel at [0, 0] of each quadrant is read first. The
+quadrants are E (upper left), F (upper right), G (lower right) and H (lower left), as in the Euclid Data Product
+Description Document, LE1 VIS. Columns are prescan, pixels and overscan, in this order; rows are pixels and overscan.
+The amplifiers of ground cameras are listed in a table of the detector in the mission database.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
 NAMES = "EFGH"
-# True for quadrants in the upper half, and in the right half.
-_UPPER, _RIGHT = (True, True, False, False), (False, True, True, False)
+# For the quadrants E, F, G and H: True if the quadrant is in the upper half of the detector.
+_UPPER = (True, True, False, False)
+# For the quadrants E, F, G and H: True if the quadrant is in the right half of the detector.
+_RIGHT = (False, True, True, False)
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -36,25 +39,26 @@ def apply(
     injection_rows: int = 0,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """Split a detector into four quadrants in readout order.
+    """Split a frame into the four quadrants E, F, G, H, each flipped so that the pixel at [0, 0] is read first.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
     prescan, overscan : int
-        Columns before and after the pixels, 0 to 4096.
+        Number of columns that are added before and after the pixels of a quadrant, 0 to 4096.
     rows : int
-        Overscan rows after the pixels, 0 to 4096.
+        Number of overscan rows that are added after the pixels of a quadrant, 0 to 4096.
     injection_rows : int, optional
-        Rows between the halves of the detector, which are not read, 0 to 4096. The number must be even.
+        Number of rows between the halves of the detector, which are not read, 0 to 4096. The number must be even.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape (4, (ny - injection_rows) / 2 + rows, prescan + nx / 2 + overscan)
-        Electrons; 0 in prescan and overscan.
+        Electrons of the quadrants E (upper left), F (upper right), G (lower right) and H (lower left); 0 in prescan and
+        overscan.
 
     Raises
     ------
@@ -84,14 +88,20 @@ def apply(
 
 
 def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
-    """Flip a quadrant (ny, nx) from readout order to the axes of the detector, or back."""
+    """Flip a quadrant [ny, nx] from readout order (pixel [0, 0] read first) to the axes of the detector, or back.
+
+    `number` is the index of the quadrant: 0 upper left, 1 upper right, 2 lower right, 3 lower left. The result is a
+    view that shares the memory of `quadrant`.
+    """
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
 def pixel_offset(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> tuple[int, int]:
-    """Offset between pixel positions on the detector and in a quadrant in detector axes.
+    """Return the offset from pixel positions on the detector to positions in the image of a quadrant.
+
+    The image includes prescan and overscan, and is oriented as on the detector.
 
     Parameters
     ----------
@@ -99,13 +109,17 @@ def pixel_offset(
         Index of the quadrant, 0 to 3 for E, F, G, H.
     shape : (int, int)
         Rows and columns of the quadrant, with prescan and overscan.
-    prescan, overscan, rows, injection_rows : int
-        Same as in `apply`.
+    prescan, overscan : int
+        Number of columns that are read before and after the pixels.
+    rows : int
+        Number of overscan rows that are read after the pixels.
+    injection_rows : int, optional
+        Number of rows between the halves of the detector, which are not read.
 
     Returns
     -------
     column, row : int
-        Offset to add to a position on the detector.
+        Number of columns and of rows to add to a position on the detector.
     """
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
@@ -115,7 +129,9 @@ def pixel_offset(
 def sections(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> Sections:
-    """Image sections of a quadrant in detector axes.
+    """Return the sections of a quadrant's image for its FITS header: pixels, their place on the detector, and bias.
+
+    The image includes prescan and overscan, and is oriented as on the detector.
 
     Parameters
     ----------
@@ -123,18 +139,23 @@ def sections(
         Index of the quadrant, 0 to 3 for E, F, G, H.
     shape : (int, int)
         Rows and columns of the quadrant, with prescan and overscan.
-    prescan, overscan, rows, injection_rows : int
-        Same as in `apply`.
+    prescan, overscan : int
+        Number of columns that are read before and after the pixels.
+    rows : int
+        Number of overscan rows that are read after the pixels.
+    injection_rows : int, optional
+        Number of rows between the halves of the detector, which are not read.
 
     Returns
     -------
     Sections
-        Sections of the pixels, of their place on the detector, and of the bias (None without overscan).
+        Section of the pixels in the image, section of the same pixels on the detector, and section of columns that
+        measure the bias (None without overscan).
 
     Notes
     -----
-    The bias is measured in the second half of the overscan columns, because the first half contains charge released
-    from traps.
+    The bias is measured in those overscan columns that are read last, the second half, because the first half contains
+    charge released from traps.
     """
     (ny, nx), (across, up) = shape, pixel_offset(number, shape, prescan, overscan, rows, injection_rows)
     x, y = overscan if _RIGHT[number] else prescan, rows if _UPPER[number] else 0
@@ -147,19 +168,23 @@ def sections(
 def assemble(
     quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> npt.NDArray[Number]:
-    """Combine quadrants in readout order into a detector.
+    """Combine the four quadrants of a detector, in readout order, to one image.
 
     Parameters
     ----------
     quadrants : array, shape (4, ny, nx)
-        Result of `apply`.
-    prescan, overscan, rows, injection_rows : int
-        Same as in `apply`.
+        Quadrants E, F, G, H with prescan and overscan, the result of `apply`.
+    prescan, overscan : int
+        Number of columns before and after the pixels of a quadrant.
+    rows : int
+        Number of overscan rows after the pixels of a quadrant.
+    injection_rows : int, optional
+        Number of rows between the halves of the detector, which are not read.
 
     Returns
     -------
     array, shape (ny, nx)
-        Detector without prescan and overscan; 0 in the rows between the halves.
+        Image of the detector without prescan and overscan; 0 in the rows between the halves.
     """
     pixels = [
         to_detector_axes(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)
@@ -170,7 +195,11 @@ def assemble(
 
 
 def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
-    """Return the numbers of prescan columns, overscan columns, overscan rows, and rows between the halves."""
+    """Return the sizes with which the detector of a scene is split into quadrants by `apply`.
+
+    They are the numbers of prescan columns, overscan columns, overscan rows, and rows between the halves of the
+    detector.
+    """
     prescan, overscan, rows = (
         int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
     )
@@ -178,21 +207,26 @@ def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
 
 
 def apply_amplifiers(frame: Frame, layout: Layout, rng: np.random.Generator | None = None) -> Frame:
-    """Split a detector into amplifiers (q, rows, columns) in readout order, with prescan and overscan.
+    """Split a frame into the amplifiers of a ground camera's detector, each with the pixel at [0, 0] read first.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
     layout : Layout
-        Amplifiers of the detector.
+        Pixels that each of the q amplifiers reads, and numbers of prescan columns, overscan columns and overscan rows.
     rng : numpy.random.Generator, optional
         Not used.
 
     Returns
     -------
     float array, shape (q, rows, columns)
-        Electrons. Pixels that are not read are lost.
+        Electrons; 0 in prescan and overscan. Pixels that no amplifier reads are lost.
+
+    Raises
+    ------
+    BadInput
+        If the frame does not have the size of the detector.
     """
     return layout.split(frame)
 

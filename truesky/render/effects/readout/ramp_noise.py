@@ -1,10 +1,13 @@
-"""Noise of the reads of a ramp: white read noise, 1/f drift of the outputs, and reset levels.
+"""Noise of an up-the-ramp exposure (reads without reset): read noise, 1/f drift of the outputs, and reset levels.
 
-A group is the mean of r reads with the noise s each, so that its read noise is s / sqrt(r). A detector has 32 outputs,
-each of which reads its columns row by row. Reference pixels correct slow drifts of an output; the rest is noise with a
-1/f spectrum in readout order. The mission gives the width that this noise adds to the signal of a ramp. It is taken as
-linear in time over the ramp: each of the n differences of groups gets 1 / n of it, so that it does not increase their
-scatter. The level to which each pixel is reset is the same in all groups, so that the signal does not contain it.
+Reads are averaged in groups. A group of r reads with the noise s each has the read noise s / sqrt(r). A detector has 32
+outputs, each of which reads its columns row by row. Reference pixels correct slow drifts of an output. The rest is
+noise with a 1/f spectrum in the order in which pixels are read.
+
+The mission database contains the standard deviation that the 1/f noise adds to the signal of a ramp (an up-the-ramp
+exposure). As an approximation, this noise grows linearly from the first group to the last: each of the n differences of
+successive groups gets 1 / n of it, so that it does not increase their scatter. The random level to which each pixel is
+reset is the same in all groups, so that it cancels in the signal.
 
 References
 ----------
@@ -27,29 +30,32 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
+# Number of readout outputs of a detector.
 OUTPUTS = 32
-# Number of rows in which reference pixels follow a drift (assumed). Slower drifts are subtracted.
+# Longest period of the simulated 1/f noise of an output, in detector rows (assumed). Slower drifts are left out,
+# because they are measured with reference pixels and subtracted.
 _REFERENCE_ROWS = 64
 
 
 def edges(columns: int) -> Int:
-    """Return the first column of each output, and the number of columns: an int array of 33 values."""
+    """Return the first column of each of the 32 outputs, then the number of columns: an int array of 33 values."""
     return np.linspace(0, columns, OUTPUTS + 1).astype(int)
 
 
 def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
-    """Add the read noise of the groups.
+    """Add read noise to each group (mean of several reads) of a ramp.
 
     Parameters
     ----------
     frame : float array, shape (groups, ny, nx)
-        Electrons.
+        Mean charge of the reads of each group in electrons.
     sigma : float
-        Noise of one read in electrons, 0 to 1e5.
+        Standard deviation of the noise of one read in electrons, at least 0, below 1e5.
     reads : int
-        Reads per group.
+        Number of reads per group.
     rng : numpy.random.Generator
-        Source of the key from which each pixel derives its random numbers.
+        Random generator from which one 64-bit key is drawn. Each pixel derives its random numbers from the key and its
+        index.
 
     Returns
     -------
@@ -59,7 +65,7 @@ def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> F
     Raises
     ------
     OutOfRange
-        If `sigma` is outside its limits.
+        If `sigma` is outside its limits or NaN.
     """
     if not 0.0 <= sigma < 1e5:
         raise OutOfRange("read noise", sigma, 0.0, 1e5)
@@ -75,16 +81,18 @@ def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
 
 
 def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
-    """Add 1/f noise of the outputs, which grows linearly from the first group to the last.
+    """Add 1/f noise of the outputs to the groups of a ramp. It grows linearly from the first group to the last.
 
     Parameters
     ----------
     frame : float array, shape (groups, ny, nx)
-        Electrons. Each output reads neighbouring columns; their number need not be a multiple of 32.
+        Mean charge of the reads of each group in electrons, for at least 2 groups. Each output reads neighbouring
+        columns; nx need not be a multiple of 32.
     width : float
-        Standard deviation of the difference between the last and the first group in electrons, 0 to 1e5.
+        Standard deviation of the noise in the difference of the last and the first group, in electrons, at least 0,
+        below 1e5.
     rng : numpy.random.Generator
-        Random numbers of the drift.
+        Random generator of the noise, which is different in each call.
 
     Returns
     -------
@@ -94,12 +102,13 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     Raises
     ------
     OutOfRange
-        If `width` is outside its limits.
+        If `width` is outside its limits or NaN.
 
     Notes
     -----
-    The mission's width is the measured noise of a signal in excess of the noise of its reads. It is attributed to 1/f
-    noise. Ramps with other groups or of another length have the same width.
+    The mission database has the measured noise of the signal of a ramp in excess of the noise of its reads. This excess
+    is attributed to 1/f noise, and is used as `width`. As an approximation, `width` does not depend on the number of
+    groups and on the duration of the ramp.
     """
     if not 0.0 <= width < 1e5:
         raise OutOfRange("1/f noise", width, 0.0, 1e5)
@@ -120,26 +129,27 @@ def _add_drift(group: Any, drift: Any, width: float, out: Any) -> None:
 
 
 def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
-    """Add the reset level of each pixel, the same in all groups.
+    """Add the random level to which each pixel was reset before a ramp, the same in all groups of the ramp.
 
     Parameters
     ----------
     frame : float array, shape (groups, ny, nx)
-        Electrons.
+        Mean charge of the reads of each group in electrons.
     sigma : float
-        Standard deviation in electrons, 0 to 1e6.
+        Standard deviation of the level between pixels in electrons, at least 0, below 1e6.
     rng : numpy.random.Generator
-        Source of the key from which each pixel derives its random number.
+        Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
+        index.
 
     Returns
     -------
     float array, shape of `frame`
-        Electrons above the zero level.
+        Electrons including the reset level, which may be negative.
 
     Raises
     ------
     OutOfRange
-        If `sigma` is outside its limits.
+        If `sigma` is outside its limits or NaN.
     """
     if not 0.0 <= sigma < 1e6:
         raise OutOfRange("reset noise", sigma, 0.0, 1e6)
@@ -158,13 +168,17 @@ def _add_levels(groups: Any, out: Any, sigma: float, key: Any) -> None:
 
 
 def _one_over_f(count: int, rng: np.random.Generator, slowest: int = 1) -> Frame:
-    """Draw 1/f noise with mean 0 and ensemble rms 1, without frequencies below `slowest` cycles per stream."""
+    """Draw a sequence of `count` values of 1/f noise (power inversely proportional to frequency), in order of time.
+
+    Over many sequences it has the mean 0 and the rms 1. It contains no frequencies below `slowest` cycles per sequence.
+    """
     size = scipy.fft.next_fast_len(max(count, 2), real=True)
     frequency = np.arange(size // 2 + 1)
     amplitude = np.zeros(len(frequency), np.float32)
     slowest = min(slowest, size // 2)
     amplitude[slowest:] = 1.0 / np.sqrt(frequency[slowest:])
-    # In the spectrum of a real stream each frequency represents two, except 0 and the last one of an even size.
+    # `shares` is the number of terms of the full Fourier series that each frequency stands for: 2 (the positive and the
+    # negative frequency), except 1 for the frequency 0 and for the highest frequency of a sequence of even length.
     shares = np.where((frequency == size / 2) | (frequency == 0), 1.0, 2.0)
     amplitude /= np.sqrt((shares * amplitude**2).sum())
     parts = rng.standard_normal((2, len(frequency)), np.float32) * np.sqrt(np.float32(0.5))
@@ -187,7 +201,7 @@ def _reset(scene: Scene) -> float:
 
 
 def _difference_noise(scene: Scene) -> float:
-    """Read noise of the difference of two groups, in electrons."""
+    """Return the read noise, in electrons rms, of the difference of two groups (means of several reads)."""
     sigma, reads = _read_parameters(scene)
     return sigma * float(np.sqrt(2.0 / reads))
 

@@ -1,4 +1,4 @@
-"""Read noise: the output amplifier adds Gaussian noise to every pixel."""
+"""Read noise of detectors that are read once: the output amplifier adds Gaussian noise to every pixel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame:
-    """Add Gaussian read noise.
+    """Add Gaussian read noise to every pixel of a frame.
 
     Parameters
     ----------
@@ -24,7 +24,8 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame
     sigma : float or array, shape (q,)
         Standard deviation in electrons, 0 or more.
     rng : numpy.random.Generator
-        Source of the key from which each pixel derives its random number.
+        Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
+        index.
 
     Returns
     -------
@@ -34,11 +35,12 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame
     Raises
     ------
     OutOfRange
-        If `sigma` is negative or infinite.
+        If `sigma` is negative, infinite or NaN.
     """
     if not (np.min(sigma) >= 0.0 and np.max(sigma) < np.inf):
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    # Index of the first pixel of each amplifier in the frame.
+    # Index of the first pixel of each amplifier in the flat frame. It gives every pixel of the detector its own random
+    # number.
     first = np.arange(len(frame)) * frame[0].size if np.ndim(sigma) else 0
     return map_pixels(_add, frame, sigma, pixel_random.draw_key(rng), first)
 

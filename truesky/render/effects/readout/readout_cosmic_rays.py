@@ -1,4 +1,4 @@
-"""Cosmic rays that arrive during the readout: their charge appears in later rows."""
+"""Cosmic rays that arrive during the readout: their charge appears in the image some rows after the pixels they hit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Frame, Scene
 
-# Trapped electrons below which a trail is not followed further.
+# Electrons that traps still hold, below which the trail that they release behind a cosmic ray is not followed further.
 _NEGLIGIBLE = 1e-3
 
 
@@ -22,31 +22,36 @@ def apply_readout(
     frame: Frame, expected: float, quantiles: Frame, rows: int, prescan: int, columns: int, silicon: Traps | None,
     rng: np.random.Generator,
 ) -> Frame:  # fmt: skip
-    """Add tracks that arrive while the quadrants are read.
+    """Draw the cosmic rays that arrive while the quadrants of a detector are read, and add their charge.
 
     Parameters
     ----------
     frame : float array, shape (q, ny, nx)
-        Electrons of each quadrant in readout order.
+        Electrons of each of the q quadrants, with the pixel at [0, 0] read first.
     expected : float
-        Mean number of tracks on the pixels of one quadrant, 0 to 1e8.
+        Expected number of tracks on the pixels of one quadrant during the readout, 0 to 1e8.
     quantiles : float array, shape (n, 3)
-        Same as in `cosmic_rays.draw_tracks`.
+        Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons.
     rows : int
-        Rows of a quadrant that are pixels.
+        Number of rows of a quadrant that are pixels; the following rows are overscan.
     prescan : int
-        Columns before the pixels.
+        Number of prescan columns before the pixels.
     columns : int
-        Columns of a quadrant that are pixels.
+        Number of columns of a quadrant that are pixels.
     silicon : Traps or None
-        Traps along the columns. None to ignore charge transfer inefficiency.
+        Traps along the columns, which capture and release charge. None to ignore them.
     rng : numpy.random.Generator
-        Random numbers of the tracks.
+        Random generator of the tracks.
 
     Returns
     -------
     float array, shape of `frame`
-        Electrons including the tracks.
+        Electrons including the cosmic rays.
+
+    Raises
+    ------
+    OutOfRange
+        If `expected` is outside its limits or NaN.
     """
     out = np.array(frame, dtype=float)
     for quadrant in out.reshape(-1, *frame.shape[-2:]):
@@ -57,7 +62,8 @@ def apply_readout(
         event, column, row, charge = cosmic_rays.pixels_of_events(
             cosmic_rays.draw_events(count, rows, columns, quantiles, rng)
         )
-        # Rows that were read before the hit. The charge is read with a packet that is this many rows later.
+        # Number of rows that were read before the cosmic ray arrived. Its charge is read that many rows later than its
+        # pixel.
         rows_read = rng.integers(0, quadrant.shape[0], count)
         column, row = column % part.shape[1], row % rows
         packet = row + rows_read[event]
@@ -67,10 +73,12 @@ def apply_readout(
 
 
 def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame, silicon: Traps | None) -> None:
-    """Add charge, less the part that traps capture, and its trail in place, to packets in the rows of the hits.
+    """Add the charge of cosmic rays to a quadrant in place; traps capture a part of it and release it as a trail.
 
-    The error is a tenth of the effect of traps, because only the number of traps that earlier hits have filled is
-    known.
+    For each hit pixel, `row` is its row, `packet` the row of the image in which its charge is read, `column` its
+    column, and `charge` its electrons. Rows count from the one read first. `silicon` are the traps along the columns,
+    or None for no traps. As an approximation, traps above the existing charge are empty unless earlier cosmic rays have
+    filled them. The error is a tenth of the effect of traps.
     """
     if silicon is None:
         cosmic_rays.add_charge(quadrant, packet, column, charge)
@@ -79,7 +87,8 @@ def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame,
     column, packet, row = (x[order] for x in (column, packet, row))
     charge = charge[order]
     existing = quadrant[packet, column]
-    # Traps that the added charge reaches and the existing packet does not, from the row of the hit down.
+    # Traps on the way down from the hit pixel that the added charge reaches but the existing charge does not. They are
+    # counted as a number of pixels with all their traps.
     reached = (row + 1) * (silicon.volume(existing + charge) - silicon.volume(existing))
     released = -np.expm1(-1.0 / np.array(silicon.release))
     _add_trails(quadrant, column, packet, charge, reached, np.array(silicon.density), released)
@@ -89,7 +98,13 @@ def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame,
 def _add_trails(
     quadrant: Any, column: Any, packet: Any, charge: Any, reached: Any, density: Any, released: Any
 ) -> None:
-    """Add charge and trails column by column, in the order of packets."""
+    """Add the charge of cosmic rays and the trails of charge released from traps to a quadrant, in place.
+
+    The hits are sorted by column, then by `packet` (row of the image, from the one read first). `charge` has the
+    electrons of each hit, and `reached` the number of pixels, with fraction, whose traps only this charge reaches.
+    `density` is the number of traps per pixel of each species, and `released` the fraction of trapped electrons
+    released per row.
+    """
     trapped = np.zeros(len(density))
     for i in range(len(column)):
         if i == 0 or column[i] != column[i - 1]:

@@ -1,8 +1,10 @@
 """Readout trail (frame-transfer smear): with an open shutter, rows collect light while they are shifted.
 
 The effect acts on expected electrons: the light of the trail is counted like all other light, with the sensitivity of
-the pixel on which it falls. The lamp is off during the readout. The pixel response is applied later, once for the pixel
-in which a row began; it is therefore divided out here. Rows beyond the defect of a dark column lose their trail, too.
+the pixel on which it falls. A calibration lamp is off during the readout. The effect `pixel_response` is applied later.
+It multiplies the whole charge of a row by the sensitivity of the pixels in which the row began; this sensitivity is
+therefore divided out here. In a dark column (a column with a defect that charge cannot pass), the pixels beyond the
+defect, farther from the serial register, lose their trail as well as their signal.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ def apply(
     response: pixel_response.Parameters | None = None,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """Add the light that rows collect on their way to the register.
+    """Add the light that rows collect during the readout, on their way to the serial register, to a frame.
 
     Parameters
     ----------
@@ -34,11 +36,13 @@ def apply(
     share : float
         Time that a row spends over one pixel as a fraction of the exposure time, 0 to 1e6.
     halves : int
-        2 if the upper half is read through the last row, 1 if all rows are read through row 0.
+        2 if the upper half of the rows is read through the last row, 1 if all rows are read through row 0.
     response : tuple, optional
-        Parameters of `pixel_response.response`, which is applied later. By default all pixels have the same response.
+        Parameters of `pixel_response.response`, the sensitivity of each pixel that is applied later. By default all
+        pixels have the same sensitivity.
     rng : numpy.random.Generator, optional
-        Random numbers of the pixel response. By default all pixels have the same response.
+        Random generator of the sensitivity, in the same state in which the effect `pixel_response` gets it. By default
+        all pixels have the same sensitivity.
 
     Returns
     -------
@@ -48,7 +52,7 @@ def apply(
     Raises
     ------
     OutOfRange
-        If `share` or `halves` is outside its limits.
+        If `share` or `halves` is outside its limits or NaN.
     """
     if not 0.0 <= share <= 1e6:
         raise OutOfRange("readout trail", share, 0.0, 1e6)
@@ -68,7 +72,12 @@ def apply(
 
 @jit
 def _add_trail(light: Any, sensitivity: Any, share: float, out: Any) -> None:
-    """Fill `out`. A row passes over the rows that are read before it; row 0 is read first."""
+    """Fill `out` with the light and its trail, in electrons; row 0 is read first.
+
+    Each row passes over all rows that are read before it, and collects the fraction `share` of their light. The light
+    is counted with `sensitivity`, the relative sensitivity of each pixel. The trail is divided by that of the pixel in
+    which the row began, because a later effect multiplies by it.
+    """
     collected = np.zeros(light.shape[1])
     for r in range(len(light)):
         for c in range(light.shape[1]):
@@ -79,7 +88,8 @@ def _add_trail(light: Any, sensitivity: Any, share: float, out: Any) -> None:
 
 
 def _parameters(scene: Scene) -> tuple[float, int, pixel_response.Parameters | None]:
-    # The time per row is the same if only a part of the detector is simulated.
+    # Divide the readout time by the number of rows of half a full detector, also if only a part of the detector is
+    # simulated: the time per row is the same.
     rows = scene.value("fpa.ny", "pix") / 2 + scene.value("fpa.parallel_overscan", "pix")
     share = scene.value("readout_time", "s") / rows / max(scene.exposure_time_s, 1e-3)
     return share, 2, pixel_response.parameters(scene) if pixel_response.EFFECT.is_applied(scene) else None

@@ -1,13 +1,15 @@
-"""Trap pumping: charge is shuffled over the traps, and each pumped trap moves charge to a neighbour, forming a dipole.
+"""Trap pumping: charge is shifted back and forth over traps, which then form dipoles of a bright and a dark pixel.
 
-In each cycle a packet leaves an electrode and comes back; all phases take the same time. A trap that captures an
-electron may release it one phase later, when the next packet is nearer. In N cycles a trap moves::
+In each cycle the charge packet of a pixel leaves an electrode and comes back; all phases of the cycle take the same
+time. A trap that captures an electron may release it one phase later, when the packet of the neighbouring pixel is
+nearer. In N cycles a trap moves I electrons to the neighbour::
 
     I = N P (exp(-t / tau) - exp(-2 t / tau))
 
-electrons, with the phase time t, the release time tau and the capture probability P. They are the traps of charge
-transfer: the same density of each species, at uniformly distributed heights of the volume that a cloud fills. Positions
-are fixed for a detector. With age, traps are added to the existing ones.
+with the phase time t, the release time tau and the capture probability P. The same traps, with the same species and
+densities, cause charge transfer inefficiency. They are uniformly distributed over the height of a pixel's volume, which
+a charge cloud fills up to a certain height. Their positions are fixed for a detector. As the detector ages, traps are
+added to the existing ones.
 
 Not modelled: the shot noise of capture and release (less than the square root of I), and the decrease of dipoles while
 they empty a pixel. A pixel gives no more charge than it has.
@@ -33,30 +35,33 @@ from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Frame, Scene
 
-# Phases of a cycle: over the four electrodes, pair by pair, to the next pixel and back.
+# Number of phases of a cycle: the charge moves over the four electrodes, pair by pair, to the next pixel and back.
 _PHASES = 6
-# Number of traps that are drawn at a time.
+# Number of traps that are drawn together, to limit the memory.
 _CHUNK_SIZE = 1 << 19
-# Base of the numbers in the truth map: one digit per species.
+# `trap_map` stores the numbers of traps of all species in a pixel as the digits of one number with this base. More than
+# 255 traps of a species in a pixel would spill into the digit of the next species; this is not checked.
 _PER_SPECIES = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Pumping:
-    """Shuffling of charge.
+    """Parameters of trap pumping: how charge is shifted back and forth.
 
     Attributes
     ----------
     shuffles : int
-        Number of cycles.
+        Number of pumping cycles.
     phase : float
-        Time of a phase in seconds.
+        Time of one phase of a cycle in seconds.
     efficiency : float
-        Fraction of the traps at positions that the cycle pumps, 0 to 1. Half of them pump up, half down.
+        Fraction of the traps that the cycle pumps because of their positions, 0 to 1. Half of them move charge to the
+        next row, the other half to the previous row.
     capture : float
-        Probability of capture, 0 to 1.
+        Probability that a trap captures an electron in a cycle, 0 to 1.
     dwell : float
-        Time of a transfer in seconds, the unit of the traps' release times.
+        Time in seconds of the transfer from pixel to pixel in a normal readout, the unit of the release times in
+        `Traps`.
     """
 
     shuffles: int
@@ -69,31 +74,31 @@ class Pumping:
 def apply(
     frame: Frame, silicon: Traps, pumping: Pumping, segments: Sequence[tuple[int, int, bool]], rng: np.random.Generator
 ) -> Frame:
-    """Move charge between neighbouring rows by trap pumping.
+    """Move charge between neighbouring rows, as traps do during pumping.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons, 0 or more.
     silicon : Traps
-        Traps along the columns.
+        Density and release times of the traps along the columns, and the volume of a pixel that charge fills.
     pumping : Pumping
-        Shuffling of charge.
+        Number and duration of the pumping cycles, and fraction of traps that are pumped.
     segments : sequence of (int, int, bool)
-        Segments of every column: first row, last row + 1, and a value that is not used. No charge moves between
-        segments.
+        Parts of every column that are read through one serial register, each (first row, last row + 1, value that is
+        not used). No charge moves between segments.
     rng : numpy.random.Generator
-        Random numbers of the positions of traps, the same in every exposure.
+        Random generator of the positions of traps, in the same state in every exposure.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons with the same sum. Whole electrons move.
+        Electrons with the same sum. Whole numbers of electrons move, and no pixel becomes negative.
 
     Raises
     ------
     OutOfRange
-        If a value of `pumping` is outside its limits.
+        If `shuffles` (0 to 1e9), `efficiency` or `capture` of `pumping` is outside its limits or NaN.
     """
     for name, value, highest in (
         ("shuffles", pumping.shuffles, 1e9), ("pumping efficiency", pumping.efficiency, 1.0),
@@ -102,7 +107,7 @@ def apply(
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
     charge = np.asarray(frame, dtype=float)
-    # Rows from which charge may move up (not from the last row of a segment) and down (not from the first).
+    # Mark the rows from which charge may move up (all but the last row of a segment) and down (all but the first row).
     up, down = np.zeros((2, len(charge)), bool)
     for first, end, _ in segments:
         up[first : end - 1], down[first + 1 : end] = True, True
@@ -124,26 +129,31 @@ def apply(
 
 
 def moved_electrons(tau: float, pumping: Pumping) -> float:
-    """Return the electrons that a pumped trap moves; `tau` is its release time in transfers."""
+    """Return the electrons that one pumped trap moves to the neighbouring pixel in all cycles together.
+
+    `tau` is the mean release time of the trap, in units of `pumping.dwell` seconds (one transfer of a normal readout).
+    """
     x = pumping.phase / (tau * pumping.dwell)
-    # This is exp(-x) - exp(-2 x) without cancellation.
+    # The last two factors are exp(-x) - exp(-2 x), up to the sign, without cancellation of digits.
     return float(-pumping.shuffles * pumping.capture * np.exp(-x) * np.expm1(-x))
 
 
 @dataclass(frozen=True, slots=True)
 class _TrapChunk:
-    """Traps as arrays of shape (n,).
+    """A number n of traps and their positions in the detector.
 
     Attributes
     ----------
     species : int array
-        Index of the species.
+        Index of the trap's species.
     row, column : int array
-        Pixel.
+        Row and column of the pixel that contains the trap.
     height : float array
-        Height as a fraction of the pixel's volume, 0 to 1.
+        Height of the trap in the pixel as a fraction of its volume, 0 to 1. A charge cloud reaches all traps below its
+        top.
     electrode : float array
-        Position between the electrodes, 0 to 1.
+        Random number from 0 to 1 for the position of the trap under the electrodes of the pixel, which decides whether
+        pumping moves charge to the next row (lowest numbers), to the previous row (highest numbers) or not at all.
     """
 
     species: Int
@@ -153,16 +163,20 @@ class _TrapChunk:
     electrode: Float
 
     def upward(self, pumping: Pumping) -> Bool:
-        """Return a mask of the traps that move charge to the next row."""
+        """Return a mask, bool[n], of the traps whose pumping moves charge to the next row (row number + 1)."""
         return np.asarray(self.electrode < 0.5 * pumping.efficiency)
 
     def downward(self, pumping: Pumping) -> Bool:
-        """Return a mask of the traps that move charge to the previous row."""
+        """Return a mask, bool[n], of the traps whose pumping moves charge to the previous row (row number - 1)."""
         return np.asarray(self.electrode > 1.0 - 0.5 * pumping.efficiency)
 
 
 def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random.Generator) -> Iterator[_TrapChunk]:
-    """Yield the traps of a detector in chunks, in the order in which damage creates them."""
+    """Yield the random traps of a detector in chunks, in the order in which radiation damage creates them.
+
+    `shape` is (rows, columns), and `density` the traps per pixel of each species. A higher density gives the same traps
+    and additional ones, for the same state of `rng` and the same ratios of species.
+    """
     (ny, nx), total = shape, float(sum(density))
     shares = np.cumsum(density) / total if total > 0.0 else np.ones(len(density))
     remaining = int(stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
@@ -174,9 +188,10 @@ def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random
 
 
 def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
-    """Return the traps per pixel, int32[ny, nx]: species 1 plus 256 x species 2 plus 65536 x species 3.
+    """Return the number of traps in each pixel: species 1 plus 256 x species 2 plus 65536 x species 3, int32[ny, nx].
 
-    `rng` must be the generator that `EFFECT` uses for the same scene.
+    The sum is unambiguous for at most 255 traps of a species per pixel, which is not checked. `rng` must be in
+    the same state as the generator with which `EFFECT` draws the traps of the same scene.
     """
     silicon = charge_transfer.silicon_traps(scene, "parallel")
     out = np.zeros((scene.ny, scene.nx), np.int32)
@@ -186,14 +201,14 @@ def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
 
 
 def duration(phase: float, section: str, mission: MissionConfiguration) -> float:
-    """Time that pumping takes.
+    """Return the time in seconds that all cycles of trap pumping take.
 
     Parameters
     ----------
     phase : float
-        Time of a phase in seconds.
+        Time of one phase of a cycle in seconds.
     section : str
-        Section of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database.
     mission : MissionConfiguration
         Mission database.
 
