@@ -1,1 +1,1 @@
-"""Slitless spectra: the light of every source, dispersed by a grism."""
+"""Draw slitless spectra: the light of every source on a detector, dispersed by a grism."""

@@ -1,7 +1,8 @@
-"""Draw slitless spectra: the light of sources, spread along the traces of a grism's orders and summed onto a frame.
+"""Draw slitless spectra: the light of sources, spread along the traces of a grism's orders on a detector.
 
-A galaxy that exceeds the largest stamp is drawn in two parts (large_galaxies.py). A trail is drawn in pieces, each on a
-separate stamp.
+The image of a source is computed on a stamp (square image around the source), and added at each position along the
+trace. A galaxy that exceeds the largest stamp is drawn in two parts, a sharp and a smooth one (large_galaxies.py). The
+trail of a moving source is drawn in pieces, each on a separate stamp.
 """
 
 from __future__ import annotations
@@ -26,31 +27,41 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import Accuracy
 
-# Number of sources whose spectra are in memory at a time, and number of samples of their images.
-_BATCH_SOURCES, _BATCH_SAMPLES = 256, 1 << 17
-# Number of positions at which a trace is sampled. A trace counts as straight if its slope (rows per column) deviates
-# from the common slope by at most the second value. Wings that fall as r^-3 and are moved by a first derivative then
-# have a relative error of 6 times its square, 0.5 %.
-_PLACES, _STRAIGHT = 33, 0.03
-# Largest slope, in rows per column, for sheared images. They ring by 7e-5 of their peak at 4 deg, by 2e-4 at 8 deg and
-# by 2e-3 at 30 deg.
+# Number of sources whose spectra are in memory at a time.
+_BATCH_SOURCES = 256
+# Largest number of samples of source images, at all wavelengths of the PSF together, that are in memory at a time. A
+# single image may be larger; it is then computed alone.
+_BATCH_SAMPLES = 1 << 17
+# Number of positions along a trace that are computed to test whether the trace is straight (see `_STRAIGHT`).
+_PLACES = 33
+# A trace counts as straight if its slope (rows per column) differs everywhere by at most this from the slope of the
+# first order's trace. Larger differences require the slower method for curved traces. In a straight trace, the
+# difference is corrected to first order by a derivative of the source's image. Wings that fall as r^-3 with the
+# distance r from the source then have a relative error of 6 times the square of the difference, 0.5 %.
+_STRAIGHT = 0.03
+# Largest slope of a trace, rows per column, for which the images of sources are stored in sheared coordinates, in which
+# the trace is a row. Steeper traces are drawn by the slower method for curved traces. The shear causes ringing in the
+# images: 7e-5 of their peak for a trace inclined by 4 deg to the rows, 2e-4 for 8 deg and 2e-3 for 30 deg.
 _STEEPEST = 0.15
-# An order is drawn on the largest stamp of its source if its stamp has at least this fraction of that side.
+# The spectral orders of a source need stamps of different sizes. If the side that an order needs is at least this
+# fraction of the source's largest side, the order is drawn from the image on the largest stamp. The image of the source
+# is then computed only once.
 _SHARED_FRACTION = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Trace and response of a grism order.
+    """Trace and response of one spectral order of a grism.
 
     Attributes
     ----------
     trace : Trace
-        Trace of the order.
+        Positions of the wavelengths on the detector relative to the undispersed image.
     first : int
-        Wavelength of the first element of the response, Angstrom.
+        Wavelength of the first element of `response`, Angstrom.
     response : float array, shape (w,)
-        Electrons per unit of the spectrum, in steps of 1 Angstrom. Negative values subtract electrons.
+        Electrons in a bin of 1 Angstrom per unit of a source's spectrum, at wavelengths in steps of 1 Angstrom.
+        Negative values subtract electrons.
     """
 
     trace: Trace
@@ -59,32 +70,35 @@ class Order:
 
     @property
     def wavelength(self) -> Float:
-        """Wavelengths [w] of the response, Angstrom."""
+        """Wavelengths [w] of the elements of `response`, Angstrom."""
         return self.first + np.arange(float(len(self.response)))
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Limits for neglected light of a spectrum, and sampling of its image.
+    """Limits for the light that is neglected in a slitless spectrum, and sampling of the images of sources.
+
+    Limits are fractions of the noise (rms) of a detector pixel.
 
     Attributes
     ----------
     edge : float
-        Largest light in a row at the edge of a stamp, as a fraction of the pixel noise.
+        Largest light of a spectrum that a pixel at the edge of its stamp (square image of the source) may have.
     faint : float
-        An order is not drawn if the light of its brightest column is below this fraction of the pixel noise; `edge` is
-        the limit for the first order.
+        A spectral order is not drawn if all light in its brightest column (sum over rows) is below this limit. For the
+        first order, `edge` is used instead.
     min_size : int
         Smallest side of a stamp, pixels.
     along, across : int
-        Samples per pixel of a stamp, along and across the trace.
+        Samples of a source's image per detector pixel, along and across the trace.
     block : float
-        Range of wavelengths with a common PSF, Angstrom. With 0, each wavelength has its PSF and its rows, which is
-        slow.
+        Range of wavelengths along a straight trace that are drawn with the same PSF, Angstrom. If it is shorter than
+        two pixels of the trace, as with 0, the PSF and the row of the trace are computed for each sample along the
+        trace, which is slow.
     nodes : int
-        Number of wavelengths at which the PSF is computed.
+        Number of wavelengths at which the PSF is computed; it is interpolated between them.
     positions : int
-        Number of PSF positions on a detector, one of `euclid.DEGREES`.
+        Number of positions on a detector at which the PSF is computed: 1, 4, 9 or 25 (keys of `euclid.DEGREES`).
     """
 
     edge: float = 0.003
@@ -97,19 +111,25 @@ class Settings:
     positions: int = 9
 
 
-# Settings with the allowed background error (fractions of the pixel noise), measured by benchmarks/_dispersion.py.
+# File with one row of settings (attributes of `Settings`) per accuracy. The column `allowed` is the error of the
+# background, as a fraction of the noise of a pixel, that these settings do not exceed. benchmarks/_dispersion.py
+# measures these errors.
 TABLE = Path(__file__).with_name("settings.csv")
 
 
 @cache
 def settings_for(requested: Accuracy) -> Settings:
-    """Return the fastest settings for an accuracy, or the most accurate ones if no settings are sufficient."""
+    """Return the fastest settings in settings.csv whose error of the background is at most `requested.background`.
+
+    Both errors are fractions of the noise of a pixel. If no settings are that accurate, the most accurate ones are
+    returned.
+    """
     table = read_settings()
     return settings_from_row(next((row for row in table if row["allowed"] <= requested.background), table[-1]))
 
 
 def read_settings() -> list[dict[str, float]]:
-    """Read the table of settings, sorted from the fastest to the most accurate."""
+    """Return the rows of settings.csv as dictionaries by column name, from the fastest to the most accurate."""
     with TABLE.open(newline="", encoding="utf-8") as lines:
         read = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     settings_rows = [{name: float(value) for name, value in row.items()} for row in read]
@@ -117,29 +137,32 @@ def read_settings() -> list[dict[str, float]]:
 
 
 def settings_from_row(row: dict[str, float]) -> Settings:
-    """Return the settings in a row of the table."""
+    """Return the settings in a row of `read_settings`. KeyError is raised if a column is missing."""
     values: dict[str, Any] = {name: row[name] for name in ("edge", "faint", "block")}
     values |= {name: int(row[name]) for name in ("min_size", "along", "across", "nodes", "positions")}
     return Settings(**values)
 
 
+# Function that returns the spectra [n, w] of n sources at the w wavelengths of a grism's orders, from the indices [n]
+# of these sources.
 Spectra = Callable[[Int], Float32]
-# Planes of a PSF by the sampling of stamps.
+# Fourier transforms of the images of one PSF, by size and sampling of the stamps (square images of sources) for which
+# they were computed.
 PlanesCache = dict[Sampling, Planes]
 
 
 @dataclass(frozen=True, slots=True)
 class DispersedSources:
-    """Spectra of sources, orders of a grism, and settings.
+    """Spectra of sources, spectral orders of a grism, and limits for the light that is not drawn.
 
     Attributes
     ----------
     spectra : callable
-        (indices of n sources) -> float32[n, w] spectra at the wavelengths of the orders.
+        Function (indices of n sources) -> float32[n, w], their spectra at the wavelengths of the orders.
     orders : tuple of Order
-        Orders of one grism, with the same wavelengths.
+        Orders of one grism; all must have the same w wavelengths.
     settings : Settings
-        Settings of drawing.
+        Limits for the light that is not drawn, and sampling of the images of sources.
     """
 
     spectra: Spectra
@@ -149,18 +172,20 @@ class DispersedSources:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Light of each source by order, filled by `draw`.
+    """Light of each of n sources in each spectral order, as an output of `draw`.
 
     Attributes
     ----------
     electrons : float array, shape (n, orders)
-        Electrons on the frame.
+        Electrons that were drawn on the frame (image of the detector).
     expected : float array, shape (n, orders)
-        Electrons on and outside the frame.
+        Electrons of the whole order, on and outside the frame. If the response is negative, their absolute values are
+        counted.
     peak : float array, shape (n, orders)
-        Electrons of the brightest column, 0 if the order is not drawn.
+        Electrons (absolute values) in the brightest column of the order, summed over its rows; 0 if the order was not
+        drawn.
     sizes : int array, shape (n,)
-        Side of the largest stamp, pixels; 0 if nothing was drawn.
+        Side of the largest stamp (square image of the source) from which an order was drawn, pixels; 0 if none was.
     """
 
     electrons: Float
@@ -170,12 +195,16 @@ class Tally:
 
     @classmethod
     def empty(cls, sources: int, orders: int) -> Tally:
-        """Return a tally of zeros for given numbers of sources and orders."""
+        """Return a tally of zeros for the given number of sources and of orders, to be filled by `draw`."""
         shape = sources, orders
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(sources, np.int64))
 
     def add(self, pieces: Tally, parent: Int) -> None:
-        """Add the tally of pieces [p] to that of their sources `parent` [p]."""
+        """Add the light of p pieces of sources to this tally, which has one entry per whole source.
+
+        The trail of a moving source is drawn in several pieces. `parent` [p] is the index of the source to which each
+        piece belongs. Electrons, in total and in the brightest column, are added. The largest side of a stamp is kept.
+        """
         np.add.at(self.electrons, parent, pieces.electrons)
         np.add.at(self.expected, parent, pieces.expected)
         np.add.at(self.peak, parent, pieces.peak)
@@ -186,31 +215,35 @@ def draw(
     sources: Sources, dispersed: DispersedSources, psf: Psf, shape: tuple[int, int], noise: float,
     tally: Tally | None = None, layers: dict[int, Float] | None = None, planes_cache: PlanesCache | None = None,
 ) -> Float:  # fmt: skip
-    """Draw the expected electrons of dispersed sources, without sky.
+    """Draw the expected electrons of slitless spectra on a detector, without sky and noise.
 
     Parameters
     ----------
     sources : Sources
-        Positions of the undispersed images, pixels, and shapes.
+        Sources with the positions of their undispersed images, pixels. Their attribute `electrons` is the factor by
+        which the spectrum of each source is multiplied.
     dispersed : DispersedSources
-        Spectra of the sources and orders of the grism.
+        Spectra of the sources, and spectral orders of the grism.
     psf : Psf
-        PSF of the detector; its wavelengths are the nodes.
+        PSF of the detector, given by images at the wavelengths of `images.nodes`.
     shape : (int, int)
-        Rows and columns of the frame.
+        Number of rows and of columns of the detector.
     noise : float
-        Noise per pixel, electrons.
+        Noise of a pixel, electrons rms. The limits in `dispersed.settings` are fractions of it.
     tally : Tally, optional
-        Filled with the light of each source.
+        Light of each source; this call adds to it.
     layers : dict, optional
-        Filled with the frame of each order, whose sum is the result; None to draw all orders on one frame.
+        Filled with the image of each order (by number of the order), whose sum is the result. None to draw all orders
+        on one image, which needs less memory.
     planes_cache : PlanesCache, optional
-        Planes that calls with the same PSF and orders share; filled when needed.
+        Fourier transforms of the PSF. Several calls with the same PSF and orders can share them. Missing ones are
+        added.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons.
+        Expected electrons, rounded to 1 / FIXED_POINT (1e-6 electrons) for each spectrum and pixel. The result does not
+        depend on the order of the sources.
     """
     frames = [np.zeros(shape, np.int64)]
     orders, settings = dispersed.orders, dispersed.settings
@@ -218,12 +251,14 @@ def draw(
         frames += [np.zeros(shape, np.int64) for _ in orders[1:]]
     order_frames = frames if layers is not None else frames * len(orders)
     slope = _slope(next((order for order in orders if order.trace.order == 1), orders[0]).trace)
-    # Long trails are drawn in pieces, each with a part of the light.
+    # The trail of a moving source is split into pieces. Each piece has a part of the source's light, and is drawn like
+    # a source on a separate stamp.
     pieces, trail, parent = stamps.split_into_pieces(sources)
     pieces = pieces if sources.trail is None else replace(pieces, trail=trail)
     sizes = Sizes.from_sources(pieces, psf, settings.edge * noise, settings.min_size)
     plans = [_OrderPlan.from_order(order, psf, settings, slope) for order in orders]
-    # Orders share images. If one of the orders is straight, these have the coordinates in which it is a row.
+    # All spectral orders of a source are drawn from the same image. If any order may have straight traces, the image is
+    # stored in sheared coordinates, in which straight traces are rows.
     straight = any(plan.tile > 0 for plan in plans)
     source_images = _SourceImages(
         pieces, psf, sizes, settings, (slope, straight), shape, {} if planes_cache is None else planes_cache
@@ -243,14 +278,16 @@ def draw(
         tally.add(piece_tally, parent)
     if layers is not None:
         layers.update({order.trace.order: frame / FIXED_POINT for order, frame in zip(orders, frames, strict=True)})
-    # The sum of integers does not depend on whether the orders have separate frames.
+    # Frames have integer pixels (FIXED_POINT per electron). Their sum is exact, so the result is the same whether each
+    # order has its own frame or not.
     return sum(frames[1:], frames[0]) / FIXED_POINT
 
 
 def _slope(trace: Trace) -> float:
-    """Slope of the first order at the middle of the detector, rows per column; 0 if it is not along the columns.
+    """Return the slope of a trace for a source at the first pixel of the detector, in rows per column.
 
-    Apart from their curvature, all orders have this slope.
+    It is 0 if the trace spans at least as many rows as columns. All orders of a grism have nearly the same slope; only
+    their curvatures differ.
     """
     along, across = (float(part[1:].sum()) for part in trace.polynomials(0.0, 0.0))
     return across / along if abs(along) > abs(across) else 0.0
@@ -258,20 +295,22 @@ def _slope(trace: Trace) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _OrderPlan:
-    """Properties of an order that are the same for all sources.
+    """Properties of a spectral order of a grism that are the same for all sources.
 
     Attributes
     ----------
     order : Order
         The order.
     angstrom_per_pixel : float
-        Dispersion along the trace.
+        Dispersion along the trace, Angstrom per pixel.
     tile : int
-        Pixels along a straight trace with a common PSF; 0 if no trace of this order is straight.
+        Number of pixels along a straight trace that are drawn with the same PSF; 0 if traces of this order are never
+        drawn as straight.
     share : float array, shape (w, b)
-        Shares of the PSF's wavelengths.
+        Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
     t : (float, float)
-        Trace parameter t of the first wavelength, and its step.
+        Parameter t of the trace's polynomials at the first wavelength of the spectrum, and step of t from one
+        wavelength to the next. t is 0 and 1 at the wavelengths `order.trace.first` and `order.trace.last`.
     """
 
     order: Order
@@ -296,20 +335,23 @@ class _OrderPlan:
 
 @dataclass(frozen=True, slots=True)
 class _OrderBatch:
-    """One order of k sources.
+    """Traces, stamps and light of one spectral order of k sources.
 
     Attributes
     ----------
     along, across : float array, shape (k, i)
-        Polynomials of the traces for columns and rows.
+        Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns (`along`) and in rows
+        (`across`), pixels. The parameter t is linear in wavelength.
     sizes : int array, shape (k,)
-        Sides of the stamps, pixels; 0 if the order is not drawn.
+        Sides of the stamps (square images of the sources), pixels; 0 if the order of this source is too faint to be
+        drawn or not on the detector.
     tiles : int array, shape (k,)
-        Pixels with a common PSF; 0 if the trace is not straight.
+        Number of pixels along the trace that are drawn with the same PSF; 0 if the trace is not straight.
     expected : float array, shape (k,)
-        Electrons on and outside the frame.
+        Electrons of the whole order, on and outside the detector. If the response is negative, their absolute values
+        are counted.
     peak : float array, shape (k,)
-        Electrons of the brightest column.
+        Electrons (absolute values) in the brightest column of the order, summed over its rows.
     """
 
     along: Float
@@ -355,7 +397,7 @@ class _OrderBatch:
 
 
 class _SourceImages:
-    """Images of sources through the PSF."""
+    """Undispersed images of sources, blurred by the PSF, which are computed for a few sources at a time when needed."""
 
     def __init__(
         self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: tuple[float, bool],
@@ -367,7 +409,8 @@ class _SourceImages:
         self.profiles = images.source_profiles(sources, self.slope if self.straight else 0.0)
         assert psf.planes is not None
         count = len(psf.planes.wavelength)
-        # The variation of the PSF is defined only on the detector.
+        # The polynomials of position by which the PSF varies are valid only on the detector. A source outside is given
+        # the PSF of the nearest position on the detector.
         column, row = np.clip(sources.column, 0.0, shape[1] - 1.0), np.clip(sources.row, 0.0, shape[0] - 1.0)
         node_weights = [
             transfer.basis_weights(psf, np.tile(part, (len(sources), 1)), column, row) for part in np.eye(count)
@@ -376,12 +419,21 @@ class _SourceImages:
         self._planes = planes_cache
 
     def stamp_sampling(self, size: int, smooth: bool = False) -> Sampling:
-        """Sampling of stamps of `size` pixels; `smooth` selects the part drawn by `large_galaxies.add`."""
+        """Return the sampling of stamps (square images of sources) with a side of `size` pixels.
+
+        A galaxy larger than the largest stamp is drawn in two parts: its image blurred by a wide Gaussian filter (the
+        smooth part), and the sharp rest. `smooth` selects the smooth part, and has no effect for smaller sources.
+        """
         template = Sampling(size, self.settings.along, self.settings.across, self.slope, self.straight)
         return large_galaxies.stamp_sampling(size, template, smooth)
 
     def images(self, batch: Int, sampling: Sampling) -> Float32:
-        """Spline coefficients [m, b, n along, n across] of sources on stamps."""
+        """Return the images of the m sources with the indices `batch`, as spline coefficients.
+
+        The result has the shape [m, b, n * along, n * across]: one image for each source and for each of the b
+        wavelengths of the PSF. `sampling` contains the side n of an image in pixels, and its samples per pixel along
+        and across the trace.
+        """
         if sampling not in self._planes:
             self._planes[sampling] = images.planes(self.psf, sampling)
         stamp_planes = self._planes[sampling]
@@ -389,7 +441,7 @@ class _SourceImages:
         return images.coefficients(stamp_planes, self.weights[batch], self.profiles.take(batch), transforms)
 
     def batch_size(self, sampling: Sampling) -> int:
-        """Number of stamps that are in memory at a time."""
+        """Return for how many sources, at least 1, images with this sampling may be in memory at a time."""
         samples = self.weights.shape[1] * sampling.n**2 * sampling.along * sampling.across
         return max(int(_BATCH_SAMPLES // samples), 1)
 
@@ -402,9 +454,13 @@ def _add_orders(
     order_frames: list[Int],
     tally: Tally,
 ) -> None:
-    """Add the orders of a batch of sources to their frames."""
+    """Draw all spectral orders of the k sources with the indices `batch` on frames (images of the detector).
+
+    `spectra`, shape (k, w), are the spectra of these sources. `orders` and `order_frames` have one element per order;
+    all orders may have the same frame. The drawn electrons, and the sides of the stamps, are stored in `tally`.
+    """
     sizes = np.stack([part.sizes for _, part in orders])
-    # Orders with stamps of similar size share the largest.
+    # Spectral orders of a source that need stamps of similar size are drawn from one image, on the largest stamp.
     largest = sizes.max(axis=0)
     sizes = np.where((sizes > 0) & (sizes >= _SHARED_FRACTION * largest), largest, sizes)
     tally.sizes[batch] = np.maximum(tally.sizes[batch], largest)

@@ -1,4 +1,7 @@
-"""Write traces and sensitivities of a grism in the format of grismconf: a text file and FITS tables."""
+"""Write the traces and sensitivities of a grism in the format of grismconf: a text file and FITS tables.
+
+grismconf is a Python package that programs for the extraction of slitless spectra use.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +31,14 @@ SENSITIVITY = Table(
     "Sensitivity of an order of a grism, in electrons/s per erg s-1 cm-2 A-1.",
     key=("WAVELENGTH",),
 )
-# Number of terms 1, x, y, x^2, x y, y^2. grismconf requires the squares in polynomials of four powers of t.
+# Number of coefficients, of 1, x, y, x^2, x y and y^2, that the file contains for each power of t. (x, y) is the
+# undispersed position in pixels, and t the parameter along a trace. The coefficients of the squares and of x y are 0,
+# but grismconf requires them for polynomials with four powers of t.
 _TERMS = 6
 
 
 def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
-    """Text of a configuration file.
+    """Return the text of a configuration file of the package grismconf, which describes the traces of a grism.
 
     Parameters
     ----------
@@ -44,7 +49,7 @@ def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], fi
     shape : (int, int)
         Rows and columns of the detector.
     files : sequence of str
-        Names of the files with the sensitivity of each order.
+        Names of the files with the sensitivity of each order, in the order of `traces`.
 
     Returns
     -------
@@ -55,7 +60,8 @@ def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], fi
     lines = [f"# {name}, simulated", f"NAXIS {ny} {nx}"]
     for trace, file in zip(traces, files, strict=True):
         label = f"{trace.order:+d}" if trace.order else "0"
-        # The light of a source outside the detector may fall on the detector.
+        # XRANGE and YRANGE give how far outside the detector an undispersed image may lie, in pixels. The range must
+        # include all sources whose dispersed light falls onto the detector.
         reach = float(np.abs(trace.polynomials(0.0, 0.0)[0]).sum())
         lines += ["", f"BEAM_{label}", f"SENSITIVITY_{label} {file}"]
         lines += [f"XRANGE_{label} {-reach:.1f} {reach:.1f}", f"YRANGE_{label} {-reach:.1f} {reach:.1f}"]
@@ -70,10 +76,11 @@ def _terms(row: Float) -> str:
 
 
 def sensitivity(order: Order) -> pa.Table:
-    """Sensitivity of an order as rows of SENSITIVITY.
+    """Return the sensitivity of a spectral order as a table: wavelengths in Angstrom, sensitivities, and errors of 0.
 
-    The response of `order` must be electrons per second in 1 Angstrom, per erg s-1 cm-2 A-1. The first and last two
-    values are 0, because extraction software sets them to 0.
+    The response of `order` must be in electrons per second in a bin of 1 Angstrom, per erg s-1 cm-2 A-1; this is also
+    the unit of the sensitivity. Two values of 0 are added at each end of the response, because software for the
+    extraction of spectra sets the first and last two values to 0.
     """
     response = np.pad(order.response, 2)
     wavelength = order.first - 2 + np.arange(float(len(response)))
@@ -82,14 +89,14 @@ def sensitivity(order: Order) -> pa.Table:
 
 
 def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, int]) -> Path:
-    """Write the tables and then the configuration, each replaced atomically.
+    """Write the sensitivity tables of all orders, and then the configuration file that names them.
 
     Parameters
     ----------
     folder : Path
-        Folder of the files.
+        Folder of the files, which must exist.
     name : str
-        Prefix of their names.
+        Prefix of the names of the files, also written in the configuration file.
     orders : sequence of Order
         Orders, with responses as for `sensitivity`.
     shape : (int, int)
@@ -98,7 +105,7 @@ def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, in
     Returns
     -------
     Path
-        The configuration file.
+        The configuration file. Existing files are replaced.
     """
     files = [f"{name}_{order.trace.order:+d}.fits" for order in orders]
     for order, file in zip(orders, files, strict=True):

@@ -1,20 +1,27 @@
-"""Images of sources at a few wavelengths, as spline coefficients that can be spread along a trace.
+"""Images of sources at a few wavelengths, as spline coefficients, from which slitless spectra are drawn.
 
-The PSF at a wavelength is sum_b l_b(lambda) PSF_b, where l_b is the Lagrange polynomial of a few nodes. On a periodic
-stamp of N pixels, the image through each PSF_b is::
+The PSF at the wavelength lambda is sum_b l_b(lambda) PSF_b. Here PSF_b is the PSF at the b-th of a few wavelengths
+(nodes), and l_b the Lagrange polynomial of this node. A stamp is a periodic square image of N x N pixels around a
+source. On it, the image through PSF_b at the position r = (x, y), in pixels from the source, is::
 
     I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r)
 
-It is needed at any position, not only at pixels. It is stored with ox samples per pixel along the columns and oy
-across, without aliasing (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines::
+The sum is over the frequencies k = (kx, ky) in radian per pixel. profile(k), PSF_b(k) and pixel(k) are the Fourier
+transforms of the source's light profile, of PSF_b and of a detector pixel.
 
-    I = sum_j C_j B5(ox x - j) B3(oy y - j)
-    C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4),   f = k / 2 pi
+The image is needed at any position, not only at pixels. It is stored with ox samples per pixel along x (columns) and oy
+along y (rows), without aliasing (all |kx| <= pi ox, |ky| <= pi oy). The stored values are coefficients C of the
+B-splines B5 and B3, of degrees 5 and 3::
 
-so that the splines do not reduce the resolution. The quintic spline lies along the trace, of slope s: f = fx + s fy.
+    I(x, y) = sum_ij C_ij B5(ox x - i) B3(oy y - j)
+    C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4),   (fx, fy) = k / (2 pi),   sinc(a) = sin(pi a) / (pi a)
 
-For straight traces the image is stored in the coordinates u = x and v = y - s x, in which the traces are rows. Then
-kx = ku - s kv, ky = kv and f = fu. Sums along u are moved to their position across the trace column by column.
+The division by the transforms of the splines cancels their smoothing. The quintic spline lies along the trace of a
+spectrum, whose slope is s rows per column. Therefore its frequency is f = fx + s fy.
+
+For straight traces the image is stored in the coordinates u = x and v = y - s x, in which the traces are rows. With
+frequencies ku and kv along u and v, kx = ku - s kv, ky = kv and f = ku / (2 pi). The light of all wavelengths is first
+summed along u. Then each column is moved to the row at which the trace crosses it.
 """
 
 from __future__ import annotations
@@ -34,15 +41,18 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources import galaxy_shapes, sersic
 from truesky.render.sources.source_list import Sources
 
-# Degrees of the splines along and across the trace.
-ALONG, ACROSS = 5, 3
-# Frequency, in cycles per sample, beyond which the PSF passes little light. The spline's transform is constant beyond
-# it, to avoid a division by small numbers.
+# Degree of the spline along the trace of a spectrum.
+ALONG = 5
+# Degree of the spline across the trace of a spectrum.
+ACROSS = 3
+# Spatial frequency along the trace, cycles per sample of the image, beyond which the PSF passes little light. The
+# transform of the image is divided by the transform of the spline. Beyond this frequency it is divided by the value at
+# this frequency instead, to avoid a division by small numbers.
 _FARTHEST = 0.6
 
 
 def nodes(first: float, last: float, count: int) -> Float:
-    """Chebyshev nodes [count] between two wavelengths, for the smallest maximum error of Lagrange interpolation.
+    """Return the wavelengths (Chebyshev nodes) at which the PSF is computed; at all others it is interpolated.
 
     Parameters
     ----------
@@ -54,14 +64,19 @@ def nodes(first: float, last: float, count: int) -> Float:
     Returns
     -------
     float array, shape (count,)
-        Wavelengths in increasing order, Angstrom.
+        Wavelengths in increasing order, Angstrom. Lagrange interpolation between these nodes has nearly the smallest
+        possible maximum error.
     """
     angle = np.pi * (2 * np.arange(count)[::-1] + 1) / (2 * count)
     return np.asarray(0.5 * (first + last) + 0.5 * (last - first) * np.cos(angle))
 
 
 def shares(wavelength: Float, at: Float) -> Float:
-    """Lagrange polynomials [n, b] of nodes `at` [b] at wavelengths [n]; each row sums to 1."""
+    """Return the weights [n, b] that interpolate a function from b nodes to n wavelengths by a polynomial.
+
+    `wavelength` are the n wavelengths, and `at` the b nodes in the same unit. The weights in column j are
+    the Lagrange polynomial of the node `at[j]`. The sum of each row is 1. All nodes must differ, which is not checked.
+    """
     out = np.ones((len(wavelength), len(at)))
     for b in range(len(at)):
         for other in range(len(at)):
@@ -72,23 +87,25 @@ def shares(wavelength: Float, at: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Sampling of a stamp.
+    """Size and sampling of a stamp, the periodic square image of a source from which its spectrum is drawn.
 
     Attributes
     ----------
     n : int
         Side of the stamp, pixels; even.
     along, across : int
-        Samples per pixel, along and across the trace.
+        Samples per pixel along and across the trace of the spectrum.
     slope : float
         Slope of the trace, rows per column.
     straight : bool
-        True for coordinates in which the trace is a row.
+        True if the image is stored in sheared coordinates, in which the trace is a row.
     step : int
-        Detector pixels per pixel of the stamp. If it is above 1, the pixels contain coefficients of a cubic spline.
+        Width of a pixel of the stamp in detector pixels. If it is above 1, the spectrum drawn with these coarse pixels
+        is not the light in them, but coefficients of a cubic spline, which is evaluated at the detector's pixels.
     split : float
-        Scale that separates the smooth part of an image from the rest, pixels. A step above 1 selects the smooth part,
-        a step of 1 the rest; 0 selects the whole image.
+        Rms, in detector pixels, of the Gaussian filter that separates the image of a large galaxy into a smooth part
+        and the sharp rest. If it is positive, a stamp with a `step` above 1 contains the smooth part, and a stamp with
+        a `step` of 1 the rest. With 0 a stamp contains the whole image.
     """
 
     n: int
@@ -101,32 +118,36 @@ class Sampling:
 
     @property
     def shear(self) -> float:
-        """Rise of a row of the image, in rows per column of the detector."""
+        """Slope of the stamp's rows relative to the detector's rows, in rows per column; 0 unless `straight`."""
         return self.slope if self.straight else 0.0
 
     @property
     def rows(self) -> tuple[float, float]:
-        """Slope and shear."""
+        """Slopes of the trace (`slope`) and of the stamp's rows (`shear`) on the detector, in rows per column."""
         return self.slope, self.shear
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Values of n, along and across."""
+        """Side of the stamp in pixels, and samples per pixel along and across the trace (`n`, `along`, `across`)."""
         return self.n, self.along, self.across
 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """PSF times pixel divided by the splines, on a stamp's Fourier grid.
+    """Fourier transforms of the PSF's basis images (planes), with which the images of sources are computed.
+
+    The PSF of a source is a weighted sum of the p basis images. Their transforms are multiplied by the transform of a
+    detector pixel, and divided by that of the B-splines of which the images of sources consist.
 
     Attributes
     ----------
     sampling : Sampling
-        Sampling of the stamp.
+        Size and sampling of the stamps (square images of sources) for which the transforms were computed.
     ku, kv : float32 array, shape (rows,) and (columns,)
-        Frequencies, radian / pixel.
+        Frequencies of the rows of `planes` (along the detector's columns axis x, or along the trace in sheared
+        coordinates) and of its columns (along y), radian per detector pixel.
     planes : complex64 array, shape (p, rows, columns)
-        All planes of the PSF.
+        Transforms of all basis images.
     """
 
     sampling: Sampling
@@ -136,7 +157,10 @@ class Planes:
 
 
 def planes(psf: Psf, sampling: Sampling) -> Planes:
-    """Planes for stamps of one sampling, for a PSF with planes whose wavelengths are the nodes."""
+    """Return the Fourier transforms of a PSF's basis images for stamps (images of sources) of one size and sampling.
+
+    The PSF must consist of images (`psf.planes`) at the wavelengths that the function `nodes` returns.
+    """
     assert psf.planes is not None
     n, count = sampling.n, sampling.n * sampling.along
     iu, iv = scipy.fft.fftfreq(count, 1.0 / count).astype(int), np.arange(n * sampling.across // 2 + 1)
@@ -144,13 +168,15 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     fx, step = fu - sampling.shear * fy, sampling.step
     on_trace = np.clip(fx + sampling.slope * fy, -_FARTHEST * sampling.along, _FARTHEST * sampling.along)
     spline = np.sinc(on_trace / sampling.along) ** (ALONG + 1) * np.sinc(fy / sampling.across) ** (ACROSS + 1)
-    # The stamp's middle is at sample n / 2 of each axis.
+    # In Fourier space, the factors (-1)^frequency index move the source from sample 0 to the middle sample of each
+    # axis.
     sign = (-1.0) ** iu[:, None] * (-1.0) ** iv
     factor = sampling.along * sampling.across * np.sinc(fx / step) * np.sinc(fy / step) * sign / spline
     factor *= _split(sampling, fx / step, fy / step)
     if step > 1:
         factor /= _spline_transfer(fx) * _spline_transfer(fy)
-    # For the lowest frequencies, the PSF may be binned to pixels.
+    # A stamp whose pixels are wider than the detector's contains only the lowest frequencies. For these it is
+    # sufficient to bin the PSF images from several samples per pixel to one, which saves time.
     fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
     factor /= _bin_transfer(fx / step, fold) * _bin_transfer(fy / step, fold)
     images = [*psf.planes.images, *psf.planes.drift]
@@ -164,7 +190,10 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
 
 
 def _bin_pixels(image: Float32, fold: int) -> Float32:
-    """Bin an image [n, n] to pixels of fold x fold samples with triangular weights; n and fold are odd."""
+    """Bin an image [n, n] to pixels of `fold` x `fold` samples, centred on its middle sample; n and `fold` must be odd.
+
+    The weights are triangular along each axis: samples up to one pixel from the middle of a pixel contribute to it.
+    """
     middle = len(image) // 2
     count = -(-middle // fold)
     padded = np.pad(image, fold * count + fold // 2 - middle)
@@ -174,21 +203,30 @@ def _bin_pixels(image: Float32, fold: int) -> Float32:
 
 
 def _bin_transfer(f: Float, fold: int) -> Float:
-    """Transfer function of this binning at f cycles per pixel; aliasing onto the lowest frequencies is small."""
+    """Return by what factor `_bin_pixels` multiplies the Fourier transform of an image, along one axis.
+
+    `f` are frequencies in cycles per binned pixel, and `fold` the number of samples that are binned. The factor is
+    valid for low frequencies, because it neglects light that the binning aliases from higher ones.
+    """
     return np.asarray((np.sinc(f) / np.sinc(f / fold)) ** 2)
 
 
 def _spline_transfer(f: Float) -> Float:
-    """Transfer function, at f cycles per pixel, from the coefficients of a cubic spline to its values at the pixels."""
+    """Return the ratio of the Fourier transforms of a cubic spline's values at pixels and of its coefficients.
+
+    The ratio is that of one axis. `f` are frequencies along this axis in cycles per pixel.
+    """
     return np.asarray((2.0 + np.cos(2 * np.pi * f)) / 3.0)
 
 
 def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
-    """Transfer function of the smooth part of an image or of the rest, by cycles per pixel.
+    """Return the factor by which a Fourier transform is multiplied to get the smooth or the sharp part of an image.
 
-    The smooth part is the image convolved with 2 g - g^2, where g is a Gaussian of `split` pixels. The rest, convolved
-    with (1 - g)^2, is proportional to the fourth derivative of an image that is smooth on this scale, and is negligible
-    far from the middle.
+    `fx` and `fy` are frequencies in cycles per detector pixel. The factor of the smooth part is 2 g - g^2, where g is
+    the transform of a Gaussian with an rms of `sampling.split` pixels. The factor of the sharp rest is (1 - g)^2. If
+    the image is smooth on this scale, the rest is proportional to its fourth derivative. The rest is therefore
+    negligible far from the middle of a galaxy. The smooth part is selected if `sampling.step` is above 1, otherwise the
+    rest. If `sampling.split` is 0, the factor is 1.
     """
     if sampling.split == 0.0:
         return np.ones(())
@@ -198,18 +236,28 @@ def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """Profiles of n sources, as arguments of `kernels.zones`.
+    """Light profiles (Sersic bulge and exponential disc) of n sources; all numbers are 0 for point sources.
+
+    Below, k is a wave vector in radian per pixel, and `@` a product of vector and matrix.
 
     Attributes
     ----------
     body : bool array, shape (n,)
-        False for point sources.
+        True for galaxies, False for point sources.
     fraction : float array, shape (n,)
         Fraction of the light in the bulge.
-    bulge, disk, thick : float array, shape (n, 2, 2), (n, 2, 2) and (n, 2)
-        Matrices and vectors of `galaxy_shapes.Forms`.
-    row, row_weights : array, shape (n,) and (n, 4)
-        First row and weights from `sersic.interpolation_weights`.
+    bulge, disk : float array, shape (n, 2, 2)
+        Matrices whose columns are vectors along the major and minor axis of the bulge and of the disc, pixels. Their
+        lengths are the half-light radius of the bulge, or the scale length of the disc, along these axes. The Fourier
+        transform of the bulge (disc) depends only on the length of k @ matrix.
+    thick : float array, shape (n, 2)
+        Vectors, pixels, that describe the thickness of inclined discs. With q = k @ vector, the transform of the disc
+        has the factor q / sinh(q).
+    row : int array, shape (n,)
+        First of the four rows, in the table of Fourier transforms of Sersic profiles, from which the transform of the
+        bulge is interpolated.
+    row_weights : float array, shape (n, 4)
+        Interpolation weights of these four rows.
     """
 
     body: Bool
@@ -221,12 +269,15 @@ class Profiles:
     row_weights: Float
 
     def take(self, selected: Int) -> Profiles:
-        """Return the selected profiles."""
+        """Return the profiles of the sources with the indices `selected`, in this order."""
         return Profiles(*(getattr(self, field.name)[selected] for field in fields(self)))
 
 
 def source_profiles(sources: Sources, shear: float) -> Profiles:
-    """Profiles of sources in coordinates whose rows rise by `shear` rows per column."""
+    """Return the light profiles of sources in sheared coordinates u = x and v = y - `shear` * x.
+
+    x and y are the columns and rows of the detector, in pixels. `shear` is the slope of traces in rows per column.
+    """
     n, body = len(sources), sources.shape >= 0
     shapes = sources.shapes.take(sources.shape[body])
     form = galaxy_shapes.forms(shapes, shear_jacobian(sources.jacobian[body], shear))
@@ -238,26 +289,33 @@ def source_profiles(sources: Sources, shear: float) -> Profiles:
 
 
 def shear_jacobian(jacobian: Float, shear: float) -> Float:
-    """Convert a Jacobian [.., 2, 2] in arcsec per pixel to the sheared coordinates (u, v)."""
+    """Return the Jacobian [..., 2, 2] from sheared pixel coordinates to the sky, in arcsec per pixel.
+
+    The sheared coordinates are u = x and v = y - `shear` * x, where x is the column and y the row. `jacobian` is the
+    Jacobian for (x, y): arcsec to the west and north (rows) for a step of one column and one row (columns).
+    """
     return np.asarray(matrices.matmul(jacobian, np.array([[1.0, 0.0], [shear, 1.0]])), float)
 
 
 def spread_transform(stamp_planes: Planes, sources: Sources, i: int) -> Array | None:
-    """Transform [rows, columns] of the picture or trail of source `i`, or None for other sources.
+    """Return the Fourier transform of a source's picture (given image) or of the trail of a moving source.
+
+    The caller multiplies the Fourier transform of the PSF by it, to get the image of the source.
 
     Parameters
     ----------
     stamp_planes : Planes
-        Planes of the stamp.
+        Transforms of the PSF; their frequencies are used.
     sources : Sources
         List of sources.
     i : int
-        Number of the source.
+        Index of the source in the list.
 
     Returns
     -------
     array, shape (rows, columns), or None
-        The transform.
+        Transform of the picture (complex64), or of the trail of a moving source (float32). None for a source at rest
+        without a picture.
     """
     picture, trail, shear = sources.picture_of(i), sources.trail, stamp_planes.sampling.shear
     if picture is None and (trail is None or not trail[i].any()):
@@ -277,23 +335,27 @@ def _sersic() -> Float32:
 
 
 def coefficients(stamp_planes: Planes, weights: Float, profiles: Profiles, transforms: list[Array | None]) -> Float32:
-    """Spline coefficients of the images of m sources of one electron, for `spreading.spread`.
+    """Return the images of m sources, each of one electron, as spline coefficients.
+
+    `spreading.spread` draws slitless spectra with these images.
 
     Parameters
     ----------
     stamp_planes : Planes
-        Planes of the stamps.
+        Fourier transforms of the PSF's p basis images, for stamps (square images of sources) of one size.
     weights : float array, shape (m, b, p)
-        Weights of the planes for each node.
+        Weights of the p basis images in the PSF of each source, at each of b wavelengths (nodes).
     profiles : Profiles
-        Profiles of the sources.
+        Bulge and disc profiles of the sources.
     transforms : list of array or None
-        Result of `spread_transform` for each source.
+        For each source, the transform of its picture (of a lensed galaxy) or trail (of a moving body), which
+        `spread_transform` computes, or None.
 
     Returns
     -------
-    float32 array, shape (m, b, n along, n across)
-        The coefficients.
+    float32 array, shape (m, b, n s_a, n s_c)
+        Coefficients for each source and node. The stamp has n pixels per side, with s_a samples per pixel along the
+        trace and s_c across it (`stamp_planes.sampling`).
     """
     zones = np.empty((*weights.shape[:2], *stamp_planes.planes.shape[1:]), np.complex64)
     kernels.zones(

@@ -1,4 +1,4 @@
-"""Compiled inner loops of dispersing, before the light is added to a frame."""
+"""Compiled inner loops for slitless spectra: images of sources in Fourier space, and electrons along a trace."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from truesky.numerics.compiling import jit
 from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.kernels.frame import min_singular_squared
 
-# Number of wavelengths that are processed together.
+# Number of wavelengths of a spectrum that `add_to_trace` processes together, in vector operations.
 _WAVES = 64
 
 
@@ -20,20 +20,36 @@ def zones(
     planes: Any, weights: Float32, ku: Float32, kv: Float32, body: Bool, fraction: Float, bulge: Float, disk: Float,
     thick: Float, sersic: Float32, row: Int, row_weights: Float, out: Any,
 ) -> None:  # fmt: skip
-    """Fill `out` with the product of profiles and weighted sums of planes on a stamp's Fourier grid.
+    """Fill `out` with the Fourier transforms of the images of m sources, each blurred by the PSF at b wavelengths.
+
+    The PSF of a source is a weighted sum of p basis images (planes).
 
     Parameters
     ----------
     planes : complex array, shape (p, rows, columns)
-        Planes of the PSF.
+        Fourier transforms of the basis images.
     weights : float32 array, shape (m, b, p)
-        Weights of the planes for each source and node.
+        Weights of the basis images for each source and wavelength.
     ku, kv : float32 array, shape (rows,) and (columns,)
-        Frequencies, radian / pixel.
-    body, fraction, bulge, disk, thick, sersic, row, row_weights : array
-        Profiles of m sources, see `fourier.nyquist_zones`.
+        Frequencies of the rows and columns of a transform, radian / pixel. The wave vector is k = (ku, kv).
+    body : bool array, shape (m,)
+        False for point sources, whose other profile arguments are ignored.
+    fraction : float array, shape (m,)
+        Fraction of a galaxy's light in the bulge; the rest is in the disc.
+    bulge, disk : float array, shape (m, 2, 2)
+        Matrices of bulge and disc, pixels. Their columns are vectors along the major and minor axis, with the lengths
+        of the radii. The transform of the bulge (disc) depends only on the length of k @ matrix.
+    thick : float array, shape (m, 2)
+        Vectors, pixels, for the thickness of inclined discs: the transform of a disc has the factor q / sinh(q) with
+        q = k @ vector.
+    sersic : float32 array, shape (indices, nodes)
+        Fourier transforms of Sersic profiles, one row per Sersic index, from `sersic.table`.
+    row : int array, shape (m,)
+        First of the four rows of `sersic` from which the transform of each bulge is interpolated.
+    row_weights : float array, shape (m, 4)
+        Interpolation weights of these four rows.
     out : complex array, shape (m, b, rows, columns)
-        Result.
+        Result: transform of the light profile (1 for point sources) times the weighted sum of `planes`.
     """
     rows, columns = len(ku), len(kv)
     square, high = np.empty(columns, np.float32), np.empty(columns, np.float32)
@@ -72,20 +88,22 @@ def zones(
 def measure_peak_and_total(
     spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float
 ) -> None:
-    """Measure the electrons of spectra: the sum, and the largest sum in a window that moves by half its width.
+    """Measure the electrons of k spectra: in total, and in the brightest window of wavelengths.
 
     Parameters
     ----------
     spectra : float32 array, shape (k, w)
-        Spectra.
+        Spectra of k sources at w wavelengths, before the multiplication by `factor`.
     factor : float array, shape (k,)
-        Factor of each spectrum.
+        Factor by which each spectrum is multiplied.
     response : float array, shape (w,)
-        Electrons per unit of the spectrum; the sign is ignored.
+        Electrons per unit of the multiplied spectrum, by wavelength. The absolute values of negative electrons are
+        counted.
     window : int
-        Number of wavelengths in the window.
+        Number of successive wavelengths in the window, such as the wavelengths in one pixel. It is rounded down to an
+        even number, but is at least 2. The window moves in steps of half of its width.
     peak, total : float array, shape (k,)
-        Results, electrons.
+        Results, changed in place: electrons in the brightest window, and at all wavelengths.
     """
     half = max(window // 2, 1)
     for k in range(len(spectra)):
@@ -106,30 +124,34 @@ def add_to_trace(
     electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
     out: Float,
 ) -> None:  # fmt: skip
-    """Add the electrons of each wavelength to the samples of a trace.
+    """Distribute the electrons of a spectrum among evenly spaced samples along its trace on the detector.
 
     Parameters
     ----------
     electrons : float array, shape (w,)
         Electrons by wavelength.
     along : float array, shape (i,)
-        Coefficients of t^i for the columns, pixels.
+        Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns, pixels. The parameter
+        t is linear in wavelength.
     times : (float, float)
-        Trace parameter t of the first wavelength, and its step.
+        Value of t at the first wavelength, and step of t from one wavelength to the next.
     start : float
-        Column of the undispersed image, pixels.
+        Column of the undispersed image, pixels from 0.
     samples : int
-        Samples per pixel.
+        Samples per pixel (column).
     share : float array, shape (b, w)
-        Share of each PSF by wavelength.
+        Weights that interpolate the PSF at each wavelength from the PSFs at b wavelengths. The electrons are divided
+        among the b rows of `out` in these proportions.
     first : int
-        Position of the first element of `out`, samples.
+        Position of the first sample in `out`: its column on the detector times `samples`.
     out : float array, shape (b, m)
-        Samples of the trace, changed in place.
+        Electrons to be drawn with each of the b PSFs at each of m samples, changed in place. Light outside the samples
+        is lost.
 
     Notes
     -----
-    The quintic spline conserves the total, the mean and the higher moments.
+    The light of each wavelength is distributed among the six nearest samples by a quintic B-spline. This conserves the
+    number of electrons and their mean position.
     """
     count, places, low = out.shape[1], np.empty(_WAVES), np.empty(_WAVES, np.int64)
     weights = np.empty((6, _WAVES))
@@ -138,7 +160,8 @@ def add_to_trace(
         batch = electrons[begin : begin + _WAVES]
         if np.max(np.abs(batch)) == 0.0:
             continue
-        # Positions are computed for whole vectors, before the light is added to samples.
+        # Compute the displacements of all wavelengths of the batch in a separate loop, which the compiler can
+        # vectorise.
         places[:] = along[len(along) - 1]
         for j in range(len(along) - 2, -1, -1):
             for i in range(_WAVES):
@@ -157,7 +180,8 @@ def add_to_trace(
             w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
         group_start, stop = 0, 0
         while group_start < len(batch):
-            # Wavelengths between the same samples are summed first.
+            # Successive wavelengths that lie between the same two samples are distributed among the same six samples.
+            # Their light is summed before it is added to `out`.
             at, stop = low[group_start], group_start + 1
             while stop < len(batch) and low[stop] == at:
                 stop += 1
@@ -171,7 +195,11 @@ def add_to_trace(
 
 @jit
 def _add_weighted(weights: Float, share: Float, out: Float) -> None:
-    """Add the products of weights [6, k] and shares [k] to `out` [6]."""
+    """Add the electrons of k wavelengths that are drawn with one PSF to six successive samples of a trace, `out` [6].
+
+    `weights` [6, k] are the electrons of each wavelength in each sample, and `share` [k] the weight of the PSF at each
+    wavelength.
+    """
     w0, w1, w2, w3, w4, w5 = weights
     s0 = s1 = s2 = s3 = s4 = s5 = 0.0
     for i in range(len(share)):

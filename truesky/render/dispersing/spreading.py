@@ -1,7 +1,10 @@
-"""Compiled loops that spread the image of a source along the trace of an order onto a frame.
+"""Compiled loops that draw a slitless spectrum: the image of a source is added along its trace on the detector.
 
-Along a curved trace, each sample of the trace has its PSF and its rows. Along a straight trace, the image is convolved
-for a few samples at a time and then moved into rows.
+A trace is divided into samples of a fraction of a pixel. First the electrons of the spectrum are distributed among the
+samples by wavelength. Along a curved trace, the image of the source is then added at each sample, with the PSF and the
+row of this sample. Along a nearly straight trace, a faster method is used: the image is convolved with the electrons of
+many samples at a time, in coordinates in which the trace is a row. Then each column of the result is moved to the row
+at which the trace crosses it.
 """
 
 from __future__ import annotations
@@ -12,15 +15,25 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics.compiling import jit
 from truesky.render.dispersing.kernels import add_to_trace
 
-# Number of positions along a trace, between which it is treated as straight.
+# Number of positions along a trace (nodes) at which its column, row and wavelength are computed. They are interpolated
+# linearly between the nodes.
 _NODES = 129
-# Number of pixels of a trace that are processed together, and number of image values that fit into the cache.
-STEP, _CLOSE = 4, 24_000
+# Number of pixels along a straight trace whose electrons are multiplied with the image in one loop, which is faster
+# than a loop for each pixel.
+STEP = 4
+# Number of float32 values of a source's image that fit into the cache of the processor. Larger images are convolved
+# with the trace in strips.
+_CLOSE = 24_000
 
 
 @jit
 def _path(along: Float, across: Float, times: tuple[float, float], count: int, start: tuple[float, float]) -> Float:
-    """Columns (ascending), rows and wavelength numbers [3, nodes] at positions along a trace."""
+    """Return a table [3, _NODES] of columns (ascending), rows and fractional wavelength indices along a trace.
+
+    `start` is the column and row of the undispersed image in pixels. `along` and `across` are the coefficients of t^i
+    (i from 0) of the displacement from it, in columns and in rows. The parameter t is linear in wavelength: `times` are
+    the t of the first of `count` wavelengths, and the step of t from one wavelength to the next.
+    """
     out = np.empty((3, _NODES))
     for i in range(_NODES):
         number = (count - 1.0) * i / (_NODES - 1.0)
@@ -38,7 +51,11 @@ def _path(along: Float, across: Float, times: tuple[float, float], count: int, s
 
 @jit
 def _interpolate_path(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
-    """Row, wavelength number and slope of a path at column x, with the slopes `ends` before and after the path."""
+    """Return the row, the fractional wavelength index and the slope (rows per column) of a trace at the column x.
+
+    `path` [3, nodes] are the columns, rows and wavelength indices along the trace. Before the first and after the last
+    column of `path`, the trace continues straight with the two slopes `ends`, and the wavelength index stays constant.
+    """
     columns = path[0]
     last = len(columns) - 1
     if x <= columns[0]:
@@ -60,7 +77,10 @@ def _interpolate_path(path: Float, x: float, ends: tuple[float, float]) -> tuple
 
 @jit
 def _slope(path: Float, i: int) -> float:
-    """Slope of a path from position i to the next, rows per column."""
+    """Return the slope of a trace between the nodes i and i + 1, in rows per column.
+
+    `path` [3, nodes] are the columns, rows and wavelength indices of the trace at its nodes.
+    """
     return float((path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12))
 
 
@@ -76,28 +96,29 @@ def add_samples(
     corner: tuple[int, int],
     out: Float32,
 ) -> None:
-    """Add the image of a source at every sample of its trace, each with its PSF and its rows.
+    """Add the image of a source at every sample of its trace, with the PSF and the row of this sample.
 
     Parameters
     ----------
     images : float32 array, shape (b, n along, n across)
-        Spline coefficients of the source through PSF b; the middle of the stamp is at sample n / 2 of each axis.
+        Spline coefficients of the source's image (for one electron), blurred by the PSF at b wavelengths. The source is
+        in the middle of the image.
     trace_electrons : float array, shape (b, m)
-        Electrons by sample of the trace.
+        Electrons that are drawn with each of the b images, at each of the m samples of the trace.
     first : int
-        Position of the first sample of the trace, samples.
+        Position of the first sample of the trace: its column times the samples per pixel.
     path : float array, shape (3, nodes)
-        Result of `_path`.
+        Columns, rows and wavelength indices along the trace, from `_path`.
     slope : float
-        Slope of the trace before and after the path, rows per column.
+        Slope with which the trace continues before the first and after the last column of `path`, rows per column.
     shear : float
-        Rise of a row of the image, rows per column.
+        Slope of the image's rows relative to the detector's rows, in rows per column.
     shape : (int, int, int)
-        Side of the stamp in pixels, and samples per pixel along and across.
+        Side n of the stamp in pixels, and samples of the image per pixel, along and across the trace.
     corner : (int, int)
-        Column and row of the first pixel of `out`.
+        Column and row of the detector at which `out` begins.
     out : float32 array, shape (h, w)
-        Piece of the frame, changed in place.
+        Part of the detector, electrons, changed in place. Light outside is ignored.
     """
     n, ox, oy = shape
     line = np.empty(n * oy, np.float32)
@@ -126,7 +147,12 @@ def add_samples(
 def _add_line(
     line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
 ) -> None:
-    """Add a column of an image, with `oy` samples per row and its middle at `row`, to `out` [h] from row `low`."""
+    """Add one column of a source's image to a column of the detector.
+
+    `out` [h] are the pixels of the detector's column from the row `low` on. The array `line` contains the spline
+    coefficients of the image's column, `oy` for each of n rows. The middle of `line` is placed at the fractional row
+    `row` of the detector. The arrays `wrapped` and `fine` are scratch memory.
+    """
     tall, begin = len(line), int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
     floor_v = int(np.floor(v))
@@ -135,12 +161,13 @@ def _add_line(
     w0, w3 = np.float32(s * s * s / 6.0), np.float32(t * t * t / 6.0)
     w1 = np.float32((4.0 + t * t * (3.0 * t - 6.0)) / 6.0)
     w2 = np.float32((4.0 + s * s * (3.0 * s - 6.0)) / 6.0)
-    # The column is periodic.
+    # The image is periodic. Its column is continued at each end by samples from the other end, which the spline needs.
     wrapped[0] = line[tall - 1]
     wrapped[1 : tall + 1] = line
     wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
     a0, a1, a2, a3 = wrapped[floor_v:], wrapped[floor_v + 1 :], wrapped[floor_v + 2 :], wrapped[floor_v + 3 :]
-    # Computing all samples in whole vectors is faster than computing only the rows.
+    # Only every `oy`-th sample, one per row of the detector, is needed. But computing all samples is faster, because
+    # the compiler vectorises this loop.
     for i in range(len(fine) - oy + 1):
         fine[i] = w0 * a0[i] + w1 * a1[i] + w2 * a2[i] + w3 * a3[i]
     for r in range(max(0, low - begin), min(n, low + len(out) - begin)):
@@ -160,30 +187,31 @@ def convolve_trace(
     low: int,
     out: Float32,
 ) -> None:
-    """Add the image of a source at every sample of a straight trace to columns in trace coordinates.
+    """Convolve the image of a source with a straight trace, in coordinates in which the trace is a row.
 
     Parameters
     ----------
     images : float32 array, shape (b, n along, n across)
-        Images as for `add_samples`, in coordinates that rise by `slope` rows per column.
+        Spline coefficients of the source's image (for one electron), blurred by the PSF at b wavelengths, in sheared
+        coordinates. The source is in the middle of the image.
     trace_electrons : float array, shape (m,)
-        Electrons by sample of the trace.
+        Electrons at each of the m samples of the trace.
     first : int
-        Position of the first sample of the trace, samples.
+        Position of the first sample of the trace: its column times the samples per pixel.
     path : float array, shape (3, nodes)
-        Result of `_path`.
+        Columns, rows and wavelength indices along the trace, from `_path`.
     slope : float
-        Slope of the coordinates, rows per column.
+        Slope of the rows of the sheared coordinates relative to the detector's rows, in rows per column.
     share : float array, shape (wavelengths, b)
-        Share of each PSF.
+        Weights that interpolate the PSF at each wavelength of the spectrum from the PSFs at b wavelengths.
     shape : (int, int, int)
-        Side of the stamp in pixels, and samples per pixel along and across.
+        Side n of the stamp in pixels, and samples of the image per pixel, along and across the trace.
     tile : int
-        Pixels with a common PSF, a multiple of STEP.
+        Number of pixels along the trace that are drawn with the same PSF, a multiple of STEP.
     low : int
-        Column of the first element of `out`.
+        Column of the detector to which the first element of `out` belongs.
     out : float32 array, shape (w, n across)
-        Columns across the trace, changed in place.
+        Result: the light across the trace in each of w columns, as spline coefficients, to which this call adds.
     """
     n, ox, oy = shape
     tall = n * oy
@@ -191,7 +219,8 @@ def convolve_trace(
     _steepness_image(images[len(images) // 2], ox, oy, steep)
     count = (n * ox * tall + _CLOSE - 1) // _CLOSE
     for k in range(count):
-        # Only as many samples across the trace as fit into the processor's cache are used at a time.
+        # The image is processed in strips parallel to the trace. A strip has the full length of the image, and so many
+        # samples across the trace that it fits into the cache of the processor.
         begin, end = k * tall // count, (k + 1) * tall // count
         parts = _by_phase(images, steep, ox, begin, end)
         lines = np.zeros((len(out), end - begin), np.float32)
@@ -201,7 +230,13 @@ def convolve_trace(
 
 @jit
 def _by_phase(images: Float32, steep: Float32, ox: int, begin: int, end: int) -> Float32:
-    """Strip [b + 1, ox, n x samples across] of images [b, n along, n across] and of `steep`, sorted by phase."""
+    """Copy a strip of b images of a source, and of their derivative `steep`, sorted by the place of samples in a pixel.
+
+    The strip contains the samples `begin` to `end` - 1 across the trace. There are `ox` samples per pixel along the
+    trace, and the phase of a sample, 0 to `ox` - 1, is its number within its pixel. The result has the shape [b + 1,
+    ox, n * (end - begin)], where n is the side of an image in pixels: for each image and phase, the strip with one
+    sample per pixel. The last of the b + 1 images is `steep`, the change of the image for a steeper trace.
+    """
     n, wide = images.shape[1] // ox, end - begin
     out = np.empty((len(images) + 1, ox, n * wide), np.float32)
     for b in range(len(out)):
@@ -224,7 +259,34 @@ def _convolve_strip(
     low: int,
     out: Float32,
 ) -> None:
-    """Add the result of `convolve_trace` for one strip, from the parts of `_by_phase`, to `out` [w, wide]."""
+    """Convolve one strip of a source's images with the electrons along a straight trace, and add the result to `out`.
+
+    A strip is a range of samples across the trace, over the full length of the images along the trace.
+
+    Parameters
+    ----------
+    parts : float32 array, shape (b + 1, ox, n wide)
+        Strip of the images at b wavelengths of the PSF, and of their change for a steeper trace, from `_by_phase`. ox
+        is the number of samples per pixel along the trace, and `wide` the number of samples in the strip across it.
+    trace_electrons : float array, shape (m,)
+        Electrons at each of the m samples of the trace.
+    first : int
+        Position of the first sample of the trace: its column times ox.
+    path : float array, shape (3, nodes)
+        Columns, rows and wavelength indices along the trace, from `_path`.
+    slope : float
+        Slope of the images' rows relative to the detector's rows, in rows per column.
+    share : float array, shape (wavelengths, b)
+        Weights that interpolate the PSF at each wavelength of the spectrum from the PSFs at b wavelengths.
+    shape : (int, int, int)
+        Side n of the images in pixels, and their samples per pixel along (ox) and across the trace.
+    tile : int
+        Number of pixels along the trace that are drawn with the same PSF, a multiple of STEP.
+    low : int
+        Column of the detector to which the first element of `out` belongs.
+    out : float32 array, shape (columns, wide)
+        Result, changed in place: spline coefficients of the light across the trace, for each column of the detector.
+    """
     n, ox, _ = shape
     tall, pad = out.shape[1], STEP - 1
     mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)
@@ -241,7 +303,9 @@ def _convolve_strip(
         if total == 0.0:
             continue
         _, number, rise = _interpolate_path(path, (first + mean / total) / ox, ends)
-        # If a trace is steeper by d than the image's rows, its image is I(u, v + d u), approximately I + d u dI / dv.
+        # Here the slope of the trace exceeds the slope of the image's rows by d = rise - slope. The image I(u, v), with
+        # u along and v across the trace, must be sheared to I(u, v + d u), approximately I + d u dI / dv. The last
+        # image in `parts` is u dI / dv, so its weight is d.
         amounts[:-1], amounts[-1] = share[int(number)], rise - slope
         for phase in range(ox):
             _mix(parts, phase, amounts, mixed[phase, pad * tall : (pad + n) * tall])
@@ -263,7 +327,11 @@ def _convolve_strip(
 
 @jit
 def _steepness_image(image: Float32, ox: int, oy: int, out: Float32) -> None:
-    """Fill `out` [n along, n across] with u dI / dv of an image I, the change of the image for a steeper trace."""
+    """Fill `out` with u dI / dv for an image I(u, v): to first order, how the image changes for a steeper trace.
+
+    u and v are distances from the middle of the image in pixels, along and across the trace. `image` and `out` are
+    indexed [u, v], with `ox` and `oy` samples per pixel. The first and last two samples along v are set to 0.
+    """
     tall = image.shape[1]
     out[:] = np.float32(0.0)
     for j in range(len(image)):
@@ -278,7 +346,11 @@ def _steepness_image(image: Float32, ox: int, oy: int, out: Float32) -> None:
 
 @jit
 def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
-    """Fill `out` [e] with the sum of parts [k, phase, e] times amounts [k], three terms at a time."""
+    """Fill `out` [e] with a weighted sum of images: the sum over k of `parts[k, phase, e]` times `amounts[k]`.
+
+    `phase` selects the samples at one place within each pixel, and e numbers these samples. Three images are added at a
+    time, because this is faster.
+    """
     last = len(parts) - 1
     for k in range(0, len(parts), 3):
         a0, a1, a2 = parts[k, phase], parts[min(k + 1, last), phase], parts[min(k + 2, last), phase]
@@ -297,22 +369,23 @@ def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
 def add_lines(
     lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
 ) -> None:
-    """Add columns of `convolve_trace` to a piece of the frame, at the rows of the trace.
+    """Add the result of `convolve_trace` to a part of the detector, each column at the row where the trace crosses it.
 
     Parameters
     ----------
-    lines : float32 array, shape (w, n across)
-        Columns across the trace.
+    lines : float32 array, shape (columns, n across)
+        Light across the trace in each column as spline coefficients, from `convolve_trace`. It must include all columns
+        of `out`.
     low : int
-        Column of the first of these.
+        Column of the detector to which the first element of `lines` belongs.
     path : float array, shape (3, nodes)
-        Result of `_path`.
+        Columns, rows and wavelength indices along the trace, from `_path`.
     shape : (int, int, int)
-        Side of the stamp in pixels, and samples per pixel along and across.
+        Side n of the stamp in pixels, and samples of the image per pixel, along and across the trace.
     corner : (int, int)
-        Column and row of the first pixel of `out`.
+        Column and row of the detector at which `out` begins.
     out : float32 array, shape (h, w)
-        Piece of the frame, changed in place.
+        Part of the detector, electrons, changed in place.
     """
     n, _, oy = shape
     wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
@@ -324,23 +397,23 @@ def add_lines(
 
 @jit
 def add_piece(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> float:
-    """Add a piece of an image to the frame.
+    """Add a small image in electrons to the image of a detector (frame), whose pixels are integers.
 
     Parameters
     ----------
     piece : float32 array, shape (h, w)
-        Electrons.
+        The small image, electrons.
     corner : (int, int)
-        Column and row of its first pixel on the frame.
+        Column and row of the frame at which the first pixel of `piece` lies. Pixels outside the frame are ignored.
     unit : float
-        Units of the frame per electron.
+        Integers of the frame per electron. Each pixel is rounded to an integer.
     frame : int array, shape (ny, nx)
         Frame, changed in place.
 
     Returns
     -------
     float
-        Electrons that were added to the frame.
+        Electrons that were added to the frame, after rounding.
     """
     ny, nx = frame.shape
     first, stop = max(0, -corner[0]), min(piece.shape[1], nx - corner[0])
@@ -357,21 +430,24 @@ def add_piece(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) 
 
 @jit
 def add_refined(coarse: Int, step: int, frame: Int) -> int:
-    """Add a cubic spline with nodes on coarse pixels to the frame.
+    """Add an image that is given as a cubic spline on coarse pixels to the image of a detector (frame).
+
+    A coarse pixel is a square of `step` x `step` pixels of the frame. It is a node of the spline.
 
     Parameters
     ----------
     coarse : int array, shape (h, w)
-        Coefficients of the spline, units of the frame per coarse pixel.
+        Coefficients of the spline: light per coarse pixel, in the integer unit of the frame. The nodes must extend to
+        one node before the first and to two nodes after the last pixel of the frame, along each axis.
     step : int
-        Width of a coarse pixel, pixels of the frame.
+        Width of a coarse pixel in pixels of the frame.
     frame : int array, shape (ny, nx)
-        Frame, changed in place; its first pixel is at the node (1, 1).
+        Frame in integers, changed in place. Its first pixel is at the node in row 1 and column 1, counted from 0.
 
     Returns
     -------
     int
-        Units that were added to the frame.
+        Light that was added to the frame, in its integer unit.
     """
     ny, nx = frame.shape
     weights, wide, total = np.empty((step, 4)), np.empty(coarse.shape[1]), np.int64(0)
@@ -407,43 +483,49 @@ def spread(
     times: tuple[float, float], start: tuple[float, float], slope: float, shear: float, shape: tuple[int, int, int],
     tile: int, unit: float, frame: Int,
 ) -> float:  # fmt: skip
-    """Spread an order of a source onto the frame.
+    """Draw one spectral order of a source on the image of a detector (frame).
 
     Parameters
     ----------
     images : float32 array, shape (b, n along, n across)
-        Spline coefficients for `add_samples` or, if `tile` is positive, for `convolve_trace`.
+        Spline coefficients of the source's image (for one electron), blurred by the PSF at b wavelengths, from
+        `images.coefficients`. If `tile` is positive, they must be in sheared coordinates, in which the trace is nearly
+        a row.
     spectrum : float32 array, shape (w,)
-        Spectrum.
+        Spectrum of the source.
     factor : float
-        Factor of the spectrum.
+        Factor by which the spectrum is multiplied.
     response : float array, shape (w,)
-        Electrons per unit of the spectrum times `factor`.
+        Electrons per unit of `spectrum` times `factor`, by wavelength.
     share : float array, shape (w, b)
-        Share of each PSF by wavelength.
+        Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
     along, across : float array, shape (i,)
-        Coefficients of t^i for columns and rows, pixels.
+        Coefficients of t^i (i from 0) of the displacement from the undispersed image in columns (`along`) and in rows
+        (`across`), pixels. The parameter t is linear in wavelength.
     times : (float, float)
-        Trace parameter t of the first wavelength, and its step.
+        Value of t at the first wavelength, and step of t from one wavelength to the next.
     start : (float, float)
-        Column and row of the undispersed image.
+        Column and row of the undispersed image, 0-based pixels.
     slope : float
-        Slope of the trace before and after the order, rows per column.
+        Slope with which a curved trace continues beyond its first and last wavelength, rows per column. It is not used
+        if `tile` is positive.
     shear : float
-        Rise of a row of the images, rows per column.
+        Slope of the images' rows relative to the detector's rows, in rows per column; 0 for images that are not
+        sheared.
     shape : (int, int, int)
-        Side of the stamp in pixels, and samples per pixel along and across.
+        Side n of the stamp in pixels, and samples of the images per pixel, along and across the trace.
     tile : int
-        Pixels with a common PSF; 0 if each sample of the trace has its PSF.
+        Number of pixels along a straight trace that are drawn with the same PSF, a multiple of STEP. 0 for a curved
+        trace, in which the PSF is computed for each sample.
     unit : float
-        Units of the frame per electron.
+        Integers of the frame per electron.
     frame : int array, shape (ny, nx)
-        Frame, changed in place.
+        Frame in integers, changed in place.
 
     Returns
     -------
     float
-        Electrons that were added to the frame.
+        Electrons that were added to the frame; 0 if the spectrum does not touch it.
     """
     n, ox, oy = shape
     ny, nx = frame.shape
@@ -455,7 +537,8 @@ def spread(
     bottom, top = np.min(path[1]), np.max(path[1])
     first = int(np.floor(ox * x_first)) - 3
     trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 - first))
-    # Straight traces apply the shares per tile instead.
+    # For a straight trace, `convolve_trace` applies the interpolation weights of the PSFs later. So the electrons are
+    # distributed along the trace as if there were only one PSF.
     wave_share = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
     add_to_trace(electrons, along, times, start[0], ox, wave_share, first, trace_electrons)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))

@@ -1,1 +1,1 @@
-"""Drawing of the light of sources onto a frame."""
+"""Draw the expected light of stars and galaxies onto the image of a detector, with the PSF."""

@@ -1,7 +1,7 @@
-"""Fourier transforms of sources that are pictures: arcs of strong lenses and the structure of discs.
+"""Fourier transforms of sources that are given as pictures (images): lensed arcs, and spiral arms and knots of discs.
 
-Between its pixels, a picture is interpolated by the quintic interpolant. Its transform is the transform of the pixels
-multiplied by that of the interpolant.
+Between its pixels, a picture is interpolated by the quintic interpolant. The transform of the picture is therefore the
+transform of the pixels multiplied by that of the interpolant.
 
 References
 ----------
@@ -19,19 +19,22 @@ from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.transfer import Grid, Transfer
 from truesky.render.sources.lensed_arcs import Picture
 
-# The picture is padded to twice its side. Between the frequencies of the padded picture, the transform is interpolated
-# from _WIDTH samples per direction with the window exp(_SLOPE (sqrt(1 - z^2) - 1)). The error is 1e-7 of the flux.
-# Barnett, Magland & af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479.
+# Number of samples per direction from which the transform of a picture is interpolated between the frequencies of the
+# FFT. The picture is first padded to twice its side. The error is 1e-7 of the flux. Barnett, Magland & af Klinteberg
+# 2019, SIAM J. Sci. Comput. 41, C479.
 _WIDTH = 8
+# Parameter of the window with which the Fourier transform of a picture is interpolated between frequencies of the FFT:
+# exp(_SLOPE (sqrt(1 - z^2) - 1)), with z from -1 to 1 over _WIDTH samples.
 _SLOPE = 2.30 * _WIDTH
-# Smallest q for q / sinh q, which is 1 there.
+# Smallest value of q in the factor q / sinh q, by which the thickness of an inclined disc changes its Fourier
+# transform. Smaller values of q are replaced by it, to avoid 0 / 0; the factor is 1 there.
 _THIN = 1e-9
-# Nodes of the integral for the window's transform.
+# Number of Gauss-Legendre nodes for the Fourier integral of the interpolation window.
 _NODES = 64
 
 
 def quintic(frequency: Array) -> Array:
-    """Transform of the quintic interpolant at a frequency in radian / pixel.
+    """Return the Fourier transform of the quintic interpolant at frequencies in radian per pixel; 1 at 0.
 
     References
     ----------
@@ -43,21 +46,21 @@ def quintic(frequency: Array) -> Array:
 
 
 def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
-    """Fourier transform of a picture about its middle, at frequencies of the detector.
+    """Return the Fourier transform of a picture about its middle, at frequencies on the detector.
 
     Parameters
     ----------
     picture : Picture
-        The picture.
+        The picture: an image with its position and scale on the sky.
     jacobian : float array, shape (2, 2)
-        d(u, v) / d(column, row), arcsec per pixel, with u to the west.
+        d(u, v) / d(column, row) at the source, arcsec per detector pixel, with u to the west and v to the north.
     kx, ky : float array, shape (s,)
-        Frequencies, radian per pixel of the detector.
+        Frequencies along columns and rows, radian per detector pixel.
 
     Returns
     -------
     complex array, shape (s,)
-        The transform, with an error of 1e-6 of the flux.
+        The transform for the flux of the picture (1, or 0 for spiral arms), with an error of 1e-6 of the flux.
     """
     on_sky = matrices.matmul(matrices.inverse(jacobian).T, np.stack([kx, ky]).astype(float))
     across, up = matrices.matmul(picture.matrix.T, on_sky)
@@ -65,32 +68,34 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     values = np.empty(len(kx), complex)
     fourier.interpolate_spectrum(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, values)
     if rows % 2 == 0 or columns % 2 == 0:
-        # With an even number of pixels, the middle lies between pixels.
+        # With an even number of pixels, the middle of the picture lies half a pixel before the pixel that the FFT uses.
         values *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
     values = values * quintic(across) * quintic(up)
     if picture.thick is not None:
-        # The factor q / sinh q is the same as for the smooth light of the disc.
+        # Spiral arms and knots are as thick as their disc. Their transform is therefore multiplied by the same factor
+        # q / sinh q as that of the smooth disc. q is the product of the frequency and `picture.thick`, the vector that
+        # describes the thickness of the inclined disc.
         q = np.maximum(np.abs(matrices.matmul(picture.thick, on_sky)), _THIN)
         values = values * (2.0 * q * np.exp(-q) / -np.expm1(-2.0 * q))
     return np.asarray(values)
 
 
 def apply_picture(psf_transfer: Transfer, picture: Picture, jacobian: Float) -> Transfer:
-    """Convert the transfer function of a point source (one plane) to that of a picture.
+    """Multiply the Fourier transform of the PSF by that of a picture.
 
     Parameters
     ----------
     psf_transfer : Transfer
-        One plane of the PSF and the pixel.
+        Transform of PSF and pixel for the source, in its first plane. Further planes (basis images) are ignored.
     picture : Picture
-        The picture.
+        The picture: an image that is drawn instead of a profile.
     jacobian : float array, shape (2, 2)
-        d(u, v) / d(column, row), arcsec per pixel, with u to the west.
+        d(u, v) / d(column, row) at the source, arcsec per detector pixel, with u to the west and v to the north.
 
     Returns
     -------
     Transfer
-        The plane, multiplied by the transform of the picture.
+        The product, as one plane on the same frequencies and with the same data type.
     """
     grid: Grid = psf_transfer.grid
     picture_transform = transform(picture, jacobian, grid.kx, grid.ky)
@@ -105,7 +110,11 @@ def apply_picture(psf_transfer: Transfer, picture: Picture, jacobian: Float) -> 
 
 
 def _spectrum(image: Array) -> Array:
-    """Transform of the picture about its middle pixel, padded to twice its side and divided by that of the window."""
+    """Return the FFT of an image about its middle pixel, prepared for interpolation between its frequencies.
+
+    The image is padded to about twice its sides. It is divided by the transform of the interpolation window, which
+    cancels the effect of the window.
+    """
     middle = [n // 2 for n in image.shape]
     period = [2 * scipy.fft.next_fast_len(max(n, _WIDTH)) for n in image.shape]
     rows, columns = (_window_transform(np.arange(n) - n // 2, p) for n, p in zip(image.shape, period, strict=True))
@@ -115,7 +124,11 @@ def _spectrum(image: Array) -> Array:
 
 
 def _window_transform(place: Array, period: int) -> Array:
-    """Transform of the frequency window at the pixel `place`."""
+    """Return the Fourier transform of the window that interpolates between frequencies, at pixels of an image.
+
+    `place` [n] are the positions of the pixels from the middle of the image, along one axis. `period` is the number of
+    pixels of the padded image along this axis.
+    """
     z, weights = matrices.gauss_legendre(_NODES)
     window = weights * np.exp(_SLOPE * (np.sqrt((1 - z) * (1 + z)) - 1.0))
     half = 0.5 * _WIDTH

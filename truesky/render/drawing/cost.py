@@ -1,4 +1,4 @@
-"""Predicted cost of drawing: work, CPU time and memory."""
+"""Predict the cost of drawing the sources of a detector: number of pixels to be computed, CPU time and memory."""
 
 from __future__ import annotations
 
@@ -12,33 +12,52 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources import selection
 from truesky.render.sources.source_list import Sources
 
-# Measured memory of drawing, bytes: per pixel of the frame (integers and result); per pixel of the largest stamp (its
-# plane and transforms) in single precision, in double precision and if it is followed beyond the PSF's last frequency;
-# per source (its form and weights); and for everything else (planes of the small stamps).
-_FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _DEEP_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 470, 900, 40_000_000
-# Measured bytes per pixel of the largest stamp of a picture.
+# Measured memory of drawing, bytes per pixel of the detector, for the image in integers and the result.
+_FRAME_BYTES = 16
+# Measured memory, bytes per pixel of the largest stamp that is drawn in single precision: PSF image and transforms.
+_STAMP_BYTES = 160
+# Measured memory, bytes per pixel of the largest stamp that is drawn in double precision: PSF image and transforms.
+_DOUBLE_BYTES = 190
+# Measured memory, bytes per pixel of the largest stamp of a bright source that has a side of at most DEEP pixels (more
+# frequencies are computed for such sources).
+_DEEP_BYTES = 470
+# Measured memory of drawing, bytes per source: mainly its shape, and the weights of the images whose weighted sum is
+# its PSF.
+_SOURCE_BYTES = 900
+# Measured memory of drawing for everything else, bytes: mainly transforms of the PSF for small stamps.
+_OTHER_BYTES = 40_000_000
+# Measured memory, bytes per pixel of the largest stamp of a source that is drawn from an image, such as a lensed arc.
 _PICTURE_BYTES = 370
-# Measured CPU time of drawing, s (2.5 GHz, one core): per pixel of a stamp, of a PSF plane on a stamp's grid and of the
-# frame; per block that a galaxy's light beyond its stamp may reach; and for everything else.
-_STAMP_S, _PLANE_S, _FRAME_S, _BLOCK_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 1.5e-8, 0.01
+# Measured CPU time of drawing a source on its stamp and adding it to the image, s per pixel of the stamp (2.5 GHz, one
+# core).
+_STAMP_S = 2.0e-8
+# Measured CPU time of transforming a PSF image for a stamp, s per pixel of the stamp (2.5 GHz, one core).
+_PLANE_S = 2.3e-7
+# Measured CPU time that does not depend on the sources, s per pixel of the detector (2.5 GHz, one core).
+_FRAME_S = 1.1e-8
+# Measured CPU time, s per block of 8 x 8 pixels to which a galaxy may add light beyond its stamp (2.5 GHz, one core).
+_BLOCK_S = 1.5e-8
+# Measured CPU time of drawing for everything else, s per detector (2.5 GHz, one core).
+_START_S = 0.01
 
 
 def count_work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
-    """Amount of work of `stamps.draw`, before anything is drawn.
+    """Predict the amount of work of `stamps.draw`.
 
     Parameters
     ----------
     sources : Sources
-        Sources at rest, or pieces of trails.
+        Sources at rest, or pieces of the trails of moving sources. All are counted, also outside the detector.
     sizes : int array, shape (n,)
-        Sides of their stamps, pixels.
+        Sides of the stamps on which they are drawn, pixels.
     psf : Psf
         PSF of the detector.
 
     Returns
     -------
     (int, int)
-        Number of stamp pixels, and number of grid points of transformed PSF planes.
+        Total number of pixels of all stamps; and total number of pixels of the PSF images that must be transformed, at
+        the pixel scale of the detector. (0, 0) without sources.
     """
     planes, transformed = transfer.plane_count(psf), 0
     for size in np.unique(sizes).tolist():
@@ -48,23 +67,23 @@ def count_work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
 
 
 def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
-    """Predicted CPU time of `stamps.draw`, s.
+    """Predict the CPU time of `stamps.draw`.
 
     Parameters
     ----------
     sources : Sources
         Sources to be drawn.
     sizes : int array, shape (n,)
-        Sides of their stamps, pixels.
+        Sides of the sources' stamps, pixels.
     psf : Psf
         PSF of the detector.
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and of rows of the detector.
 
     Returns
     -------
     float
-        CPU time, s, accurate to a factor of 2 on the machine of the measurements.
+        CPU time on one core of 2.5 GHz, s, accurate to a factor of 2.
     """
     pieces, trail, parent = stamps.split_into_pieces(sources)
     sizes = sizes[parent]
@@ -84,24 +103,25 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
 
 
 def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:
-    """Predicted peak memory of `stamps.draw` in addition to its arguments, from the stamps alone.
+    """Predict the peak memory of `stamps.draw` in addition to that of its arguments, from the sizes of the stamps.
 
     Parameters
     ----------
     electrons : float array, shape (n,)
         Expected electrons of the sources.
     sizes : int array, shape (n,)
-        Sides of their stamps, pixels.
+        Sides of the sources' stamps, pixels.
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and of rows of the detector.
     picture : int array, shape (n,), optional
-        Number of the picture of each source, -1 for none; None if no source has a picture.
+        Index of the picture (an image that is drawn instead of a profile or in addition) of each source, -1 for none;
+        None if no source has a picture.
 
     Returns
     -------
     float
-        Bytes. The true peak is between a third of this and this, since faint sources are not followed to the PSF's last
-        frequency.
+        Upper limit of the memory, bytes. The true peak is at least a third of this value. It is smaller because high
+        frequencies are not computed for faint sources.
     """
     bright = electrons > BRIGHT
     pictured = np.zeros(len(sizes), bool) if picture is None else picture >= 0

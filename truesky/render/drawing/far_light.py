@@ -1,14 +1,16 @@
-"""Light diffracted by the pupil's edges far from a bright star, beyond the plane of its PSF.
+"""Draw light far from a bright star: diffraction by the edges of the pupil, and an aureole of scattered light.
 
-Rings fall off as r^-3 and an aureole as r^-2; spikes are tabulated (psf/spikes.py). The plane of side N fades over 24
-pixels by the smooth step s(z) = z^2 (3 - 2 z) in columns and in rows. `add` draws the fraction 1 - s s of the light
-there and all light farther out, so that the sum has no seam. A moving star is drawn as points along its trail, which
-are closer than the finest fringe lambda / l of a bar.
+The core of the star is drawn with an image of the PSF, which has a side of N pixels; this module draws the light beyond
+it. Rings fall off as r^-3 and the aureole as r^-2; diffraction spikes are tabulated (psf/spikes.py). Near its border,
+the PSF image fades to 0 over 24 pixels by the smooth step s = z^2 (3 - 2 z), where z falls from 1 to 0 towards the
+border. With s_x for columns and s_y for rows, `add` draws the fraction 1 - s_x s_y of the light in this zone, and all
+light farther out, so that the sum has no seam. A moving star is drawn as points along its trail, which are closer than
+the finest fringe lambda / l of a bar of length l in the pupil.
 
-The plane is a discrete transform of the pupil with a period Q. A pixel at r from the middle therefore also contains the
-light of the positions r + Q m (m is a pair of integers). The softened edges of the sampled pupil weaken that light to
-sinc^2(|r + Q m| / Q), relative to sinc^2(|r| / Q) for the light at r itself. `remove_aliased` multiplies each pixel by
-direct / (direct + aliased) light.
+The PSF image is a discrete transform of the pupil with a period Q. A pixel at r from the middle therefore also contains
+the light of the positions r + Q m (m is a pair of integers), which is called aliased. The softened edges of the sampled
+pupil weaken aliased light to sinc^2(|r + Q m| / Q), relative to sinc^2(|r| / Q) for the direct light at r.
+`remove_aliased` multiplies each pixel by direct / (direct + aliased) light.
 
 References
 ----------
@@ -29,35 +31,45 @@ from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.psf import spikes
 from truesky.render.psf.spikes import ARCSEC, FARTHEST, LONG, STEP, Edges
 
-# Light is drawn down to this fraction of the negligible light, so that its border is invisible.
+# Light of a star is drawn down to this fraction of `Star.negligible_electrons` (electrons per pixel that may be
+# neglected), so that the border of the drawn light is invisible.
 _FAINTEST = 0.5
-# Spacing of points along a trail, in finest fringes. It is below 1 to reduce steps at the end of a spike's table.
+# Spacing of the points with which the trail of a moving star is drawn, as a fraction of the width of the finest
+# diffraction fringe. The table of a spike ends abruptly, which causes a step in the light at each point of the trail. A
+# value below 1 makes these steps smaller.
 _ALONG = 0.6
-# Spacing of points along a piece of a trail when aliased light is removed, pixels. Only a ratio is needed there.
+# Spacing of points along the trail of a moving star when aliased light is removed, pixels. It can be wide, since only
+# the ratio of direct and aliased light is needed.
 _POINT_SPACING = 4.0
-# Measured CPU time, s (2.5 GHz, one core): per pixel of the frame for a star, and in addition per pixel of a trail's
-# length; per pixel of a stamp and point along a piece.
-_STAR_S, _LONGER_S, _UNFOLD_S = 7e-9, 1.6e-9, 5e-8
+# Measured CPU time of drawing the light of one bright star at rest beyond its PSF image, s per pixel of the detector
+# (2.5 GHz, one core).
+_STAR_S = 7e-9
+# Measured additional CPU time of drawing the light of a moving star beyond its PSF image: s per pixel of the detector,
+# for each pixel of the length of the star's trail.
+_LONGER_S = 1.6e-9
+# Measured CPU time of removing aliased light from a star's stamp (2.5 GHz, one core): s per pixel of the stamp, for
+# each of the points with which the trail of a moving star is approximated (1 for a star at rest).
+_UNFOLD_S = 5e-8
 
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """A point source that shines beyond the plane of its PSF.
+    """A bright star whose light is drawn also beyond the border of its PSF image (called plane here).
 
     Attributes
     ----------
     column, row : float
-        Position, or the middle of its trail, pixels.
+        Position, or middle of the trail of a moving star, 0-based pixels.
     electrons : float
-        Expected electrons.
+        Expected electrons in total.
     photons : float array, shape (w,), or None
-        Fraction of the photons in each sub-band; None if all are equal.
+        Fraction of the photons in each of w sub-bands of the passband; None if all are equal.
     size : int
-        Side of the plane, pixels.
+        Side of the plane (PSF image), pixels.
     negligible_electrons : float
-        Electrons per pixel that may be neglected.
+        Electrons per pixel that may be neglected; 0 to neglect nothing.
     edges : Edges or None
-        Diffracting edges of the pupil; None if there is no diffraction.
+        Edges of the telescope's pupil, which diffract light, and aureole; None to draw nothing beyond the plane.
     trail : float array, shape (2,), or None
         Displacement of the star and its plane during the exposure, pixels; None if it is at rest.
     """
@@ -73,16 +85,19 @@ class Star:
 
 
 def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
-    """Add the light of a star outside its plane, which fades by `fading_window`, to a frame.
+    """Add the light of a star outside its PSF image, and the light that the image lacks near its border, to a frame.
+
+    The PSF image must have been multiplied by `fading_window` when it was drawn. Nothing is added if `star.edges` is
+    None.
 
     Parameters
     ----------
     frame : int array, shape (ny, nx)
-        Frame, changed in place.
+        Image of the detector in integers, changed in place.
     star : Star
-        The star.
+        The star, which may lie outside the frame.
     unit : float
-        Units of the frame per electron.
+        Factor from electrons to the integers of the frame.
     """
     if star.edges is None:
         return
@@ -96,11 +111,12 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     lines = star.electrons * spikes.spike_light(edges, photons, max(farthest, edges.period))
     faintest = _FAINTEST * star.negligible_electrons
     halo, core = star.electrons * edges.aureole[0], edges.aureole[1]
-    # Radius at which rings and aureole have both become negligible.
+    # Distance from the star in pixels beyond which diffraction rings and aureole are both fainter than `faintest`.
     radius = max((level / faintest) ** (1.0 / 3.0), (halo / faintest) ** 0.5) if faintest > 0.0 else farthest
     radius = min(radius, farthest)
     inner = star.size / 2 - SPARED
-    # Length and half width of the visible part of the spikes outside the plane.
+    # Outside the PSF image, diffraction spikes are drawn where they are brighter than `faintest` (electrons per pixel):
+    # compute the distance from the star and the distance from the axis of a spike up to which they are, in pixels.
     visible = lines[:, int(inner / LONG) :] > faintest
     out, across = (np.flatnonzero(visible.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     spike_reach = min(inner + LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
@@ -114,29 +130,32 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
 
 
 def _farthest_corner(frame: Int, x: Float, y: Float) -> float:
-    """Largest distance from the points to a corner of the frame, plus a pixel."""
+    """Return an upper limit, in pixels, of the distance from any of the points (x, y) to the pixels of the frame."""
     ny, nx = frame.shape
     return float(np.hypot(max(x.max() + 1.0, nx - x.min()), max(y.max() + 1.0, ny - y.min())))
 
 
 def remove_aliased(star: Star, stamp: Array, x0: int, y0: int, nx: int, ny: int) -> None:
-    """Remove the aliased light of a star's plane from its stamp, up to a fifth of the light in the corners.
+    """Remove the aliased light of a star's PSF image from its stamp; it is up to a fifth of the light in the corners.
+
+    The PSF image is a periodic discrete transform, so it also contains light of periodic copies of the star.
 
     Parameters
     ----------
     star : Star
         The star.
     stamp : array, shape (N, N)
-        Stamp, changed in place.
+        Image of the star, electrons, changed in place.
     x0, y0 : int
-        First column and row of the stamp on the frame.
+        Column and row of the detector at which the first pixel of the stamp lies.
     nx, ny : int
-        Columns and rows of the frame. Pixels outside the frame are not changed.
+        Number of columns and of rows of the detector. Pixels outside the detector are not changed.
 
     Notes
     -----
-    Each pixel is multiplied by the direct fraction of the expected direct and aliased light. The two interfere, and
-    where they cancel, both are smaller.
+    Each pixel is multiplied by d / (d + a), where d and a are the expected direct and aliased light. A subtraction of a
+    would be wrong: the amplitudes interfere, and where they cancel, the pixel contains less aliased light. Nothing is
+    changed if the aliased light is negligible, or if `star.edges` is None or has the period 0.
     """
     if star.edges is None or star.edges.period == 0.0:
         return
@@ -152,36 +171,48 @@ def remove_aliased(star: Star, stamp: Array, x0: int, y0: int, nx: int, ny: int)
 
 
 def seconds(length: Float, nx: int, ny: int) -> float:
-    """Predicted CPU time of `add`.
+    """Predict the CPU time of `add` for n stars.
 
     Parameters
     ----------
     length : float array, shape (n,)
-        Lengths of trails, pixels; 0 for stars at rest.
+        Displacements of the stars during the exposure, pixels; 0 for stars at rest.
     nx, ny : int
-        Columns and rows of the frame.
+        Number of columns and of rows of the detector.
 
     Returns
     -------
     float
-        CPU time, s, accurate to a factor of 2. If the light is hardly noticeable, the true time is shorter.
+        CPU time of all stars together on one core of 2.5 GHz, s, accurate to a factor of 2. If the light is hardly
+        noticeable, the true time is shorter.
     """
     return float((_STAR_S + _LONGER_S * length).sum()) * nx * ny
 
 
 def remove_aliased_seconds(length: Float, sizes: Int) -> float:
-    """Predicted CPU time of `remove_aliased`, s, for pieces of trails [n] of given lengths and stamp sides, pixels."""
+    """Return the predicted CPU time, s, of `remove_aliased` for n stamps of stars together.
+
+    `length` [n] are the displacements of the stars on their stamps during the exposure, pixels; 0 for stars at rest.
+    `sizes` [n] are the sides of the stamps, pixels.
+    """
     return float((_UNFOLD_S * sizes.astype(float) ** 2 * np.maximum(np.ceil(length / _POINT_SPACING), 1.0)).sum())
 
 
 def _photons_and_directions(photons: Float | None, edges: Edges) -> tuple[Float, Float]:
-    """Photons by sub-band [w], and directions of the bars [b, 2]."""
+    """Return the fractions of a star's photons in w sub-bands, and unit vectors [b, 2] along b bars in the pupil.
+
+    `photons` [w] are these fractions; None is replaced by equal fractions. The bars cross the telescope's pupil and
+    cause diffraction spikes.
+    """
     photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
     return photons, np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
 
 
 def _trail_points(star: Star, spacing: float) -> tuple[Float, Float]:
-    """Columns and rows [p] of points along a trail, at most `spacing` pixels apart; one point if it is shorter."""
+    """Return the columns and rows [p] of points along a star's trail, at most `spacing` pixels apart.
+
+    A star at rest, or with a trail shorter than `spacing`, has one point.
+    """
     length = 0.0 if star.trail is None else float(np.hypot(*star.trail))
     if star.trail is None or length <= spacing:
         return np.array([star.column]), np.array([star.row])
@@ -191,26 +222,32 @@ def _trail_points(star: Star, spacing: float) -> tuple[Float, Float]:
 
 
 def _finest_fringe(edges: Edges) -> float:
-    """Width of the finest fringe across a spike, pixels; points at this spacing look like a continuous line."""
+    """Return the width in pixels of the finest fringe across a diffraction spike, lambda / l.
+
+    lambda is the shortest wavelength, and l the length of the longest bar in the telescope's pupil.
+
+    The spikes of points at this spacing along the trail of a moving star add up without gaps.
+    """
     return float(edges.wavelength.min() * 1e-7 / edges.bars[:, 2].max() / (edges.pixel_scale * ARCSEC))
 
 
 def fading_window(size: int, samples: int, count: int) -> Float:
-    """Factors by which a star's plane is multiplied along each axis, to fade into the light of `add`.
+    """Return the factors by which a star's PSF image is multiplied along each axis, to fade to 0 at its border.
 
     Parameters
     ----------
     size : int
-        Side of the plane, pixels.
+        Side of the PSF image, pixels.
     samples : int
-        Samples per pixel.
+        Number of samples of the image per pixel.
     count : int
-        Number of samples, centred on the plane.
+        Number of samples of the result. Its middle sample is that of the PSF image.
 
     Returns
     -------
     float array, shape (count,)
-        Factors from 0 to 1.
+        Factors: 1 around the middle, and 0 from a distance of size / 2 - 2 pixels from the middle on. They fall from 1
+        to 0 over the 24 pixels before this distance.
     """
     distance = np.abs(np.arange(count) - count // 2) / samples
     return np.array([far_light.fading_compiled(float(d), size / 2 - SPARED) for d in distance])

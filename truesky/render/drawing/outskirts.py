@@ -1,9 +1,10 @@
-"""Outer light of galaxies that are larger than the largest stamp, in real space.
+"""Draw the outer light (outskirts) of galaxies that are larger than the largest stamp, in real space.
 
-A stamp is periodic. For a galaxy that exceeds it, the aliased light is removed from the stamp, and the light outside
-the stamp is drawn pixel by pixel. The size of a galaxy is therefore not limited. At these distances the profile is
-smooth on the scale of a pixel. A bulge is evaluated in closed form, and a disc from a table of its light integrated
-along the line of sight. The effect of the PSF is small and even smoother; it is evaluated on blocks of pixels.
+A stamp is a square image around one source, drawn by a Fourier transform and therefore periodic: light outside it is
+aliased onto it. For a galaxy that exceeds the largest stamp, the aliased light is removed from the stamp, and the light
+outside the stamp is drawn pixel by pixel. The size of a galaxy is therefore not limited. At these distances the profile
+is smooth on the scale of a pixel. A bulge is evaluated in closed form, and a disc from a table of its light integrated
+along the line of sight. The effect of the PSF is small and even smoother. It is evaluated on a coarse grid of nodes.
 
 References
 ----------
@@ -32,49 +33,90 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.selection import FARTHEST
 
-# Measured CPU time, s (2.5 GHz, one core), per pixel of the frame and of the stamp.
-FRAME_S, STAMP_S = 6e-8, 4e-7
-# Light of a galaxy is noticeable above this fraction of the pixel noise. The limit is lower than for effects, since the
-# light is coherent over many pixels.
+# Measured CPU time of drawing the light outside the stamp of one galaxy that exceeds the largest stamp, s per pixel of
+# the detector (2.5 GHz, one core).
+FRAME_S = 6e-8
+# Measured CPU time of removing aliased light from the stamp of one galaxy that exceeds the largest stamp, s per pixel
+# of the stamp (2.5 GHz, one core).
+STAMP_S = 4e-7
+# Light of a large galaxy is noticeable in a pixel above this fraction of the rms noise of the pixel. The limit is lower
+# than the 10 % for effects of the detector, since the light extends smoothly over many pixels.
 _NOTICED = 1e-2
-# Spacing of the nodes for the effect of the PSF: largest and smallest, pixels; axis ratio from which the largest is
-# sufficient; largest number of nodes from a galaxy to the end of its light for smaller spacings.
-_BLOCK, _FINEST_BLOCK, _SLIM, _MOST_NODES = 8, 2, 0.025, 1536
-# Periodic images of a galaxy are summed in rings around its stamp, at most this number. The sum ends when the number of
-# the ring times its deviation from uniform light is below the second value, electrons per pixel.
-_RINGS, _UNEVEN = 64, 0.05
-# Spacing of the nodes in a ring: smallest, pixels; largest, in sides of a stamp; and as a fraction of the width of the
-# ellipse at that distance.
-_FINEST, _COARSEST, _SPACING_FRACTION = 4, 1.0 / 16.0, 0.2
-# Radius up to which a PSF without planes is evaluated, pixels. For an atmosphere, 1e-5 of the light lies beyond it.
+# Largest spacing of the grid on which the change of a galaxy's outer light by the PSF is computed, pixels.
+_BLOCK = 8
+# Smallest spacing of the grid on which the change of a galaxy's outer light by the PSF is computed, pixels.
+_FINEST_BLOCK = 2
+# Galaxies with at least this axis ratio use the largest spacing (8 pixels) of the grid on which the change of their
+# outer light by the PSF is computed. Galaxies thinner than this use 4 pixels, and below half this ratio 2 pixels.
+_SLIM = 0.025
+# The change of a galaxy's light by the PSF is computed on a grid up to the farthest pixel needed. The spacing of the
+# grid is halved for a thin galaxy only if at most this number of grid points then lie between the galaxy and this pixel
+# along a column or row.
+_MOST_NODES = 1536
+# A stamp is repeated periodically. The aliased light of the galaxy's copies is added up in square rings around its
+# stamp, up to this number of rings. The light of all farther copies is added as uniform light.
+_RINGS = 64
+# The sum over rings of periodic copies ends when the light of a ring is nearly uniform over the stamp: when the number
+# of the ring (1 for the eight stamps next to the galaxy's stamp), times the largest deviation from uniform light in
+# electrons per pixel, is below this value.
+_UNEVEN = 0.05
+# Smallest spacing of the grid on which the light of a ring of periodic copies of a galaxy is computed, pixels.
+_FINEST = 4
+# Largest spacing of the grid on which the light of a ring of periodic copies of a galaxy is computed, as a fraction of
+# the side of the galaxy's stamp.
+_COARSEST = 1.0 / 16.0
+# Spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the width (minor
+# axis) that the galaxy's ellipse has at the distance of the ring.
+_SPACING_FRACTION = 0.2
+# Half side of the square in which a PSF that is given as a profile (not as images) is evaluated, pixels. For seeing by
+# the atmosphere, 1e-5 of the light lies outside.
 _MOFFAT = 128
-# Table of a disc: nodes per axis; spacing of t, with u = sinh t; points along the line of sight; extent of the disc in
-# scale lengths and in scale heights; smallest light.
-_NODES, _STEP, _POINTS, _LENGTHS, _HEIGHTS, _DARK = 76, 1.0 / 16.0, 512, 45.0, 20.0, 1e-40
-# Light below this is neglected, electrons per pixel.
+# Number of nodes along the major axis, and along the minor axis, of the table of an inclined disc's light.
+_NODES = 76
+# Spacing of the nodes in the table of an inclined disc's light. Nodes are equally spaced in t = arsinh(u), where u is
+# the distance from the middle along the major axis in scale lengths. Along the minor axis, the distance is first
+# divided by the factor w of `surface_disk`, about the axis ratio.
+_STEP = 1.0 / 16.0
+# Number of points along each line of sight through a galaxy's disc at which its light is summed up.
+_POINTS = 512
+# Largest distance from the major axis, in the plane of a galaxy's disc, up to which its light is integrated, in scale
+# lengths of the disc.
+_LENGTHS = 45.0
+# Largest height above and below the plane of a galaxy's disc up to which its light is integrated, in scale heights.
+_HEIGHTS = 20.0
+# Smallest value of a disc's light in its table (fraction of the flux per squared scale length). Smaller values are
+# replaced by it, because the table contains logarithms.
+_DARK = 1e-40
+# Light of a disc is neglected where an estimate of it is below this, electrons per pixel. The estimate is exp(-u) times
+# the electrons of the disc per squared scale length, where u is the distance along the major axis in scale lengths. It
+# is too large for a face-on disc, but about ten times too small far out along the major axis of an edge-on disc.
 _NEGLIGIBLE = 1e-4
-# Smallest axis ratio of all sources, reached by bulges.
+# Smallest axis ratio (minor / major) of any bulge or disc; some bulges have it.
 _THINNEST = 0.02
-# Number of directions for the integral of a profile outside a square.
+# Number of directions from the middle of a galaxy over which its light outside a square is averaged.
 _DIRECTIONS = 1440
 
 
 @dataclass(frozen=True, slots=True)
 class Outskirts:
-    """Light of one galaxy as a function of the pixel offset (x, y) from its middle.
+    """Outer light of one galaxy as a function of the offset (x, y) from its middle in pixels.
 
     Attributes
     ----------
     light : float array, shape (11,)
-        Row of `galaxy_shapes.real_space_profile`, electrons, with matrix and light of the disc seen face-on.
+        Parameters of bulge and disc as in a row of `galaxy_shapes.real_space_profile`, electrons, with two differences:
+        the matrix of the disc is that of the disc seen face-on, and the value for the light in the disc's middle is
+        instead the factor by which the light in the table `disk` is multiplied.
     disk : float array, shape (n, n)
-        Logarithm of the disc's light at u = sinh and v = w sinh of the nodes.
+        Table of `surface_disk`: natural logarithm of the inclined disc's light at u = sinh t_i along the major axis and
+        v = w sinh t_j along the minor axis, in scale lengths. The nodes t are equally spaced.
     across : float
-        Ratio w of v to the sinh of the nodes, see `surface_disk`.
+        Factor w of the coordinate v, about the apparent axis ratio of the disc.
     blurred : float array, shape (m, m)
-        Light that the PSF adds to a pixel, at nodes `block` pixels apart with the galaxy in the middle.
+        Electrons by which the PSF changes a pixel (also negative), at nodes `block` pixels apart. The middle node is
+        the middle of the galaxy.
     block : int
-        Spacing of these nodes, pixels.
+        Spacing of the nodes of `blurred`, pixels.
     """
 
     light: Float
@@ -85,18 +127,19 @@ class Outskirts:
 
 
 def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
-    """Compute the outskirts of a galaxy.
+    """Compute the outer light of one galaxy.
 
     Parameters
     ----------
     shape, form : Shapes, Forms
-        Shape and form of one galaxy.
+        Bulge and disc parameters of one galaxy, and the sizes and orientations of both in pixels from
+        `galaxy_shapes.forms`.
     electrons : float
         Expected electrons.
     psf : Psf
         PSF of the detector.
     weights : float array, shape (planes,)
-        Weights of `transfer.basis_weights`.
+        Weights of the PSF's planes (basis images) for this galaxy, from `transfer.basis_weights`.
     farthest : float
         Largest distance along columns or rows at which light is needed, pixels.
 
@@ -131,30 +174,32 @@ def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights:
 
 @lru_cache(maxsize=16)
 def surface_disk(inclination: float) -> tuple[Float, float]:
-    """Table of the light of an inclined disc of finite thickness, with scale length 1 and flux 1.
+    """Return a table of the light of an inclined disc of finite thickness, with scale length 1 and flux 1.
 
     Parameters
     ----------
     inclination : float
-        Inclination, deg.
+        Inclination, deg, 0 (face-on) to 90.
 
     Returns
     -------
     (float array, float)
-        Logarithm of the light at u, v = (sinh t, w sinh t) along the major and minor axes, and w. The nodes of t start
-        one step below 0, so that the table extends beyond its axes.
+        Table [i, j] of ln(light per squared scale length) at u = sinh t_i along the major axis and v = w sinh t_j along
+        the minor axis, in scale lengths; and the factor w. The first node of t is one step below 0, so that cubic
+        interpolation works at the axes.
 
     Notes
     -----
-    The light is the integral of exp(-R) sech^2(z / h) along the line of sight. The error is 1e-4. It is 3e-3 at the
-    axes within half a scale length of the middle. It is 8e-3 within a fifth of a scale length of the cusp of a face-on
-    disc, which lies inside the stamp.
+    The light is the integral of exp(-R) sech^2(z / h) along the line of sight, at the radius R in the plane and the
+    height z; h is the scale height (DISK_SCALE_HEIGHT, in scale lengths). The relative error is 1e-4. On the axes
+    within half a scale length of the middle it is 3e-3. Within a fifth of a scale length of the central cusp of a
+    face-on disc, which lies inside the galaxy's stamp, it is 8e-3.
     """
     cosine, sine = (float(f(np.radians(inclination))) for f in (np.cos, np.sin))
     wide = float(np.hypot(cosine, DISK_SCALE_HEIGHT))
     along = np.sinh(_STEP * np.abs(np.arange(-1, _NODES - 1)))
     u, v = along[:, None, None], wide * along[None, :, None]
-    # Section of the line of sight inside the disc.
+    # First and last point of the part of each line of sight that lies inside the disc.
     thick = _HEIGHTS * DISK_SCALE_HEIGHT
     inverse = 1.0 / max(cosine, 1e-9), 1.0 / max(sine, 1e-9)
     first = np.maximum((-thick - v * sine) * inverse[0], (v * cosine - _LENGTHS) * inverse[1])
@@ -162,7 +207,7 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
     length = np.maximum(last - first, 0.0)
     s = first + length * (np.arange(_POINTS) + 0.5) / _POINTS
     height = np.abs(v * sine + s * cosine) / DISK_SCALE_HEIGHT
-    # This form of sech^2 does not overflow.
+    # sech^2(x) is computed as 4 exp(-2 x) / (1 + exp(-2 x))^2, which does not overflow for large x.
     fading = np.exp(-2.0 * height)
     light = np.exp(-np.hypot(u, v * cosine - s * sine)) * 4.0 * fading / (1.0 + fading) ** 2
     total = light.sum(axis=2) * length[..., 0] / _POINTS / (4.0 * np.pi * DISK_SCALE_HEIGHT)
@@ -170,7 +215,11 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
 
 
 def _block(slim: float, farthest: float) -> int:
-    """Spacing of the nodes for the PSF's effect, pixels, for axis ratio `slim` and light up to `farthest` pixels."""
+    """Return the spacing (2, 4 or 8 pixels) of the grid on which the change of a galaxy's light by the PSF is computed.
+
+    It is smaller for galaxies with a small axis ratio `slim`, unless the grid, which extends to `farthest` pixels from
+    the galaxy, would then have too many points.
+    """
     block = _BLOCK
     while block > _FINEST_BLOCK and slim < _SLIM * block / _BLOCK and farthest <= _MOST_NODES * (block // 2):
         block //= 2
@@ -178,10 +227,11 @@ def _block(slim: float, farthest: float) -> int:
 
 
 def _cells(psf: Psf, weights: Float, block: int) -> Float:
-    """PSF minus a delta function, on nodes `block` pixels apart.
+    """Return the PSF of a source minus a delta function, on nodes `block` pixels apart.
 
-    Each of its samples is distributed to five nodes per direction, which preserves moments up to the fourth and
-    includes the pixel.
+    Convolved with the light of a galaxy at the nodes, it gives the change of the light by the PSF. Each sample of the
+    PSF is averaged over a pixel and distributed to five nodes per direction, which preserves moments up to the fourth.
+    `weights` [planes] are the weights of the PSF's planes (basis images) for the source, from `transfer.basis_weights`.
     """
     if psf.planes is None:
         side = 2 * _MOFFAT * SAMPLES + 1
@@ -197,13 +247,18 @@ def _cells(psf: Psf, weights: Float, block: int) -> Float:
 
 
 def _shares(length: int, block: int, samples: int) -> Float:
-    """Shares [length, nodes] of a line of samples in the nodes, about the middle, with `samples` per pixel."""
+    """Return the fraction [length, nodes] of the light of each sample of a line that is added to each node of a grid.
+
+    The line has `length` samples, `samples` per pixel; the nodes are `block` pixels apart. Sample and node in the
+    middle coincide. The light of a sample is added to the five nearest nodes only. The fractions, some of which are
+    negative, have the sum 1.
+    """
     place = (np.arange(length) - length // 2) / (samples * block)
     node = np.rint(place).astype(int)
     off, pixel = place - node, 1.0 / (12.0 * block**2)
     half = int(np.abs(node).max()) + 2
     out = np.zeros((length, 2 * half + 1))
-    # Moments of a pixel about the node.
+    # Moments, about the nearest node, of a uniform pixel centred on the sample.
     first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
     fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
     for step, share in (
@@ -218,14 +273,15 @@ def _shares(length: int, block: int, samples: int) -> Float:
 
 
 def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
-    """Subtract the aliased light of a galaxy from its stamp.
+    """Subtract the aliased light of a galaxy from its stamp, the light that a Fourier transform moved onto it.
 
     Parameters
     ----------
     galaxy : Outskirts
-        Light of the galaxy.
+        Light of the galaxy. Its grid `blurred` (change of the light by the PSF) must extend to the corners of the eight
+        neighbouring stamps.
     stamp : array, shape (N, N)
-        Stamp, changed in place.
+        Image of the galaxy, electrons, changed in place. N is a power of two.
     x, y : float
         Position of the galaxy in the stamp, pixels.
     """
@@ -243,7 +299,9 @@ def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
 
 
 def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Float:
-    """Light in a stamp from all periodic images of a galaxy except those in the eight neighbouring stamps.
+    """Return the light in a stamp from the distant periodic copies of a galaxy.
+
+    A stamp is repeated periodically. The copies in the eight neighbouring stamps are not included.
 
     Parameters
     ----------
@@ -257,12 +315,13 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
     Returns
     -------
     float array, shape (size, size)
-        Electrons, with an error of 0.05 electrons; 1e-3 of the light for axis ratio 0.02.
+        Electrons in each pixel, with an error of 0.05 electrons, or of 1e-3 of the light for the axis ratio 0.02.
 
     Notes
     -----
-    The images of an ellipse add up to uniform light only if they are wider than a stamp. This happens farther out for
-    thinner ellipses.
+    The light of the copies is computed ring by ring, in square rings around the stamp, until that of a ring is nearly
+    uniform over the stamp. All light of copies farther out is then added as uniform light. For thinner galaxies, this
+    is the case farther out.
     """
     slim, pixels = slimness(galaxy.light, galaxy.across), np.arange(size)
     out, ring_sum, step = np.zeros((size, size)), np.zeros((1, 1)), 0
@@ -288,13 +347,17 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
 
 
 def _spline(values: Float, step: int) -> RectBivariateSpline:
-    """Spline through nodes `step` apart in both directions, the first of them at 0."""
+    """Return the bicubic spline through the values [n, n] at nodes `step` pixels apart, the first of which is at 0."""
     nodes = step * np.arange(len(values))
     return RectBivariateSpline(nodes, nodes, values)
 
 
 def slimness(light: Float, across: float) -> float:
-    """Axis ratio of the thinner component on the pixels, for `light` and `across` of `Outskirts`."""
+    """Return the smaller of the axis ratios, in pixels, of a galaxy's bulge and disc; 1 for a galaxy without light.
+
+    `light` [11] (parameters of bulge and disc) and `across` (factor of the disc's minor axis) are attributes of
+    `Outskirts`.
+    """
     out = 1.0
     for middle, first, width in ((BULGE, BULGE_FORM, 1.0), (DISK, DISK_FORM, across)):
         if light[middle] > 0.0:
@@ -308,7 +371,7 @@ def add(
     galaxy: Outskirts, frame: Int, column: float, row: float, hole: tuple[int, int, int], unread_rows: tuple[int, int],
     unit: float,
 ) -> int:  # fmt: skip
-    """Add a galaxy to a frame, except within its stamp.
+    """Add the light of a galaxy to the image of a detector (frame), except within the stamp of the galaxy.
 
     Parameters
     ----------
@@ -317,18 +380,19 @@ def add(
     frame : int array, shape (ny, nx)
         Frame, changed in place.
     column, row : float
-        Position of the galaxy, pixels.
+        Position of the galaxy, 0-based pixels; it may lie outside the frame.
     hole : (int, int, int)
-        First column, first row and side of the stamp.
+        First column, first row and side of the stamp, whose pixels are not changed.
     unread_rows : (int, int)
-        Rows that are not counted in the result, see `stamps.Tally`.
+        First row that the detector does not read, and the row after the last of these rows. They are drawn, but not
+        counted in the result.
     unit : float
-        Units of the frame per electron.
+        Factor from electrons to the integers of the frame.
 
     Returns
     -------
     int
-        Light on the counted rows, in units.
+        Light that was added on read rows, in the integers of the frame.
     """
     return int(
         _add_galaxy(
@@ -348,7 +412,7 @@ def add(
 
 
 def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, min_radius: float) -> Float:
-    """Radius up to which galaxies are noticeable.
+    """Return the radius up to which the light of each of n galaxies is noticeable.
 
     Parameters
     ----------
@@ -359,14 +423,14 @@ def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, mi
     pixel_scale : float
         Arcsec per pixel.
     noise : float
-        Noise per pixel, electrons.
+        Noise of a pixel, electrons rms. Light below 1 % of the noise is not noticeable.
     min_radius : float
-        Smallest radius, arcsec.
+        Smallest radius, arcsec; the result is not smaller, also for faint galaxies.
 
     Returns
     -------
     float array, shape (n,)
-        Radius in arcsec, `min_radius` to FARTHEST in steps of 10 %.
+        Radius in arcsec, from `min_radius` in steps of 10 % to at most FARTHEST (1200 arcsec).
     """
     out, remaining = np.full(len(electrons), min(min_radius, FARTHEST)), np.arange(len(electrons))
     while len(remaining):
@@ -381,7 +445,7 @@ def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, mi
 
 
 def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float) -> float:
-    """Smallest number of electrons of a galaxy that could be noticeable at a distance.
+    """Return a lower limit of the electrons of a large galaxy that is noticeable at a given distance from its middle.
 
     Parameters
     ----------
@@ -390,18 +454,23 @@ def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float) 
     pixel_scale : float
         Arcsec per pixel.
     noise : float
-        Noise per pixel, electrons.
+        Noise of a pixel, electrons rms. Light below 1 % of the noise is not noticeable.
 
     Returns
     -------
     float
-        Electrons. The limit uses that no profile rises outward.
+        Total electrons of the galaxy. Fainter galaxies are not noticeable at this distance, since no profile rises
+        outward and no axis ratio is below 0.02.
     """
     return float(_NOTICED * noise * np.pi * _THINNEST * (distance / pixel_scale) ** 2)
 
 
 def _light_outside_square(light: Float, across: float, half: float) -> float:
-    """Electrons outside a centred square of a given half side in pixels, for a thin disc."""
+    """Return the electrons of a galaxy outside a square centred on it; `half` is half of the square's side in pixels.
+
+    The disc is treated as thin, an approximation. `light` [11] (parameters of bulge and disc) and `across` (factor of
+    the disc's minor axis) are attributes of `Outskirts`.
+    """
     angle = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)])
     total = 0.0
@@ -418,13 +487,20 @@ def _light_outside_square(light: Float, across: float, half: float) -> float:
 
 
 def _log_bulge_total(n: float) -> float:
-    """Logarithm of a bulge's total light over that in the middle, for exp(-(u^2 + v^2)^p) with p = 1 / 2n."""
+    """Return the logarithm of the integral of exp(-(u^2 + v^2)^p) over the (u, v) plane, the light of a bulge.
+
+    The light in the bulge's middle is 1. The exponent is p = 1 / (2 n), where n is the Sersic index.
+    """
     return float(np.log(2 * np.pi * n) + gammaln(2 * n))
 
 
 @jit
 def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
-    """Electrons in a pixel at an offset (x, y) from a galaxy's middle, without PSF."""
+    """Return the electrons of a galaxy in a pixel at (x, y) pixels from its middle, without the effect of the PSF.
+
+    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light) and `across` (factor of the
+    coordinate along the disc's minor axis) are attributes of `Outskirts`.
+    """
     out = 0.0
     if light[BULGE] > 0.0:
         u = light[BULGE_FORM] * x + light[BULGE_FORM + 1] * y
@@ -440,8 +516,13 @@ def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
 
 @jit
 def _from_table(disk: Float, u: float, v: float) -> Any:
-    """Interpolate the table of a disc (cubic in both directions) and return its exponential; 0 beyond the table."""
-    # The axis is at node 1.
+    """Return the light of a disc from the table `disk` of its logarithm, by cubic interpolation; 0 beyond the table.
+
+    The nodes of the table are equally spaced in `u` and `v`, both at least 0: sinh u is the distance from the middle
+    along the major axis in scale lengths, and sinh v that along the minor axis divided by the factor `across` of
+    `Outskirts`. The result is for flux 1, per squared scale length.
+    """
+    # Coordinate 0 is at node 1 of the table, since cubic interpolation needs a node (node 0) on the other side of it.
     a, b = u / _STEP + 1.0, v / _STEP + 1.0
     i, j = int(a), int(b)
     if i + 2 >= len(disk) or j + 2 >= len(disk):
@@ -459,7 +540,10 @@ def _from_table(disk: Float, u: float, v: float) -> Any:
 
 @jit
 def _cubic(part: float, node: int) -> Any:
-    """Weight of one of four nodes for cubic interpolation at the fraction `part` between the second and third."""
+    """Return the weight of `node`, 0 to 3, for cubic interpolation between four values at even spacing.
+
+    The interpolated position is the fraction `part`, 0 to 1, of the way from node 1 to node 2.
+    """
     if node == 0:
         return -part * (part - 1.0) * (part - 2.0) / 6.0
     if node == 1:
@@ -471,7 +555,7 @@ def _cubic(part: float, node: int) -> Any:
 
 @jit
 def _bilinear(nodes: Float, x: float, y: float) -> Any:
-    """Interpolate linearly between nodes at integer coordinates; 0 beyond them."""
+    """Return a value at (x, y) by linear interpolation between `nodes` [y, x] at integer coordinates; 0 beyond them."""
     i, j = int(np.floor(y)), int(np.floor(x))
     if i < 0 or j < 0 or i + 1 >= nodes.shape[0] or j + 1 >= nodes.shape[1]:
         return 0.0
@@ -482,7 +566,12 @@ def _bilinear(nodes: Float, x: float, y: float) -> Any:
 
 @jit
 def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
-    """Electrons in a pixel at an offset (x, y) from a galaxy's middle."""
+    """Return the electrons of a galaxy in a pixel at (x, y) pixels from its middle, with the effect of the PSF.
+
+    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light), `across` (factor of its minor
+    axis), `blurred` (change of the light by the PSF at the nodes of a grid) and `block` (spacing of the nodes, pixels)
+    are attributes of `Outskirts`. A negative result is replaced by 0.
+    """
     middle = blurred.shape[0] // 2
     blur_light = _bilinear(blurred, x / block + middle, y / block + middle)
     return max(_light(light, disk, across, x, y) + blur_light, 0.0)
@@ -490,7 +579,12 @@ def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block
 
 @jit
 def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: float, out: Float) -> None:
-    """Add the light of a galaxy at (x, y) to nodes `step` pixels apart, the first of them at 0."""
+    """Add the light of a galaxy to the nodes `out` of a grid, electrons per pixel at each node.
+
+    The nodes are `step` pixels apart, and `out[0, 0]` is at (0, 0). The middle of the galaxy is at (x, y), pixels.
+    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light) and `across` (factor of its minor
+    axis) are attributes of `Outskirts`. The effect of the PSF is not included.
+    """
     for r in range(out.shape[0]):
         for c in range(out.shape[1]):
             out[r, c] += _light(light, disk, across, step * c - x, step * r - y)

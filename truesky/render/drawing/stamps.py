@@ -1,9 +1,11 @@
-"""Draw sources on stamps in Fourier space, each with its PSF, and add them to a frame.
+"""Draw sources on stamps in Fourier space, each with its PSF, and add the stamps to the image of a detector (frame).
 
-The image of a stamp is the inverse transform of profile(k) PSF(k) pixel(k) on the k grid of the stamp. Light of a
-galaxy outside its stamp is aliased to the opposite edge. The part that reaches the middle is removed and drawn at its
-correct position, as are the PSF's wings beyond the stamp (wings.py). The rest stays at the edge, where it is below the
-noise. A PSF without planes leaves all of its wings there (transfer.py).
+A stamp is a square image around one source. It is the inverse transform of profile(k) PSF(k) pixel(k) on a grid of k.
+A discrete transform is periodic, so light of a galaxy outside its stamp is aliased to the opposite edge. The aliased
+light that reaches the middle is removed and drawn at its correct position. The PSF's wings beyond the stamp are also
+drawn at their correct position (wings.py). The remaining aliased light stays at the edge of the stamp, where it is
+below the noise. For a PSF that is given as a profile instead of images, all aliased wings are moved to the edge
+(transfer.py).
 
 A stamp is large enough that all aliased light is below a given fraction of the flux in the source's aperture. For a
 galaxy that exceeds the largest stamp, the outer light is drawn in real space (outskirts.py). No light is lost and no
@@ -29,16 +31,20 @@ from truesky.render.sources import galaxy_shapes, selection, sersic
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.source_list import Sources
 
-# Bright sources are followed in Fourier space down to this multiple of their neglected flux, since at most 0.3 % of the
-# part that is cut off rings (for seeing of two pixels).
+# The Fourier transform of a bright source is used up to the frequency where it falls below this multiple of the size of
+# a Fourier sample that may be neglected. The cut causes ringing in the image, but by at most 0.3 % of the part of the
+# transform that is cut off (for a seeing of two pixels).
 _RINGS = 1e2
-# Largest side of the stamps of sources that are followed beyond the default frequency, pixels.
+# Largest side of a stamp, pixels, for which bright sources use frequencies above the usual limit.
 DEEP = 1024
-# Stamps with larger sides sum the PSF's planes for each source, since all planes would not fit into memory.
+# On stamps with sides above this number of pixels, the PSF's planes (basis images) are summed before the transform, for
+# each source separately. The transforms of all planes would not fit into memory.
 _SHARED = 512
-# With fewer sources per plane than this, transforming all planes takes longer than summing them for each source.
+# Number of sources with equal stamp size, divided by the number of the PSF's planes (basis images). Below this ratio,
+# transforming all planes takes longer than summing the planes for each source.
 _FEW = 0.5
-# Number of stamp pixels that are transformed together.
+# Number of stamp pixels that one call of the FFT transforms together. At least two stamps are transformed, also if they
+# have more pixels.
 _BATCH = 1 << 17
 
 
@@ -52,30 +58,33 @@ def draw(
     neglected: Float | None = None,
     tally: Tally | None = None,
 ) -> Float:
-    """Draw the expected electrons of sources, without sky.
+    """Draw the expected electrons of sources on a detector, without sky and noise.
 
     Parameters
     ----------
     sources : Sources
         Sources to be drawn.
     sizes : int array, shape (n,)
-        Sides of their stamps from `stamp_sizes`, pixels.
+        Sides of the sources' stamps from `stamp_sizes.stamp_sizes`, pixels.
     psf : Psf
         PSF of the detector.
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and of rows of the detector.
     progress : callable, optional
-        Called repeatedly with the number of sources drawn.
+        Function that is called after each batch of stamps with the total number of stamps that are done. A moving
+        source has several stamps.
     neglected : float array, shape (n,), optional
-        Fourier samples that may be neglected, from `neglected_flux`; None to neglect nothing.
+        Size of the Fourier samples that may be neglected, as a fraction of each source's flux, from
+        `stamp_sizes.neglected_flux`. None to use all samples up to the last frequency of the PSF.
     tally : Tally, optional
-        Filled with the light of each source's stamp on the frame.
+        Its array `electrons` is filled with the electrons of each source that fall onto the frame.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons, rounded per source to half a unit of `fourier.units_of` (5e-7 electrons for all but the brightest
-        sources). The result does not depend on the order of the sources.
+        Expected electrons. The light of each source in a pixel is rounded to a multiple of 2^-20 = 1e-6 electrons, or
+        of a larger power of two with extremely bright sources (`kernels.fourier.units_of`). The sum therefore does not
+        depend on the order of the sources.
     """
     pieces, trail, parent = split_into_pieces(sources)
     piece_neglected = None if neglected is None else neglected[parent]
@@ -99,14 +108,16 @@ def draw(
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Light of each source's stamp that falls onto the frame.
+    """Electrons of each of n sources that fall onto the frame (image of the detector), as an output of `draw`.
 
     Attributes
     ----------
     electrons : float array, shape (n,)
-        Filled by `draw`.
+        Electrons of the source's stamps on the frame, filled by `draw`. For a galaxy that is larger than the largest
+        stamp, light outside its stamp is included. For other sources it is not.
     unread_rows : (int, int)
-        First row of the frame that is not counted, and the row after the last.
+        First row that is not counted, because the detector does not read it, and the row after the last of these rows.
+        (0, 0) to count all rows.
     """
 
     electrons: Float
@@ -114,7 +125,10 @@ class Tally:
 
 
 def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
-    """Split trails into pieces, and structured discs into the smooth source and the structure.
+    """Split sources into pieces that are drawn on one stamp each.
+
+    The trail of a moving source is split along its length. A galaxy whose disc has spiral arms and knots is split into
+    the smooth galaxy and the structure. All other sources are one piece.
 
     Parameters
     ----------
@@ -124,7 +138,8 @@ def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
     Returns
     -------
     (Sources, float array, int array)
-        The p pieces as sources; the trail of each piece [p, 2], pixels; the number of its source [p].
+        The p pieces as sources; the displacement of each piece during the exposure [p, 2] along columns and rows,
+        pixels; the index of the source from which each piece comes [p].
     """
     structured = np.flatnonzero(sources.has_structure)
     if len(structured):
@@ -134,7 +149,7 @@ def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
     count = stamp_sizes.piece_count(sources.trail_length)
     parent = np.repeat(np.arange(len(sources)), count)
     number = np.arange(len(parent)) - np.repeat(np.cumsum(count) - count, count)
-    # Offset from the middle of the trail to that of the piece, in lengths of the trail.
+    # Offset from the middle of the trail to the middle of the piece, as a fraction of the trail's length.
     along = (number + 0.5) / count[parent] - 0.5
     trail = sources.trail[parent]
     pieces = replace(
@@ -148,7 +163,7 @@ def split_into_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
 
 
 def _net_electrons(pieces: Sources) -> Float:
-    """Net electrons of each piece [p]; 0 for the structure of a disc."""
+    """Return the total electrons of each stamp [p]: 0 for the arms and knots of a disc, whose pixels have the sum 0."""
     if pieces.picture is None or not any(picture.is_structure for picture in pieces.pictures):
         return pieces.electrons
     is_structure = np.array([*(picture.is_structure for picture in pieces.pictures), False])
@@ -156,7 +171,10 @@ def _net_electrons(pieces: Sources) -> Float:
 
 
 def _split_with_structure(sources: Sources, structured: Int) -> tuple[Sources, Float, Int]:
-    """Result of `split_into_pieces` if discs have a structure: first the smooth sources, then the structures."""
+    """Return the result of `split_into_pieces` for sources some of which are discs with spiral arms and knots.
+
+    `structured` [m] are the indices of these galaxies. The smooth sources come first, then the arms and knots.
+    """
     assert sources.picture is not None
     bare = sources.picture.copy()
     bare[structured] = -1
@@ -172,44 +190,49 @@ def _split_with_structure(sources: Sources, structured: Int) -> tuple[Sources, F
 
 @dataclass(frozen=True, slots=True)
 class _PreparedSources:
-    """Properties of the pieces [p] that are computed before drawing.
+    """Properties of p pieces (sources, or parts of their trails, on one stamp each) that are computed before drawing.
 
     Attributes
     ----------
     sources : Sources
         The pieces.
     trail : float array, shape (p, 2)
-        Displacement of each piece, pixels.
+        Displacement of each piece along columns and rows during the exposure, pixels.
     parent : int array, shape (p,)
-        Number of its source.
+        Index of the source from which the piece comes.
     sizes : int array, shape (p,)
         Sides of the stamps, pixels.
     psf : Psf
         PSF of the detector.
     weights : float array, shape (p, planes)
-        Weights of `transfer.basis_weights`.
+        Weights of the PSF's planes (basis images) from `transfer.basis_weights`.
     shapes, form : Shapes, Forms
-        Shapes and forms of the pieces that have a shape.
-    profile_arguments, table : array
-        Arguments of the kernel for each profile, and the table of Sersic transforms.
+        Bulge and disc parameters, and sizes and orientations of bulge and disc in pixels, of those pieces that are
+        galaxies, in order.
+    profile_arguments : tuple of array
+        Arrays with one row per piece, from `_profile_arguments` (profiles of bulge and disc), followed by `trail`.
+    table : array
+        Table of the Fourier transforms of Sersic profiles, from `sersic.table`.
     cut : float array, shape (p,)
-        Frequency up to which each piece is followed, radian / pixel.
+        Largest |k| at which the transform of the piece is computed, radian / pixel.
     deep : bool array, shape (p,)
-        True for pieces that are followed beyond the default frequency.
+        True for bright pieces whose `cut` may exceed `reach`.
     reach : float
-        Default frequency, radian / pixel.
+        Largest |k| at which the PSF is not negligible for pieces that are not `deep`, radian / pixel.
     left_out : float array, shape (p,)
-        Fourier samples that may be neglected.
+        Size of the Fourier samples that may be neglected, as a fraction of the flux.
     outside : wings.OutsideLight
-        Light of galaxies that is drawn beyond their stamps; `_draw_batch` stores the removed light in it.
+        Light of galaxies that is drawn beyond their stamps. `_draw_batch` stores the electrons that it removed from
+        the stamps in it.
     curve : float array, shape (p, 5)
-        Result of `kernels.frame.aliased_light`.
+        Light of each galaxy that is aliased onto its stamp (light beyond one edge appears at the opposite edge), as a
+        polynomial about the galaxy, from `kernels.frame.aliased_light`.
     has_far_light : bool array, shape (p,)
-        True for points that shine beyond the PSF's planes.
+        True for stars so bright that their light beyond the PSF's planes is drawn.
     largest : bool array, shape (p,)
         True for galaxies that are larger than the largest stamp.
     unit : float
-        Units of the frame per electron.
+        Factor from electrons to the integers of the frame.
     """
 
     sources: Sources
@@ -233,7 +256,7 @@ class _PreparedSources:
     unit: float
 
     def star(self, parts: Int) -> far_light.Star:
-        """Star for a point at rest, or for the pieces of one trail."""
+        """Return the far_light.Star of a point source; `parts` are the indices of its pieces, which form one trail."""
         sources, first = self.sources, parts[0]
         electrons = float(sources.electrons[parts].sum())
         photons = None if sources.photons is None else sources.photons[first]
@@ -244,11 +267,12 @@ class _PreparedSources:
         )  # fmt: skip
 
     def outskirts(self, i: int, nx: int, ny: int) -> outskirts.Outskirts:
-        """Outskirts of galaxy `i`."""
+        """Return the light of galaxy `i` outside its stamp, up to the farthest pixel of a frame of ny x nx pixels."""
         sources = self.sources
         shape_row = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
         x, y = sources.column[i], sources.row[i]
-        # Distance to the corners of the neighbouring stamps and of the frame.
+        # Largest distance along columns or rows: to the corners of the periodic stamps next to the galaxy's stamp, and
+        # to the corners of the frame.
         farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
         galaxy_form = Forms(*(getattr(self.form, part.name)[shape_row] for part in fields(Forms)))
         light = float(sources.electrons[i])
@@ -285,8 +309,9 @@ def _prepare(
         deep=_extend_reach(cut, sources.electrons, sizes, left_out, psf, reach_arguments),
         reach=transfer.STEP * len(max_transfer),
         left_out=left_out,
-        # For stamps that are not drawn, the aliased light approximates the removed light: to 5 % for single sources,
-        # and to 0.1 % for many together.
+        # `outside.electrons` starts as the expected aliased light, and is replaced by the light that is really removed
+        # when the stamp is drawn. Stamps outside the frame are not drawn, so they keep the expected value. It is wrong
+        # by 5 % for single sources and by 0.1 % for the sum of many.
         outside=wings.OutsideLight(profile, curve[:, -1].copy(), farthest),
         curve=curve,
         has_far_light=stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf),
@@ -296,9 +321,11 @@ def _prepare(
 
 
 def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Iterator[tuple[Int, Transfer, Array]]:
-    """Yield (pieces of one stamp size, planes of their PSF, weights [n, planes]) for the stamps on the frame.
+    """Yield groups of stamps that are drawn together: (indices of n pieces, PSF transforms, their weights [n, planes]).
 
-    Pieces of the mask `precise` are drawn in double precision.
+    A piece is a source, or a part of the trail of a moving source, on one stamp. The stamps of a group have one size.
+    Only pieces in the mask `on_frame` [p] are drawn. Pieces in the mask `precise` [p] are drawn in double precision,
+    and each is the only piece of its group.
     """
     sources, psf = prepared.sources, prepared.psf
     for size in np.unique(prepared.sizes).tolist():
@@ -328,7 +355,11 @@ def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Itera
 def _add_outskirts(
     prepared: _PreparedSources, i: int, light: outskirts.Outskirts, frame: Int, unread_rows: tuple[int, int]
 ) -> float:
-    """Add the light of galaxy `i` outside its stamp to the frame, and return its electrons there."""
+    """Add the light of a galaxy outside its stamp to the image of the detector (frame), and return the added electrons.
+
+    `i` is the index of the galaxy in `prepared.sources`, and `light` its light as a function of position. Electrons on
+    the rows from unread_rows[0] to unread_rows[1] - 1, which the detector does not read, are not counted.
+    """
     place, size = (float(prepared.sources.column[i]), float(prepared.sources.row[i])), int(prepared.sizes[i])
     x_first, y_first = (int(np.rint(at)) - size // 2 for at in place)
     return float(
@@ -339,9 +370,11 @@ def _add_outskirts(
 def _draw_light_beyond_stamps(
     prepared: _PreparedSources, on_frame: Bool, frame: Int, fallen: Float, unread_rows: tuple[int, int]
 ) -> None:
-    """Draw galaxies whose stamps are outside the frame, and points beyond the PSF's planes.
+    """Draw light far from sources: of very large galaxies whose stamps lie outside the frame, and of bright stars.
 
-    Electrons of these galaxies on the frame are added to `fallen` [p].
+    `on_frame` [p] is the mask of the pieces of sources whose stamps overlap the image of the detector (frame). Stars
+    are drawn beyond the border of their PSF images. The electrons of galaxies on the frame, without those in
+    `unread_rows`, are added to `fallen` [p]; electrons of stars are not.
     """
     ny, nx = frame.shape
     for i in np.flatnonzero(prepared.largest & ~on_frame).tolist():
@@ -354,10 +387,13 @@ def _draw_light_beyond_stamps(
 def _extend_reach(
     cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf, reach_arguments: tuple[Array, ...]
 ) -> Bool:
-    """Extend `cut` for bright sources until ringing is not noticeable, and return the mask [n] of these sources.
+    """Increase the largest |k| at which the transforms of bright sources are computed; return their mask [n].
 
-    A sharp edge in Fourier space rings by up to 0.3 % of the part that is cut off. Planes have a last frequency. In
-    `left_out`, 0 stands for the default limit. `reach_arguments` are arguments of `fourier.fourier_reach`.
+    `cut` [n] is this |k| in radian / pixel, changed in place. A sharp edge in Fourier space causes ringing of up to 0.3
+    % of the part that is cut off; with the larger `cut` it is not noticeable. A PSF given by images has a fixed last
+    frequency, so the mask is then False everywhere. `left_out` [n] is the size of the Fourier samples that may be
+    neglected, as a fraction of the flux; 0 stands for 1e-7, and `cut` is then not increased. `reach_arguments` are
+    profiles of the sources: body, fraction, bulge, disk, sersic and row of `fourier.fourier_reach`.
     """
     floor = np.where(
         left_out > 0.0, np.clip(_RINGS * left_out, transfer.NEGLIGIBLE_DOUBLE, transfer.NEGLIGIBLE), transfer.NEGLIGIBLE
@@ -369,20 +405,27 @@ def _extend_reach(
         body, fraction, bulge, disk, table, row = reach_arguments
         arguments = body[indices], fraction[indices], bulge[indices], disk[indices], table, row[indices]
         new_reach = fourier.fourier_reach(max_transfer, transfer.STEP, *arguments, floor[indices])
-        # The limited memory does not allow a larger reach for the largest stamps.
+        # On stamps with sides above DEEP pixels, more frequencies would need too much memory.
         new_reach[sizes[indices] > DEEP] = np.minimum(new_reach[sizes[indices] > DEEP], transfer.HIGHEST)
         cut[indices] = np.maximum(cut[indices], new_reach)
     return deep
 
 
 def in_double_precision(sources: Sources, neglected: Float | None) -> Bool:
-    """Mask [n] of the sources that are drawn in double precision; `neglected` is the argument of `draw`."""
+    """Return the mask [n] of the sources that are drawn in double precision, because single precision would show.
+
+    `neglected` [n] is the fraction of the flux that may be neglected in a Fourier sample. With None, only sources with
+    more than BRIGHT electrons are drawn in double precision.
+    """
     is_precise = np.zeros(len(sources), bool) if neglected is None else neglected < ROUNDING
     return np.asarray(is_precise | (sources.electrons > BRIGHT))
 
 
 def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bool) -> tuple[Int, Int]:
-    """Find sources of one stamp size that have individual PSFs, and sources that share the PSF's planes.
+    """Divide the sources with stamps of one size into sources with individual PSFs and sources that share transforms.
+
+    The PSF of a source is a weighted sum of planes (basis images). Either the planes are summed before the transform,
+    for each source, or the transforms of all planes are computed once and shared by the sources.
 
     Parameters
     ----------
@@ -400,7 +443,7 @@ def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bo
     Returns
     -------
     (int array, int array)
-        Indices of sources with individual PSFs, and of sources that share planes.
+        Indices of sources with individual PSFs, and of sources that share the transformed planes; either may be empty.
     """
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
@@ -417,7 +460,12 @@ def _draw_batch(
     frame: Int,
     unread_rows: tuple[int, int],
 ) -> Float:
-    """Draw stamps of one size with one set of planes onto the frame, and return each source's electrons there."""
+    """Draw the stamps of the pieces `chosen`, which have one size, onto the frame.
+
+    `share` [m, planes] are the weights of the transforms in `psf_transfer`, whose weighted sum is the transform of each
+    piece's PSF. Returns the electrons [m] of each piece on the frame. Rows that the detector does not read, from
+    unread_rows[0] to unread_rows[1] - 1, are not counted.
+    """
     sources, size = prepared.sources, psf_transfer.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
@@ -445,7 +493,8 @@ def _draw_batch(
     subtract_aliased(stamps, column - x0, row - y0, prepared.curve[chosen], removed)
     prepared.outside.electrons[chosen] = removed
     first, stamp_x, stamp_y, (ny, nx) = int(chosen[0]), int(x0[0]), int(y0[0]), frame.shape
-    # Sources with outskirts or far light are alone in their batch; their aliased light is removed here.
+    # A galaxy larger than the largest stamp is alone in its batch, and so is a star with light beyond its PSF images.
+    # Aliased light of such a source is removed by a special function.
     outer = prepared.outskirts(first, nx, ny) if prepared.largest[first] else None
     if outer is not None:
         outskirts.remove_aliased(outer, stamps[0], float(column[0]) - stamp_x, float(row[0]) - stamp_y)
@@ -458,14 +507,22 @@ def _draw_batch(
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:
-    """Shapes and forms of the sources that have a shape."""
+    """Return the parameters of bulges and discs, and their sizes and orientations in pixels.
+
+    Both results have one row for each source that is a galaxy, in the order of the sources.
+    """
     body = sources.shape >= 0
     shapes = sources.shapes.take(sources.shape[body])
     return shapes, galaxy_shapes.forms(shapes, sources.jacobian[body])
 
 
 def _profile_arguments(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
-    """Arguments of the kernel for each profile: body, fraction, bulge, disk, thick, row, row_weights."""
+    """Return the profiles of n sources as arguments of `fourier.nyquist_zones`, with zeros for point sources.
+
+    The arrays have one row per source: body (True for galaxies), fraction (of the light in the bulge), bulge and disk
+    (matrices of axes in pixels), thick (vector for the thickness of the disc), row and row_weights (rows of the table
+    of Sersic transforms, and their weights). `shapes` and `form` describe the galaxies among the sources, in order.
+    """
     n, body = len(sources), sources.shape >= 0
     fraction, row, row_weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
     bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
@@ -478,15 +535,17 @@ def _profile_arguments(sources: Sources, shapes: Shapes, form: Forms) -> tuple[A
 def _light_outside(
     sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float
 ) -> tuple[Float, Float, Float]:
-    """Light of sources [n] outside their stamps.
+    """Return the light of n sources outside their stamps, as (profiles, distances, upper limits).
 
-    Returns the profiles [n, 11] of `galaxy_shapes.real_space_profile`, in electrons and 0 if no light leaves the stamp;
-    the distances [n] up to which the light is drawn, pixels; and upper limits [n] of the light, electrons.
+    Profiles [n, 11] are rows of `galaxy_shapes.real_space_profile` (central brightness in electrons per pixel, shape
+    and orientation of bulge and disc); the brightness is 0 if no light is drawn outside the stamp. Distances [n] are
+    those up to which the light is drawn, pixels. Upper limits [n] are the electrons outside the stamp. All are 0 for
+    point sources. `shapes` and `form` describe those sources that are galaxies, in order.
     """
     body = sources.shape >= 0
     profile, light_reach, max_electrons = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
     light_reach[body], outside_fraction = stamp_sizes.light_beyond_stamps(shapes, sizes[body], pixel_scale)
-    # The outer light of the largest galaxies is drawn by outskirts.py.
+    # The outer light of galaxies that are larger than the largest stamp is drawn by outskirts.py instead.
     light_reach[stamp_sizes.on_largest(sources.shape, sizes)] = 0.0
     sky = galaxy_shapes.real_space_profile(shapes, form)
     sky[:, [BULGE, DISK]] *= np.where(light_reach[body] > 0, sources.electrons[body], 0.0)[:, None]

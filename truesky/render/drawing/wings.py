@@ -1,9 +1,9 @@
-"""Light of the PSF beyond the stamps, drawn for all sources together.
+"""Draw the light of the PSF's wings beyond the stamps, for all sources together.
 
-The size of a stamp depends on the noise and on the source's profile, and the PSF is cut to it. The light that is cut
-off (2 % in VIS, beyond 3 arcsec) lies below the noise of a pixel, but it is a part of the sky. For all sources together
-it is drawn here on blocks of pixels, with the mean PSF. Light of galaxies outside their stamps is drawn in the same
-way.
+A stamp is a square image around one source. Its size depends on the noise and on the source's profile, and the PSF is
+cut to it. The light that is cut off (2 % in VIS, beyond 3 arcsec) lies below the noise of a pixel, but the sum over all
+sources contributes to the brightness of the sky. This sum is drawn here on blocks of 8 x 8 pixels, with the mean PSF.
+Light of galaxies outside their stamps is drawn in the same way.
 """
 
 from __future__ import annotations
@@ -17,25 +17,27 @@ from truesky.render.drawing.kernels import frame
 from truesky.render.psf.model import SIDE, Psf
 from truesky.render.sources import selection
 
-# Side of a block, pixels. All stamps consist of whole blocks.
+# Side of the square blocks on which the light of the PSF's wings is drawn, pixels. The sides of all stamps are
+# multiples of it.
 BLOCK = 8
-# Number of blocks from a point to the end of its wings, and number of blocks on each side of the frame. The caller must
-# include the sources in these blocks.
+# Number of blocks by which the grid of blocks extends beyond each side of the detector. It is also the number of blocks
+# from a point source to the end of its wings, so sources in this border contribute light to the detector. The caller
+# must include them.
 MARGIN = SIDE // 2 // BLOCK + 1
-# Pixels by which light on blocks extends beyond its nominal square, to each side, because of whole blocks and
-# interpolation.
+# Light on all blocks (of 8 x 8 pixels) that touch a square of pixels extends beyond this square by up to this number of
+# pixels on each side, because blocks are whole and the light is interpolated between their centres.
 _WIDER = 3.0 * BLOCK
 
 
 def wings(
     column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int, unit: float
 ) -> Float:  # fmt: skip
-    """Light of sources beyond their stamps, on blocks.
+    """Return the light of the PSF's wings beyond the stamps of n sources, on blocks of 8 x 8 pixels.
 
     Parameters
     ----------
     column, row : float array, shape (n,)
-        Positions, pixels.
+        Positions, 0-based pixels.
     electrons : float array, shape (n,)
         Expected electrons.
     sizes : int array, shape (n,)
@@ -43,20 +45,20 @@ def wings(
     psf : Psf
         PSF of the detector.
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and of rows of the detector.
     unit : float
-        Units of the blocks' integers per electron.
+        Factor from electrons per pixel to the integers in which the light is summed, for example 2^20.
 
     Returns
     -------
-    float array
-        Electrons per pixel on blocks, MARGIN of which lie before the first pixel of the frame. The result does not
-        depend on the order of the sources.
+    float array, shape (ceil(ny / 8) + 2 MARGIN, ceil(nx / 8) + 2 MARGIN)
+        Electrons per pixel on blocks; block [MARGIN, MARGIN] begins at the first pixel of the detector. 0 for a PSF
+        without planes (images), whose wings stay on the stamps. The result does not depend on the order of the sources.
 
     Notes
     -----
-    The PSF of mean colour at the detector's centre is used, on blocks. The error is a few per cent of the light beyond
-    the stamp.
+    All sources have the PSF of mean colour at the centre of the detector, averaged over blocks. The error is a few per
+    cent of the light beyond the stamp.
     """
     out = _layer(nx, ny)
     if psf.planes is None:
@@ -76,16 +78,17 @@ def _layer(nx: int, ny: int) -> Int:
 
 
 class OutsideLight(NamedTuple):
-    """Light of galaxies [n] outside their stamps.
+    """Light of n galaxies outside their stamps.
 
     Attributes
     ----------
     profile : float array, shape (n, 11)
-        Rows of `galaxy_shapes.real_space_profile`.
+        Rows of `galaxy_shapes.real_space_profile` (brightness, shape and orientation of bulge and disc), in proportion
+        to which the electrons are distributed.
     electrons : float array, shape (n,)
-        Electrons outside the stamp.
+        Electrons to be drawn outside the stamp; 0 for none.
     reach : float array, shape (n,)
-        Distance up to which the light is drawn, pixels.
+        Distance from the galaxy along columns and rows up to which this light is drawn, pixels.
     """
 
     profile: Float
@@ -94,30 +97,30 @@ class OutsideLight(NamedTuple):
 
 
 def galaxies(column: Float, row: Float, outside: OutsideLight, sizes: Int, nx: int, ny: int, unit: float) -> Float:
-    """Light of galaxies outside their stamps, on the blocks of `wings`.
+    """Return the light of n galaxies outside their stamps, on the blocks of 8 x 8 pixels of `wings`.
 
     Parameters
     ----------
     column, row : float array, shape (n,)
-        Positions, pixels.
+        Positions, 0-based pixels.
     outside : OutsideLight
-        Light that was removed from their stamps.
+        Light that was removed from the stamps, because it was aliased, and is now drawn outside them.
     sizes : int array, shape (n,)
         Sides of the stamps, pixels.
     nx, ny : int
-        Columns and rows of the detector.
+        Number of columns and of rows of the detector.
     unit : float
-        Units of the blocks' integers per electron.
+        Factor from electrons per pixel to the integers in which the light is summed, for example 2^20.
 
     Returns
     -------
-    float array
-        Electrons per pixel on blocks. The result does not depend on the order of the galaxies.
+    float array, shape (ceil(ny / 8) + 2 MARGIN, ceil(nx / 8) + 2 MARGIN)
+        Electrons per pixel on blocks, as in `wings`. The result does not depend on the order of the galaxies.
 
     Notes
     -----
-    The effect of the PSF at these distances is neglected. Light that remains on the stamp is not moved. Blocks have
-    integer units per pixel, so that very faint light is lost.
+    The PSF has little effect at these distances and is neglected. Aliased light that was not removed from a stamp
+    stays there. Light is rounded to integers, so light below half a unit per pixel is lost.
     """
     out = _layer(nx, ny)
     selected = (outside.electrons > 0) & selection.overlaps_frame(column, row, region_side(2.0 * outside.reach), nx, ny)
@@ -129,12 +132,20 @@ def galaxies(column: Float, row: Float, outside: OutsideLight, sizes: Int, nx: i
 
 
 def region_side(sides: Float) -> Float:
-    """Sides of the squares, in pixels, that receive light from blocks drawn in squares of given sides."""
+    """Return the sides, in pixels, of the squares that may receive light if light is drawn in given squares.
+
+    `sides` are the sides of the given squares in pixels. The result is larger by 48 pixels, because the light is drawn
+    on blocks of 8 x 8 pixels and interpolated between them.
+    """
     return sides + 2.0 * _WIDER
 
 
 def _half_block_sums(plane: Float32, samples: int) -> Float:
-    """Sums of a plane with `samples` per pixel over squares of half a block, in an even number about its middle."""
+    """Return the sums of a PSF image over squares of 4 x 4 pixels (half the side of a block).
+
+    The image has `samples` samples per pixel. The number of squares per side is even, so that the middle of the image
+    lies between squares.
+    """
     middle, step = len(plane) // 2, samples * BLOCK // 2
     count = (middle // step - 1) // 2 * 2 + 1
     central = slice(middle - count * step, middle + count * step)
@@ -143,7 +154,11 @@ def _half_block_sums(plane: Float32, samples: int) -> Float:
 
 
 def _light_outside_square(cells: Float, size: int) -> Float:
-    """Light outside a square of `size` pixels, on blocks about the middle one, with a border of zeros."""
+    """Return the light of a PSF outside its central square with a side of `size` pixels, on blocks of 8 x 8 pixels.
+
+    `cells` are the sums of the PSF over squares of 4 x 4 pixels, from `_half_block_sums`. The middle block of the
+    result is centred on the PSF, and its outermost blocks are 0.
+    """
     middle, half = len(cells) // 2, min(size // BLOCK, len(cells) // 2)
     hollow = cells.copy()
     hollow[middle - half : middle + half, middle - half : middle + half] = 0.0

@@ -1,1 +1,1 @@
-"""Point-spread functions of all cameras."""
+"""Models of the point-spread functions (PSFs) of all cameras, in space and on the ground."""

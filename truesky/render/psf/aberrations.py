@@ -1,4 +1,9 @@
-"""Transfer function of a ground telescope's optics, for the small pupil distances that turbulent air transmits."""
+"""Transfer function of the optics of a ground telescope with aberrations, in images through turbulent air.
+
+The value of a transfer function at a spatial frequency is determined by pairs of points in the pupil. The distance of
+the two points (m) is the wavelength (m) times the frequency (cycles per radian). Turbulent air transmits only
+frequencies that belong to small distances, so the transfer function of the optics is computed only for these.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,20 @@ from lake_schema.arrays import Complex, Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
-# Largest distance in the pupil, in Fried lengths; the air transmits little beyond it.
+# Largest distance of two points in the pupil (wavelength times spatial frequency) for which the transfer function of
+# the optics is computed, in Fried lengths. At larger distances the air transmits little, and the light is neglected.
 FARTHEST = 3.0
-# Samples across the pupil; samples of the transform for its overlaps; steps of the lattice up to FARTHEST.
-_ACROSS, _TRANSFORM, _LATTICE = 120, 256, 10
-# Distance at which the phase gives the centroid of the light, m.
+# Number of samples across the diameter of the pupil.
+_ACROSS = 120
+# Number of samples per side of the Fourier transform by which the pupil is correlated with a shifted copy of itself. It
+# is more than twice `_ACROSS`, so that the periodic copies do not overlap.
+_TRANSFORM = 256
+# Number of steps, from 0 to at least FARTHEST along one axis, of the lattice of shifts in the pupil at which the
+# transfer function of the optics is computed. One more step is added at each end. A step is a multiple of the spacing
+# of the pupil's samples.
+_LATTICE = 10
+# Shift in the pupil, m, near which the phase of the optics' transfer function is measured: at the nearest shift of the
+# lattice other than 0. The phase divided by the shift gives the displacement of the image's centroid by aberrations.
 _CENTROID_LAG = 0.06
 
 
@@ -39,7 +53,10 @@ class Telescope:
 
     @classmethod
     def from_mission(cls, section: str, mission: MissionConfiguration) -> Telescope:
-        """Read a camera's section of the mission database; the obscured area is assumed to be a central circle.
+        """Read a telescope from the mission database (parameters of telescopes and cameras).
+
+        `section` is the prefix of the camera's parameters, such as "ext.lsstcam". The part of the aperture that does
+        not collect light (aperture minus collecting area) is assumed to be a central circle.
 
         Raises
         ------
@@ -56,14 +73,15 @@ class Telescope:
 
 @dataclass(frozen=True, slots=True)
 class TransferRatio:
-    """Transfer function of the optics, divided by that without aberrations.
+    """Transfer function of the optics with aberrations, divided by that of the same optics without aberrations.
 
     Attributes
     ----------
     values : complex array, shape (2 m + 1, 2 m + 1)
-        The ratio on a lattice of distances in the pupil.
+        The ratio, indexed [y, x], on a square lattice of shifts in the pupil (wavelength times spatial frequency). The
+        middle element is shift 0, where the ratio is 1.
     step : float
-        Spacing of the lattice, m.
+        Spacing of the lattice of shifts, m.
     """
 
     values: Complex
@@ -71,25 +89,25 @@ class TransferRatio:
 
     @classmethod
     def from_wavefront(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> TransferRatio:
-        """Compute the ratio for a wavefront, without the tilt that moves the centroid.
+        """Compute the ratio for a wavefront, without the shift of the image's centroid that the wavefront causes.
 
         Parameters
         ----------
-        nm : float array
-            Coefficients by Noll number, nm.
+        nm : float array, shape (z,)
+            Zernike coefficients of the wavefront, nm rms; the index is the Noll number.
         telescope : Telescope
             The telescope.
         wave : float
             Wavelength, Angstrom.
         fried : float
-            Fried length, m.
+            Fried length at this wavelength, m. The lattice of shifts extends to at least 3.3 Fried lengths.
         turn : float
-            Rotation of the axes, radian.
+            Angle from the x axis of the focal plane to the x axis of the detector, radian, positive towards the y axis.
 
         Returns
         -------
         TransferRatio
-            The ratio.
+            The ratio in the axes of the detector.
         """
         step = 2.0 * telescope.radius / _ACROSS
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
@@ -112,7 +130,12 @@ class TransferRatio:
 
 @lru_cache(maxsize=8)
 def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
-    """Positions x, y in radii and transmission [n, n] of the pupil, and its overlap with itself by lags."""
+    """Return a sampled annular pupil: positions x and y, transmission (0 to 1), and its autocorrelation.
+
+    `radius` and `inner` are the outer and inner radius in m. The first three arrays have the shape [n, n]; x and y are
+    measured from the centre of the pupil in units of `radius`. The autocorrelation is a square array indexed by the
+    shift in samples, in the order of the FFT.
+    """
     step = 2.0 / _ACROSS
     axis = (np.arange(_ACROSS + 4) - (_ACROSS + 3) / 2) * step
     x, y = np.meshgrid(axis, axis)
@@ -123,19 +146,21 @@ def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
 
 
 def ideal_transfer(distance: Float, radius: float, inner: float) -> Float:
-    """Transfer function of perfect optics: the overlap of a ring with itself after a shift, divided by its area.
+    """Return the transfer function of perfect optics with an annular pupil.
+
+    It is the overlap of the pupil with a shifted copy of itself, divided by the area of the pupil.
 
     Parameters
     ----------
     distance : float array
-        Shift, m.
+        Shift in the pupil (wavelength times spatial frequency), m, at least 0.
     radius, inner : float
-        Outer and inner radius of the ring, m.
+        Outer and inner radius of the pupil, m.
 
     Returns
     -------
     float array
-        Transfer function, 0 to 1.
+        Transfer function in the shape of `distance`: 1 at 0, and 0 for shifts of more than the diameter.
     """
     area = np.pi * (radius**2 - inner**2)
     overlap = (
@@ -147,7 +172,7 @@ def ideal_transfer(distance: Float, radius: float, inner: float) -> Float:
 
 
 def _circle_overlap(distance: Float, first_radius: float, second_radius: float) -> Float:
-    """Common area of two circles whose centres are a distance apart."""
+    """Return the common area of two circles with given radii, whose centres are `distance` apart (array, any unit)."""
     small = min(first_radius, second_radius)
     if small == 0.0:
         return np.zeros_like(distance)

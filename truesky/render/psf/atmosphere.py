@@ -1,4 +1,4 @@
-"""Long-exposure transfer function of von Karman turbulence, and atmospheric refraction."""
+"""Transfer function of turbulent air (von Karman turbulence) in long exposures, and atmospheric refraction."""
 
 from __future__ import annotations
 
@@ -11,36 +11,52 @@ from scipy.special import gamma, j0, kv
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
+# Radian per arcsec.
 _ARCSEC = np.pi / 180.0 / 3600.0
-# Half the phase structure function at large distances, divided by (outer / fried)^(5/3); and the limit of the Bessel
-# term at small distances.
+# Factor by which (outer scale / Fried length)^(5/3) is multiplied in D / 2. D is the structure function of the phase of
+# light that has passed von Karman turbulence (Tokovinin 2002, eq. 8).
 _STRENGTH = (24.0 * gamma(1.2) / 5.0) ** (5.0 / 6.0) * gamma(11.0 / 6.0) / (2.0 ** (5.0 / 6.0) * np.pi ** (8.0 / 3.0))
+# Limit of x^(5/6) K_5/6(x) for x = 0, where K_5/6 is the modified Bessel function of the second kind, of order 5/6.
 _AT_ONE_PLACE = gamma(5.0 / 6.0) / 2.0 ** (1.0 / 6.0)
-# Smallest and largest Fried length, divided by the outer scale.
-_SHORTEST, _LONGEST = 1e-5, 0.05
-# Integral over distances in the pupil: upper limit in Fried lengths, and number of steps.
-_FARTHEST, _STEPS = 6.0, 600
-# Scale height of the pressure, m, and pressure at sea level, mm Hg; temperature in deg C and water vapour pressure in
-# mm Hg of mountain tops at night (Filippenko 1982).
-_SCALE_HEIGHT, _PRESSURE, _TEMPERATURE, _VAPOUR = 8400.0, 760.0, 7.0, 8.0
+# Smallest Fried length that is allowed (the worst seeing), divided by the outer scale of the turbulence. A seeing
+# outside the range raises OutOfRange.
+_SHORTEST = 1e-5
+# Largest Fried length that is allowed (the best seeing), divided by the outer scale of the turbulence.
+_LONGEST = 0.05
+# Upper limit, in Fried lengths, of the integral over distances in the pupil by which the FWHM of the seeing is
+# computed. At larger distances the air transmits practically nothing.
+_FARTHEST = 6.0
+# Number of steps of the integral over distances in the pupil by which the FWHM of the seeing is computed.
+_STEPS = 600
+# Height over which the air pressure falls by the factor e, m.
+_SCALE_HEIGHT = 8400.0
+# Air pressure at sea level, mm Hg.
+_PRESSURE = 760.0
+# Temperature on mountain tops at night, deg C (Filippenko 1982).
+_TEMPERATURE = 7.0
+# Pressure of water vapour on mountain tops at night, mm Hg (Filippenko 1982).
+_VAPOUR = 8.0
 
 
 def transfer(distance: Float, fried: float, outer: float) -> Float:
-    """Transfer function exp(-D / 2) of turbulent air, with von Karman's structure function D of the phase.
+    """Return the transfer function exp(-D / 2) of turbulent air in a long exposure.
+
+    D is the structure function of the phase for von Karman turbulence: the mean square difference of the phase between
+    two points in the pupil, as a function of their distance.
 
     Parameters
     ----------
     distance : float array
-        Distance in the pupil, m.
+        Distance of two points in the pupil, m: wavelength times spatial frequency. The sign is ignored.
     fried : float
-        Fried length, m.
+        Fried length at this wavelength, m.
     outer : float
-        Outer scale, m.
+        Outer scale of the turbulence, m.
 
     Returns
     -------
     float array
-        Transfer function, 1 at distance 0.
+        Transfer function in the shape of `distance`, 1 at distance 0.
 
     References
     ----------
@@ -52,64 +68,69 @@ def transfer(distance: Float, fried: float, outer: float) -> Float:
 
 
 def fwhm(wavelength: float, fried: float, outer: float) -> float:
-    """FWHM of the image of a point source through turbulent air.
+    """Return the FWHM of the image of a point source through turbulent air, for a very large telescope.
 
     Parameters
     ----------
     wavelength : float
         Wavelength, Angstrom.
     fried : float
-        Fried length, m.
+        Fried length at this wavelength, m, between 1e-5 and 0.05 times the outer scale; this is not checked.
     outer : float
-        Outer scale, m.
+        Outer scale of the turbulence, m.
 
     Returns
     -------
     float
-        FWHM, arcsec, with an error of 1e-5.
+        FWHM, arcsec, with a relative error of 1e-5.
     """
     at = fried * _FARTHEST * (np.arange(_STEPS) + 0.5) / _STEPS
     passed = transfer(at, fried, outer) * at
-    # Half the FWHM in units of wavelength / fried.
+    # The root r is half of the FWHM, in units of wavelength / Fried length: the surface brightness at the angle r is
+    # half of that in the centre.
     half = brentq(lambda r: float((passed * (j0(2.0 * np.pi * r * at / fried) - 0.5)).sum()), 0.02, 0.6, xtol=1e-9)
     return 2.0 * float(half) * wavelength * 1e-10 / fried / _ARCSEC
 
 
 @lru_cache(maxsize=256)
 def finest_seeing(wavelength: float, outer: float) -> float:
-    """Smallest FWHM that is allowed for a wavelength (Angstrom) and an outer scale (m), arcsec."""
+    """Return the smallest seeing (FWHM in arcsec) that this module can compute at a wavelength in Angstrom.
+
+    It is the seeing through air whose Fried length is 0.05 times the outer scale of the turbulence. `outer` is this
+    outer scale in m.
+    """
     return fwhm(wavelength, _LONGEST * outer, outer)
 
 
 @lru_cache(maxsize=256)
 def fried_length(seeing: float, wavelength: float, outer: float) -> float:
-    """Fried length of air with a given seeing.
+    """Return the Fried length of turbulent air with a given seeing.
 
     Parameters
     ----------
     seeing : float
-        FWHM of a point source, arcsec.
+        FWHM of a point source at this wavelength, arcsec.
     wavelength : float
         Wavelength, Angstrom.
     outer : float
-        Outer scale, m.
+        Outer scale of the turbulence, m.
 
     Returns
     -------
     float
-        Fried length, m.
+        Fried length at this wavelength, m.
 
     Raises
     ------
     OutOfRange
-        If turbulence of this outer scale cannot cause the seeing.
+        If the Fried length would be outside 1e-5 to 0.05 times the outer scale.
     """
     ends = tuple(ratio * outer for ratio in (_SHORTEST, _LONGEST))
     worst, best = fwhm(wavelength, ends[0], outer), finest_seeing(wavelength, outer)
     if not best <= seeing <= worst:
         raise OutOfRange("seeing, arcsec", seeing, best, worst)
-    # For an infinite outer scale this is the Fried length. The true length lies between it and half of it, except in
-    # the best seeing.
+    # `estimate` is the Fried length for an infinite outer scale. With a finite outer scale, the Fried length lies
+    # between 0.4 and 1.02 times this value.
     estimate = 0.976 * wavelength * 1e-10 / (seeing * _ARCSEC)
     low, high = (max(ends[0], 0.4 * estimate), min(ends[1], 1.02 * estimate))
     length = brentq(lambda fried: np.log(fwhm(wavelength, float(fried), outer) / seeing), low, high, rtol=1e-7)
@@ -117,19 +138,20 @@ def fried_length(seeing: float, wavelength: float, outer: float) -> float:
 
 
 def refraction(wavelength: Float, height: float) -> Float:
-    """Refraction towards the zenith at a zenith distance of 45 deg; it is proportional to the tangent.
+    """Return the atmospheric refraction of a source at a zenith distance of 45 deg.
 
     Parameters
     ----------
     wavelength : float array
         Vacuum wavelength, Angstrom.
     height : float
-        Height of the observatory, m.
+        Height of the observatory above sea level, m.
 
     Returns
     -------
     float array
-        Refraction, arcsec, to 1 % because the weather is neglected.
+        Angle by which the source appears displaced towards the zenith, arcsec, in the shape of `wavelength`. To get the
+        angle at another zenith distance z, multiply it by tan(z). The error is 1 %, because the weather is neglected.
 
     References
     ----------

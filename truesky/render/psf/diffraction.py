@@ -12,20 +12,22 @@ import scipy.fft
 from lake_schema.arrays import Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
 
+# Radian per arcsec.
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
 def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
-    """Transmission of the entrance pupil: aperture stop, decentred central stop, three spider bars.
+    """Return the transmission of Euclid's entrance pupil: aperture stop, decentred central stop, three spider bars.
 
     Parameters
     ----------
-    x, y : float array
-        Positions in the pupil, mm.
+    x, y : float array, same shape
+        Positions in the pupil relative to the centre of the aperture, mm.
     softness : float
-        Width of the edges, mm. With a width of one sample, edges cover their pixels by area.
+        Width over which the transmission changes from 0 to 1 at an edge, mm. If it equals the spacing of the positions,
+        the transmission is approximately averaged over the square around each position.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
@@ -40,7 +42,8 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
     for bar in ("spider1", "spider2", "spider3"):
         bar_x, bar_y = mission.value(f"plm.pupil.{bar}.x", "mm"), mission.value(f"plm.pupil.{bar}.y", "mm")
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
-        # The normal form of a line has no singular angle.
+        # Distance of each position from the axis of the spider bar, mm. It is computed from the angle of the bar, since
+        # the slope would be infinite for a bar along y.
         across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
         blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
         clear = clear * (1.0 - blocked)
@@ -53,16 +56,16 @@ def _step(depth: Float, softness: float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """The pupil, sampled for a wavelength.
+    """The pupil of Euclid's telescope, sampled for the computation of the PSF at one wavelength.
 
     Attributes
     ----------
     transform : int
-        Side of the optical transform, samples.
+        Side of the Fourier transform from the pupil to the image, samples.
     transmission : float array, shape (n, n)
-        Transmission of the pupil.
-    x, y : float array
-        Positions of the samples that transmit light, in radii of the pupil.
+        Transmission of the pupil, 0 to 1.
+    x, y : float array, shape (m,)
+        Positions of the m samples with a transmission above 0, from the centre of the pupil in units of its radius.
     wavelength : float
         Wavelength, Angstrom.
     """
@@ -75,23 +78,23 @@ class Optics:
 
 
 def optics_of(wavelength: float, sampling: float, mission: MissionConfiguration, transform: int) -> Optics:
-    """Sample the pupil for a wavelength, so that the sampling of the image does not depend on the wavelength.
+    """Sample the pupil with a spacing for which the PSF image at a given wavelength has a given spacing of samples.
 
     Parameters
     ----------
     wavelength : float
         Wavelength, Angstrom.
     sampling : float
-        Sampling of the image, arcsec.
+        Spacing of the samples of the image, arcsec.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     transform : int
-        Side of the image, samples.
+        Side of the Fourier transform from the pupil to the image, samples.
 
     Returns
     -------
     Optics
-        The sampled pupil; its edges are one sample wide.
+        The sampled pupil, whose transmission changes over one sample at the edges.
     """
     step = wavelength * 1e-7 / (transform * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
@@ -104,22 +107,23 @@ def optics_of(wavelength: float, sampling: float, mission: MissionConfiguration,
 
 
 def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Float32:
-    """Image of a point source through a wavefront, |FFT of the pupil|^2.
+    """Return the image of a point source through aberrated optics: the squared modulus of the pupil's transform.
 
     Parameters
     ----------
-    nm : float array
-        Wavefront by Noll number, nm.
+    nm : float array, shape (z,)
+        Zernike coefficients of the wavefront, nm rms; the index is the Noll number.
     optics : Optics
         The sampled pupil.
     side : int, optional
-        Side of the result about the middle, samples; by default that of the whole transform.
+        Side of the result about its middle sample, samples; by default that of the whole transform.
 
     Returns
     -------
     float32 array, shape (side, side)
-        Image with unit flux over the whole sky, corrected for the loss by soft edges. Because of single precision, the
-        relative error per sample is 5e-4, and 5e-6 in the core.
+        Image centred on sample side // 2. The flux over the whole sky is 1, so the sum of the image is below 1. The
+        sampled pupil has soft edges, which weaken light far from the centre; this is corrected. Because of single
+        precision, the relative error per sample is 5e-4, and 5e-6 in the core.
     """
     transmission, transform = optics.transmission, optics.transform
     side = transform if side is None else side
@@ -129,7 +133,8 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
     field.real[lit] = transmission[lit] * np.cos(phase)
     field.imag[lit] = transmission[lit] * np.sin(phase)
     middle = (np.arange(side) - side // 2) % transform
-    # Rows with light are transformed first, and then only the columns in the result.
+    # The inverse Fourier transform along rows is done first. Then the transform along columns is needed only for those
+    # columns that are part of the result.
     lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)[:, middle]
     parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True)[middle].view(np.float32)
     parts *= parts
@@ -141,6 +146,11 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
 
 @lru_cache(maxsize=4)
 def _edge_gain(transform: int, side: int) -> Float32:
-    """Inverse of the fraction of diffracted light that soft edges leave, by angle: 1 / sinc^2(angle / side)."""
+    """Return the factors [side, side] that correct the light in a diffraction image for the soft edges of the pupil.
+
+    The sampled pupil has edges over which the transmission changes gradually. This multiplies the light at a distance
+    of r samples from the middle by approximately sinc^2(r / transform), where `transform` is the number of samples per
+    side of the Fourier transform. The factors are the inverse of this.
+    """
     angle = (np.arange(side) - side // 2) / transform
     return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** -2.0, np.float32)

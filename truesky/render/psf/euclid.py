@@ -1,7 +1,9 @@
-"""PSF of Euclid's cameras: optics from their pupil, jitter and charge diffusion.
+"""PSF of Euclid's cameras VIS and NISP: diffraction at the pupil with aberrations, pointing jitter, charge diffusion.
 
-A PSF is stored in the axes of the detector (x along columns, y along rows), without the pixel. For VIS it is centred on
-the chief ray (coma moves the centroid by a few mas), and for NISP on its centroid.
+The PSF of a source is a sum of images (planes), whose weights depend on the spectrum of the source and on its position.
+The images are stored in the axes of the detector (x along columns, y along rows) and are not averaged over a pixel. For
+VIS an image is centred on the chief ray, the ray through the centre of the pupil, from which coma moves the centroid by
+a few mas. For NISP an image is centred on the centroid of its light.
 """
 
 from __future__ import annotations
@@ -30,22 +32,23 @@ from truesky.render.psf.sub_bands import sub_bands
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Sampling of the PSF of a camera.
+    """Sizes and sampling of the PSF images of a camera.
 
     Attributes
     ----------
     samples : int
-        Samples per pixel.
+        Samples per pixel of the detector.
     side : int
-        Side of the planes, pixels.
+        Side of the PSF images, pixels.
     transform : int
-        Side of the optical transform, samples. Light outside it is missing (0.15 % for VIS).
+        Side of the Fourier transform from the pupil to the image, samples. Light outside it is missing (0.15 % for
+        VIS).
     core_transform, core_side : int
-        Side of the transform (samples) and of the planes (pixels) for the drift across a detector, which needs only the
-        core.
+        Side of the transform (samples) and of the images (pixels) for the changes of the PSF across a detector. They
+        are smaller, because only the core of the PSF changes noticeably.
     window : float
-        Rms of the Gaussian window in which the centroid of the light lies at the source's position, arcsec. With 0, the
-        chief ray lies there.
+        Rms of a Gaussian window, arcsec. The PSF is drawn so that the centroid of its light in this window lies at the
+        position of the source. With 0, the chief ray lies at the position of the source instead.
     """
 
     samples: int
@@ -57,20 +60,24 @@ class Sampling:
 
 
 VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
-# In Y the optics reach 1.84 cycles per pixel, or 0.37 cycles per sample. Coma would move centroids tens of mas from the
-# chief ray, but astrometry is calibrated with centroids. The window is SourceExtractor's for the light in a pixel.
+# Sampling of NISP, with five samples per pixel. In band Y the optics transmit spatial frequencies up to 1.84 cycles per
+# pixel, or 0.37 cycles per sample. Coma moves centroids by tens of mas from the chief ray. Since astrometry is
+# calibrated with centroids, the PSF is centred on its centroid in a Gaussian window like that of SourceExtractor (rms
+# 0.2 arcsec).
 NISP = Sampling(5, 256, 2048, 768, 96, window=0.2)
-# Degrees of the polynomials in position, by the number of positions: for the drift of the mean PSF, and for that of its
-# slope with wavelength.
+# Allowed numbers of positions on a detector at which the PSF is computed. The values are the degrees of two polynomials
+# in position. The first describes the change of the PSF averaged over the wavelengths, and the second the change of the
+# PSF's derivative with wavelength. Degree 0 stands for no change.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
-# Noll number of defocus. All wavefronts have this coefficient.
+# Noll number of defocus, its index in a list of Zernike coefficients. Each list is long enough to have this element.
 _DEFOCUS = 4
-# Half side of the region for a window, in units of its rms.
+# Half side of the square in which the centroid of a PSF in a Gaussian window is measured, in units of the window's rms.
+# Outside the square the window is treated as 0.
 _WINDOWS = 5.0
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """PSF of a VIS detector: optics, pointing jitter, charge diffusion.
+    """Return the PSF of a VIS detector: diffraction with aberrations, pointing jitter, charge diffusion.
 
     Parameters
     ----------
@@ -79,29 +86,30 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of DEGREES). Polynomials
+        describe the changes between them; with 1 the PSF is the same everywhere.
 
     Returns
     -------
     Psf
-        The PSF.
+        The PSF at eight wavelengths in the band, not averaged over a pixel.
 
     Notes
     -----
-    The number of wavelengths causes errors of 2e-4 of the second moments. Errors across the detector are measured in
-    psf_positions.csv.
+    The number of wavelengths causes relative errors of 2e-4 of the second moments. Errors across the detector are
+    measured in psf_positions.csv.
 
     References
     ----------
-    Liaudat et al. 2023 (pupil); the mission database (wavefront and diffusion).
+    Liaudat et al. 2023 (shape of the pupil); the mission database (wavefront and diffusion).
     """
     return _psf(VIS, detector, band, mission, positions)
 
 
 def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """PSF of a NISP detector: optics, and pointing jitter together with all other blur.
+    """Return the PSF of a NISP detector: diffraction with aberrations, and one Gaussian for jitter and all other blur.
 
     Parameters
     ----------
@@ -110,29 +118,30 @@ def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, 
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of DEGREES). Polynomials
+        describe the changes between them; with 1 the PSF is the same everywhere.
 
     Returns
     -------
     Psf
-        The PSF.
+        The PSF at eight wavelengths in the band, not averaged over a pixel.
 
     Notes
     -----
-    The number of wavelengths causes errors of 4e-4 of the second moments. Errors across the detector are measured in
-    psf_positions_nisp.csv.
+    The number of wavelengths causes relative errors of 4e-4 of the second moments. Errors across the detector are
+    measured in psf_positions_nisp.csv.
 
     References
     ----------
-    Liaudat et al. 2023 (pupil); the mission database (wavefront).
+    Liaudat et al. 2023 (shape of the pupil); the mission database (wavefront).
     """
     return _psf(NISP, detector, band, mission, positions)
 
 
 def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """PSF of a NISP detector at given wavelengths, without the light beyond its planes.
+    """Return the PSF of a NISP detector at given wavelengths, without light beyond the border of the PSF images.
 
     Parameters
     ----------
@@ -141,9 +150,10 @@ def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration,
     waves : float array, shape (w,)
         Wavelengths, Angstrom.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions on the detector at which the PSF is computed, one of DEGREES; polynomials interpolate.
+        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of DEGREES). Polynomials
+        describe the changes between them; with 1 the PSF is the same everywhere.
 
     Returns
     -------
@@ -155,7 +165,7 @@ def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration,
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """Pupil edges for the light beyond the planes of the VIS PSF.
+    """Return the edges of the pupil that diffract light beyond the border of the VIS PSF images.
 
     Parameters
     ----------
@@ -164,18 +174,18 @@ def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration)
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
     Edges
-        The edges.
+        Edges of the pupil, from which rings and spikes far from a star are computed.
     """
     return _edges(VIS, detector, band, mission)
 
 
 def nisp_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """Pupil edges for the light beyond the planes of the NISP PSF.
+    """Return the edges of the pupil that diffract light beyond the border of the NISP PSF images.
 
     Parameters
     ----------
@@ -184,18 +194,20 @@ def nisp_edges(detector: Detector, band: Passband, mission: MissionConfiguration
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
     Edges
-        The edges.
+        Edges of the pupil, from which rings and spikes far from a star are computed.
     """
     return _edges(NISP, detector, band, mission)
 
 
 def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
-    # The second moments of diffraction are proportional to the square of the wavelength.
+    # The PSF of each sub-band of the passband is computed at one wavelength, the root mean square of its photons'
+    # wavelengths. The second moments of a diffraction image are proportional to the square of the wavelength, so they
+    # have their correct mean over the sub-band.
     parts = sub_bands(band)
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     planes = _planes(sampling, detector, waves, mission, positions)
@@ -210,25 +222,24 @@ def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: Miss
     return spikes.from_euclid_pupil(parts, blur, detector.pixel_scale, sampling.transform / sampling.samples, mission)
 
 
-# ------------------------------------------------------------------------------------------------ the optics
-
-
 def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -> Float:
-    """Zernike coefficients of the wavefront at a field position.
+    """Return the Zernike coefficients of the wavefront at a position in the focal plane.
 
     Parameters
     ----------
     x, y : float
-        Position in the focal plane, -1 to 1.
+        Position in the focal plane along its axes. For VIS and NISP, each coordinate runs from -1 to 1 between the
+        outer edges of the detectors. For a ground camera, the unit is the distance of the farthest corner of a detector
+        from the centre.
     section : str
-        Prefix of the camera in the mission database.
+        Prefix of the camera's parameters in the mission database, such as "vis".
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
-    float array
-        Coefficients, nm rms; the index is the Noll number.
+    float array, shape (highest Noll number + 1,)
+        Coefficients, nm rms; the index is the Noll number, and element 0 is 0.
     """
     terms = mission.numbers(f"{section}.psf.wavefront")
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
@@ -243,7 +254,11 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
 def _planes(
     camera_sampling: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
 ) -> Planes:
-    """Planes of the PSF at the wavelengths `waves` [w], Angstrom."""
+    """Return the images whose weighted sum is the PSF of a detector, at the wavelengths `waves` [w], Angstrom.
+
+    `positions` is the number of positions on the detector at which the PSF is computed, a key of DEGREES. The images
+    are computed once and then read from a cache on disc.
+    """
     section = detector.section
     nodes, powers = _nodes(positions), _powers(positions)
     places = [_field_position(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
@@ -265,7 +280,9 @@ def _planes(
             _plane(coefficients[0], w, camera_sampling, sampling, blur, mission)
             for w, blur in zip(waves, blurs, strict=True)
         ]
-        # The drift is only one per cent of the light, so the mean blur is accurate enough.
+        # Jitter and charge diffusion blur the PSF by a Gaussian that depends on wavelength. The changes of the PSF
+        # across the detector are only one per cent of its light, so the variances averaged over the wavelengths are
+        # accurate enough for them.
         blur = tuple(np.mean(blurs, axis=0).tolist())
         return {
             "images": np.stack(centre).astype(np.float32),
@@ -276,7 +293,9 @@ def _planes(
 
     arrays = cache.cached_arrays(f"{section}_psf", key, make)
     axis_order = slice(None, None, -1 if detector.upside_down else 1)
-    # If the detector is upside down, both the planes and the coordinates of the drift are inverted.
+    # PSF images are computed in the axes of the focal plane. For a detector that is mounted upside down, images are
+    # rotated by 180 deg. The change of the PSF across the detector (drift) is a polynomial of the position (x, y). Both
+    # coordinates have the opposite sign on this detector, so images of terms of odd degree are multiplied by -1.
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
     drift = arrays["drift"][:, axis_order, axis_order] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
@@ -284,7 +303,12 @@ def _planes(
 
 
 def _field_position(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Field coordinates, -1 to 1 between the focal plane's outer edges, of a position in half sides from the centre."""
+    """Convert a position on a detector to a position in the focal plane.
+
+    `x` and `y` are measured from the centre of the detector along the axes of the focal plane, in units of half the
+    sides of the detector. Each coordinate of the result runs from -1 to 1 between the outer edges of the camera's
+    detectors.
+    """
     all_detectors = detectors(detector.section, mission)
     half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
     reach_x, reach_y = (max(abs(getattr(d, axis)) for d in all_detectors) for axis in ("x", "y"))
@@ -297,10 +321,11 @@ def _field_position(detector: Detector, x: float, y: float, mission: MissionConf
 
 
 def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Variance of pointing jitter and charge diffusion along x and y, arcsec^2, at a wavelength in Angstrom.
+    """Return the variances of the blur by pointing jitter and charge diffusion along x and y, arcsec^2.
 
-    Charge diffuses farther for blue light and in thicker detectors. There is no separate diffusion if the mission
-    database contains one width for the whole blur of the optics.
+    x and y are the axes of the focal plane. Charge diffusion depends on the `wavelength` (Angstrom) and on the
+    detector. If the mission database contains one rms width for all blur of the camera (<section>.psf.jitter, where
+    <section> is the prefix of the camera's parameters), only this width is used.
     """
     section = detector.section
     if f"{section}.psf.jitter" in mission:
@@ -314,7 +339,11 @@ def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfi
 
 
 def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
-    """Diffusion length of a detector, divided by that of the mission."""
+    """Return the width (rms) of charge diffusion in this detector, divided by that in a typical detector of the camera.
+
+    The ratio is 1 for a detector that is not in the mission database's table of charge diffusion, or if there is no
+    such table. It is never negative.
+    """
     key = f"{detector.section}.diffusion_detectors"
     if key not in mission:
         return 1.0
@@ -323,13 +352,22 @@ def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
-    """Positions at which the PSF is computed across a detector, in half sides from its centre."""
+    """Return the positions (x, y) at which the PSF is computed, from -1 to 1 between the edges of a detector.
+
+    The `positions` positions form a square grid that includes the edges. If `positions` is 1, the result is empty,
+    since the PSF is then computed at the centre only.
+    """
     axis = np.linspace(-1.0, 1.0, math.isqrt(positions)).tolist() if positions > 1 else []
     return tuple((x, y) for y in axis for x in axis)
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
-    """Powers of the drift (`Planes.powers`): first for the mean PSF, then for its slope with wavelength."""
+    """Return the powers (of x, y and wavelength) of the polynomials for changes of the PSF across a detector.
+
+    x and y are the position from the detector's centre. `positions`, a key of DEGREES, determines the degrees. Terms of
+    the PSF averaged over wavelengths (power 0 of wavelength) come first, then terms of its derivative with wavelength
+    (power 1). The terms without x and y are not included, since the polynomials are 0 at the centre.
+    """
     return tuple(
         (degree - j, j, colour)
         for colour, max_degree in enumerate(DEGREES[positions])
@@ -347,9 +385,12 @@ def _drift(
     blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float:
-    """Planes of the drift (`Planes.drift`) in the focal plane's axes, by least squares.
+    """Return one image per term of the polynomials that describe how the PSF changes across a detector.
 
-    The coefficients are the wavefronts of the centre and of the nodes.
+    The images, `Planes.drift`, are in the axes of the focal plane. `coefficients` are the wavefronts (Zernike
+    coefficients in nm by Noll number) at the detector's centre and then at the positions of `_nodes`. The polynomials
+    are fitted to the PSFs at these positions by least squares. `waves` are the wavelengths in Angstrom, `sampling` is
+    the spacing of the image's samples in arcsec, and `blur` are the variances of the blur along x and y in arcsec^2.
     """
     powers, weights = _powers(positions), _blur_weights(blur, sampling)
     side = camera_sampling.core_side * camera_sampling.samples + 1
@@ -371,7 +412,8 @@ def _drift(
         if terms:
             from_nodes = matrices.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
             change = matrices.matmul(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
-            # The blur is linear and the same for all images.
+            # The blur is linear and the same for all images. It is applied to the images of the fitted polynomial,
+            # which are fewer than the computed images.
             changes += [_blur_image(image, weights) for image in change]
     return np.stack(changes)
 
@@ -379,29 +421,32 @@ def _drift(
 def centre_wavefront(
     nm: Float, waves: Float, camera_sampling: Sampling, sampling: float, mission: MissionConfiguration
 ) -> Float:
-    """Add the tilt that moves the windowed centroid of the light, within a pixel, to the middle sample.
+    """Add a tilt to a wavefront, so that the centroid of the PSF lies on the middle sample of its image.
+
+    The centroid is measured in a Gaussian window, on the image averaged over pixels. Blur by jitter is not included.
 
     Parameters
     ----------
-    nm : float array
-        Wavefront by Noll number, nm.
+    nm : float array, shape (z,)
+        Zernike coefficients of the wavefront, nm rms; the index is the Noll number.
     waves : float array, shape (w,)
         Wavelengths, Angstrom.
     camera_sampling : Sampling
-        Sampling for the camera. Without a window, the wavefront is returned unchanged.
+        Sampling of the camera's PSF images. If its `window` is 0, the wavefront is returned unchanged.
     sampling : float
-        Sampling of the image, arcsec.
+        Spacing of the samples of the image, arcsec.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
-    float array
-        Wavefront by Noll number, nm, with an error of the centroid of 0.1 mas.
+    float array, shape (z,)
+        Zernike coefficients with the tilt. The error of the centroid is 0.1 mas.
     """
     if not camera_sampling.window:
         return nm
-    # Two wavelengths are sufficient for the mean over a band.
+    # The centroid of the light in the whole band is approximated by that of the sum of the images at two wavelengths.
+    # They lie 0.58 of the band's half width below and above its mean wavelength.
     off = 0.58 * 0.5 * (waves.max() - waves.min())
     optics = [
         optics_of(float(waves.mean() + part), sampling, mission, camera_sampling.core_transform) for part in (-off, off)
@@ -432,7 +477,12 @@ def _plane(
     nm: Float, wavelength: float, camera_sampling: Sampling, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float32:  # fmt: skip
-    """PSF at one wavelength in the focal plane's axes, a square of side * samples + 1."""
+    """Return the image of the PSF at one wavelength (Angstrom) in the axes of the focal plane.
+
+    Each side of the image has `camera_sampling.side` times `camera_sampling.samples` plus 1 samples. `nm` are the
+    Zernike coefficients of the wavefront in nm rms by Noll number, `sampling` is the spacing of samples in arcsec, and
+    `blur` are the variances of the Gaussian blur along x and y in arcsec^2.
+    """
     weights = _blur_weights(blur, sampling)
     optics = optics_of(wavelength, sampling, mission, camera_sampling.transform)
     return _blur_image(
@@ -442,9 +492,11 @@ def _plane(
 
 
 def _blur_image(image: Array, weights: tuple[Float, Float]) -> Float32:
-    """Blur diffracted light by weights along x and y, and cut the margin.
+    """Convolve a PSF image with two kernels, `weights` along x and along y, and remove the border of the result.
 
-    The convolution is done on the image, since rounding errors of a transform of the bright core would hide the wings.
+    The removed border is half as wide as the longer kernel: there, the convolution would need light outside the image.
+    The convolution is a sum over samples. With Fourier transforms, rounding errors from the bright core of the PSF
+    would be larger than its faint wings.
     """
     across, along = (w.astype(np.float32) for w in weights)
     return _convolve_separable(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
@@ -452,7 +504,11 @@ def _blur_image(image: Array, weights: tuple[Float, Float]) -> Float32:
 
 @jit
 def _convolve_separable(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
-    """Convolve an image with weights along columns (`across`) and rows (`along`); return the middle [side, side]."""
+    """Convolve a square image with a separable kernel, and return the middle [side, side] of the result.
+
+    `across` are the weights along x (from column to column), and `along` those along y. Both have odd lengths. The
+    image must be wider than `side` by at least the longer kernel minus 1.
+    """
     margin, reach_x, reach_y = (len(image) - side) // 2, len(across) // 2, len(along) // 2
     out = np.zeros((side, side), np.float32)
     line = np.empty(len(image), np.float32)
@@ -480,9 +536,11 @@ def _blur_weights(blur: tuple[float, float], sampling: float) -> tuple[Float, Fl
 
 @lru_cache(maxsize=64)
 def _gaussian_weights(sigma: float) -> Float:
-    """Weights of a Gaussian of `sigma` samples, for images without detail finer than DETAIL; their sum is 1.
+    """Return the weights of a convolution with a Gaussian of rms `sigma` samples; their sum is 1.
 
-    The number of weights is odd. The error of the transfer function is 1e-7.
+    The number of weights is odd. They are not samples of a Gaussian: they are fitted so that their Fourier transform
+    equals that of the Gaussian, with an error of 1e-7, up to DETAIL (0.4) cycles per sample. They must be used only for
+    images without higher spatial frequencies.
     """
     k = np.linspace(0.0, 2 * np.pi * DETAIL, 400)
     lost, half = 1.0 - np.exp(-0.5 * (sigma * k) ** 2), 0

@@ -1,16 +1,16 @@
-"""Read a user's PSF: a cube of planes, or a file written by PSFEx.
+"""Read a PSF from a user's file: a cube of PSF images (planes), or a file written by PSFEx.
 
 A cube is the first image of a FITS file with two axes, or with three axes and wavelengths along the third. The sum of
-each plane is the fraction of the light that it contains. The cards are:
+each plane is the fraction of the light that it contains. The header cards are:
 
 - CDELT1 = CDELT2 and CUNIT1 (arcsec, mas or deg): spacing of the samples.
-- CRPIX1 and CRPIX2: position of the chief ray; by default the middle.
+- CRPIX1 and CRPIX2: position of the chief ray (light through the centre of the pupil), 1-based; by default the middle.
 - CRVAL3, CDELT3 and CRPIX3, or WAVE1 to WAVEn: wavelengths in CUNIT3 (Angstrom, nm, um or m).
-- PIXEL: T if the PSF includes the detector's pixel.
+- PIXEL: T if the PSF images are already averaged over the detector's pixel; by default F.
 
-Planes have the axes of the focal plane, with x to the right; they are rotated for detectors that are mounted rotated.
-A file of PSFEx has the axes and pixels of the detector, includes the pixel's response, and contains polynomials of the
-position on the detector.
+The planes of a cube have the axes of the focal plane, with x to the right. They are rotated for detectors that are
+mounted rotated. A file of PSFEx has the axes and pixels of the detector, includes the average over a pixel, and
+contains polynomials of the position on the detector.
 """
 
 from __future__ import annotations
@@ -31,51 +31,68 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.psf.model import SAMPLES, SIDE, Planes, Psf, from_planes
 from truesky.render.psf.sub_bands import sub_bands
 
+# Units that the header card CUNIT1 may have for the spacing of samples, and their size in arcsec.
 _ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
+# Units that the header card CUNIT3 may have for wavelengths, and their size in Angstrom.
 _ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4, "m": 1e10}
-# Allowed range of the sum of a plane.
-_LEAST_SUM, _MOST_SUM = 0.5, 1.001
-# Smallest and largest spacing of samples, pixels.
+# Smallest sum of a PSF image (fraction of the light that it contains) that is accepted.
+_LEAST_SUM = 0.5
+# Largest sum of a PSF image (fraction of the light that it contains) that is accepted; above 1 for rounding errors.
+_MOST_SUM = 1.001
+# Smallest and largest spacing of the samples in a user's file that is accepted, detector pixels.
 _SPACING = (0.02, 2.0)
-# Largest number in a card, and largest degree of polynomials.
-_LARGEST, _MOST_DEGREE = 1e300, 20
-# Smallest side of a plane, samples.
+# The absolute value of a number in a header card must be below this; larger numbers, NaN and infinities raise BadInput.
+_LARGEST = 1e300
+# Largest degree of the polynomials in a file of PSFEx that is accepted.
+_MOST_DEGREE = 20
+# Smallest side of the PSF images after resampling, samples: 66 pixels. Smaller images are extended by zeros.
 _LEAST_SIDE = 3 * 66 + 1
-# Lobes of the interpolant: models of PSFEx are made for three; for cubes more lobes are more accurate.
-_OF_PSFEX, _OF_CUBES = 3, 15
+# Number of lobes of the Lanczos kernel with which images in a file of PSFEx are resampled. PSFEx fits its models with
+# this kernel.
+_OF_PSFEX = 3
+# Number of lobes of the Lanczos kernel with which the PSF images in a user's cube are resampled. With more lobes, the
+# interpolation is more accurate.
+_OF_CUBES = 15
 
 
 def path_for_detector(name: str, detector: str) -> Path:
-    """Path of the PSF for a detector: {detector} in the path is replaced by the detector's name."""
+    """Return the path of the PSF file for a detector: `name`, in which the text {detector} is replaced by `detector`.
+
+    Without {detector} in `name`, all detectors have the same file.
+    """
     return Path(name.replace("{detector}", detector))
 
 
 def read(path: Path, detector: Detector, band: Passband) -> Psf:
-    """Read the PSF of a file for a detector and a band.
+    """Read the PSF of a detector in a band from a user's file, and resample it to three samples per pixel.
 
     Parameters
     ----------
     path : Path
-        The file.
+        FITS file with a cube of PSF images, or file of PSFEx.
     detector : Detector
         The detector.
     band : Passband
-        The passband.
+        The passband. It is divided into sub-bands. A cube with several wavelengths must reach from the mean wavelength
+        of the first sub-band, or below, to that of the last sub-band, or above.
 
     Returns
     -------
     Psf
-        The PSF.
+        The PSF in the axes of the detector.
 
     Raises
     ------
     BadInput
-        If the content of the file is invalid; the message contains the path.
+        If the file does not exist, is too large or not FITS, a header card is missing or invalid, a sample is not
+        finite, the sum of an image or the spacing of its samples is out of range, the wavelengths do not cover the
+        band, or a PSFEx model has other variables than x and y; the message contains the path.
 
     Notes
     -----
-    The interpolation has an error of 5e-5 of the peak for a cube whose samples are finer than half its width. For PSFEx
-    it is 1e-3, since its interpolant rings at frequencies that planes of three samples per pixel do not contain.
+    For a cube, the interpolation has an error of 5e-5 of the peak if the spacing of its samples is less than half the
+    width of the PSF. For PSFEx the error is 1e-3, because its interpolation kernel adds high spatial frequencies, which
+    the resampled images do not contain.
     """
     data, header = external.read_planes(path, "PSF_MASK")
     try:
@@ -86,9 +103,6 @@ def read(path: Path, detector: Detector, band: Passband) -> Psf:
         return from_planes(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from None
-
-
-# ------------------------------------------------------------------------------------------------ cubes
 
 
 def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband) -> Planes:
@@ -117,7 +131,12 @@ def _has_pixel(header: Mapping[str, Any]) -> bool:
 
 
 def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Float, Float]:
-    """Wavelengths of the resulting planes, Angstrom, and their weights [planes, count] of the planes in the cube."""
+    """Return the wavelengths (Angstrom) of PSF images of sub-bands, and weights [images, count] of the cube's planes.
+
+    The cube has `count` planes, images of the PSF at one wavelength each. The PSF image of a sub-band of the passband
+    is a weighted sum of these planes: the PSF interpolated linearly in wavelength and averaged over the sub-band's
+    photons. A cube with one plane gives one image, and the wavelength in its header is ignored.
+    """
     parts = sub_bands(band)
     means: Float = np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
     if count == 1:
@@ -139,13 +158,12 @@ def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Flo
     )
 
 
-# ------------------------------------------------------------------------------------------------ PSFEx
-
-
 def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes:
-    """Convert a PSFEx model to planes, with polynomials about the detector's middle.
+    """Convert a PSFEx model to PSF images, with polynomials of the position relative to the detector's centre.
 
-    The sum of the PSF is 1 in the middle, and kept constant elsewhere to first order.
+    The images are normalised so that the sum of the PSF is 1 everywhere on the detector. The sum of a PSFEx model may
+    change with position. The shape of the normalised PSF is exact at the centre, and elsewhere correct to first order
+    in this change.
 
     References
     ----------
@@ -163,7 +181,9 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
     if data.ndim != 3 or len(data) != len(powers):
         raise BadInput(f"PSF_MASK has {list(data.shape)} samples, but degree {degree} requires {len(powers)} planes")
     half = _half(detector)
-    # (x - zero) / scale = shift + stretch * (position in the units of Planes).
+    # A PSFEx model has polynomials of (x - zero) / scale, and the same for y, where x is the 1-based pixel. This equals
+    # shift + stretch * t, where t is the position from -1 to 1 between the edges of the detector. The polynomials are
+    # expanded in powers of t.
     zero, scale = ([_card(header, f"POL{kind}{axis}") for axis in (1, 2)] for kind in ("ZERO", "SCAL"))
     if not all(scale):
         raise BadInput("POLSCAL1 and POLSCAL2 must not be 0")
@@ -191,11 +211,13 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
     )
 
 
-# ------------------------------------------------------------------------------------------------ samples
-
-
 def _resample(plane: Float, spacing: float, middle: list[float], lobes: int) -> Float:
-    """Resample a plane with samples `spacing` pixels apart, centred on `middle` (row, column), to that of `Planes`."""
+    """Resample a PSF image to SAMPLES (3) samples per detector pixel, with a Lanczos kernel of `lobes` lobes.
+
+    `spacing` is the spacing of the samples of `plane` in detector pixels; BadInput is raised if it is out of range.
+    `middle` is the position (row, column, from 0) of the PSF in `plane`, which becomes the middle sample of the result.
+    The sum of the image is preserved, except for light outside a square of SIDE (512) pixels, which is cut off.
+    """
     if not _SPACING[0] <= spacing <= _SPACING[1]:
         raise BadInput(f"its samples are {spacing:.4g} pixels apart, but {_SPACING[0]:g} to {_SPACING[1]:g} is allowed")
     reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + lobes
@@ -206,10 +228,15 @@ def _resample(plane: Float, spacing: float, middle: list[float], lobes: int) -> 
 
 
 def _interpolant(at: Float, count: int, lobes: int) -> Float:
-    """Weights [n, count] of the samples for the positions `at`: Lanczos' kernel, normalised to preserve a constant."""
+    """Return the weights [n, count] that interpolate `count` samples at the positions `at` [n], by a Lanczos kernel.
+
+    Positions are fractional indices of samples. The weights are normalised so that equal samples give the same value
+    between them. Samples with indices below 0 or from `count` on are treated as 0.
+    """
     distance = at[:, None] - np.arange(count)
     kernel = np.where(np.abs(distance) < lobes, np.sinc(distance) * np.sinc(distance / lobes), 0.0)
-    # Sum of the kernel over an infinite grid of samples.
+    # `total` is the sum of the kernel over an infinite grid of samples, by which the weights are divided. Near the
+    # border the weights add up to less than 1, because samples outside are 0.
     steps = (at % 1.0)[:, None] - np.arange(1 - lobes, lobes + 1)
     total = (np.sinc(steps) * np.sinc(steps / lobes)).sum(axis=1, keepdims=True)
     return np.asarray(kernel / total)

@@ -1,16 +1,19 @@
-"""PSF of a ground telescope: turbulent air, and optics with aberrations.
+"""PSF of a ground telescope: turbulent air, optics with aberrations, an aureole, and spikes of the spider's vanes.
 
-A plane is the Fourier transform of the product of three functions of rho = wavelength x frequency::
+An image of the PSF at one wavelength is the Fourier transform of the product of three functions of the spatial
+frequency. They are expressed by a distance rho in the pupil, the wavelength (m) times the frequency (cycles / radian)::
 
     transfer(rho)       transfer function of the air (psf/atmosphere.py), for the seeing at this wavelength
     clear(rho)          overlap of an annular pupil without aberrations with itself after a shift by rho
     ratio(rho)          mean of exp(i phase difference) over that overlap: the aberrations of the optics
 
-The air transmits nothing beyond a few Fried lengths, which is a small part of the pupil. There the ratio is smooth and
-can be interpolated from a coarse lattice. Its phase at small rho is removed, since astrometry is calibrated with
-centroids. The aureole, A / (r^2 + c^2) of a star's light per arcsec^2, and the spikes of the spider's vanes are added
-to the planes. A plane contains the light of a star that photometry calls its flux; light beyond the plane is
-additional.
+The air transmits practically nothing if rho is more than a few Fried lengths, which are a small part of the pupil. Up
+to there the ratio is smooth and is interpolated from a coarse lattice. The phase of the ratio at small rho, which would
+shift the image, is removed, since astrometry is calibrated with centroids.
+
+The aureole and the spikes are added to the images. At the distance r arcsec from a star, the aureole has the fraction
+A / (r^2 + c^2) of its light per arcsec^2, with A and c from the mission database. The images are normalised to the sum
+1: the light in an image is the flux of a star in photometry. Light beyond its border is additional.
 
 References
 ----------
@@ -40,16 +43,24 @@ from truesky.render.psf.model import Planes, Psf
 from truesky.render.psf.spikes import ARCSEC, LONG, STEP, Edges
 from truesky.render.psf.sub_bands import N_SUB_BANDS, sub_bands
 
-# Sides of the planes and of the drift across a detector, pixels. Beyond the planes the aureole dominates.
-SIDE, _DRIFT_SIDE = 256, 64
-# Smallest number of samples per FWHM: above their Nyquist frequency the air transmits less than 1e-7. Smallest and
-# largest number of samples per pixel.
-_SAMPLES_OF_FWHM, _LEAST_SAMPLES, _MOST_SAMPLES = 6.0, 2, 6
-# Bands with a larger mean wavelength (Angstrom) use half the number of wavelengths, since refraction varies less there.
+# Side of the PSF images, pixels. Beyond their border, only the aureole, spikes and rings of bright stars are drawn.
+SIDE = 256
+# Side of the images that describe the change of the PSF across a detector, pixels.
+_DRIFT_SIDE = 64
+# The number of samples per pixel of a PSF image is chosen so that there are at least this many samples per FWHM. Above
+# the Nyquist frequency of these samples the air transmits less than 1e-7.
+_SAMPLES_OF_FWHM = 6.0
+# Smallest number of samples of a PSF image per detector pixel.
+_LEAST_SAMPLES = 2
+# Largest number of samples of a PSF image per detector pixel. It takes precedence over `_SAMPLES_OF_FWHM`.
+_MOST_SAMPLES = 6
+# In bands with a mean wavelength (Angstrom) above this, the PSF is computed at four wavelengths instead of eight, since
+# atmospheric refraction varies less there.
 _REDDER = 5300.0
-# Largest seeing that fits into the planes, arcsec.
+# Largest allowed seeing (FWHM), arcsec, for which the PSF still fits into its image. Above it OutOfRange is raised.
 _WORST = 10.0
-# Number of steps of the radial table.
+# Number of distances in the pupil, from 0 to 3 Fried lengths, at which the transfer function of the air and of optics
+# without aberrations is tabulated. It is interpolated linearly between them.
 _TABLE = 4000
 # FWHM of a Gaussian in units of its standard deviation.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
@@ -57,22 +68,24 @@ _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """State of the air during an exposure, in the axes of a detector.
+    """State of the air during an exposure, in the axes of a detector (x along columns, y along rows).
 
     Attributes
     ----------
     seeing : float
-        FWHM at the mean wavelength of the band, arcsec.
+        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
     shear : (float, float)
-        Ellipticity (e1, e2) caused by the air: along columns, and along the diagonal.
+        Ellipticity (e1, e2) of the PSF that is caused by the air. The PSF is stretched along x for positive e1, and
+        along the diagonal x = y for positive e2. The squared axis ratio is (1 - e) / (1 + e) with e^2 = e1^2 + e2^2.
     slope : float
-        Exponent of the seeing's dependence on wavelength.
+        Exponent s in seeing proportional to wavelength^s; 0 for seeing that does not depend on wavelength.
     tan_zenith_distance : float
-        Tangent of the zenith distance, times the correction for refraction.
+        Tangent of the zenith distance, times the fraction of the refraction that an atmospheric dispersion corrector
+        leaves; 0 for no refraction.
     zenith : float
-        Direction of the zenith, radian from x to y.
+        Direction of the zenith on the detector, radian, from the x axis, positive towards y.
     height : float
-        Height of the observatory, m.
+        Height of the observatory above sea level, m.
     """
 
     seeing: float
@@ -84,35 +97,40 @@ class Air:
 
 
 def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
-    """State of the air during an exposure, with a random ellipticity that is the same for all detectors.
+    """Return the state of the air during an exposure, with a random ellipticity that is the same for all detectors.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Row of the table `exposures`.
+        Row of the table `exposures`. If it has no airmass or no direction of the zenith, there is no refraction.
     detector : Detector
-        Detector of its camera.
+        Detector of the camera of this exposure.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
     Air
-        The state.
+        The state in the axes of the detector.
     """
     section = detector.section
-    # The seeing already depends on the seed of the request.
+    # The random ellipticity must depend on the exposure and on the seed of the user's request. The seed itself is not
+    # needed in `identity`, because the seeing, which is part of the stream's name, was drawn with it.
     identity = (exposure.camera, exposure.band, *(x.hex() for x in (exposure.ra, exposure.dec, exposure.mjd)))
     rms = mission.value(f"{section}.psf.air_ellipticity", "")
     size, turn = rng.stream("psf.air", exposure.seeing.hex(), *identity).random(2)
-    # The squared size of two normal components is exponentially distributed.
+    # Both components of the ellipticity are normally distributed with the given rms. Then the square of its size is
+    # exponentially distributed, and is drawn as rms^2 times -2 ln(1 - u) with a uniform u from 0 to 1. The size is
+    # limited to 0.5.
     size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
     angle = 2.0 * (np.pi * float(turn) - np.radians(detector.rotation))
     shear = size * float(np.cos(angle)), size * float(np.sin(angle))
     slope = mission.value(f"{section}.psf.seeing_slope", "")
     if exposure.airmass is None or exposure.zenith is None:
         return Air(exposure.seeing, shear, slope)
-    # At position angle 0 the focal plane's x axis points west.
+    # Angle on the detector from the x axis to the zenith, positive towards y. For the position angle 0 the x axis of
+    # the focal plane points west and the y axis north, so north is at 90 deg. Position angles, from north to east, are
+    # counted in the same direction as angles from x to y.
     zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
     tan_zenith_distance = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(
         f"{section}.psf.refraction", ""
@@ -121,23 +139,25 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
-    """Refuse a seeing finer than a pixel or than turbulence allows, and a pupil with an impossible area.
+    """Check that the PSF of turbulent air can be computed for a seeing and for the pupil of a telescope.
 
     Parameters
     ----------
     seeing : float
-        Seeing, arcsec.
+        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
     detector : Detector
         Detector of the camera.
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Raises
     ------
     OutOfRange
-        If the seeing, or the area of the pupil, is not allowed.
+        If the seeing is below one pixel, below the finest seeing for the outer scale of the turbulence
+        (`atmosphere.finest_seeing`), or above 10 arcsec. Also if the telescope's collecting area is not positive or
+        exceeds its aperture.
     """
     outer, slope = (
         Telescope.from_mission(detector.section, mission).outer,
@@ -151,25 +171,26 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
 
 
 def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
-    """PSF of a detector of a ground camera.
+    """Return the PSF of a detector of a ground camera, through turbulent air and aberrated optics.
 
     Parameters
     ----------
     air : Air
-        State of the air.
+        State of the air during the exposure.
     detector : Detector
         The detector.
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions at which the PSF is computed, one of `euclid.DEGREES`; polynomials interpolate.
+        Number of positions on the detector at which the aberrations are computed: 1, 4, 9 or 25 (keys of
+        `euclid.DEGREES`); 25 is treated as 9. Polynomials describe the changes between them.
 
     Returns
     -------
     Psf
-        The PSF, with an error of 1e-3 of the peak because of the sampling of the pupil.
+        The PSF in the axes of the detector, with an error of 1e-3 of the peak because of the sampling of the pupil.
 
     Notes
     -----
@@ -207,12 +228,12 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
 
 
 def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """Sources of light beyond the planes: rings of the pupil's circles, spikes of the spider, the aureole.
+    """Return what causes light far from a star: circular edges of the pupil, vanes of the spider, and the aureole.
 
     Parameters
     ----------
     air : Air
-        State of the air.
+        State of the air during the exposure.
     detector : Detector
         The detector.
     band : Passband
@@ -228,7 +249,8 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
     section, telescope = detector.section, Telescope.from_mission(detector.section, mission)
     vanes = int(mission.value(f"{section}.pupil.vanes"))
     width = mission.value(f"{section}.pupil.vane_width", "mm")
-    # On an altazimuth mount, the spider has a fixed angle to the zenith.
+    # On an altazimuth mount, the vanes of the spider have a fixed angle to the direction of the zenith. On other mounts
+    # they have a fixed angle to the x axis of the focal plane. `turn` converts to an angle from the detector's x axis.
     turn = air.zenith if mission.value(f"{section}.pupil.altazimuth") == 1.0 else -np.radians(detector.rotation)
     first = mission.value(f"{section}.pupil.vane_angle", "rad") + turn
     length = 1e3 * (telescope.radius - telescope.inner)
@@ -243,7 +265,12 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
 
 
 def _waves(band: Passband, air: Air) -> Float:
-    """Mean wavelengths [w] of sub-bands with equal photons for flat f_nu, Angstrom; one if the air is achromatic."""
+    """Return the wavelengths (Angstrom) at which the PSF is computed: the mean wavelengths of sub-bands of a passband.
+
+    There is only one sub-band if seeing does not depend on wavelength and there is no refraction. Otherwise there are
+    8, or 4 if the mean wavelength is above 5300 Angstrom. The sub-bands have equal numbers of photons for constant
+    f_nu.
+    """
     photons = band.response / band.wavelength
     mean = float((photons * band.wavelength).sum() / photons.sum())
     count = (
@@ -258,7 +285,10 @@ def _waves(band: Passband, air: Air) -> Float:
 
 
 def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> Float:
-    """Wavefront by Noll number, nm, at a position on a detector in half sides from its middle."""
+    """Return the Zernike coefficients of the wavefront, nm rms by Noll number, at a position on a detector.
+
+    `x` and `y` are measured from the centre of the detector along its own axes, in units of half of its sides.
+    """
     turn, scale = np.radians(detector.rotation), detector.pixel_scale
     u, v = x * detector.nx * scale / 2, y * detector.ny * scale / 2
     at = (detector.x + np.cos(turn) * u - np.sin(turn) * v, detector.y + np.sin(turn) * u + np.cos(turn) * v)
@@ -266,25 +296,33 @@ def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfigura
     return euclid.wavefront(at[0] / reach, at[1] / reach, detector.section, mission)
 
 
-# ------------------------------------------------------------------------------------------------ planes
-
-
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Frequencies of a plane, cycles per radian: across [n / 2 + 1] and along [n]."""
+    """Spatial frequencies of a PSF image with n x n samples, in cycles per radian, in the order of the FFT.
+
+    `across` [n / 2 + 1] are the frequencies along x, without the negative ones, which a real image does not need.
+    `along` [n] are the frequencies along y.
+    """
 
     across: Float
     along: Float
 
     @classmethod
     def from_pixels(cls, side: int, samples: int, scale: float) -> _Grid:
-        """Grid of a plane of `side` pixels of `scale` arcsec, with `samples` per pixel."""
+        """Return the frequencies of an image of `side` x `side` pixels.
+
+        A pixel is `scale` arcsec wide and has `samples` samples along each axis.
+        """
         step = scale * ARCSEC / samples
         n = side * samples
         return cls(np.asarray(np.fft.rfftfreq(n, step), float), np.asarray(np.fft.fftfreq(n, step), float))
 
     def transfer(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
-        """Transfer function of the air and of perfect optics, for a wavelength in Angstrom and a Fried length in m."""
+        """Return the transfer function of the air and of optics without aberrations, at all frequencies [n, n / 2 + 1].
+
+        `wave` is the wavelength in Angstrom, and `fried` the Fried length at this wavelength in m. The ellipticity of
+        the air is included. The result is 0 where the distance in the pupil exceeds 3 Fried lengths.
+        """
         farthest = FARTHEST * fried
         rho = np.linspace(0.0, farthest, _TABLE)
         table = atmosphere.transfer(rho, fried, telescope.outer) * ideal_transfer(
@@ -296,7 +334,12 @@ class _Grid:
         return np.interp(distance, rho, table, right=0.0)
 
     def interpolate_ratio(self, ratio: TransferRatio, wave: float) -> Complex:
-        """Interpolate a ratio at a wavelength (Angstrom) between its lags; it is not needed beyond them."""
+        """Interpolate a `TransferRatio` at all frequencies [n, n / 2 + 1].
+
+        `ratio` is the transfer function of aberrated optics divided by that of perfect optics, on a lattice of shifts
+        in the pupil. `wave` is the wavelength in Angstrom. The result is 0 for shifts beyond the lattice, where the air
+        transmits practically nothing.
+        """
         count = (len(ratio.values) - 1) // 2
         lags = ratio.step * (np.arange(len(ratio.values)) - count)
         rows, columns = (_spline(np.asarray(lags, float), wave * 1e-10 * axis) for axis in (self.along, self.across))
@@ -306,11 +349,15 @@ class _Grid:
         return np.asarray(parts[0] + 1j * parts[1])
 
     def phase_shift(self, x: float, y: float) -> Complex:
-        """Transfer function of a shift by x and y radian."""
+        """Return the factors of a transform [n, n / 2 + 1] that move its image by the angles x and y in radian."""
         return np.asarray(np.exp(-2j * np.pi * x * self.across) * np.exp(-2j * np.pi * y * self.along[:, None]))
 
     def image(self, plane_transfer: Array) -> Float:
-        """Image [n + 1, n + 1] about the middle sample; the light on the border is shared by both sides."""
+        """Return the PSF image [n + 1, n + 1] that belongs to a transfer function, centred on the middle sample.
+
+        The inverse Fourier transform is periodic with n samples, so the first and last row (and column) of the image
+        would be equal. Each of them is given half of the light, which preserves the sum.
+        """
         n = len(self.along)
         centred_image = np.fft.fftshift(scipy.fft.irfft2(plane_transfer, (n, n)))
         out = np.pad(centred_image, ((0, 1), (0, 1)), mode="wrap")
@@ -320,7 +367,11 @@ class _Grid:
 
 
 def _spline(lags: Float, at: Float) -> Float:
-    """Weights [n, lags] of a cubic spline at the positions `at`; 0 beyond the lags."""
+    """Return the weights [n, m] that interpolate values at `lags` [m] by a cubic spline at positions `at` [n].
+
+    `lags` and `at` are shifts in the pupil along one axis, m. The lags must ascend and be symmetric about 0. Weights
+    are 0 for positions farther from 0 than the last lag.
+    """
     inside = np.abs(at) <= lags[-1]
     out = np.zeros((len(at), len(lags)))
     out[inside] = make_interp_spline(lags, np.eye(len(lags)), k=3)(at[inside])
@@ -328,17 +379,29 @@ def _spline(lags: Float, at: Float) -> Float:
 
 
 def _degree(positions: int) -> int:
-    """Degree of the drift; degrees above 2 change sizes by less than 1e-5."""
+    """Return the degree of the polynomial by which the PSF changes across a detector: 0 (no change), 1 or 2.
+
+    `positions` is a key of `euclid.DEGREES`. Terms of higher degree are neglected. They would change the sizes of
+    sources by less than 1e-5.
+    """
     return min(euclid.DEGREES[positions][0], 2)
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
-    """Powers of the drift (`Planes.powers`), which does not depend on colour."""
+    """Return the powers of x, y and wavelength in the polynomial by which the PSF changes across a detector.
+
+    x and y are the position on the detector, from -1 to 1 between its edges. The power of wavelength is always 0: the
+    change is the same at all wavelengths. The constant term is not included. `positions` is a key of `euclid.DEGREES`.
+    """
     return tuple((k - j, j, 0) for k in range(1, _degree(positions) + 1) for j in range(k + 1))
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
-    """Positions at which the optics are evaluated across a detector, in half sides from its middle."""
+    """Return the positions (x, y) on a detector, from -1 to 1 between its edges, at which aberrations are computed.
+
+    `positions` is a key of `euclid.DEGREES`. If it is 1, the result is empty: aberrations are then computed only at the
+    centre of the detector, which need not be listed.
+    """
     axis = np.linspace(-1.0, 1.0, _degree(positions) + 1).tolist() if _degree(positions) else []
     return tuple((x, y) for y in axis for x in axis)
 
@@ -347,7 +410,12 @@ def _drift(
     air: Air, detector: Detector, wave: float, positions: int, telescope: Telescope, samples: int,
     mission: MissionConfiguration,
 ) -> Float:  # fmt: skip
-    """Planes of the drift (`Planes.drift`) at the mean wavelength, by least squares of the ratios at the nodes."""
+    """Return one image per term of the polynomial in position that describes how the PSF changes across a detector.
+
+    These are the images of `Planes.drift`. The polynomial is fitted by least squares to the transfer functions of the
+    optics at several positions. As an approximation, all are computed at the mean wavelength `wave` (Angstrom) of the
+    band. `samples` is the number of samples per pixel.
+    """
     powers, nodes = _powers(positions), _nodes(positions)
     grid = _Grid.from_pixels(_DRIFT_SIDE, samples, detector.pixel_scale)
     if not powers:
@@ -372,9 +440,12 @@ def _drift(
 
 
 def _match_rings(edges_: Edges, image: Float, samples: int) -> Edges:
-    """Scale the rings so that they are as bright at the border of the plane as the wings of the air in it.
+    """Return the edges of the pupil with diffraction rings that are as bright as the PSF image at its border.
 
-    The wings fall as r^-11/3; at twice the distance, the rings are too bright by a half.
+    Otherwise the light of a star would have a step at the border of the image. `image` is the PSF image with `samples`
+    samples per pixel. Rings are only made brighter, never fainter. With the distance r from the star they fall as r^-3,
+    but the wings caused by the air as r^(-11/3). As an approximation this is neglected: at twice the distance of the
+    border, the light drawn is too bright by a half.
     """
     axis = (np.arange(len(image)) - len(image) // 2) / samples
     r = np.hypot(axis, axis[:, None])
@@ -387,7 +458,11 @@ def _match_rings(edges_: Edges, image: Float, samples: int) -> Edges:
 def _outer_light(
     air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, samples: int
 ) -> tuple[Edges, Float32]:
-    """Edges, and their light [n + 1, n + 1] inside a plane without the rings, which are part of its optics."""
+    """Return the edges of the pupil, and an image [n + 1, n + 1] of aureole and diffraction spikes of a star of flux 1.
+
+    n is the side of the PSF images in samples, with `samples` samples per pixel. Diffraction rings are not included,
+    since the image that is computed from the transfer function already contains them.
+    """
     pupil_edges = edges(air, detector, band, mission)
     step = 1.0 / samples
     axis = (np.arange(SIDE * samples + 1) - SIDE * samples // 2) * step

@@ -1,4 +1,4 @@
-"""Data model of a PSF: planes by wavelength and position, or a profile."""
+"""Data model of a PSF: images that depend on wavelength and position (planes), or one analytic profile."""
 
 from __future__ import annotations
 
@@ -12,43 +12,57 @@ from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 from truesky.render.psf.spikes import Edges
 
-# Samples per pixel for VIS, for files and for profiles: the finest optical detail (lambda / D at 540 nm) is 2.8
-# samples wide. The second value is an upper limit of its frequency in cycles per sample.
-SAMPLES, DETAIL = 3, 0.4
-# Largest side of a plane, and of the stamp of a point source, pixels. Light outside it (0.2 % for VIS) is drawn only
-# for bright stars (drawing/far_light.py).
+# Number of samples of a PSF image per detector pixel: for VIS, for PSFs from files, and for analytic profiles. The
+# finest optical detail of VIS (lambda / D at 540 nm) is 2.8 samples wide.
+SAMPLES = 3
+# Upper limit of the spatial frequencies that the optics transmit, cycles per sample of a PSF image. The kernels with
+# which PSF images are blurred are accurate only up to this frequency.
+DETAIL = 0.4
+# Largest side of a PSF image, pixels. It is also the largest side of the stamp (square image) of a star at rest that is
+# drawn with PSF images. Light outside it (0.2 % for VIS) is drawn only for bright stars (drawing/far_light.py).
 SIDE = 512
-# Side of the image for measuring the width, samples, and its samples per pixel: the first that lets the core fit.
-_CORE, _FINE = 243, (9, 3, 1)
+# Side of the image on which the FWHM of a PSF is measured, samples.
+_CORE = 243
+# Numbers of samples per pixel for the image on which the FWHM of a PSF is measured. They are tried in this order until
+# the core of the PSF (above half of the maximum) fits into the image.
+_FINE = (9, 3, 1)
+# Range of rows and columns, the middle two thirds, of the image on which the FWHM of a PSF is measured. The core of the
+# PSF (above half of the maximum) must lie inside it; otherwise a wider image is used.
 _WITHIN = slice(_CORE // 6, -(_CORE // 6))
 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """PSF by wavelength and position, centred on the middle sample.
+    """Images (planes) whose weighted sum is the PSF of a source with a given spectrum and position on the detector.
 
     Attributes
     ----------
     wavelength : float array, shape (w,)
-        Wavelengths, Angstrom.
+        Wavelengths of `images`, Angstrom.
     images : float32 array, shape (w, s, s)
-        PSF at the detector's centre, of unit flux over the whole sky.
+        PSF at the detector's centre by wavelength, centred on the middle sample. The sum of an image is the fraction of
+        the light inside it. For a ground telescope through turbulent air and for PSFEx, images are normalised to the
+        sum 1 instead.
     drift : float32 array, shape (d, t, t)
-        Changes with position and colour; d = 0 for one PSF per detector.
+        Changes of the PSF with position and colour, centred like `images`; d = 0 if the PSF does not depend on
+        position.
     half : (float, float)
-        Half the columns and half the rows of the detector, the units of x and y.
+        Column and row of the detector's centre, (nx - 1) / 2 and (ny - 1) / 2.
     powers : tuple of (int, int, int)
-        Powers of x, y and redder for each plane of the drift.
+        For each image in `drift`, the powers (a, b, c) of x, y and colour in the term that multiplies it; see the
+        notes.
     samples : int
-        Samples per pixel.
+        Samples per pixel of the detector.
 
     Notes
     -----
     The PSF of a source is::
 
-        sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j,   (a, b, c) = powers
+        sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j,   (a_j, b_j, c_j) = powers_j
 
-    where redder is the mean wavelength of its photons minus that of the planes, Angstrom.
+    The first sum is over the wavelengths, and the second over the images in `drift`. photons_w is the fraction of the
+    source's photons at each wavelength. x and y are its position on the detector, from -1 to 1 between the edges.
+    redder is the mean wavelength of the source's photons minus the mean of `wavelength`, Angstrom.
     """
 
     wavelength: Float
@@ -60,37 +74,40 @@ class Planes:
 
     @property
     def max_frequency(self) -> float:
-        """Highest frequency used, radian / pixel: a quarter of a cycle per pixel below the Nyquist frequency."""
+        """Highest spatial frequency of the images that is used, radian / pixel.
+
+        It is 0.5 pi below the Nyquist frequency of the samples.
+        """
         return (self.samples - 0.5) * np.pi
 
 
 @dataclass(frozen=True, slots=True)
 class Psf:
-    """A point-spread function, with the tables needed for the choice of stamp sizes.
+    """A point-spread function, with tables from which the sizes of the stamps (square images of sources) are chosen.
 
     Attributes
     ----------
     profile : galsim.GSObject
-        Profile in arcsec and detector axes, without the pixel, for flat f_nu at the detector's centre. Its flux is the
-        fraction that the model contains.
+        PSF in arcsec in the axes of the detector, for a source with constant f_nu at the detector's centre. It does not
+        include the pixel unless `intra_pixel` is None. Its flux is the fraction of the light that the model contains.
     pixel_scale : float
         Arcsec per pixel.
     surface : float array, shape (side / 2,)
-        Azimuthal mean of the fraction of the flux in a pixel at a distance of r pixels.
+        Element r is the azimuthal mean of the fraction of the flux in a pixel at a distance of r pixels.
     rim : float array, shape (side / 2,)
-        Largest fraction in a pixel at r pixels or more along columns or rows; spikes of the pupil's bars exceed the
-        mean.
+        Element r is the largest fraction of the flux in a pixel at r pixels or more along columns or rows. Diffraction
+        spikes make it larger than `surface`.
     outside : float array, shape (side / 2,)
-        Fraction of the flux beyond r pixels.
+        Element r is the fraction of the flux farther than r pixels away, within the flux of `profile`.
     fwhm : float
         FWHM including the pixel, arcsec.
     planes : Planes or None
-        Planes by wavelength and position; None if `profile` is the whole model.
+        Images by wavelength and position, with which sources are drawn; None if `profile` is the whole model.
     intra_pixel : float or None
         Loss of response at a pixel's edges relative to its centre (effects/light/intra_pixel.py), 0 for a uniform
         response. None if the PSF already includes the pixel.
     edges : Edges or None
-        Sources of light beyond the planes; None if there is no such light.
+        Edges of the pupil and aureole, which cause light beyond the border of `planes`; None if there is no such light.
     """
 
     profile: galsim.GSObject
@@ -105,17 +122,20 @@ class Psf:
 
     @property
     def side(self) -> int:
-        """Side of its planes, pixels."""
+        """Side of the PSF images, pixels; for an analytic PSF, twice the largest radius in the table `surface`."""
         return 2 * len(self.surface)
 
 
 def reduce_colours(psf: Psf, colours: int) -> Psf:
-    """Return the PSF with at most `colours` wavelengths, each the mean of neighbours with equal numbers of photons.
+    """Return the PSF with at most `colours` wavelengths, to save drawing time.
+
+    Neighbouring wavelengths and their images are averaged in groups of equal size. A PSF that has at most `colours`
+    wavelengths, or no planes, is returned unchanged.
 
     Raises
     ------
     BadInput
-        If the number of wavelengths is not a multiple of `colours`.
+        If the number of wavelengths is larger than `colours` and not a multiple of it.
     """
     planes = psf.planes
     if planes is None or len(planes.wavelength) <= colours:
@@ -128,25 +148,26 @@ def reduce_colours(psf: Psf, colours: int) -> Psf:
 
 
 def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim.GSObject:
-    """Convert a plane to a galsim object in arcsec.
+    """Convert a PSF image to a galsim object in arcsec.
 
     Parameters
     ----------
-    image : float array
-        The plane.
+    image : float array, shape (s, s)
+        Image of the PSF, centred on the middle sample.
     sampling : float
-        Spacing of its samples, arcsec.
+        Spacing of the samples, arcsec.
     exact : bool
-        True, for the reference, to interpolate almost like the Fourier series. galsim's quintic interpolant has errors
-        of 1e-4 in the middle of steep bulges.
+        True to interpolate between samples with a wide Lanczos kernel, as reference images require. By default galsim's
+        quintic interpolant is used, which has errors of 1e-4 in the middle of steep bulges.
 
     Returns
     -------
     galsim.GSObject
-        The profile.
+        The PSF; its flux is the sum of the image.
     """
     sampled = galsim.Image(np.asarray(image, float), scale=sampling)
-    # A plane that is empty at its border needs little padding, and its extent in real and Fourier space is known.
+    # A PSF is nearly 0 at the border of its image, so galsim need pad it only to twice its side. The step and the
+    # largest frequency in Fourier space are given, since galsim would spend time on finding them.
     return galsim.InterpolatedImage(
         sampled,
         x_interpolant=galsim.Lanczos(31) if exact else None,
@@ -158,16 +179,16 @@ def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim
 
 
 def from_planes(planes: Planes, pixel_scale: float, has_pixel: bool, side: int = SIDE) -> Psf:
-    """Build a PSF from planes.
+    """Build a PSF from images, and compute its FWHM and the tables of its light by radius.
 
     Parameters
     ----------
     planes : Planes
-        The planes.
+        Images by wavelength and position.
     pixel_scale : float
         Arcsec per pixel.
     has_pixel : bool
-        True if the planes include the detector's pixel.
+        True if the images are already averaged over the detector's pixel.
     side : int
         Side of the largest stamp of a point source, pixels.
 
@@ -187,20 +208,20 @@ def from_profile(
     has_pixel: bool = False,
     side: int = SIDE,
 ) -> Psf:
-    """Build a PSF from a profile, with azimuthal means and largest values on pixels.
+    """Build a PSF from a galsim profile, and compute its FWHM and the tables of its light by radius.
 
     Parameters
     ----------
     profile : galsim.GSObject
-        Profile of the PSF.
+        Profile of the PSF in arcsec, centred on 0.
     pixel_scale : float
         Arcsec per pixel.
     planes : Planes, optional
-        Planes for drawing; None to draw the profile.
+        Images with which sources are drawn; by default the profile is drawn.
     has_pixel : bool
         True if the profile is already averaged over a pixel.
     side : int
-        Twice the radius of the tables, pixels.
+        Twice the radius up to which the tables are computed, pixels.
 
     Returns
     -------
@@ -222,38 +243,42 @@ def from_profile(
 
 
 def _width(profile: galsim.GSObject, pixel_scale: float, has_pixel: bool) -> float:
-    """FWHM including the pixel, arcsec."""
+    """Return the FWHM of a PSF averaged over pixels, arcsec; `has_pixel` is True if `profile` is already averaged."""
     for samples in _FINE:
         core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / samples, method="no_pixel", dtype=float)
         with_pixel = core.array if has_pixel else uniform_filter(core.array, samples)
         bright = with_pixel > 0.5 * with_pixel.max()
-        # A core that fits into the image needs no coarser sampling.
+        # If the core (all samples above half of the maximum) lies in the middle of the image, coarser samples, which
+        # cover a wider area, are not necessary.
         if bright[_WITHIN, _WITHIN].sum() == bright.sum():
             break
-    # The width is measured about the middle of the core, since a user's PSF may not be centred.
+    # The FWHM is measured about the middle of the samples above half of the maximum, since a PSF from a user's file may
+    # not be centred on the image.
     y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
     return float(galsim.Image(with_pixel, scale=pixel_scale / samples).calculateFWHM(center=galsim.PositionD(x, y)))
 
 
 def profile_spectrum(psf: Psf, size: int, reach: int) -> Array:
-    """Fourier transform of the profile on the grid of a stamp, without the pixel.
+    """Return the Fourier transform of `psf.profile`, without the pixel, at the frequencies of a stamp.
 
     Parameters
     ----------
     psf : Psf
         The PSF.
     size : int
-        Side of the stamp, pixels.
+        Side of the stamp (square image around a source), pixels.
     reach : int
-        Largest index of the frequencies.
+        Largest index of the frequencies along columns and rows.
 
     Returns
     -------
     complex array, shape (2 reach + 1, reach + 1)
-        Transform [iy, ix] at (ix, iy) times 2 pi / size radian / pixel.
+        The element [iy, ix] is the transform at the frequencies ix and iy along x and y, in units of 2 pi / size radian
+        per pixel. Rows are in the order of the FFT: iy from 0 to `reach`, then from -`reach` to -1.
     """
     profile = psf.profile.dilate(1.0 / psf.pixel_scale)
     image = galsim.ImageCD(galsim.BoundsI(0, reach, -reach, reach), scale=2 * np.pi / size)
-    # A half plane is sufficient for a real image, but galsim's public method draws both halves.
+    # The transform of a real image is determined by a half plane. galsim's public method drawKImage would compute the
+    # other half too, so its private method is used.
     profile._drawKImage(image)
     return np.asarray(np.roll(image.array, -reach, axis=0))

@@ -12,32 +12,37 @@ from truesky.render.psf import ground, model
 from truesky.render.psf.model import Psf
 from truesky.render.psf.spikes import Edges
 
-# Values of the mission parameter <section>.psf.profile.
-_GAUSSIAN, _MOFFAT = 0.0, 1.0
+# Value of the mission parameter <section>.psf.profile that selects a Gaussian PSF. <section> is the prefix of the
+# camera's parameters.
+_GAUSSIAN = 0.0
+# Value of the mission parameter <section>.psf.profile that selects a Moffat profile as PSF. <section> is the prefix of
+# the camera's parameters. Values other than 0 (Gaussian) and 1 (Moffat) select turbulent air.
+_MOFFAT = 1.0
 
 
 def exposure_psf(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
 ) -> Psf:
-    """PSF of a detector of a ground camera, with the seeing of the exposure.
+    """Return the PSF of a detector of a ground camera, with the seeing of the exposure.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Row of the table `exposures`.
+        Row of the table `exposures`, which contains the seeing (FWHM in arcsec) and the airmass.
     detector : Detector
-        Detector of its camera.
+        Detector of the camera of this exposure.
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database, which selects the profile.
+        Mission database (parameters of telescopes and cameras), which selects the kind of profile.
     positions : int
-        Number of positions at which the PSF is computed, one of `euclid.DEGREES`.
+        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of `euclid.DEGREES`); 25
+        is treated as 9. It is ignored for a Gaussian or Moffat profile, which is the same on the whole detector.
 
     Returns
     -------
     Psf
-        The PSF.
+        The PSF. For turbulent air, OutOfRange is raised if the seeing is not allowed (`ground.check`).
     """
     section, scale = detector.section, detector.pixel_scale
     profile = mission.value(f"{section}.psf.profile")
@@ -49,25 +54,31 @@ def exposure_psf(
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
-    """Refuse a seeing, or a pupil, for which there is no PSF.
+    """Check that a PSF can be computed for a seeing and for the pupil of a ground camera.
 
     Parameters
     ----------
     seeing : float
-        Seeing, arcsec.
+        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
     detector : Detector
         Detector of a ground camera.
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
+
+    Raises
+    ------
+    OutOfRange
+        If the profile is that of turbulent air, and the seeing or the area of the pupil is not allowed. Gaussian and
+        Moffat profiles are not checked.
     """
     if mission.value(f"{detector.section}.psf.profile") not in (_GAUSSIAN, _MOFFAT):
         ground.check(seeing, detector, band, mission)
 
 
 def typical_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
-    """Sources of light beyond the planes, for the typical seeing of the band.
+    """Return what causes light beyond the border of the PSF images, for the typical seeing of a band.
 
     Parameters
     ----------
@@ -76,12 +87,12 @@ def typical_edges(detector: Detector, band: Passband, mission: MissionConfigurat
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras). If it has no seeing for the band, 1 arcsec is used.
 
     Returns
     -------
     Edges or None
-        Edges of the pupil, and the aureole; None for a profile without planes.
+        Edges of the pupil, and the aureole; None for a Gaussian or Moffat profile, which has no such light.
     """
     section = detector.section
     if mission.value(f"{section}.psf.profile") in (_GAUSSIAN, _MOFFAT):
@@ -92,14 +103,16 @@ def typical_edges(detector: Detector, band: Passband, mission: MissionConfigurat
 
 
 def moffat_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
-    """PSF with a round Moffat profile.
+    """Return a PSF with a round Moffat profile: surface brightness proportional to (1 + (r / r_d)^2)^-beta at radius r.
+
+    The scale radius r_d follows from the FWHM.
 
     Parameters
     ----------
     seeing : float
-        FWHM, arcsec.
+        FWHM without the pixel, arcsec.
     beta : float
-        Exponent, above 1.
+        Exponent, above 1; galsim raises an error for an exponent that is too small.
     pixel_scale : float
         Arcsec per pixel.
 

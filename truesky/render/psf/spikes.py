@@ -1,26 +1,31 @@
-"""Diffraction spikes and rings of a pupil, far from a star.
+"""Diffraction spikes and rings around a star, far from its core, computed from the edges of the telescope's pupil.
 
-The light of a point source is spread over angles theta as |A(theta)|^2 / (lambda^2 S), where A is the integral of
-exp(-2 pi i x theta / lambda) over the clear pupil and S is the area of the pupil. Far out only edges matter. The
-interference of different parts of the pupil varies so fast that their light adds up.
+At an angle theta from a point source, the fraction |A(theta)|^2 / (lambda^2 S) of its light arrives per steradian. Here
+lambda is the wavelength, S the area of the clear pupil, and A the integral of exp(-2 pi i x theta / lambda) over the
+positions x in the clear pupil. Far from the source only the edges of the pupil matter. The interference between
+different edges varies so fast with theta that, on average, their light simply adds up.
 
 Circles: for an aperture of radius R, A = 2 pi R^2 J1(z) / z with z = 2 pi R theta / lambda. Far out,
 J1(z)^2 = 2 / (pi z) cos^2(z - 3 pi / 4), with the mean 1 / (pi z) over rings, so that::
 
     |A|^2 / (lambda^2 S) = R lambda / (2 pi^2 S theta^3) = P lambda / (4 pi^3 S theta^3)
 
-with the perimeter P = 2 pi R; the perimeters of all circles add up. A pixel of side p at r pixels receives p^2 times
-this, with theta = p r: P lambda / (4 pi^3 S p r^3). The value at r = 1 is `ring_light`.
+with the perimeter P = 2 pi R; the perimeters of all circles add up. A pixel of side p (radian) at a distance of r
+pixels receives p^2 times this, with theta = p r: P lambda / (4 pi^3 S p r^3). The function `ring_light` returns this
+fraction for r = 1.
 
-Bars: a straight bar of width w and length l removes A = w l sinc(w u / lambda) sinc(l v / lambda), where u runs across
-the bar, v along it, and sinc(x) = sin(pi x) / (pi x). Its light in a pixel is::
+Bars: a straight bar of width w and length l blocks the part A = w l sinc(w u / lambda) sinc(l v / lambda) of the
+integral. Here u and v are the components of theta across and along the bar, and sinc(x) = sin(pi x) / (pi x). Far from
+the source, a blocked part gives as much light as an opening of the same shape (Babinet's principle). The fraction of
+the light in a pixel is::
 
     (w l p / lambda)^2 / S  sinc^2(w p r / lambda)  sinc^2(l p t / lambda)
 
-This is a pair of spikes across the bar, with fringes along them; r is the distance along the spike and t that from its
-axis, in pixels. Longer bars have narrower spikes. The mean of the fringes is l^2 / (2 pi^2 S r^2) for any width: far
-out, spikes are brighter than rings. Each sub-band is the sum of several wavelengths, smoothed across the spike by
-jitter, diffusion and the pixel.
+This formula describes a pair of spikes perpendicular to the bar, with fringes along them. r is the distance along the
+spike and t the distance from its axis, in pixels. Longer bars have narrower spikes. On the axis, the mean over the
+fringes is l^2 / (2 pi^2 S r^2) for any width w: far out, spikes are brighter than rings. The light of a sub-band of the
+passband is the sum over several wavelengths, smoothed across the spike by pointing jitter, charge diffusion and the
+pixel.
 
 References
 ----------
@@ -38,41 +43,54 @@ from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes.passbands import Passband
 from truesky.numerics import matrices
 
-# Number of wavelengths per sub-band. The fringes of a bar differ between wavelengths.
+# Number of wavelengths per sub-band of the passband at which spikes are computed and added. Several are needed, since
+# the fringes along a spike lie at distances proportional to the wavelength.
 _WAVES = 8
-# Half the width of a spike, and the steps of its table across and along, pixels. Kernels contain these constants, and
-# naming truesky.numerics.compiling here makes this file part of the key of the machine code.
-WIDE, STEP, LONG = 40, 0.25, 8.0
-# Number of points along a bar for measuring its visible length.
+# Largest distance from the axis of a spike, pixels, up to which the light of the spike is tabulated and drawn. Another
+# module compiles STEP and LONG into machine code, which is cached. The key of this cache includes every file with the
+# text truesky.numerics.compiling, as in this comment, so that the code is compiled again if these values change.
+WIDE = 40
+# Spacing, across the spike, of the points at which the light of a spike is tabulated, pixels.
+STEP = 0.25
+# Spacing, along the spike, of the points at which the light of a spike is tabulated, pixels.
+LONG = 8.0
+# Number of points along a spider bar at which it is tested whether the bar lies in the clear pupil. The fraction of
+# visible points gives the visible length of the bar.
 _POINTS = 7001
+# Radian per arcsec.
 ARCSEC = np.pi / 180.0 / 3600.0
-# Largest distance from a star at which spikes are drawn, arcsec. At this distance, the spikes of a star of 7.4 mag have
-# a tenth of the pixel noise of a nominal exposure, and the spikes of a star of 4.9 mag are equal to it.
+# Largest distance between a star and a detector on which its spikes are drawn, arcsec. On this detector, the spikes of
+# a star at rest are drawn up to the farthest corner, but those of a moving star only up to this distance from it. At
+# this distance, spikes of a star of 7.4 mag have a tenth of the pixel noise of a nominal exposure, and spikes of a star
+# of 4.9 mag equal the pixel noise.
 FARTHEST = 1200.0
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Edges of a pupil, and other sources of light far from a star.
+    """Everything that causes light far from a star: edges of the telescope's pupil, and an aureole.
 
     Attributes
     ----------
     wavelength : float array, shape (w, n)
-        Wavelengths in each sub-band of the PSF, Angstrom.
+        n wavelengths in each of w sub-bands of the passband, Angstrom.
     area : float
-        Clear area, mm^2.
+        Area of the pupil through which light passes, mm^2.
     perimeter : float
-        Sum of the perimeters of all circles, mm.
+        Sum of the perimeters of all circular edges of the pupil, mm. It determines the brightness of diffraction rings.
     bars : float array, shape (b, 3)
-        Angle (radian), width and visible length (mm) of each bar.
+        For each straight bar of the spider: angle of its axis from x towards y (radian), width and visible length (mm).
+        It causes a pair of spikes perpendicular to it.
     blur : float
-        Rms of jitter and diffusion, arcsec.
+        Rms of the blur by pointing jitter and charge diffusion (or by the air), arcsec, which widens the spikes.
     pixel_scale : float
         Arcsec per pixel.
     period : float
-        Period of the plane's transform, pixels; 0 if its aliasing is negligible.
+        Period of the discrete Fourier transform with which the PSF images were computed, pixels. Because of it, the
+        images contain aliased light from beyond their borders. 0 if this light is negligible.
     halo : (float, float)
-        Values (A, c) of the aureole, A / (r^2 + c^2) of the light per arcsec^2 at r arcsec.
+        Values (A, c) of the aureole: at r arcsec, the fraction A / (r^2 + c^2) of the star's light per arcsec^2, with c
+        in arcsec. (0, 1) for no aureole.
     """
 
     wavelength: Float
@@ -86,12 +104,19 @@ class Edges:
 
     @property
     def aureole(self) -> tuple[float, float]:
-        """Values (A, c^2) of the aureole per pixel, with distances in pixels."""
+        """Values (A, c^2) of the aureole in pixels instead of arcsec.
+
+        A pixel at a distance of r pixels has the fraction A / (r^2 + c^2) of the star's light.
+        """
         return self.halo[0], (self.halo[1] / self.pixel_scale) ** 2
 
 
 def wavelengths(parts: tuple[Passband, ...]) -> Float:
-    """Wavelengths of sub-bands [w, n], Angstrom: the middles of parts with equal numbers of photons."""
+    """Return n = 8 representative wavelengths of each of the w sub-bands `parts` of a passband, Angstrom: [w, n].
+
+    A sub-band is divided into n intervals with equal numbers of photons for constant f_nu. The result contains the
+    wavelength in the middle of the photons of each interval.
+    """
     places = (np.arange(_WAVES) + 0.5) / _WAVES
     waves = []
     for part in parts:
@@ -103,25 +128,26 @@ def wavelengths(parts: tuple[Passband, ...]) -> Float:
 def from_euclid_pupil(
     parts: tuple[Passband, ...], blur: float, pixel_scale: float, period: float, mission: MissionConfiguration
 ) -> Edges:
-    """Edges of the Euclid pupil: aperture stop, central stop, and three bars where they are not hidden by the stops.
+    """Return the edges of Euclid's pupil: aperture stop, central stop, and the visible parts of three spider bars.
 
     Parameters
     ----------
     parts : tuple of Passband
-        Sub-bands of the PSF.
+        Sub-bands of the passband.
     blur : float
-        Rms of jitter and diffusion, arcsec.
+        Rms of the blur by pointing jitter and charge diffusion, arcsec.
     pixel_scale : float
         Arcsec per pixel.
     period : float
-        Period of the plane's transform, pixels.
+        Period of the discrete Fourier transform with which the PSF images are computed, pixels. Because of it, the
+        images contain aliased light from beyond their borders.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
     Edges
-        The edges.
+        Edges of the pupil, without an aureole.
     """
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
@@ -141,45 +167,49 @@ def from_euclid_pupil(
 
 
 def ring_light(edges: Edges, photons: Float) -> float:
-    """Fraction of a star's light in a pixel at a distance of one pixel, extrapolated by the law r^-3.
+    """Return the brightness of a star's diffraction rings, averaged over the rings.
 
     Parameters
     ----------
     edges : Edges
         Edges of the pupil.
     photons : float array, shape (w,)
-        Fraction of the photons in each sub-band.
+        Fraction of the star's photons in each sub-band of the passband.
 
     Returns
     -------
     float
-        The fraction. The error is 3 % beyond 5 arcsec, 1 % of which is caused by bars that hide the circles.
+        Fraction of the star's light in a pixel one pixel away, extrapolated with the law r^-3 from large distances.
+        Divide it by r^3 to get the fraction in a pixel at a distance of r pixels. Beyond 5 arcsec the error is 3 %, of
+        which 1 % is caused by bars that hide parts of the circular edges.
     """
     wavelength = float(matrices.matmul(photons, edges.wavelength.mean(axis=1))) * 1e-7
     return wavelength * edges.perimeter / (4.0 * np.pi**3 * edges.area) / (edges.pixel_scale * ARCSEC)
 
 
 def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
-    """Fraction of a star's light in the pixels of each bar's spike.
+    """Return tables of the diffraction spikes of a star, one for each of b bars of the pupil.
 
     Parameters
     ----------
     edges : Edges
         Edges of the pupil.
     photons : float array, shape (w,)
-        Fraction of the photons in each sub-band.
+        Fraction of the star's photons in each sub-band of the passband.
     reach : float
-        Length of the spike, pixels.
+        Length of the spikes from the star, pixels.
 
     Returns
     -------
     float array, shape (b, r, t)
-        The fraction at r LONG pixels along the spike and t STEP pixels from its axis.
+        Fraction of the star's light in a pixel, at 0, LONG, 2 LONG ... pixels along the spike and 0, STEP, 2 STEP ...
+        pixels from its axis.
     """
     share = np.repeat(photons / _WAVES, _WAVES)
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     out = LONG * np.arange(int(reach / LONG) + 2)
-    # The table is wider than the result, to include the light that the blur moves into it.
+    # Spikes without blur are computed up to twice the distance from the axis that the result has, since the blur moves
+    # light from outside into it.
     across = STEP * np.arange(2 * round(WIDE / STEP))
     lines = []
     for _, width, length in edges.bars:
@@ -192,7 +222,7 @@ def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
 
 
 def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
-    """Distance from a star up to which its spikes or its aureole are noticeable.
+    """Return the distance from each of n stars up to which its diffraction spikes or its aureole are noticeable.
 
     Parameters
     ----------
@@ -201,24 +231,27 @@ def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
     electrons : float array, shape (n,)
         Expected electrons of the stars.
     min_electrons : float
-        Smallest noticeable light in a pixel, electrons.
+        Electrons in a pixel below which the light of spikes and aureole is not noticeable.
 
     Returns
     -------
     float array, shape (n,)
-        Distance of the last such pixel, pixels, at most FARTHEST arcsec.
+        Distance in pixels at which the light falls below `min_electrons`, at most FARTHEST (1200 arcsec).
 
     Notes
     -----
-    The error is 15 %, because of fringes along the spike and because sub-bands are treated as equal.
+    The error is 15 %, because fringes along the spike are averaged, and because equal numbers of photons are assumed
+    in all sub-bands.
     """
     share = 1.0 / edges.wavelength.size
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     across, blur = STEP * np.arange(2 * round(WIDE / STEP)), edges.blur / edges.pixel_scale
-    # Light that the blur moves from each position, on both sides, to the middle.
+    # Weights with which the blur moves light to the axis of a spike, for each distance from the axis. Both sides are
+    # added, so that all weights except that of the axis itself are doubled.
     blur_kernel = np.fft.irfft(_blur_transfer(2 * len(across) - 1, blur), 2 * len(across) - 1)[: len(across)]
     blur_kernel[1:] *= 2.0
-    # The mean of the fringes is half of their peak.
+    # Fraction of the star's light in a pixel on the axis of each bar's spike, times the square of the distance in
+    # pixels. Along a spike, fringes vary as sin^2, whose mean is half of the maximum.
     middle = [
         share
         * float(np.maximum((np.sinc(length * cycles[:, None] * across) ** 2 * blur_kernel).sum(axis=1), 0.0).sum())
@@ -233,7 +266,12 @@ def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
 
 
 def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
-    """Sum of the lines [w, t], t >= 0, blurred by jitter, diffusion and pixel: [r, t] up to WIDE."""
+    """Return a table [i, j] of the light of a spike, blurred across the spike by a Gaussian and by the pixel.
+
+    i is the index along the spike, and j counts steps of STEP pixels from its axis. `along` [i, w] is the light on the
+    axis at each of w wavelengths. `lines` [w, j] are the profiles across the spike before the blur, 1 on the axis.
+    `blur` is the rms of the Gaussian in pixels. The table extends to WIDE pixels from the axis.
+    """
     symmetric = np.concatenate([lines[:, :0:-1], lines], axis=1)
     passed = np.fft.rfft(symmetric, axis=1) * _blur_transfer(symmetric.shape[1], blur)
     smooth = np.fft.irfft(passed, symmetric.shape[1], axis=1)[:, lines.shape[1] - 1 :]
@@ -241,6 +279,10 @@ def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
 
 
 def _blur_transfer(count: int, blur: float) -> Float:
-    """Transfer function of jitter, diffusion and pixel at the frequencies of `count` samples."""
+    """Return the transfer function of a Gaussian blur (rms `blur` pixels) and of the pixel.
+
+    It is the product of both along one axis, at the frequencies of a real FFT of `count` samples that are STEP pixels
+    apart. The pixel averages over its width.
+    """
     k = 2.0 * np.pi * np.fft.rfftfreq(count, STEP)
     return np.asarray(np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi)))

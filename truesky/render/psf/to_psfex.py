@@ -1,4 +1,4 @@
-"""Write the PSF of a detector in the format of PSFEx, including pixels and for flat f_nu."""
+"""Write the PSF of a detector in the format of PSFEx, averaged over pixels and for a source with constant f_nu."""
 
 from __future__ import annotations
 
@@ -13,12 +13,19 @@ from lake_schema.fits import psfex
 from truesky.render.camera.detectors import Detector
 from truesky.render.psf.model import Planes, Psf
 
-# Half the side of a model, in FWHM, and its largest value, in samples; samples per pixel of a PSF without planes.
-_HALF, _MAX_HALF, _SAMPLES = 5.0, 63, 2
+# Distance from the middle to the edge of the written PSF images, in units of the FWHM of the PSF.
+_HALF = 5.0
+# Largest distance from the middle to the edge of the written PSF images, samples. It limits their side to 127 samples.
+_MAX_HALF = 63
+# Number of samples per detector pixel in the written image of a PSF that is given as an analytic profile. Other PSFs
+# keep the samples of their images.
+_SAMPLES = 2
 
 
 def write(psf: Psf, detector: Detector, path: Path) -> None:
-    """Write the model of a detector, with flux 1 within its side of 10 FWHM or at most 127 samples.
+    """Write the PSF of a detector to a file of PSFEx.
+
+    Its images have a side of 10 FWHM, but at most 127 samples. The sum of the image at the centre of the detector is 1.
 
     Parameters
     ----------
@@ -27,11 +34,11 @@ def write(psf: Psf, detector: Detector, path: Path) -> None:
     detector : Detector
         The detector.
     path : Path
-        File to write.
+        File to write; an existing file is replaced.
 
     Notes
     -----
-    The dependence on the source's colour is neglected. Errors of size and ellipticity are 1e-3.
+    The dependence of the PSF on the colour of the source is neglected. Errors of size and ellipticity are 1e-3.
     """
     planes, step = psfex_planes(psf)
     middle = ((detector.nx + 1) / 2, (detector.ny + 1) / 2)
@@ -39,7 +46,12 @@ def write(psf: Psf, detector: Detector, path: Path) -> None:
 
 
 def psfex_planes(psf: Psf) -> tuple[Float32, float]:
-    """Planes [n, s, s] in the order of PSFEx and their spacing in pixels, for x, y = -1 to 1 across the detector."""
+    """Return the images [n, s, s] of a PSFEx model, and the spacing of their samples in pixels.
+
+    The model is a polynomial of the position on the detector, with x and y from -1 to 1 between its edges. There is one
+    image per term, by which the term is multiplied, in the order of PSFEx: 1, x, x^2 ..., y, x y .... The sum of the
+    first image is 1. n is 1 for a PSF that is the same on the whole detector.
+    """
     samples = psf.planes.samples if psf.planes else _SAMPLES
     half = min(int(np.ceil(_HALF * psf.fwhm / psf.pixel_scale * samples)), _MAX_HALF)
     if psf.planes is None:
@@ -63,8 +75,13 @@ def psfex_planes(psf: Psf) -> tuple[Float32, float]:
 
 
 def _central_plane(plane: Array, planes: Planes, half: int, has_pixel: bool) -> Float:
-    """Middle of a plane, 2 half + 1 samples, averaged over pixels; 0 outside the plane."""
-    # The average over pixels needs one pixel beyond the border.
+    """Return the middle of a PSF image, with sides of 2 * half + 1 samples, averaged over detector pixels.
+
+    If `has_pixel` is True, `plane` is already averaged and is not averaged again. `planes` gives the number of samples
+    per pixel. Outside `plane`, the PSF is treated as 0.
+    """
+    # The average over a pixel is computed by FFT, for which the image is periodic. The image needs at least one pixel
+    # more at the border than the result, so that light from the opposite border does not contribute.
     margin = half + planes.samples - len(plane) // 2
     image = np.pad(plane.astype(float), max(margin, 0))
     if not has_pixel:

@@ -1,1 +1,1 @@
-"""Compiled inner loops of drawing."""
+"""Inner loops for drawing stars and galaxies, compiled by numba."""

@@ -1,8 +1,11 @@
-"""Compiled loops for the light of stars far from them: rings, aureole and diffraction spikes.
+"""Compiled loops for the light of stars far from them: diffraction rings, aureole and diffraction spikes.
 
-In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole, for r in
-pixels. `bar_directions` [b, 2] are unit vectors of the pupil's bars. The light of a bar's spike is in the table `lines`
-[b, i, j], at the distance i LONG along the spike and j STEP across it.
+The core of a star is drawn with an image of the PSF (plane), which fades to 0 at its border. These functions draw the
+light beyond it. In all functions, a pixel at r pixels from the star has the light `level` / r^3 from the rings and
+`halo` / (r^2 + `core`) from the aureole (scattered light). `bar_directions` [b, 2] are unit vectors (column, row) along
+the b bars that cross the telescope's pupil; the spike of a bar is perpendicular to it. The table `lines` [b, i, j]
+contains the light of each bar's spike in a pixel. Its element [b, i, j] is for bar b, i * LONG pixels (i * 8) from the
+star along the spike, and j * STEP pixels (j * 0.25) from the axis of the spike.
 """
 
 from __future__ import annotations
@@ -15,16 +18,27 @@ from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
 from truesky.render.psf.spikes import LONG, STEP
 
-# Pixels over which the plane fades, and outermost pixels that are not used because a stamp is periodic.
-_FADING, SPARED = 24.0, 2.0
-# Largest aliased light in the corners, as a fraction of the light at the plane's sides; radius, as a fraction of the
-# period, within which aliased light is negligible.
-FOLDED, _MIN_FOLDED_RADIUS = 0.2, 0.15
+# Width of the border zone in which the PSF image of a star fades to 0, pixels.
+_FADING = 24.0
+# Number of pixels along each side of a star's PSF image that are not used, because the stamp on which it is drawn is
+# periodic: light at one edge would appear at the opposite edge.
+SPARED = 2.0
+# Upper limit of the aliased light in a star's PSF image (copies of the star from the periodic transform), as a fraction
+# of the light of the diffraction rings in the middle of a side of the image.
+FOLDED = 0.2
+# Distance from the star within which aliased light in the PSF image is negligible, as a fraction of the period of the
+# discrete transform with which the image was computed.
+_MIN_FOLDED_RADIUS = 0.15
 
 
 @jit
 def _spike_light(bar_directions: Any, lines: Any, b: int, dx: float, dy: float) -> Any:
-    """Light of the spike of bar `b` at an offset (dx, dy)."""
+    """Return the light of a star's diffraction spike in a pixel at (dx, dy) pixels (columns, rows) from the star.
+
+    `b` is the index of the bar in the telescope's pupil that causes the spike, and `bar_directions` [bars, 2] are unit
+    vectors along all bars. `lines` [bars, i, j] is the light at i * 8 pixels from the star along the spike and j * 0.25
+    pixels from its axis. It is interpolated linearly; the result has its unit, and is 0 beyond the table.
+    """
     t = abs(dx * bar_directions[b, 0] + dy * bar_directions[b, 1]) / STEP
     r = abs(dy * bar_directions[b, 0] - dx * bar_directions[b, 1]) / LONG
     i, j = int(r), int(t)
@@ -37,7 +51,10 @@ def _spike_light(bar_directions: Any, lines: Any, b: int, dx: float, dy: float) 
 
 @jit
 def _ring_and_aureole_light(square: float, level: float, halo: float, core: float) -> Any:
-    """Light of the rings of circular edges and of the aureole, at a squared distance."""
+    """Return the light of a star's diffraction rings and aureole, level / r^3 + halo / (r^2 + core).
+
+    `square` is r^2, the squared distance from the star in pixels. The result has the unit of `level` and `halo`.
+    """
     return level / (square * np.sqrt(square)) + halo / (square + core)
 
 
@@ -56,28 +73,30 @@ def add_outside(
     spike_reach: float,
     spike_half_width: float,
 ) -> None:
-    """Add the light outside a square of half side `inner` to a frame.
+    """Add the light of a star outside a square around it to the image of a detector.
 
     Parameters
     ----------
     frame : int array, shape (ny, nx)
-        Frame, changed in place.
+        Image of the detector in integers, changed in place.
     x, y : float
         Position of the star, pixels.
     inner : float
         Half side of the square, pixels.
     level, halo, core : float
-        Rings and aureole in units of the frame, see the module.
+        The light at r pixels from the star is level / r^3 (diffraction rings) plus halo / (r^2 + core) (aureole of
+        scattered light), in the integers of the frame.
     radius : float
         Radius up to which rings and aureole are drawn, pixels.
     bar_directions : float array, shape (b, 2)
-        Directions of the bars.
+        Unit vectors (column, row) along the bars in the telescope's pupil; their spikes are perpendicular to them.
     lines : float array, shape (b, i, j)
-        Light of the spikes in units of the frame.
+        Light of each bar's diffraction spike in the integers of the frame: element [b, i, j] at i * 8 pixels from the
+        star along the spike and j * 0.25 pixels from its axis.
     spike_reach : float
         Radius up to which spikes are drawn, pixels.
     spike_half_width : float
-        Half width of the spikes, pixels; 0 without spikes.
+        Half width of the spikes, pixels; 0 to draw no spikes.
     """
     ny, nx = frame.shape
     for r in range(ny):
@@ -116,22 +135,24 @@ def add_inside(
     bar_directions: Any,
     lines: Any,
 ) -> None:
-    """Add the light that the faded plane lacks inside the square.
+    """Add the light that a star's PSF image lacks near its border, where it has been faded to 0.
 
     Parameters
     ----------
     frame : int array, shape (ny, nx)
-        Frame, changed in place.
+        Image of the detector in integers, changed in place.
     x, y : float
         Position of the star, pixels.
     inner : float
-        Half side of the square, pixels.
+        Half side of the square outside which the PSF image is 0, pixels. Only pixels inside the square are changed.
     level, halo, core : float
-        Rings and aureole in units of the frame, see the module.
+        The light at r pixels from the star is level / r^3 (diffraction rings) plus halo / (r^2 + core) (aureole of
+        scattered light), in the integers of the frame.
     bar_directions : float array, shape (b, 2)
-        Directions of the bars.
+        Unit vectors (column, row) along the bars in the telescope's pupil; their spikes are perpendicular to them.
     lines : float array, shape (b, i, j)
-        Light of the spikes in units of the frame.
+        Light of each bar's diffraction spike in the integers of the frame: element [b, i, j] at i * 8 pixels from the
+        star along the spike and j * 0.25 pixels from its axis.
     """
     ny, nx = frame.shape
     for r in range(max(int(np.ceil(y - inner)), 0), min(int(np.ceil(y + inner)), ny)):
@@ -149,24 +170,27 @@ def add_inside(
 def remove_aliased_compiled(
     stamp: Any, x: Float, y: Float, inner: float, level: float, bar_directions: Any, lines: Any, period: float,
 ) -> None:  # fmt: skip
-    """Multiply each pixel of a stamp by the direct fraction of its direct and aliased light.
+    """Multiply each pixel of a star's stamp by d / (d + a), where d is the expected direct and a the aliased light.
+
+    Aliased light comes from copies of the star, because the PSF image is a periodic discrete transform.
 
     Parameters
     ----------
-    stamp : float array
-        Stamp, changed in place.
+    stamp : float array, shape (rows, columns)
+        Image of the star, changed in place.
     x, y : float array, shape (p,)
-        Positions of points along the trail, pixels.
+        Positions of the star, or of points along its trail, in pixels of the stamp.
     inner : float
-        Half side of the square outside which the plane has faded, pixels.
+        Half side of the square outside which the PSF image of the star is 0, pixels.
     level : float
-        Rings of each point, electrons.
+        Light of the diffraction rings of each point, extrapolated to a distance of one pixel, electrons.
     bar_directions : float array, shape (b, 2)
-        Directions of the bars.
+        Unit vectors (column, row) along the bars in the telescope's pupil; their spikes are perpendicular to them.
     lines : float array, shape (b, i, j)
-        Spikes of each point, electrons.
+        Light of each bar's diffraction spike for each point, electrons: element [b, i, j] at i * 8 pixels from the
+        point along the spike and j * 0.25 pixels from its axis.
     period : float
-        Period of the plane's transform, pixels.
+        Period of the discrete transform with which the PSF image was computed, pixels.
     """
     for r in range(stamp.shape[0]):
         for c in range(stamp.shape[1]):
@@ -187,14 +211,22 @@ def remove_aliased_compiled(
 
 @jit
 def fading_compiled(distance: float, inner: float) -> Any:
-    """Smooth step by which the plane fades, at a distance from its middle along one axis, pixels."""
+    """Return the factor from 0 to 1 by which a star's PSF image is multiplied near its border, for one axis.
+
+    `distance` is the distance from the middle along this axis, and `inner` is the distance at which the factor becomes
+    0, both in pixels. The factor is a smooth step over 24 pixels.
+    """
     z = min(max((inner - distance) / _FADING, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
 
 @jit
 def _light(dx: float, dy: float, level: float, halo: float, core: float, bar_directions: Any, lines: Any) -> Any:
-    """Light of a star in a pixel at an offset (dx, dy)."""
+    """Return the light of a star in a pixel at (dx, dy) pixels from it: rings, aureole and all diffraction spikes.
+
+    At r pixels, the rings have level / r^3 and the aureole halo / (r^2 + core). `lines` are tables of the spikes of the
+    bars in the telescope's pupil, whose directions are `bar_directions` [b, 2]. All have the unit of the result.
+    """
     light = _ring_and_aureole_light(dx * dx + dy * dy, level, halo, core)
     for b in range(len(bar_directions)):
         light += _spike_light(bar_directions, lines, b, dx, dy)
@@ -203,13 +235,19 @@ def _light(dx: float, dy: float, level: float, halo: float, core: float, bar_dir
 
 @jit
 def _folded_light(dx: float, dy: float, level: float, bar_directions: Any, lines: Any, period: float) -> Any:
-    """Light that is aliased from positions one period away, weakened by sinc^2 because the edges are softened."""
+    """Return the aliased light of a star in a pixel at (dx, dy) pixels from it.
+
+    It comes from positions one `period` (pixels) away along columns, rows or both, because the PSF image is a periodic
+    discrete transform. Relative to direct light, it is weakened by a ratio of sinc^2 functions, because the edges of
+    the sampled pupil are softened. The light at r pixels from a star is `level` / r^3 from diffraction rings, plus the
+    spikes of the pupil's bars (directions `bar_directions`, tables `lines`).
+    """
     total = 0.0
     for up in range(-1, 2):
         for right in range(-1, 2):
             ax, ay = dx + right * period, dy + up * period
             square = ax * ax + ay * ay
-            # Light from beyond one period is negligible.
+            # Light from positions more than one period away from the star is negligible.
             if (up != 0 or right != 0) and square < period * period:
                 softening = _edge_softening(np.sqrt(square) / period)
                 total += _light(ax, ay, level, 0.0, 1.0, bar_directions, lines) * softening

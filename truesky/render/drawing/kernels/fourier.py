@@ -1,6 +1,7 @@
-"""Compiled inner loops of drawing in Fourier space: transforms of sources on the grids of their stamps.
+"""Compiled inner loops of drawing in Fourier space: transforms of sources at the frequencies of their stamps.
 
-The planes determine the precision: single, or double for sources that are bright enough to show rounding errors.
+A stamp is a square image around one source. The data type of the PSF's transform (planes) determines the precision:
+single, or double for sources that are bright enough to show rounding errors.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ _FIRST = int(FIRST_BITS)
 
 
 def units_of(electrons: Float) -> float:
-    """Units per electron in a frame: FIXED_POINT, or a smaller power of two if the sum of `electrons` [n] requires it.
+    """Return the factor from electrons to the integers in which the light of all sources is summed.
+
+    It is FIXED_POINT (2^20), or a smaller power of two if the sum of `electrons` [n] would be too large for int64.
 
     Notes
     -----
-    With 5e13 electrons (the brightest star of the sky in 560 s) the frame is exact to 1e-5 electrons; with 1e17
+    With 5e13 electrons (the brightest star of the sky in 560 s) the sum is exact to 1e-5 electrons; with 1e17
     electrons, to 0.06.
     """
     _, octave = math.frexp(math.fsum(electrons.tolist()))
@@ -37,42 +40,46 @@ def nyquist_zones(
     weights: Array, x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
     fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, trail: Float,
 ) -> None:  # fmt: skip
-    """Fill the half planes that irfft2 transforms to the stamps of m sources.
+    """Fill the Fourier half planes that irfft2 transforms to the stamps of m sources.
 
     Parameters
     ----------
     zones : complex array, shape (m, N, N / 2 + 1)
-        Result: profile x PSF x pixel x phase, aliased to the Nyquist zone of the pixels.
+        Result: transforms of the sources, convolved with PSF and pixel and shifted to their positions. Frequencies
+        above the Nyquist frequency of the pixels are aliased.
     planes : float array, shape (b, 2, s)
-        Planes of `transfer.Transfer`.
+        Real and imaginary parts of the PSF's transforms, from `transfer.Transfer`.
     kx, ky : float32 array, shape (s,)
         Frequencies of `transfer.Grid`, radian / pixel.
     runs, pieces, inner : array
-        Runs and pieces of `transfer.Grid`.
+        Attributes of `transfer.Grid`: order of the frequencies, their division into groups of similar |k| (pieces), and
+        the lower limit of |k| in each piece, radian / pixel.
     weights : array, shape (m, b)
-        Weights of the planes for each source.
+        Weights with which the b transforms in `planes` are summed to the transform of each source's PSF.
     x, y : float array, shape (m,)
         Positions in the stamp, pixels; 0 is the centre of the first pixel.
     electrons : float array, shape (m,)
         Expected electrons.
     cut : float array, shape (m,)
-        |k| from which pieces are omitted, radian / pixel.
-    sersic : float32 array
-        Table of `sersic.table`.
+        Pieces with |k| of at least this value are omitted for a source, radian / pixel.
+    sersic : float32 array, shape (indices, nodes)
+        Transforms of Sersic profiles, from `sersic.table`.
     body : bool array, shape (m,)
         False for point sources.
     fraction : float array, shape (m,)
         Fraction of the light in the bulge.
     bulge, disk : float array, shape (m, 2, 2)
-        Matrices of `galaxy_shapes.Forms`.
+        Matrices of `galaxy_shapes.Forms`, whose columns are the vectors of the major and minor axis of bulge or disc,
+        pixels. The profile is round in k @ matrix, for a frequency k in radian / pixel.
     thick : float array, shape (m, 2)
-        Vectors of `galaxy_shapes.Forms`.
+        Vectors of `galaxy_shapes.Forms` that describe the thickness of inclined discs, pixels: with q = k @ thick, the
+        transform of the disc is multiplied by q / sinh q.
     row : int array, shape (m,)
-        First row of the table for the source's Sersic index.
+        First of the four rows of `sersic` from which the transform for the source's Sersic index is interpolated.
     row_weights : float array, shape (m, 4)
-        Interpolation weights of four rows of the table.
+        Interpolation weights of these four rows.
     trail : float array, shape (m, 2)
-        Displacement along columns and rows during the exposure, centred on the position, pixels.
+        Displacement along columns and rows during the exposure, centred on the position, pixels; 0 for sources at rest.
     """
     m, n, columns = zones.shape
     longest_piece, low, high, max_iy = 0, 0, 0, 0
@@ -81,7 +88,8 @@ def nyquist_zones(
     for j in range(len(runs) - 1):
         low, high = min(low, runs[j, 1]), max(high, runs[j, 1] + runs[j + 1, 0] - runs[j, 0])
         max_iy = max(max_iy, abs(runs[j, 2]))
-    # Phase factors by column and by row; the row factors include the electrons.
+    # Cosine and minus sine of the phase shift to the source's position, separately for kx (`of_column`) and for ky
+    # (`of_row`). The factors for ky are multiplied by the electrons of the source.
     of_column, of_row = np.empty((m, 2, high - low), planes.dtype), np.empty((m, 2, 2 * max_iy + 1), planes.dtype)
     tables = np.empty((m, sersic.shape[1]), np.float32)
     sums = np.zeros((m, 2, n, columns), planes.dtype)
@@ -93,7 +101,8 @@ def nyquist_zones(
             of_row[i, 0, r + max_iy] = electrons[i] * np.cos(step * r * y[i])
             of_row[i, 1, r + max_iy] = -electrons[i] * np.sin(step * r * y[i])
         if body[i] and fraction[i] > 0.0:
-            # Pieces are used as a whole, so the outer limit is the inner edge of the first unused piece.
+            # A piece (group of frequencies with similar |k|) is used as a whole or not at all. The largest |k| that is
+            # used is therefore the lower limit of the first unused piece.
             outer = step * np.hypot(max_iy, max(-low, high))
             for p in range(len(inner) - 1, -1, -1):
                 outer = inner[p] if inner[p] >= cut[i] else outer
@@ -106,7 +115,8 @@ def nyquist_zones(
     bits = square.view(np.int32)
     for p in range(len(inner)):
         first, last = runs[pieces[p], 0], runs[pieces[p + 1], 0]
-        # The compiler vectorises the loops only if they start at 0 on a slice.
+        # The slices contain only the samples of this piece (group of frequencies), so loops over them start at 0. The
+        # compiler does not vectorise loops that start elsewhere.
         piece_re, piece_im, piece_profile = re[: last - first], im[: last - first], profile[: last - first]
         for i in range(m):
             if inner[p] >= cut[i]:
@@ -142,7 +152,11 @@ def nyquist_zones(
 
 @jit
 def _collapse(planes: Any, weights: Any, first: int, last: int, re: Any, im: Any) -> None:
-    """Fill `re` and `im` with the weighted sum of the samples first to last of the planes [b, 2, s]."""
+    """Fill `re` and `im` with a weighted sum of Fourier transforms, for the samples `first` to `last` - 1.
+
+    `planes` [b, 2, s] contain real and imaginary parts of b transforms (of the PSF's basis images) at s samples.
+    `weights` [b] are their weights.
+    """
     for part, out in ((0, re), (1, im)):
         triples = len(weights) // 3 * 3
         for c in range(len(out)):
@@ -173,24 +187,26 @@ def profile_at(
     fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, kx: Float32, ky: Float32,
     square: Float32, bits: Any, out: Float32,
 ) -> None:  # fmt: skip
-    """Fill `out` with the transform of a galaxy's profile at the frequencies (kx, ky).
+    """Fill `out` with the Fourier transform of a galaxy of flux 1, bulge plus disc, at the frequencies (kx, ky).
 
     Parameters
     ----------
     fraction : float
-        Fraction of the light in the bulge.
+        Fraction of the light in the bulge, 0 to 1.
     bulge, disk : float array, shape (2, 2)
-        Matrices of `galaxy_shapes.Forms`.
+        Matrices of `galaxy_shapes.Forms`, whose columns are the vectors of the major and minor axis of bulge or disc,
+        pixels. The profile is round in k @ matrix, for a frequency k = (kx, ky).
     thick : float array, shape (2,)
-        Vector of `galaxy_shapes.Forms`.
-    table : float32 array
-        Transform for the Sersic index, from `interpolate_sersic`.
+        Vector of `galaxy_shapes.Forms` that describes the thickness of the inclined disc, pixels: with q = k @ thick,
+        the transform of the disc is multiplied by q / sinh q.
+    table : float32 array, shape (nodes,)
+        Transform of the bulge for its Sersic index, from `interpolate_sersic`.
     kx, ky : float32 array, shape (s,)
         Frequencies, radian / pixel.
     square : float32 array
-        Scratch memory of at least s elements.
+        Scratch memory of at least s elements; its content is overwritten.
     bits : int32 array
-        View of the bits of `square`.
+        View of the memory of `square` as integers, by which `table` is indexed.
     out : float32 array, shape (s,)
         Result.
     """
@@ -223,7 +239,11 @@ def profile_at(
 
 @jit
 def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: Any) -> None:
-    """Multiply by the transform of a uniform straight line: sin(q) / q with q = k . line / 2."""
+    """Multiply `re` and `im` in place by the transform of a straight trail, to draw a source that moves uniformly.
+
+    The transform is sin(q) / q with q = (kx across + ky along) / 2, at the frequencies (kx, ky) in radian / pixel.
+    `across` and `along` are the displacements in column and row during the exposure, pixels.
+    """
     for c in range(len(re)):
         q = 0.5 * (across * kx[c] + along * ky[c])
         smeared = np.sin(q) / q if abs(q) > 1e-4 else 1.0
@@ -233,8 +253,12 @@ def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: A
 
 @jit
 def _sinh_over(square: Any) -> Any:
-    """Compute sinh q / q from q^2 by its Taylor series, exact to 1e-7 for q < 4; precision is irrelevant above."""
-    # The series is written out because a loop over a tuple of coefficients would divide each time.
+    """Return sinh q / q from q^2 (`square`) by the Taylor series, with a relative error of 1e-7 for q < 4.
+
+    It is used for the thickness of a galaxy's disc, whose transform is divided by the result. For q above 4 the result
+    is too small, but the transform of the disc is negligible there.
+    """
+    # The series is written out with constant factors. A loop over coefficients would make a division in each term.
     unit = np.float32(1.0)
     out = unit + square * np.float32(1.0 / 342.0)
     out = unit + square * np.float32(1.0 / 272.0) * out
@@ -252,23 +276,33 @@ def fourier_reach(
     max_transfer: Float, step: float, body: Bool, fraction: Float, bulge: Float, disk: Float, sersic: Float32, row: Int,
     floor: Float,
 ) -> Float:  # fmt: skip
-    """Largest |k| at which the product of profile and PSF exceeds a limit in any direction.
+    """Return the |k| beyond which the transform of each of m sources, convolved with the PSF, is negligible.
 
     Parameters
     ----------
     max_transfer : float array, shape (i,)
-        Largest transfer function of the PSF at |k| = i step.
+        Largest modulus of the PSF's transform in each ring of |k|, from `transfer.max_transfer`. Rings have equal
+        widths and begin at 0.
     step : float
-        Spacing of `max_transfer`, radian / pixel.
-    body, fraction, bulge, disk, sersic, row : array
-        Profiles of m sources, see `nyquist_zones`.
+        Width of the rings, radian / pixel.
+    body : bool array, shape (m,)
+        False for point sources.
+    fraction : float array, shape (m,)
+        Fraction of the light in the bulge.
+    bulge, disk : float array, shape (m, 2, 2)
+        Matrices of `galaxy_shapes.Forms`: vectors of the major and minor axis of bulge or disc (columns), pixels.
+    sersic : float32 array, shape (indices, nodes)
+        Transforms of Sersic profiles, from `sersic.table`.
+    row : int array, shape (m,)
+        First of the four rows of `sersic` between which the transform of the bulge is interpolated.
     floor : float array, shape (m,)
-        Limit, as a fraction of the flux.
+        Fraction of the flux below which the transform of the source is negligible.
 
     Returns
     -------
     float array, shape (m,)
-        |k|, radian / pixel.
+        Outer edge of the last ring that is not negligible in some direction, radian / pixel; at least one ring is
+        always included.
     """
     out = np.full(len(body), step * len(max_transfer))
     square = np.empty(1, np.float32)
@@ -294,20 +328,21 @@ def fourier_reach(
 def interpolate_sersic(
     sersic: Float32, row: int, row_weights: Float, min_square: float, max_square: float, table: Float32
 ) -> None:
-    """Interpolate the transform for one Sersic index, in the range that the source needs.
+    """Interpolate the Fourier transform of a Sersic profile between tabulated indices.
 
     Parameters
     ----------
-    sersic : float32 array
-        Transforms for all tabulated indices.
+    sersic : float32 array, shape (indices, nodes)
+        Transforms for all tabulated Sersic indices, from `sersic.table`. The nodes are values of (k r)^2, with the
+        half-light radius r.
     row : int
-        First of the four neighbouring rows.
+        First of the four rows from which the transform is interpolated.
     row_weights : float array, shape (4,)
         Weights of these rows.
     min_square, max_square : float
-        Range of the squared frequency times the squared radius.
-    table : float32 array
-        Result, filled within this range.
+        Range of (k r)^2 in which the result is needed.
+    table : float32 array, shape (nodes,)
+        Result. Nodes outside the range are not changed, except for the first two, which are set to 1.
     """
     ends = np.array([min_square, max_square], np.float32)
     bits = ends.view(np.int32)
@@ -318,23 +353,24 @@ def interpolate_sersic(
     w2, w3 = np.float32(row_weights[2]), np.float32(row_weights[3])
     for i in range(low, high + 1):
         table[i] = w0 * sersic[row, i] + w1 * sersic[row + 1, i] + w2 * sersic[row + 2, i] + w3 * sersic[row + 3, i]
-    # At k = 0 the transform is 1.
+    # At k = 0 the transform of a Sersic profile is 1. The second node of the table is set to 1 too, if it was not
+    # computed above, because values at small k are interpolated between the first two nodes.
     table[0] = np.float32(1.0)
     table[1] = table[1] if low <= 1 else np.float32(1.0)
 
 
 @jit
 def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
-    """Fill `out` with the samples of a stamp's grid from a transform, multiplied by that of the pixel.
+    """Fill `out` with the values of a Fourier transform at the frequencies of a stamp, times that of the pixel.
 
     Parameters
     ----------
-    spectrum : complex array
-        Transform [iy, ix] of a real image, for ix >= 0.
+    spectrum : complex array, shape (rows, columns)
+        Transform [iy, ix] of a real image for ix >= 0, and for all iy in the order of the FFT.
     runs : int array, shape (r + 1, 3)
-        Runs of `transfer.Grid`.
-    pixel : float array
-        Transform [|iy|, |ix|] of the pixel.
+        Sequences of frequencies of `transfer.Grid`: index of the first sample, and ix and iy of this sample.
+    pixel : float array, shape (rows, columns)
+        Fourier transform [|iy|, |ix|] of the response of a detector pixel, which is real.
     out : float array, shape (2, s)
         Result: real and imaginary parts.
     """
@@ -343,7 +379,7 @@ def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
         for c in range(runs[j + 1, 0] - start):
             ix = first_ix + c
             pixel_transfer = pixel[abs(iy), abs(ix)]
-            # For kx < 0, the sample is the conjugate of the opposite one.
+            # `spectrum` has no values for ix < 0. The transform of a real image at -k is the conjugate of that at k.
             sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
             out[0, start + c] = pixel_transfer * sample.real
             out[1, start + c] = pixel_transfer * (sample.imag if ix >= 0 else -sample.imag)
@@ -351,7 +387,9 @@ def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
 
 @jit
 def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
-    """Find the runs of samples of a stamp's Fourier grid, see `transfer.Grid`.
+    """Find the frequencies at which the transform of a stamp is computed, as runs (see `transfer.Grid`).
+
+    A run is a sequence of samples with one iy and consecutive ix, where (ix, iy) times 2 pi / size is the frequency.
 
     Parameters
     ----------
@@ -360,9 +398,11 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
     reach : float
         Largest |(ix, iy)|.
     shells : int
-        Number of rings of equal width. Runs are sorted by ring, then by iy.
+        Number of rings of equal width into which the disc of frequencies is divided. Runs are sorted by ring, then by
+        iy.
     out : int array, shape (r, 4)
-        Result: first sample, ix, iy and ring of each run, as far as there are rows.
+        Result: index of the first sample, ix and iy of this sample, and ring of each run. Runs that do not fit into
+        `out` are only counted, so a first call with r = 0 finds the necessary length.
 
     Returns
     -------
@@ -375,11 +415,13 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
         for iy in range(-int(reach), int(reach) + 1):
             last = _half_chord(outside, iy)
             gap = _half_chord(inside, iy) if shell > 0 else -1
-            # A row crosses two arcs to the left and right of the inner shells, or one arc above or below them.
+            # A row of frequencies crosses a ring twice, left and right of its inner circle. Above or below the inner
+            # circle it crosses the ring once.
             for arc in range(2 if gap >= 0 else 1):
                 low = gap + 1 if arc == 1 else -last
                 high = last if arc == 1 or gap < 0 else -gap - 1
-                # Half of the plane is sufficient for a real image, with all aliases that fall on that half.
+                # The transform of a real image is determined by the half plane with ix modulo size from 0 to size / 2.
+                # Only frequencies that lie in this half plane, or are aliased to it, are used.
                 for alias in range(low // size, high // size + 1):
                     start, end = max(low, alias * size), min(high, alias * size + size // 2)
                     if start <= end:
@@ -392,25 +434,25 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
 
 @jit
 def _half_chord(radius: float, y: int) -> int:
-    """Largest integer x >= 0 with (x, y) inside a circle, or -1."""
+    """Return the largest integer x with (x, y) in a circle of radius `radius` about (0, 0), or -1 if |y| > radius."""
     square = radius * radius - y * y
     return int(np.sqrt(square)) if square >= 0.0 else -1
 
 
 @jit
 def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> None:
-    """Add the weighted sum of planes to the part of an image inside a margin.
+    """Add the weighted sum of planes (images of equal size) to the middle part of a larger or equal image.
 
     Parameters
     ----------
-    image : float32 array
+    image : float32 array, shape (s + 2 margin, s + 2 margin)
         Image, changed in place.
     planes : float32 array, shape (b, s, s)
-        The planes.
+        The planes; with b = 0 the image is not changed.
     weights : float array, shape (b,)
         Weights of the planes.
     margin : int
-        Pixels of the image before the first pixel of the planes.
+        Number of columns and rows of the image before the first pixel of the planes. Must not be negative.
     """
     for r in range(planes.shape[1]):
         out = image[margin + r, margin : margin + planes.shape[2]]
@@ -422,18 +464,18 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 @jit
 def interpolate_spectrum(spectrum: Array, across: Float, up: Float, width: int, slope: float, out: Array) -> None:
-    """Fill `out` with a periodic spectrum, interpolated by a window at given frequencies.
+    """Fill `out` with values of a periodic spectrum at any frequencies, interpolated between its samples by a window.
 
     Parameters
     ----------
     spectrum : complex array, shape (ny, nx)
-        The periodic spectrum.
+        Spectrum in the order of the FFT, which continues periodically.
     across, up : float array, shape (s,)
         Frequencies along columns and rows, radian / pixel.
     width : int
-        Samples of the window per direction.
+        Number of samples of the spectrum that are used per direction.
     slope : float
-        Slope of the window exp(slope (sqrt(1 - z^2) - 1)), with z from -1 to 1 over `width` samples.
+        Parameter of the window exp(slope (sqrt(1 - z^2) - 1)), with z from -1 to 1 over `width` samples.
     out : complex array, shape (s,)
         Result.
     """
