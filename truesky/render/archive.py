@@ -4,8 +4,9 @@
                                   [--failures | --exposures]
     python -m truesky.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
-Products are listed with sha256, size, seconds and peak memory. The bytes of a product depend only on its inputs. Time
-and memory come from the logs of the runs.
+A product is an image file of a detector: science image or truth map. Products are listed with SHA-256, size, rendering
+time in seconds and peak memory. Their bytes depend only on their inputs, so that a product rendered again must be
+identical. Time and memory come from the log files of the runs.
 """
 
 from __future__ import annotations
@@ -30,8 +31,11 @@ from truesky.explore.process import Process
 from truesky.numerics import matrices
 from truesky.render.products import run_log
 
-# Memory (bytes) and time (s) that a query of the archive may use.
-_MEMORY, _TIMEOUT = 1e9, 60.0
+# Default limit of the memory of an SQL query of the list of images, bytes. A query that needs more raises BadInput.
+_MEMORY = 1e9
+# Default time limit of an SQL query of the list of images, s. A query that takes longer raises BadInput.
+_TIMEOUT = 60.0
+# Columns of the list of detectors that could not be rendered.
 _FAILURES = pa.schema(
     [
         pa.field("part", pa.string()),
@@ -45,9 +49,10 @@ _FAILURES = pa.schema(
 
 
 def products(root: Path, request: str | None = None) -> pa.Table:
-    """Return the rows of `products` with sha256, bytes, seconds, and peak_gb (GB). Values without a log entry are null.
+    """Return the table `products` (one row per image file) with additional columns sha256, bytes, seconds and peak_gb.
 
-    `request` selects the products if the lake has several requests.
+    `seconds` is the rendering time and `peak_gb` the peak memory in GB of the detector; both are null without a log
+    entry. `request` is the name of the request, None if the lake has only one.
     """
     version = read.version(root, "products", request=request)
     files = {entry["path"]: entry for entry in version.manifest["files"]}
@@ -63,9 +68,10 @@ def products(root: Path, request: str | None = None) -> pa.Table:
 
 
 def exposures(root: Path, request: str | None = None) -> pa.Table:
-    """Return the rows of `exposure_files` with sha256 and bytes; `request` selects them if the lake has several.
+    """Return the table `exposure_files` (files with all detectors of an exposure) with columns sha256 and bytes.
 
-    Raises BadInput if the table does not exist or was made from an older version of `products`.
+    `request` is the name of the request, None if the lake has only one. Raises BadInput if the table does not exist, or
+    was made from an older version of the table `products`.
     """
     version, images = (read.version(root, name, request=request) for name in ("exposure_files", "products"))
     if version.manifest["facts"]["products"] != images.key:
@@ -78,9 +84,11 @@ def exposures(root: Path, request: str | None = None) -> pa.Table:
 
 
 def failures(root: Folder, request: str | None = None) -> pa.Table:
-    """Return the detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and name of the run.
+    """Return one row for each detector whose last attempt to render it failed.
 
-    `request` None means the detectors of all requests.
+    The columns are the partition (exposure number and detector), the error message, the number of the attempt, the
+    elapsed time of the attempt in seconds, its peak memory `peak_gb` in GB, and the name of the job run. `request` is
+    the name of a request; None means all requests of the lake.
     """
     last = {(line["request"], line["part"]): line for line in _log_entries(root, request)}
     failed = [last[key] for key in sorted(last) if "error" in last[key]]
@@ -88,33 +96,39 @@ def failures(root: Folder, request: str | None = None) -> pa.Table:
 
 
 def rows_at_place(rows: pa.Table, ra: float, dec: float) -> pa.Table:
-    """Return the rows whose footprint contains a position (deg), including its edge.
+    """Return the rows of images whose footprint on the sky contains a position, its edge included.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Products; `s_region` is an STC-S polygon with four corners.
+        Rows of the table `products`; column `s_region` has the footprint as an STC-S polygon with four corners.
     ra, dec : float
         ICRS position in degrees.
 
     Returns
     -------
     pyarrow.Table
-        The selected rows.
+        The selected rows in the same order; there may be none.
     """
     if not rows.num_rows:
         return rows
     corners = np.array([region.split()[2:] for region in rows["s_region"].to_pylist()], float).reshape(-1, 4, 2)
     edges = sky.unit_vectors(corners[..., 0], corners[..., 1])
     place = sky.unit_vectors(ra, dec)
-    # A position is inside if it lies on the same side of the great circles through all edges, and not at the antipode.
+    # A position is inside a footprint if it lies on the same side of the great circles through all edges of the
+    # footprint. Its antipode passes this test as well; the second condition excludes footprints on the opposite side of
+    # the sky.
     side = matrices.matmul(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return rows.filter(pa.array(inside & (matrices.matmul(edges.sum(axis=1), place) > 0)))
 
 
 def _log_entries(root: Folder, request: str | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the log lines of tasks of `products`, oldest first, with run and request; None means all requests."""
+    """Yield the log lines, one per attempt to render a detector, oldest run first.
+
+    Each line is the dict of the JSON object in the log, with the names of the job run and of the request added.
+    `request` None means all requests of the lake.
+    """
     for path in run_log.logs_of_products(root):
         lines = run_log.lines(path)
         request_name = next((str(line["request"]) for line in lines if "request" in line), "")
@@ -123,14 +137,14 @@ def _log_entries(root: Folder, request: str | None = None) -> Iterator[dict[str,
 
 
 def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
-    """Query the rows as the table `products`. The query cannot access files.
+    """Run an SQL query over rows, which it sees as a table named `products`.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Rows of the table `products`.
+        Any rows, such as the result of `products` or of `failures`.
     sql : str
-        A SELECT statement.
+        A SELECT statement. It runs in a separate process and cannot access files.
     memory : float
         Memory in bytes that the query may use.
     timeout : float
@@ -139,7 +153,7 @@ def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _
     Returns
     -------
     pyarrow.Table
-        The result.
+        The result of the query.
 
     Raises
     ------
@@ -159,7 +173,10 @@ def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _
 
 
 def _objects(rows: pa.Table) -> list[str]:
-    """Return the rows as JSON. Values without a JSON form, such as dates and decimals, become strings."""
+    """Return each row as the text of a JSON object. Values that JSON lacks, such as dates and decimals, become strings.
+
+    Raises BadInput if two columns have the same name, or a number is NaN or infinite.
+    """
     if len(set(rows.column_names)) != rows.num_columns:
         raise BadInput("--sql: two columns of the result have the same name: rename one with AS")
     try:
@@ -169,30 +186,35 @@ def _objects(rows: pa.Table) -> list[str]:
 
 
 def render_again(root: Path, product: str, out: Path, key: str | None = None, request: str | None = None) -> str:
-    """Render a published product again into a new file.
+    """Render a stored image file again from its recorded inputs into a new file, and compare the two.
 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Lake (folder of stored tables and images).
     product : str
-        Path of the product in the table.
+        Path of the image file, as in column `path` of the table `products`.
     out : Path
         File to write.
     key : str, optional
-        Key of the version of `products` that contains it; None means the current version.
+        Key (hash) of the version of the table `products` that has the image; None means the current version.
     request : str, optional
         Name of the request; required if the lake has several.
 
     Returns
     -------
     str
-        A message that describes the difference, or "" if the bytes are identical.
+        "" if the bytes are identical, otherwise a message that names the two files and tells whether the code has
+        changed.
 
     Raises
     ------
     BadInput
-        If there is no such product, or a table that it was made from has been removed.
+        If the table has no such path, or if a table from which the image was made has been removed.
+
+    Notes
+    -----
+    An error is also raised if the stored file has changed on disc.
     """
     from truesky.render import render_exposures
 
@@ -204,7 +226,7 @@ def render_again(root: Path, product: str, out: Path, key: str | None = None, re
     (part,) = (part for part in version.manifest["parts"] if detector_facts.items() <= part["facts"].items())
     facts = version.manifest["facts"]
     render_exposures.render_task(root, {**facts, **part["facts"]}).files[product](out)
-    # Raises an error if the published file has changed.
+    # Raise an error if the stored file has changed on disc: its recorded checksum, used below, would be wrong.
     version.sidecar_path(product)
     if file_sha256(out) == version.file_sha256(product):
         return ""
@@ -213,10 +235,10 @@ def render_again(root: Path, product: str, out: Path, key: str | None = None, re
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the products, one JSON object per line, optionally limited to a position or a query.
+    """Run the command: print image files as one JSON object per line, or render one of them again.
 
-    The exit status is 0, 1 if a product rendered again differs or the lake is damaged, or 2 if the arguments are
-    invalid.
+    The list may be limited to a position or an SQL query. The exit status is 0; it is 1 if an image rendered again
+    differs or the lake is damaged, or 2 if the arguments are invalid.
     """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.archive", description=(__doc__ or "").splitlines()[0]

@@ -2,7 +2,7 @@
 
     python -m truesky.render.coverage --lake LAKE [--name REQUEST] --out coverage.png
 
-The plan of a request is sufficient; no images are needed.
+The stored plan of a request (its tables `exposures` and `tasks`) is sufficient; no images are needed.
 """
 
 from __future__ import annotations
@@ -26,29 +26,43 @@ from truesky.render.channels.image_types import SKY_TYPES
 from truesky.render.planning import exposure_chunks
 from truesky.request.area import Area
 
+# Columns of the table `exposures` (one row per planned exposure) that are read to make maps of the number of exposures.
 _EXPOSURE_COLUMNS = ("exposure_id", "channel", "band", "image_type", "exposure_time_s", "ra", "dec")
+# Columns of the table `tasks` (one row per detector of an exposure) that are read to make maps of the number of
+# exposures.
 _TASK_COLUMNS = ("exposure_id", "ra", "dec", "radius", "s_region")
-# Pixels along a side of a map; largest width of a map, deg; distance from the edge of the area to its interior, deg.
-_SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
-# Number of colours in a map, fraction of positions with the highest counts that share the last colour, and the colour
-# of positions that are not observed.
-_COLOURS, _TAIL_FRACTION, _UNSEEN_COLOUR = 8, 0.01, "#efece6"
+# Pixels along each side of a map of the number of exposures.
+_SIDE = 500
+# Largest width of a map of the sky, deg; exposures that extend farther raise an error.
+_WIDEST = 60.0
+# A position counts as interior if it is inside the request's area (the sky to be observed) and at least this far from
+# its edge, deg. In a small area, half of the largest distance from the edge is used instead.
+_INSIDE = 0.5
+# Largest number of colours in a map of the number of exposures. With more different numbers, each colour stands for a
+# range of them.
+_COLOURS = 8
+# Positions with the most exposures share the last colour of a map; they are at least this fraction of all observed
+# positions.
+_TAIL_FRACTION = 0.01
+# Colour of positions that no exposure observes.
+_UNSEEN_COLOUR = "#efece6"
 
 
 @dataclass(frozen=True, slots=True)
 class Depth:
-    """Number of exposures of a band at the positions of a map.
+    """Map of the number of exposures in a band at each position on the sky.
 
     Attributes
     ----------
     channel, band : str
         Names of the channel and of the band.
     exposures : int
-        Number of exposures of the band.
+        Number of exposures that are counted.
     counts : int array, shape (side, side)
-        Number of exposures at each position; x points west, y north.
+        Number of exposures at each position; columns run to the west, rows to the north.
     interior : bool array, shape (side, side)
-        Positions more than 0.5 deg inside the area of the request, or half of the largest depth if the area is small.
+        True for positions well inside the area of the request: more than 0.5 deg from its edge. If the area is small,
+        more than half of the largest distance from the edge.
     extent : float
         Half the width of the map in degrees.
     """
@@ -61,37 +75,39 @@ class Depth:
     extent: float
 
     def share(self, min_exposures: int) -> float:
-        """Return the fraction of the interior that at least `min_exposures` exposures observe."""
+        """Return the fraction of the interior that at least `min_exposures` exposures observe; 0.0 without interior."""
         return float((self.counts[self.interior] >= min_exposures).mean()) if self.interior.any() else 0.0
 
 
 def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: Area, side: int = _SIDE) -> list[Depth]:
-    """Count the exposures at each position, for every channel and band that observes the sky.
+    """Count the exposures at each position on the sky, for every channel and band with science exposures.
 
     Parameters
     ----------
     exposures : pyarrow.Table
         Rows of the table `exposures`.
     tasks : callable
-        Returns the rows of the table `tasks`, one table per partition; called twice.
+        Function without arguments that returns the rows of the table `tasks` (one per detector of an exposure), as one
+        table per partition. It is called twice.
     area : Area
-        Area of the request, which defines the interior.
+        Area of the request. Pixels inside it, and not too close to its edge, are marked as interior.
     side : int
-        Pixels along each side of the map.
+        Pixels along each side of a map.
 
     Returns
     -------
     list of Depth
-        One map per channel and band.
+        One map per channel and band, sorted by their names.
 
     Raises
     ------
     BadInput
-        If there are no exposures of the sky, or they are too far apart for a map.
+        If there are no exposures of the sky, or they extend over more than 60 deg.
 
     Notes
     -----
-    Exposures up to half as long as the longest one of a band are not counted.
+    Only image types of the survey ("science", "deep", "self_calibration") are counted. Short exposures, up to half as
+    long as the longest one of their band, are not counted.
     """
     sky_exposures = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
     if not sky_exposures.num_rows:
@@ -103,7 +119,7 @@ def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: A
     _refuse_wide(max_distance)
     extent = max_distance + max(_reach(task_rows, sky_exposures) for task_rows in tasks())
     _refuse_wide(extent)
-    # The map is square on the tangent plane, with x to the west.
+    # Offsets of the map's pixels from its centre in arcsec on the tangent plane, along both x (west) and y (north).
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
     x, y = np.meshgrid(grid, grid)
     ra, dec = (a.ravel() for a in pointing.sky_of_plane(x, y, ra0, dec0, 0.0))
@@ -130,7 +146,7 @@ def _refuse_wide(extent: float) -> None:
 
 
 def _long_exposures(exposures: pa.Table, channel: str, band: str) -> pa.Array:
-    """Return the numbers of the long exposures of a band."""
+    """Return the numbers of the exposures of a channel and band that exceed half of the longest exposure time."""
     band_exposures = exposures.filter(
         pc.and_(pc.equal(exposures["channel"], channel), pc.equal(exposures["band"], band))
     )
@@ -144,7 +160,11 @@ def _centre(exposures: pa.Table) -> tuple[float, float]:
 
 
 def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
-    """Return the largest distance (deg) from the boresight that tasks of the exposures observe; 0 without tasks."""
+    """Return the largest distance from the boresight (deg) that circles around the detectors of `exposures` reach.
+
+    `tasks` has one row per detector of an exposure, with the circle (ra, dec, radius in deg) that contains it. Rows of
+    exposures that are not in `exposures` are ignored. The result is 0 if no row remains.
+    """
     indices = pc.index_in(tasks["exposure_id"], exposures["exposure_id"].combine_chunks()).combine_chunks()
     matched_tasks, indices = tasks.filter(pc.is_valid(indices)), indices.drop_null()
     ra, dec = (exposures[name].take(indices).to_numpy() for name in ("ra", "dec"))
@@ -156,13 +176,17 @@ def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
 
 
 def summary_line(depth: Depth) -> str:
-    """Return one line that summarises the depth of a band."""
+    """Return a line with the exposures of a band, and the fractions of the interior with at least 1 to 4 exposures."""
     shares = ", ".join(f">= {n}: {depth.share(n):.3f}" for n in range(1, 5))
     return f"{depth.channel:7} {depth.band:12} {depth.exposures:6,} exposures   fraction of the interior {shares}"
 
 
 def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
-    """Draw one map per band, north up and east to the left, with the interior outlined."""
+    """Draw the number of exposures as one map per channel and band into a PNG file `path`.
+
+    North is up and east to the left. A red line encloses the interior of the request's area, unless the interior is
+    empty or fills the map.
+    """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import BoundaryNorm
@@ -179,7 +203,7 @@ def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
         step = -(-max_count // _COLOURS)
         bounds = 0.5 + step * np.arange(-(-max_count // step) + 1)
         half = depth.extent
-        # The x axis of the map points west.
+        # Columns of the map run to the west, so that the axis of eastern offsets is reversed.
         map_image = axes.imshow(
             np.minimum(depth.counts, max_count), origin="lower", extent=(half, -half, -half, half), cmap=colours,
             interpolation="nearest", norm=BoundaryNorm(bounds, colours.N),
@@ -202,7 +226,7 @@ def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
 
 
 def area_of(version: read.Version) -> Area:
-    """Return the area of the request that a plan was made for."""
+    """Return the area of the request for which a table of the plan (`exposures` or `tasks`) was made."""
     facts = version.manifest["facts"]["request"]["area"]
     box = facts["box"]
     return Area(
@@ -216,7 +240,10 @@ def area_of(version: read.Version) -> Area:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print a line per band and draw the maps."""
+    """Run the command: print a line per channel and band of a plan, and draw the maps if `--out` is given.
+
+    Return the exit status.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.coverage", description=(__doc__ or "").splitlines()[0]
     )

@@ -1,4 +1,4 @@
-"""Read the rows of the lake that are needed to render a detector."""
+"""Read from the lake (folder of stored tables) everything that is needed to render one detector of an exposure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -32,9 +32,11 @@ from truesky.request.structure import Arms, Stamps
 
 
 def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
-    """Return a detector with its exposure, the variant of the exposure, and the mission of the request.
+    """Return a detector with its exposure, its settings, and the mission parameters of the request.
 
-    `load_inputs` describes `facts`.
+    `facts` are the recorded inputs of the image: the request, versions of the input tables, exposure number and name of
+    the detector. The second result is the variant: the parameters of telescope and camera, the accuracy, and the
+    effects that the user switches on or off, after the changes that belong to this exposure.
     """
     request = facts["request"]
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
@@ -53,28 +55,29 @@ def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfigurat
 
 
 def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
-    """Read the inputs of a detector.
+    """Read everything that is needed to render one detector of an exposure.
 
     Parameters
     ----------
     lake : Folder
-        The lake.
+        Lake (folder of stored tables).
     facts : dict
-        Facts of the plan and of its partition, such as exposure_id and detector.
+        Recorded inputs of the image: `request` (its settings), `inputs` (version of each input table), `exposure_id`,
+        `detector`, and checksums of user files.
 
     Returns
     -------
     aim : Aim
-        The detector with its exposure.
+        The detector with its exposure, world coordinate system, passband and effects.
     rows : Rows
-        Catalogue rows that may contribute light, and earlier exposures of the detector.
+        Catalogue rows that may contribute light, and earlier exposures that leave persistence in the detector.
     variant : Variant
-        Mission, accuracy and effects of the exposure.
+        Mission parameters, accuracy, and detector effects that are switched on or off, for this exposure.
 
     Raises
     ------
     BadInput
-        If a user file has changed since the plan was made.
+        If a file of the user (PSF, moving bodies, galaxy stamps) has changed since its checksum was recorded.
     """
     request, (aim, variant, mission) = facts["request"], load_aim(lake, facts)
     exposed, inputs = aim.exposure, {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
@@ -101,9 +104,9 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:
-    """Return the rows with the structure that galaxies have in addition to their profiles.
+    """Add the request's options for drawing galaxies (spiral arms, images instead of profiles) to catalogue rows.
 
-    `files` contains the sha256 of the library of galaxy images by path.
+    `files` has the SHA-256 of the user's library of galaxy images by path, or is empty.
     """
     structure, seed = request.get("structure", {}), request["seed"]
     if "arms" in structure:
@@ -123,7 +126,12 @@ def _read_rows(
     previous_exposures: tuple[PreviousExposure | PreviousSky, ...],
     seed: int,
 ) -> Rows:
-    """Read the sources of a detector, from its own cells and from neighbouring cells if their light reaches it."""
+    """Read the catalogue rows of all sources whose light may reach a detector.
+
+    The rows come from the HEALPix cells that overlap the detector, and from cells around these if the sources are
+    bright enough. `task` is the detector's row of the table `tasks`, with these cells. `bodies` computes the positions
+    of moving bodies, and `previous_exposures` leave persistence in the detector.
+    """
     exposed, detector, band = aim.exposure, aim.detector, aim.band
     margin = aim.channel.margin(detector.section, variant.mission)
     spread = visible_spectra.margin_arcsec(exposed, detector, variant.mission, band, seed)
@@ -167,27 +175,28 @@ def find_previous_exposures(
     mission: MissionConfiguration,
     seed: int,
 ) -> tuple[PreviousExposure | PreviousSky, ...]:
-    """Find earlier exposures of a detector that left charge in it.
+    """Find the earlier exposures that leave persistence in a detector.
 
     Parameters
     ----------
     lake : Folder
-        The lake.
+        Lake (folder of stored tables).
     inputs : mapping of str to Version
-        Versions of the tables that the images are made from.
+        Stored versions of the tables from which images are made, by table name.
     exposed : ExposureRow
-        Exposure of the detector.
+        Exposure to be rendered.
     task : dict
-        Row of the table `tasks`.
+        Row of the table `tasks` for the detector to be rendered.
     mission : MissionConfiguration
-        Mission configuration of the request.
+        Mission parameters of the request.
     seed : int
-        Seed of the request.
+        Seed of the request, used for random tilts of filters and grisms.
 
     Returns
     -------
     tuple of PreviousExposure or PreviousSky
-        The exposures with their bright sources, or only with their sky level if they have no simulator.
+        The exposures in order of time: with their bright sources, or only with their sky level if truesky cannot render
+        them. It is empty if the channel has no persistence.
     """
     if registry.CHANNELS[exposed.channel].persistence_effect is None:
         return ()
@@ -219,7 +228,12 @@ def _load_bright_sources(
     mission_of: Callable[[str | None], MissionConfiguration],
     seed: int,
 ) -> list[PreviousExposure]:
-    """Read the sources that leave persistence; `pairs` are earlier exposures with their tasks of the same detector."""
+    """Read the sources of earlier exposures that are bright enough to leave persistence in exposure `exposed`.
+
+    `pairs` has each earlier exposure, and its row of the table `tasks` for the same detector. The result has one item
+    per pair, in the same order. `mission_of` returns the mission parameters of an exposure, given its column `settings`
+    (JSON of changed parameters, or None).
+    """
     if not pairs:
         return []
     fluxes = inputs["galaxy_fluxes"].manifest["facts"]
@@ -231,7 +245,8 @@ def _load_bright_sources(
         min_flux = persistence.min_flux(exposed, previous, persistence.brightest_column_fraction(aim, mission))
         spectral_reach = visible_spectra.margin_arcsec(previous, detector, mission, aim.band, seed)
         extra_reach = max(spectral_reach - aim.channel.margin(detector.section, mission), 0.0)
-        # In images, the spectra of these sources are assumed to be flat.
+        # Read the columns of spectra for exposures through a grism only. In other images, sources with persistence are
+        # assumed to have flat f_nu.
         is_dispersed = aim.channel.dispersion is not None
         shapes = visible_sources.GALAXY_COLUMNS if is_dispersed else visible_sources.SHAPE_COLUMNS
         galaxies.append(catalogue_rows.BrightQuery(task, shapes, previous.band, min_flux, extra_reach))

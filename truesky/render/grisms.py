@@ -2,9 +2,10 @@
 
     python -m truesky.render.grisms --out FOLDER [--lake LAKE --exposure N [--name REQUEST]] [--detectors DET11 ..]
 
-The command writes FOLDER/RGS000_DET11.conf for every grism and detector, and next to it a table with the sensitivity of
-each order. The values come from the mission database, without an error of the grism wheel. For an exposure of a lake
-(FOLDER/RGS000_000012_DET11.conf), they are the values with which its spectra were drawn.
+The command writes a file such as FOLDER/RGS000_DET11.conf for every grism and detector, and next to it a table with the
+sensitivity of each spectral order. By default the values come from the mission database, and the grism wheel has no
+error. With --lake and --exposure, the values are the ones with which the spectra of this exposure were drawn, and names
+are such as FOLDER/RGS000_000012_DET11.conf.
 """
 
 from __future__ import annotations
@@ -30,44 +31,47 @@ from truesky.render.planning import planned_exposures
 
 
 def nominal_aim(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
-    """Return a detector that observes through an untilted grism.
+    """Return a NISP detector in a made-up exposure of one second through an untilted grism.
 
     Parameters
     ----------
     grism, detector : str
-        Names.
+        Names of the grism, such as "RGS000", and of the detector, such as "DET11". An unknown grism raises
+        StopIteration, an unknown detector BadInput.
     mission : MissionConfiguration
-        The mission database. Its error of the grism wheel applies to the orders unless it is 0.
+        Mission database. It contains the error of the angle to which the grism wheel turns. Unless this error is 0,
+        it will turn the traces that are computed for the exposure.
 
     Returns
     -------
     Aim
-        The detector with a nominal exposure. A detector that the camera does not have raises BadInput.
+        The detector with its exposure at ra = dec = 0.
     """
     row = planned_exposures.untilted_exposure(grism, mission)
     return Aim.from_exposure(row, detectors.detector(row.camera, detector, mission))
 
 
 def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
-    """Return the orders of a grism as its spectra are drawn.
+    """Return the spectral orders of a grism on a detector, with which the spectra of an exposure are drawn.
 
     Parameters
     ----------
     aim : Aim
-        Exposure and detector.
+        Detector of an exposure through a grism.
     mission : MissionConfiguration
-        Mission database of the exposure.
+        Mission parameters of the exposure.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the error of the angle of the grism wheel is drawn.
 
     Returns
     -------
     tuple of Order
-        Traces, and responses in electrons per second and A for a flux density of 1 erg s-1 cm-2 A-1 at the pupil.
+        Each order with its trace on the detector and its response: electrons per second and angstrom for a flux density
+        of 1 erg s-1 cm-2 A-1 at the pupil.
 
     Notes
     -----
-    The light that a tilted grism vignettes at the edge of the field is not included.
+    The loss of light by vignetting, which a tilted grism causes at the edge of the field, is not included.
     """
     rate_per_flux = electron_rate(aim.exposure) / (UJY_CGS * LIGHT_ANGSTROM_S * passbands.log_width(aim.band))
     trace_orders = visible_spectra.make_orders(aim, mission, seed)
@@ -77,12 +81,12 @@ def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, .
 def aims_of_exposure(
     root: Path, exposure: int, request: str | None = None
 ) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """Yield every rendered detector of an exposure.
+    """Yield every detector of an exposure through a grism that has been rendered.
 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Lake (folder of stored tables and images).
     exposure : int
         Number of the exposure.
     request : str, optional
@@ -95,14 +99,14 @@ def aims_of_exposure(
     aim : Aim
         The detector with its exposure.
     mission : MissionConfiguration
-        Mission database of the exposure.
+        Mission parameters of the exposure.
     seed : int
-        Seed of the request.
+        Seed of the request, from which random errors such as the angle of the grism wheel are drawn.
 
     Raises
     ------
     BadInput
-        If there is no such exposure, or it has no spectra.
+        If the lake has no images of the exposure, or if it is not an exposure of the sky through a grism.
     """
     version = read.version(root, "products", request=request)
     parts = [part["facts"] for part in version.manifest["parts"] if part["facts"]["exposure_id"] == exposure]
@@ -118,7 +122,10 @@ def aims_of_exposure(
 
 
 def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """Yield name, aim, mission and seed of each configuration."""
+    """Yield for each configuration file: name without ending, detector with exposure, mission parameters, and seed.
+
+    `options` are the arguments of the command. They select the detectors of a rendered exposure, or all grisms.
+    """
     if options.lake:
         for name, aim, mission, seed in aims_of_exposure(
             layout.resolve_lake(options.lake), options.exposure, options.name
@@ -134,7 +141,7 @@ def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, Mis
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the configurations and print their number."""
+    """Run the command: write the configuration files and print their number. Return the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.grisms", description=(__doc__ or "").splitlines()[0]
     )
@@ -153,7 +160,7 @@ def _write_configurations(options: argparse.Namespace) -> int:
     if options.name and not options.lake:
         raise BadInput("--name requires --lake")
     folder = user_files.check_folder(options.out)
-    # All configurations are checked before the first file is written.
+    # Make the whole list first, so that nothing is written if one configuration is invalid.
     configurations = list(_configurations(options))
     missing = set(options.detectors or ()) - {aim.detector.name for _, aim, _, _ in configurations}
     if missing:

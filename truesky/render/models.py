@@ -3,10 +3,12 @@
     python -m truesky.render.models --lake LAKE [--name REQUEST] --exposure N --detector NAME --sources ID ..
                                  [--orders] --out FILE.fits
 
-Each source is drawn separately and exactly as in the image, without noise. The file has one extension per source,
-SRC_ID, or one per order with --orders. Extensions are cut to the pixels with light; the first pixel has the 0-based
-coordinates (X0, Y0) on the detector. The sum of all sources equals the truth map `noise_free` to the rounding of
-float32, 1e-7. The float64 frames of `models` add up exactly to the float64 noise-free frame.
+Each source is drawn separately and exactly as in the image, without noise. The FITS file has one extension per source,
+or one per spectral order of each source with --orders; card SRC_ID is the identifier of the source. Extensions are cut
+to the pixels with light; cards X0 and Y0 are the column and row of the first pixel on the detector, counted from 0.
+
+The sum of all sources equals the truth map `noise_free` (expected signal of all sources) to the rounding of float32,
+1e-7. The float64 frames that the function `models` returns add up exactly to the float64 noise-free frame.
 """
 
 from __future__ import annotations
@@ -31,28 +33,31 @@ from truesky.render.exposure.single_source_spectra import SourceSpectrum
 def models(
     root: Folder, version: read.Version, exposure: int, detector: str, ids: Sequence[int] | None = None
 ) -> Iterator[SourceSpectrum]:
-    """Draw single sources of a published image.
+    """Draw the noise-free light of single sources in a stored image of spectra.
 
     Parameters
     ----------
     root : Folder
-        The lake.
+        Lake (folder of stored tables and images).
     version : Version
         Version of the table `products` that has the image.
-    exposure, detector : int, str
-        Exposure and detector of the image.
+    exposure : int
+        Number of the exposure.
+    detector : str
+        Name of the detector.
     ids : sequence of int, optional
-        Identifiers of the sources. The default is all sources that may have light in the image.
+        Identifiers of the sources. None means all sources that may have light in the image.
 
     Returns
     -------
     iterator of SourceSpectrum
-        Each source with its frame.
+        One source after another with its light on the detector in electrons.
 
     Raises
     ------
     BadInput
-        At the call, if there is no such image, it is not dispersed, or a source cannot have light in it.
+        If there is no such image, if it is not an image through a grism, or if a source cannot have light in it. The
+        error is raised at the call, before the first source is drawn.
     """
     image_facts = {"exposure_id": exposure, "detector": detector}
     parts = [part["facts"] for part in version.manifest["parts"] if image_facts.items() <= part["facts"].items()]
@@ -64,7 +69,11 @@ def models(
 
 
 def frame(image: Image, shape: tuple[int, int]) -> Float:
-    """Return an extension as a float64 frame of the detector in electrons; `shape` is (ny, nx)."""
+    """Return an extension of the FITS file, which is cut to the light of a source, in the full size of the detector.
+
+    The result is a float64 array of shape (ny, nx) = `shape` in electrons, with 0 outside the extension. The image must
+    have the cards X0 and Y0.
+    """
     out, cards = np.zeros(shape), {key: value for key, value, _ in image.cards}
     if image.data is not None:
         (height, width), first_column, first_row = image.data.shape, int(cards["X0"]), int(cards["Y0"])
@@ -73,7 +82,11 @@ def frame(image: Image, shape: tuple[int, int]) -> Float:
 
 
 def _extension(number: int, order: int | None, light: Float) -> Image:
-    """Return the light of a source, cut to the pixels that are not 0 (at least one)."""
+    """Return the FITS extension of a source: its light, shape (ny, nx), cut to the rectangle of pixels that are not 0.
+
+    `number` is the identifier of the source and `order` the spectral order, None for all orders. A source without light
+    has one pixel.
+    """
     rows, columns = (np.flatnonzero((light != 0.0).any(axis=axis)) for axis in (1, 0))
     first_row, end_row = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
     first_column, end_column = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
@@ -89,7 +102,10 @@ def _extension(number: int, order: int | None, light: Float) -> Image:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the noise-free light of the given sources to a FITS file, and print the electrons of each."""
+    """Run the command: write the noise-free light of sources to a FITS file, and print the electrons of each.
+
+    Return the exit status.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
     )

@@ -30,26 +30,28 @@ from truesky.request import universe
 from truesky.request.schema import Request
 from truesky.running.submitted_job import Job, Step, common_facts
 
-# Rows of `exposures` and of `tasks`.
+# Rows of the table `exposures`, and rows of the table `tasks` (one per detector) for the same exposures.
 PlanRows = tuple[pa.Table, pa.Table]
-# Fact of the plan of `tasks`: keys of the tables that it is made from.
+# Key in the recorded inputs of the table `tasks`: its value has the hashes of the tables from which `tasks` was made.
 _MADE_OF = "made_of"
 
 
 @dataclass(frozen=True, slots=True)
 class Planner:
-    """Make the chunks of a request's plan, on the driver or on a worker.
+    """Make the tables `exposures` and `tasks` (one row per detector of an exposure) of a request.
+
+    The tables are made in chunks (consecutive exposures that one process plans), on the Spark driver or on workers.
 
     Attributes
     ----------
     lake : Path or None
-        Lake whose catalogues give the source densities, if it has them.
+        Lake (folder of stored tables) whose catalogues give the densities of sources, if it has them.
     request : Request
-        The request.
+        The user's request.
     mission : MissionConfiguration
-        Mission configuration of the request.
+        Mission parameters of the request.
     layout : Layout
-        The exposures of the request, in chunks.
+        All exposures of the request, divided into chunks; each chunk becomes one partition of each table.
     """
 
     lake: Path | None
@@ -59,7 +61,12 @@ class Planner:
 
     @classmethod
     def from_request(cls, lake: Path | None, request: Request) -> Planner:
-        """Lay out a request. Raises BadInput for invalid pointings, observations or PSFs."""
+        """Plan the exposures of a request and divide them into chunks (consecutive exposures planned together).
+
+        `lake` is a folder of stored tables, whose catalogues give the densities of sources; None uses number counts.
+
+        Raises BadInput if the request has no pointing or observation, or if one of them or a PSF file is invalid.
+        """
         if not request.pointings and not request.observations:
             raise BadInput(f"request {request.name}: nothing to plan, it must have a pointing or an observation")
         mission = mission_of(request.mission)
@@ -69,21 +76,32 @@ class Planner:
         return cls(lake, request, mission, plan_layout)
 
     def exposures(self, lake: Path, facts: Json) -> Output:
-        """Make a partition of the table `exposures` from its facts."""
+        """Make a partition of the table `exposures`, which has the exposures of one chunk.
+
+        `facts` has the first and last exposure number and MJD of the chunk; {} if there is only one chunk. `lake` is
+        not used.
+        """
         return Output(self.rows_of_exposures(self.layout.find_chunk(facts)))
 
     def tasks(self, lake: Path, facts: Json) -> Output:
-        """Make a partition of the table `tasks` from its facts, which contain the key of `exposures`."""
+        """Make a partition of the table `tasks` from the partition of the table `exposures` with the same name.
+
+        `facts` has the first and last exposure number and MJD of the partition, its name, and the version (hash) of the
+        table `exposures`. `lake` is the folder in which this table is stored.
+        """
         exposures = read.version(lake, EXPOSURES.name, facts[_MADE_OF][EXPOSURES.name])
         chunk = self.layout.find_chunk(facts)
         return Output(self.rows_of_tasks(chunk, exposures.rows(partitions=[facts["part"]])))
 
     def rows_of_exposures(self, chunk: Chunk) -> pa.Table:
-        """Return the rows of the table `exposures` of a chunk."""
+        """Return the rows of the table `exposures` for a chunk (consecutive exposures of the plan)."""
         return self.layout.exposures(chunk, user_filters(self.request)[0], self.request.seed)
 
     def rows_of_tasks(self, chunk: Chunk, exposures: pa.Table) -> pa.Table:
-        """Return the rows of the table `tasks` of a chunk, given its rows of `exposures`."""
+        """Return the rows of the table `tasks` (one per detector) for a chunk (consecutive exposures of the plan).
+
+        `exposures` are the rows of the table `exposures` for the same chunk.
+        """
         request = self.request
         densities = source_counts.Densities(
             self.mission, request.universe, [] if self.lake is None else _catalogues(self.lake, request)
@@ -98,34 +116,42 @@ class Planner:
         return tasks.add_persistence_cost(rows, exposures, nearby_exposures, self.mission)
 
     def tables(self) -> Iterator[PlanRows]:
-        """Yield the rows of `exposures` and `tasks`, chunk by chunk."""
+        """Yield rows of the tables `exposures` and `tasks`: one pair of tables per chunk of consecutive exposures."""
         for chunk in self.layout.chunks:
             exposures = self.rows_of_exposures(chunk)
             yield exposures, self.rows_of_tasks(chunk, exposures)
 
 
 def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
-    """Return the mission configuration, and the rows of `exposures` and `tasks`. `lake` may provide catalogues."""
+    """Return the mission parameters of a request, and all rows of its tables `exposures` and `tasks`.
+
+    `lake` may be a folder of stored tables, whose catalogues give the densities of sources. Without it, or if a
+    catalogue is missing, the densities come from number counts.
+    """
     planner = Planner.from_request(lake, request)
     return planner.mission, *concatenate(planner.tables())
 
 
 def concatenate(parts: Iterable[PlanRows]) -> PlanRows:
-    """Concatenate the rows of chunks to a whole plan; tasks are sorted, longest first."""
+    """Concatenate the rows of the tables `exposures` and `tasks` of all chunks of a plan (at least one chunk).
+
+    The rows of `tasks` are sorted by estimated CPU time, longest first.
+    """
     exposures, rows = zip(*parts, strict=True)
     return pa.concat_tables(exposures).combine_chunks(), tasks.sort_by_cost(pa.concat_tables(rows))
 
 
 def _catalogues(lake: Path, request: Request) -> list[read.Version]:
-    """Return the catalogues of the request, or [] if one is missing."""
+    """Return the stored tables `galaxies` and `stars` that a request uses, or [] if the lake lacks one of them."""
     has_all = all(layout.current_link(lake, name).exists() for name in universe.CATALOGUES)
     return [read.input_version(lake, name, request.name) for name in universe.CATALOGUES] if has_all else []
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Return the steps that make the mission table, the exposures and their tasks; the last one prints the forecast.
+    """Return the steps of this job: one for each of the tables `mission`, `exposures` and `tasks`, in this order.
 
-    The driver makes a plan of a single chunk; workers make larger plans.
+    After the last step, a forecast of the CPU time, memory and disc space to render the images is printed. The Spark
+    driver makes a plan that fits into one partition; workers make larger plans.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     planner = Planner.from_request(lake, request)
@@ -143,7 +169,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     parts = planner.layout.parts()
     on_driver = len(parts) == 1
     exposures = Plan(EXPOSURES, facts, parts)
-    # The cost depends on more facts than the exposures do.
+    # The CPU times and file sizes in the table `tasks` also depend on the catalogues, and on options of the request
+    # that do not change the table `exposures`.
     catalogue_keys = {v.table: v.key for v in _catalogues(lake, request)}
     costs = {**facts, "counts": catalogue_keys, "rendered": request.facts("accuracy", "effects", "files", "readout")}
     costs[_MADE_OF] = {EXPOSURES.name: exposures.key}
@@ -164,7 +191,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def _print_published(lake: Path, version: read.Version) -> None:
-    """Print the forecast of published tasks."""
+    """Print a forecast of CPU time, memory and disc space to render all detectors in a stored table `tasks`."""
     exposures = read.version(lake, EXPOSURES.name, version.manifest["facts"][_MADE_OF][EXPOSURES.name])
     columns = ["exposure_id", "survey", "image_type"], ["exposure_id", "detector", "channel", *forecast.SUMMED_COLUMNS]
     _print_forecast(
@@ -173,16 +200,21 @@ def _print_published(lake: Path, version: read.Version) -> None:
 
 
 def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> None:
-    """Print the forecast of a plan that is not published.
+    """Print a forecast of CPU time, memory and disc space to render a plan that is not stored in the lake.
 
     Parameters
     ----------
     lake : Path
-        The lake.
+        Lake (folder of stored tables), which may have measured times of this machine.
     request : Request
-        The request.
+        The user's request.
     parts : iterable of (pyarrow.Table, pyarrow.Table)
-        Rows of `exposures` and `tasks` of each chunk.
+        Rows of the tables `exposures` and `tasks` for each chunk of the plan.
+
+    Notes
+    -----
+    Ground exposures in daylight cause a warning. BadInput is raised if the catalogues of the lake belong to another
+    request.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     _print_forecast(lake, parts)

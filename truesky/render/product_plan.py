@@ -1,4 +1,7 @@
-"""Plan the images of a request: the detectors to render now, and the detectors whose images are still valid."""
+"""Plan the table `products` of a request: which detectors are rendered now, and which images are kept.
+
+An image is kept if its key (hash of everything that determines it) has not changed.
+"""
 
 from __future__ import annotations
 
@@ -36,24 +39,27 @@ from truesky.request.schema import IMAGE_OPTIONS, Request
 
 @dataclass(frozen=True, slots=True)
 class RenderInputs:
-    """Tables, mission and exposures that a request's images depend on.
+    """Everything on which the images of a request depend: tables, mission parameters and exposures.
 
     Attributes
     ----------
     request : Request
-        The request.
+        The user's request.
     mission : MissionConfiguration
-        Mission configuration of the request.
+        Mission parameters of the request.
     versions : mapping of str to Version
-        Versions of the input tables, by table name.
+        Stored versions of the input tables, by table name.
     published_keys : mapping of str to str
-        Key of each product that the request already has, by name of its partition.
+        Key (hash of everything that determines an image) of each image that the request already has, by name of its
+        partition of the table `products`.
     selection : RenderSelection
-        Exposures, requested tasks, and tasks whose images may be reused.
+        Exposures and detectors to render, and detectors whose images may be kept.
     exposures : pyarrow.Table
-        Rows of `selection.exposures`, and of earlier exposures that left charge in their detectors.
-    previous_tasks : mapping of (int, str) to list
-        Tasks of these earlier exposures, by (exposure number, detector name).
+        Rows of the table `exposures` for the exposures of `selection`, and for other exposures of the same cameras,
+        among them all earlier ones that leave persistence in their detectors.
+    previous_tasks : mapping of (int, str) to list of dict
+        Rows of the table `tasks` for the earlier exposures of a detector that leave persistence, by (exposure number,
+        detector name).
     """
 
     request: Request
@@ -66,14 +72,14 @@ class RenderInputs:
 
     @classmethod
     def from_request(cls, lake: Path, request: Request) -> RenderInputs:
-        """Resolve the inputs of a request's images.
+        """Find the inputs of a request's images, and check that they fit the request.
 
         Parameters
         ----------
         lake : Path
-            Folder of the lake.
+            Lake (folder of stored tables), with the plan of the request.
         request : Request
-            The request.
+            The user's request.
 
         Returns
         -------
@@ -83,7 +89,7 @@ class RenderInputs:
         Raises
         ------
         BadInput
-            If a table is missing or was made for another request, or nothing can be rendered.
+            If a table is missing or was made for another request, or if truesky can render none of the exposures.
         """
         mission, versions = mission_of(request.mission), _versions(lake, request)
         preconditions.refuse_other_plan(versions, request, mission)
@@ -98,21 +104,21 @@ class RenderInputs:
 
     @classmethod
     def from_plan(cls, lake: Path, request: Request, selection: RenderSelection) -> RenderInputs:
-        """Resolve the inputs of the images of a plan that is not published.
+        """Find the inputs of images whose plan (rows of `exposures` and `tasks`) is not stored in the lake.
 
         Parameters
         ----------
         lake : Path
-            Folder of the lake.
+            Lake (folder of stored tables).
         request : Request
-            The request.
+            The user's request.
         selection : RenderSelection
-            Exposures and tasks of the plan.
+            Planned exposures and detectors.
 
         Returns
         -------
         RenderInputs
-            The inputs. The tables may have been made for another request.
+            The inputs. It is not checked whether the tables were made for this request.
 
         Raises
         ------
@@ -127,7 +133,10 @@ class RenderInputs:
         return cls(request, mission, versions, published, selection, *exposures_and_tasks)
 
     def with_previous_tasks(self, tasks: Sequence[Json]) -> list[Json]:
-        """Return the tasks, and earlier tasks of the same detectors whose sources are drawn again."""
+        """Return rows of the table `tasks`, then the rows of earlier exposures that leave persistence in their images.
+
+        The earlier rows have the same detectors. Only earlier exposures whose sources are drawn again are included.
+        """
         if not self.previous_tasks:
             return list(tasks)
         rows = map(ExposureRow.from_row, self.exposures.to_pylist())
@@ -140,7 +149,11 @@ class RenderInputs:
         return [*tasks, *(previous_task for previous_task in previous_tasks if previous_task["exposure_id"] in drawn)]
 
     def requested_or_reusable(self, requested: Set[str]) -> list[Json]:
-        """Return the tasks that are requested or have reusable images whose PSF files exist, in order."""
+        """Return the rows of the table `tasks` that are requested, or whose images the request already has.
+
+        `requested` has the partition names of requested images. An existing image is left out if a PSF file from which
+        it was made is missing. The order is that of `selection.tasks`.
+        """
         columns = (self.exposures[name].to_pylist() for name in ("exposure_id", "psf"))
         psfs = dict(zip(*columns, strict=True))
 
@@ -157,14 +170,20 @@ class RenderInputs:
 
 
 def _versions(lake: Path, request: Request) -> dict[str, read.Version]:
-    """Return the versions of the input tables, by name."""
+    """Return the stored versions of the tables that a request's images are made from, by table name.
+
+    The table `strong_lenses` is included if `_lenses` finds one for the request.
+    """
     inputs = {name: read.input_version(lake, name, request.name) for name in INPUTS}
     lenses = _lenses(lake, request, inputs["galaxies"])
     return inputs if lenses is None else {**inputs, LENSES: lenses}
 
 
 def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:
-    """Return the strong lenses, or None; lenses of another request must be placed in the same galaxies."""
+    """Return the table `strong_lenses` for a request, or None if the lake has none.
+
+    If only another request has lenses, they are used only if they were placed in the same version of `galaxies`.
+    """
     if layout.current_key(lake, LENSES) is None:
         return None
     version, request_key = (
@@ -176,17 +195,18 @@ def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Versio
 
 
 def products(inputs: RenderInputs) -> Plan:
-    """Plan the table `products`.
+    """Plan the table `products`, which has the images of a request.
 
     Parameters
     ----------
     inputs : RenderInputs
-        Inputs of the images.
+        Everything on which the images depend.
 
     Returns
     -------
     Plan
-        A task for each requested detector, and for each rendered detector whose inputs have not changed.
+        One partition for each requested detector, and for each detector that already has an image whose inputs have not
+        changed. The key (hash) of a partition tells whether an existing image can be kept instead of rendered.
     """
     facts, exposures = _facts(inputs), inputs.exposures
     requested = {part_name(task) for task in inputs.selection.requested}
@@ -209,7 +229,10 @@ def products(inputs: RenderInputs) -> Plan:
 
 
 def _facts(inputs: RenderInputs) -> Json:
-    """Return the facts of the plan that all images share."""
+    """Return the recorded inputs that all images of a request have in common.
+
+    They are the settings of the request, and hashes of the code, mission parameters, input tables and user files.
+    """
     request = inputs.request
     facts: dict[str, Any] = {
         "request": request.facts("seed", "noise_seed", "accuracy", "mission", "effects", "truth", *IMAGE_OPTIONS),
@@ -218,7 +241,7 @@ def _facts(inputs: RenderInputs) -> Json:
         "inputs": {name: version.key for name, version in inputs.versions.items()},
     }
     if request.sources is not None:
-        # The tables contain all sources, so that no moving bodies are added.
+        # The user has given tables with all sources, so that no moving bodies are added.
         facts["request"]["bodies"] = "none"
     facts["request"].update(structure.facts(request.structure))
     if request.bodies is not None:

@@ -24,9 +24,11 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Return the steps that render each detector, longest first, then collect truth tables and write exposure files.
+    """Return the steps of this job: render the detectors, collect the tables of true positions, write exposure files.
 
-    Detectors that are not requested are kept if the current version has images with unchanged inputs.
+    Detectors with the longest estimated time are rendered first. Files with all detectors of an exposure are written
+    only if the request asks for them. Images of detectors that are not requested now are kept if their inputs have not
+    changed. Raises BadInput if the plan or the catalogues do not fit the request.
     """
     inputs = RenderInputs.from_request(lake, request)
     _refuse_uncovered(inputs)
@@ -58,7 +60,11 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def _refuse_uncovered(inputs: RenderInputs) -> None:
-    """Raise BadInput if requested detectors lie outside the area of the catalogues."""
+    """Raise BadInput if the catalogues do not cover the sky of all requested detectors.
+
+    The same is checked for earlier exposures whose sources must be drawn, because they leave persistence in a requested
+    image.
+    """
     tasks = inputs.with_previous_tasks(inputs.selection.requested)
     task_by_place = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
@@ -70,7 +76,7 @@ def _refuse_uncovered(inputs: RenderInputs) -> None:
 
 
 def _dispersed_exposures(exposures: pa.Table) -> set[int]:
-    """Return the numbers of the exposures of the sky through a grism."""
+    """Return the numbers of those rows of the table `exposures` that are exposures of the sky through a grism."""
     numbers = set()
     for row in map(ExposureRow.from_row, exposures.to_pylist()):
         channel = registry.CHANNELS.get(row.channel)
@@ -80,7 +86,11 @@ def _dispersed_exposures(exposures: pa.Table) -> set[int]:
 
 
 def render_task(lake: Path, facts: Json) -> Output:
-    """Render one detector: read its sources, make its image, and return its rows and the writers of its files."""
+    """Render one detector of an exposure.
+
+    `facts` are the recorded inputs of the image (see `detector_inputs.load_inputs`). The result has the rows of the
+    table `products`, and the functions that write the files: image, truth maps, tables of drawn sources and PSF.
+    """
     request = facts["request"]
     with memory_reuse.retain_freed_memory():
         aim, source_rows, variant = detector_inputs.load_inputs(lake, facts)
@@ -102,12 +112,12 @@ def render_task(lake: Path, facts: Json) -> Output:
 
 
 def read_truth(lake: Path, facts: Json) -> Output:
-    """Read the truth table that is stored with the images of one detector."""
+    """Return the rows of the table `rendered_truth` for one detector, from the file that is stored with its images."""
     return _read_sidecar(lake, facts, truth_file)
 
 
 def read_spectra(lake: Path, facts: Json) -> Output:
-    """Read the table of spectra that is stored with the images of one detector."""
+    """Return the rows of the table `rendered_spectra` for one detector, from the file stored with its images."""
     return _read_sidecar(lake, facts, spectra_file)
 
 

@@ -1,1 +1,1 @@
-"""Render one detector of one exposure, from catalogue rows to the raw image."""
+"""Simulate the image of one detector in one exposure, from catalogue rows to the raw image."""

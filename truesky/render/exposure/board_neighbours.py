@@ -1,9 +1,9 @@
-"""Bright stars on detectors that share a readout board with this one, for crosstalk between detectors.
+"""Charge of bright stars on other detectors of the same readout board, which causes crosstalk on a detector.
 
-No detector needs the image of another: its crosstalk depends only on the plan and the catalogue.
-
-Only stars are drawn, with the colour of flat f_nu and with the PSF of the detector that receives the crosstalk. Not
-included: spikes beyond the planes of the PSF, noise and cosmic rays. Only the full well changes their charge.
+The images of the other detectors are not needed: crosstalk depends only on the planned exposure and the catalogue. Only
+stars are drawn on the other detectors, with constant f_nu and with the PSF of the detector that receives the crosstalk.
+Diffraction spikes beyond the border of the PSF images, noise and cosmic rays are not included. The only effect that is
+simulated in the other detectors is bleeding at the full well.
 """
 
 from __future__ import annotations
@@ -34,28 +34,31 @@ from truesky.render.sources.galaxy_shapes import shapes
 from truesky.render.sources.source_list import Sources
 
 _EFFECT = detector_crosstalk.EFFECT
-# Upper limit on the fraction of a point's flux in its brightest pixel.
+# Upper limit of the fraction of a point source's flux in its brightest pixel. Stars on other detectors that cause no
+# noticeable crosstalk even with this fraction are not read from the catalogue.
 _PEAK_FRACTION = 0.3
-# Electrons of a pixel that are neglected in images of the stars, relative to the noticeable electrons.
+# Pixels of other detectors are neglected if they have fewer electrons than this fraction of the number that causes
+# noticeable crosstalk.
 _NEGLECTED = 0.05
 
 
 def other_detectors(camera: str, name: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """Return the other detectors on the readout board of a detector.
+    """Return the other detectors that are on the same readout board as a detector.
 
     Parameters
     ----------
     camera : str
-        Camera.
+        Name of the camera.
     name : str
-        Name of the detector.
+        Name of the detector. ValueError is raised if the camera does not have it.
     mission : MissionConfiguration
-        Mission database. Its parameter `fpa.board` is the number of successive detectors per board, by default 1.
+        Mission database (parameters of telescopes and cameras). Its parameter `fpa.board` is the number of successive
+        detectors per board, by default 1.
 
     Returns
     -------
     tuple of Detector
-        Other detectors on the board.
+        The other detectors on the board; empty if the board has one detector.
     """
     all_detectors = detectors.detectors(camera, mission)
     key = f"{all_detectors[0].section}.fpa.board"
@@ -65,7 +68,13 @@ def other_detectors(camera: str, name: str, mission: MissionConfiguration) -> tu
 
 
 def is_noticeable(aim: Aim, variant: Variant) -> bool:
-    """Return True if a full pixel of another detector is noticeable in this one, or if the effect is forced on."""
+    """Return True if crosstalk from other detectors on the readout board must be simulated for a detector.
+
+    `aim` is the exposure and the detector, and `variant` contains the parameters of the simulation. Crosstalk is
+    simulated if a pixel at the full well on another detector would change a pixel by more than a tenth of its noise. A
+    request can also switch crosstalk on or off. It is never simulated if no light of the sky reaches the detector, as
+    in a dark image.
+    """
     if _EFFECT not in aim.effects or not aim.sees_sky:
         return False
     scene = scene_factory.from_aim(aim, variant)
@@ -76,29 +85,32 @@ def is_noticeable(aim: Aim, variant: Variant) -> bool:
 
 
 def detector_circle(exposure: ExposureRow, detector: Detector) -> dict[str, float]:
-    """Return the circle around a detector: ra, dec and radius in degrees, as in the table `tasks`."""
+    """Return a circle on the sky that contains a detector: its centre `ra` and `dec` and its `radius`, in degrees.
+
+    The table `tasks` (one row per detector of an exposure) has columns with these three names and units.
+    """
     wcs = astrometry.wcs(detector, exposure.ra, exposure.dec, exposure.position_angle)
     ra, dec = astrometry.centre(detector, wcs)
-    # With distortion, the detector may cover slightly more of the sky.
+    # The radius is increased by 5 %, because with distortion the detector may cover slightly more of the sky.
     return {"ra": ra, "dec": dec, "radius": 1.05 * detector.half_diagonal / 3600.0}
 
 
 def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant) -> tuple[NeighbourDetector, ...]:
-    """Read the stars on other detectors of the board that may be noticeable.
+    """Read the bright stars on other detectors of a readout board that may cause noticeable crosstalk on a detector.
 
     Parameters
     ----------
     inputs : mapping of str to Version
-        Versions of the tables `stars` and `star_fluxes`.
+        Tables `stars` and `star_fluxes` of the lake, by name.
     aim : Aim
         Exposure and detector that receives the crosstalk.
     variant : Variant
-        Mission, accuracy and forced effects of this detector.
+        Mission database, accuracy, and the effects that the request switches on or off.
 
     Returns
     -------
     tuple of NeighbourDetector
-        Other detectors of the board with their stars; empty if crosstalk is not noticeable.
+        Other detectors of the board with their bright stars; empty if crosstalk is not noticeable.
     """
     exposure = aim.exposure
     if not is_noticeable(aim, variant):
@@ -118,30 +130,34 @@ def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant)
 
 
 def _noticeable_electrons(scene: Scene) -> float:
-    """Return the electrons in a pixel of another detector that are noticeable in this one."""
+    """Return how many electrons in a pixel of another detector cause just noticeable crosstalk in this detector.
+
+    Crosstalk is noticeable above a tenth of the noise of a pixel. `scene` contains the properties of this detector and
+    its exposure. The crosstalk coefficient must not be 0.
+    """
     return NOTICEABLE * scene.pixel_noise / abs(detector_crosstalk.coefficient(scene))
 
 
 def with_neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> Light:
-    """Add the charge of the other detectors to the scene of a light.
+    """Add the charge on other detectors of the readout board, which causes crosstalk, to the inputs of an image.
 
     Parameters
     ----------
     light : Light
-        Light on the detector.
+        Sources, PSF and scene (properties on which effects depend) of the detector that receives the crosstalk.
     aim : Aim
-        Exposure and detector.
+        Exposure and detector that receives the crosstalk.
     rows : Rows
-        Catalogue rows, with the stars of the other detectors.
+        Catalogue rows, with the other detectors and their stars in `neighbours`.
     variant : Variant
-        Mission, accuracy and forced effects.
+        Mission database, accuracy, and the effects that the request switches on or off.
     seed : int
         Seed of the request.
 
     Returns
     -------
     Light
-        The light with the new scene.
+        `light` with the charge in its scene; unchanged without other detectors or without a PSF.
     """
     if not rows.neighbours or light.psf is None:
         return light
@@ -151,17 +167,20 @@ def with_neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, 
 
 
 def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> NeighbourCharge | None:
-    """Charge of all other detectors of the board, in the order in which this detector's pixels are read.
+    """Return the charge on all other detectors of the board that is read at the same time as pixels of this detector.
 
     Parameters
     ----------
     light, aim, rows, variant, seed : Light, Aim, Rows, Variant, int
-        Same as in `with_neighbour_charge`.
+        Sources, PSF and scene (properties on which effects depend) of the detector that receives the crosstalk; its
+        exposure and detector; catalogue rows with the other detectors and their stars in `neighbours`; mission database
+        and accuracy; seed of the request.
 
     Returns
     -------
     NeighbourCharge or None
-        Charge by pixel. None if there is no charge.
+        Pixels of this detector, and for each the electrons of the other detectors that are read at the same time. None
+        if there is no noticeable charge.
     """
     assert light.psf is not None
     scene, psf = light.scene, replace(light.psf, edges=None)
@@ -181,7 +200,8 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
         frame = stamps.draw(sources, sizes, psf, neighbour_aim.detector.nx, neighbour_aim.detector.ny)
         planes = split_amplifiers(_bled_electrons(frame, neighbour_scene), neighbour_scene)
         pixel_indices = np.argwhere(planes > _NEGLECTED * min_electrons)
-        # A detector of another kind may have pixels that this detector does not have.
+        # A detector of another type may have more pixels than this detector. They are read when this detector reads no
+        # pixel, so they are removed.
         pixel_indices = pixel_indices[(pixel_indices < shape).all(axis=1)]
         pixels.append(np.asarray(np.ravel_multi_index(tuple(pixel_indices.T), shape), np.int64))
         electrons.append(planes[tuple(pixel_indices.T)])
@@ -194,14 +214,21 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
 
 
 def _bled_electrons(frame: Frame, scene: Scene) -> Frame:
-    """Return whole electrons per pixel after bleeding."""
+    """Return the electrons per pixel after charge above the full well has bled along the columns.
+
+    `frame` contains the expected electrons per pixel. They are first rounded down to whole electrons, and negative
+    numbers are set to 0. `scene` contains the properties of the detector, such as its full well.
+    """
     return bleeding.apply(np.maximum(np.floor(frame), 0.0), bleeding.full_well(scene), scene.column_segments)
 
 
 def _select_stars(
     neighbour_aim: Aim, neighbour: NeighbourDetector, rows: Rows, psf: Psf, min_electrons: float
 ) -> Sources:
-    """Return the stars that are on another detector and have more than `min_electrons` in a pixel."""
+    """Return the stars on another detector that have more than `min_electrons` in their brightest pixel.
+
+    `neighbour_aim` is the exposure with the other detector, and `neighbour` contains its catalogue stars.
+    """
     exposure, detector = neighbour_aim.exposure, neighbour_aim.detector
     middle = exposure.mjd + 0.5 * exposure.exposure_time_s / 86400.0
     moved = catalogue_rows.apply_proper_motion(neighbour.stars, middle)

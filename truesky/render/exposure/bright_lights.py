@@ -1,4 +1,4 @@
-"""Select bright sources on and around a detector that cause ghosts and scattered light."""
+"""Select bright sources on and around a detector, which cause ghosts and scattered light on it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from truesky.render.camera import astrometry
 from truesky.render.effects.scene import Lights
 from truesky.render.sources.source_list import Sources
 
-# Electrons above which ghosts and scattered light of a source are considered.
+# Ghosts and scattered light are computed for sources with more expected electrons per exposure than this.
 _MIN_ELECTRONS = 1e6
-# Length of a piece of a trail in pixels, whose scattered light is computed as that of a point.
+# The trail of a moving body is divided into pieces of at most this length, pixels. The scattered light of each piece is
+# computed as that of a point.
 _PIECE = 32.0
 
 
@@ -30,7 +31,8 @@ def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Fl
     Returns
     -------
     Lights
-        Bright sources, as far as the rows reach, by ascending identifier.
+        Sources with more than 1e6 electrons by ascending identifier, also outside the detector. Empty if there are
+        none.
     """
     columns = []
     for rows, electrons in (galaxies, stars):
@@ -44,15 +46,16 @@ def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Fl
 
 
 def trail_lights(bodies: Sources) -> Lights:
-    """Return bright moving bodies as points along their trails.
+    """Return the moving bodies with more than 1e6 electrons as several points along their trails.
 
-    The distance of the points is small compared with the extent of scattered light.
+    The electrons of a body are divided equally among its points. Neighbouring points are at most 32 pixels apart, which
+    is small compared with the extent of scattered light.
     """
     bright = np.flatnonzero(bodies.electrons > _MIN_ELECTRONS)
     pieces = np.ceil(bodies.trail_length[bright] / _PIECE).astype(np.int64) + 1
     body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)
     count = np.repeat(pieces, pieces)
-    # Position relative to the middle of the trail, as a fraction of its length.
+    # Position of each point along the trail as a fraction of the trail's length, from -0.5 to 0.5 with 0 in the middle.
     place = (np.arange(len(body)) - first + 0.5) / count - 0.5
     trail = np.zeros((len(bodies), 2)) if bodies.trail is None else bodies.trail
     along = place[:, None] * trail[body]

@@ -1,4 +1,8 @@
-"""Compute the light of sources weighted by colour, for detectors with a chromatic response."""
+"""Compute images of sources weighted by wavelength, for detectors whose pixel response depends on wavelength.
+
+The effect `chromatic_response` changes pixels by a map that depends on the wavelength of the light. It needs images of
+the sources in which photons are weighted by functions of wavelength (components of the response).
+"""
 
 from __future__ import annotations
 
@@ -17,32 +21,40 @@ from truesky.render.exposure import visible_sources
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.psf.model import Psf, reduce_colours
 
-# Number of colours of the PSF at the detector's centre, and fraction of a source's light that may be aliased or left
-# out in its stamp. The change of a pixel is only a hundredth of the light.
-_COLOURS, _PART = 4, 1e-2
+# Largest number of wavelengths in a passband at which the PSF is used for images in which photons are weighted by
+# wavelength.
+_COLOURS = 4
+# Fraction of a source's light that may be neglected, or moved to wrong pixels because Fourier transforms are periodic
+# (aliasing), in an image in which photons are weighted by wavelength. It can be large, since the chromatic response
+# changes a pixel by only a hundredth of its light.
+_PART = 1e-2
 
 
 def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
-    """Add the light of sources whose colour changes a pixel noticeably to a scene.
+    """Add images of the sources, in which photons are weighted by wavelength, to the scene of a direct image.
+
+    From them the chromatic response is computed: the dependence of each pixel's efficiency on wavelength. Only sources
+    whose colour changes a pixel by more than a tenth of its noise are drawn.
 
     Parameters
     ----------
     scene : Scene
-        Scene with the brightest pixel of the drawn sources.
+        Properties of the exposure, with the brightest pixel of the drawn sources.
     aim : Aim
         Exposure and detector.
     light : Light
-        Light on the detector.
+        Sources with light on the detector.
 
     Returns
     -------
     Scene
-        Scene with `chromatic_light` and `chromatic_electrons`.
+        Scene with `chromatic_light` (the two weighted images, electrons) and `chromatic_electrons` (the largest change
+        of a pixel). It is unchanged if no source has a noticeable effect, if the effect is not applied, or if the PSF
+        has only one wavelength, because colours are then not computed.
 
     Notes
     -----
-    The error is 3 % of the change of a pixel, because the PSF at the detector's centre is used. If the accuracy uses a
-    PSF of one colour, the colours of sources are not known and change nothing.
+    The error is 3 % of the change of a pixel, because the PSF at the detector's centre is used for all sources.
     """
     sources, psf = light.sources, light.psf
     if _is_inactive(scene, aim) or psf is None or sources.photons is None or not len(sources):
@@ -62,7 +74,9 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
     settings = replace(settings_for(scene.accuracy), edge=NOTICEABLE, aliased=_PART, floor=_PART)
     noise = scene.pixel_noise
     sizes = stamp_sizes.stamp_sizes(change / peak_fraction, chosen.shape, chosen.shapes, psf, noise, settings)
-    # Stamps of pictures and trails cannot be smaller.
+    # Images of sources that are drawn from pictures, or that move, must not be cut. Their stamps (square images around
+    # them) are as large as in the image without weights. Other sources may have smaller stamps, since lower accuracy is
+    # sufficient.
     is_extended = (chosen.trail_length > 0.0) | (
         np.zeros(len(chosen), bool) if chosen.picture is None else chosen.picture >= 0
     )
@@ -80,29 +94,33 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
 def with_dispersed_light(
     scene: Scene, aim: Aim, light: Light, tally: dispersing.Tally, planes_cache: dispersing.PlanesCache
 ) -> Scene:
-    """Add the spectra of sources for which the colour of a column changes a pixel noticeably to a scene.
+    """Add spectra of the sources, in which photons are weighted by wavelength, to the scene of a slitless image.
+
+    From them the chromatic response is computed: the dependence of each pixel's efficiency on wavelength. Only sources
+    whose brightest column changes a pixel by more than a tenth of its noise are drawn.
 
     Parameters
     ----------
     scene : Scene
-        Scene with the brightest pixel of the drawn sources.
+        Properties of the exposure, with the brightest pixel of the drawn sources.
     aim : Aim
         Exposure and detector.
     light : Light
-        Dispersed light on the detector.
+        Sources with their spectra and the orders of the grism.
     tally : Tally
-        Light of each source that was drawn.
+        Electrons of each source that were drawn, in total and in its brightest column.
     planes_cache : dict
-        Images of the PSF that several drawings share.
+        Cache of Fourier transforms of the PSF, which other calls of `dispersing.draw` also use.
 
     Returns
     -------
     Scene
-        Scene with `chromatic_light` and `chromatic_electrons`.
+        Scene with `chromatic_light` (the two weighted images, electrons) and `chromatic_electrons` (the largest change
+        of a pixel). It is unchanged if no source has a noticeable effect, or if the effect is not applied.
 
     Notes
     -----
-    The light that is left out of the stamps of a source is at most a tenth of a pixel's noise.
+    The light that is neglected at the edges of stamps changes a pixel by at most a tenth of its noise.
     """
     dispersed, psf = light.dispersed, light.psf
     if _is_inactive(scene, aim) or psf is None or dispersed is None or not len(light.sources):
@@ -114,11 +132,12 @@ def with_dispersed_light(
     if not len(indices):
         return scene
     chosen, shape = light.sources.take(indices), (aim.detector.ny, aim.detector.nx)
-    # Only light whose colour changes a pixel by less than is noticeable is left out.
+    # Light may be neglected if the chromatic response changes it by less than half of a noticeable change, which is a
+    # tenth of a pixel's noise.
     settings = replace(dispersed.settings, edge=0.5 * NOTICEABLE / largest, faint=0.5 * NOTICEABLE / largest)
 
     def draw(weight: Float) -> Frame:
-        """Return the light with each photon multiplied by a weight, shape (w,)."""
+        """Return the image of the chosen spectra; `weight` has a factor for the photons of each wavelength."""
         orders = tuple(replace(order, response=order.response * weight) for order in dispersed.orders)
         weighted_spectra = dispersing.DispersedSources(lambda rows: dispersed.spectra(indices[rows]), orders, settings)
         return dispersing.draw(chosen, weighted_spectra, psf, shape, scene.pixel_noise, None, None, planes_cache)
@@ -128,13 +147,20 @@ def with_dispersed_light(
 
 
 def _is_inactive(scene: Scene, aim: Aim) -> bool:
-    """Return True if the channel or the image type has no chromatic response map, or if the request switches it off."""
+    """Return True if the effect of a chromatic response is not simulated.
+
+    This is so if the channel (instrument mode) has no such effect, if it does not apply to the image type, or if the
+    request switches it off.
+    """
     effect = aim.channel.chromatic_effect
     return effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
 
 
 def _peak_fraction(psf: Psf, *, of_rows: bool = False) -> float:
-    """Return the largest fraction of a point's light in one pixel, or in one row, in any colour."""
+    """Return the largest fraction, at any wavelength, of a point source's light in one pixel (in one row if `of_rows`).
+
+    It is 1 for a PSF that is given as an analytic profile.
+    """
     if psf.planes is None:
         return 1.0
     images, samples = psf.planes.images, psf.planes.samples
@@ -145,7 +171,10 @@ def _peak_fraction(psf: Psf, *, of_rows: bool = False) -> float:
 
 
 def _central_psf(psf: Psf) -> Psf:
-    """Return the PSF at the detector's centre with few colours and without spikes beyond its planes."""
+    """Return a simpler PSF for the whole detector: that at its centre, with at most four wavelengths.
+
+    Light beyond the border of the PSF images, such as spikes, is omitted.
+    """
     if psf.planes is None:
         return psf
     planes = replace(psf.planes, drift=psf.planes.drift[:0], powers=())

@@ -1,4 +1,4 @@
-"""Refuse scenes that need more memory or time than a task may use, before they are drawn."""
+"""Check, before the sources of a detector are drawn, that drawing does not need too much memory or time."""
 
 from __future__ import annotations
 
@@ -8,15 +8,33 @@ from truesky.render.drawing import cost
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.visible_sources import Light
 
-# Memory of a task in bytes, which each core of an executor can use. If the forecast is higher, it is the limit.
+# Memory that the simulation of one detector may use, bytes. Each core of a Spark executor has at least this memory. If
+# an image of the channel (instrument mode) is predicted to need more even without sources, that prediction is the
+# limit.
 _MAX_BYTES = 2e9
-# CPU seconds to draw the sources of a task. Scenes that take longer are mistakes.
+# CPU time that drawing the sources of one detector may take, s. An image that takes longer is probably a mistake.
 _MAX_SECONDS = 6 * 3600.0
 
 
 def refuse_too_large(aim: Aim, light: Light) -> None:
-    """Raise BadInput if the drawing of the sources would exceed the memory or time of a task."""
-    # Memory for spectra is limited, because only a few are in memory at the same time.
+    """Check that drawing the sources of a detector does not need more memory or time than allowed.
+
+    Images without light of the sky, and dispersed images, are not checked.
+
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    light : Light
+        Sources to be drawn.
+
+    Raises
+    ------
+    BadInput
+        If the predicted memory exceeds 2 GB, or the predicted CPU time exceeds 6 h. If the channel needs more than 2 GB
+        even without sources, that memory is the limit.
+    """
+    # Dispersed images are not checked: they need little memory, because only a few spectra are in memory at a time.
     if light.psf is None or light.dispersed is not None:
         return
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes

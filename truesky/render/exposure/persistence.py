@@ -1,13 +1,13 @@
-"""Compute the persistence of a detector: the charge that earlier exposures release in this one.
+"""Compute the persistence of a detector: charge that was trapped in earlier exposures and is released in a later one.
 
-Each earlier exposure is drawn again from the catalogue without noise. No exposure needs the image of another, so that
-they can be rendered in any order: persistence depends only on the planned exposures and the catalogue. An earlier
+Each earlier exposure is drawn again from the catalogue without noise. No exposure needs the image of another, so
+exposures can be simulated in any order: persistence depends only on the planned exposures and the catalogue. An earlier
 exposure is drawn with its sky, its lamp, and the stars and galaxies that leave noticeable charge, dispersed if it had a
-grism. An exposure of a channel that is not rendered contributes only its mean sky.
+grism. An exposure that cannot be simulated contributes only its mean sky.
 
-Cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn. For example, a pixel with a hit of 2300
-electrons lacks 10 electrons of persistence after 134 s. In spectra, the limit for drawing a source assumes a flat
-spectrum: fainter sources are omitted even if a line has more than `_MIN_ELECTRONS`.
+Cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn. For example, a pixel that was hit by a
+cosmic ray of 2300 electrons lacks 10 electrons of persistence after 134 s. Sources are selected as if their spectra
+were flat. A source may therefore be omitted although one of its emission lines leaves noticeable charge.
 """
 
 from __future__ import annotations
@@ -39,24 +39,37 @@ from truesky.render.exposure.visible_spectra import visible_spectra
 from truesky.render.psf.model import Psf
 from truesky.render.sources import solar_system
 
+# Seconds per day.
 _DAY_S = 86400.0
-# Tolerance of dates in seconds, more than their rounding.
+# Longest time in s by which an exposure of a detector may begin before the end of the previous one. Rounding of dates
+# causes shorter overlaps; a longer overlap is an error.
 _TIME_TOLERANCE_S = 1e-3
-# Types of images without light of the sky.
+# Image types without light of the sky. An earlier exposure of these types that cannot be simulated causes no
+# persistence.
 _STARLESS = ("bias", "dark", "flat", "charge_injection", "persistence")
-# Electrons of the faintest source that is drawn, electrons of a pixel that stamps may leave out, and the delay in
-# seconds for which these limits hold; they grow with the delay. A star at the limit leaves 0.8 electrons in a pixel.
-# For two earlier exposures of the demo's sky, at most 1.2 electrons of a pixel are missing.
-_MIN_ELECTRONS, _NEGLECTED_ELECTRONS, _REFERENCE_S = 400.0, 300.0, 134.0
-# Fraction of a point source's flux in its brightest column of an image. A column of a spectrum with the same flux
-# leaves the same charge.
+# Smallest number of electrons with which a point source in an earlier exposure is drawn, if the later exposure begins
+# _REFERENCE_S seconds after the earlier one. The limit is proportional to this delay. A star at the limit leaves 0.8
+# electrons of persistence in a pixel. In an example with two earlier exposures, at most 1.2 electrons in a pixel are
+# missing.
+_MIN_ELECTRONS = 400.0
+# Electrons per pixel that replace the noise of a pixel when sources of an earlier exposure are drawn: light that is
+# small compared with them is neglected. The number is for a delay of _REFERENCE_S seconds and is proportional to the
+# delay.
+_NEGLECTED_ELECTRONS = 300.0
+# Delay from the start of an earlier exposure to the start of the later one for which _MIN_ELECTRONS and
+# _NEGLECTED_ELECTRONS are given, s.
+_REFERENCE_S = 134.0
+# Assumed fraction of a point source's flux in its brightest column in a direct image. A spectrum whose brightest column
+# has the same electrons is assumed to leave the same persistence.
 _COLUMN_FRACTION = 0.5
-# Electrons that stamps of spectra may leave out in a row at their edge, relative to the lowest relevant column.
+# Light of a spectrum in a row at the edge of its stamp (image in which it is drawn) that may be neglected, as a
+# fraction of the electrons that the faintest drawn spectrum has in a column.
 _EDGE_FRACTION = 0.1
-# Electrons of its brightest pixel below which an effect is neglected: ten electrons leave 0.05.
+# A detector effect in an earlier exposure is neglected if it changes no pixel by more than this number of electrons.
+# Ten electrons leave 0.05 electrons of persistence.
 _MIN_LIGHT = 10.0
 
-# Name of the random stream for the variation of traps from pixel to pixel.
+# Name under which random numbers are drawn for the density of traps, which varies from pixel to pixel.
 _VARIATION_STREAM = "persistence_pixels"
 
 Task = Mapping[str, Any]
@@ -67,21 +80,23 @@ def previous_tasks(
     exposures: Mapping[int, ExposureRow],
     mission_of: Callable[[str | None], MissionConfiguration],
 ) -> dict[tuple[int, str], list[Task]]:
-    """Find the earlier exposures that leave persistence in each task.
+    """Find the earlier exposures that leave persistence in each detector of each exposure.
 
     Parameters
     ----------
     tasks : iterable of mapping
-        Rows of the table `tasks`.
+        Rows of the table `tasks`; a task is one detector of one exposure.
     exposures : mapping of int to ExposureRow
-        Exposures by number.
+        Rows of the table `exposures` by `exposure_id`; it must contain the exposures of all tasks.
     mission_of : callable
-        Function that returns the mission database for the settings of an exposure.
+        Function (column `settings` of an exposure: JSON of changed parameters, or None) -> mission database with them.
 
     Returns
     -------
     dict of (int, str) to list of mapping
-        For the exposure and detector of each task, earlier tasks of the same detector in order of time.
+        By exposure_id and detector: the tasks of the same detector whose exposures begin earlier, by at most
+        `window_days`, in order of time. If a request explores parameters (simulates the same sky with several values),
+        only exposures with the same values are included. Detectors without persistence have no entry.
 
     Raises
     ------
@@ -90,7 +105,7 @@ def previous_tasks(
 
     Notes
     -----
-    If several exposures differ only in their noise, the first one counts.
+    If several exposures differ only in their noise (realisations), only the first is included.
     """
     by_detector: dict[tuple[Any, ...], list[Task]] = defaultdict(list)
     cameras = {row.camera for row in exposures.values() if has_persistence(row)}
@@ -119,9 +134,10 @@ def previous_tasks(
 def _check_no_overlap(
     rows: Sequence[ExposureRow], detector: str, mission_of: Callable[[str | None], MissionConfiguration]
 ) -> None:
-    """Raise BadInput if an exposure of a detector (in order of time) begins before the previous one has ended.
+    """Raise BadInput if one of the exposures `rows` of a detector begins before the previous one has ended.
 
-    Exposures that begin at the same time are alternatives.
+    `rows` must be in order of time. Exposures that begin at the same time are allowed: they are alternative versions of
+    one exposure.
     """
     for previous, current in pairwise(rows):
         channel, seconds = registry.CHANNELS.get(previous.channel), previous.exposure_time_s
@@ -136,25 +152,25 @@ def _check_no_overlap(
 
 
 def has_persistence(exposure: ExposureRow) -> bool:
-    """Return True if detectors of an exposure show persistence of earlier exposures."""
+    """Return True if persistence of earlier exposures is simulated in the detectors of an exposure."""
     channel = registry.CHANNELS.get(exposure.channel)
     return channel is not None and channel.persistence_effect is not None
 
 
 def window_days(camera: str, mission: MissionConfiguration) -> float:
-    """Return the time in days before an exposure in which other exposures leave persistence."""
+    """Return how long before an exposure other exposures may begin and still leave persistence in it, days."""
     return mission.value(f"{camera}.persistence.window", "d")
 
 
 def is_drawn(previous: ExposureRow) -> bool:
-    """Return True if an earlier exposure can be drawn; otherwise only its mean sky counts."""
+    """Return True if an earlier exposure can be simulated; if not, only its mean sky causes persistence."""
     return registry.find_effects_or_none(previous.channel, previous.image_type) is not None
 
 
 def delay(exposure: ExposureRow, previous: ExposureRow) -> float:
-    """Return the seconds from the start of `previous` to the start of `exposure`.
+    """Return the seconds from the start of an earlier exposure `previous` to the start of `exposure`.
 
-    Raises BadInput if `previous` does not begin first.
+    Raises BadInput if `previous` does not begin before `exposure`.
     """
     seconds = (exposure.mjd - previous.mjd) * _DAY_S
     if not seconds > 0.0:
@@ -163,12 +179,18 @@ def delay(exposure: ExposureRow, previous: ExposureRow) -> float:
 
 
 def brightest_column_fraction(aim: Aim, mission: MissionConfiguration) -> float:
-    """Return the largest fraction of a point's light in one column, in any order of a grism, for flat f_nu."""
+    """Return the largest fraction of a point source's light in one column of the image.
+
+    For a direct image, and for an image without light of the sky, it is assumed to be 0.5. For a grism it is the
+    maximum over all columns of all spectral orders, for a source with constant f_nu, relative to the light that the
+    passband detects.
+    """
     dispersion, band = aim.channel.dispersion, aim.band
     if dispersion is None or not aim.sees_sky:
         return _COLUMN_FRACTION
     detected, largest = band.response / band.wavelength, 0.0
-    # Use seed 0: a position error of the wheel rotates orders, but does not change their lengths.
+    # The seed determines the position error of the grism wheel. It rotates the spectral orders, but does not change
+    # their lengths, so any seed may be used here.
     for trace in dispersion.traces(aim.exposure, aim.detector, mission, 0):
         throughput = dispersion.throughput(aim.exposure, trace.order, band.wavelength, aim.detector, mission)
         middle = trace.polynomials((aim.detector.nx - 1) / 2, (aim.detector.ny - 1) / 2)
@@ -180,19 +202,20 @@ def brightest_column_fraction(aim: Aim, mission: MissionConfiguration) -> float:
 
 
 def min_flux(exposure: ExposureRow, previous: ExposureRow, column: float = _COLUMN_FRACTION) -> float:
-    """Flux of the faintest source of an earlier exposure that is drawn for its persistence.
+    """Return the flux of the faintest source in an earlier exposure that is drawn because it leaves persistence.
 
     Parameters
     ----------
     exposure, previous : ExposureRow
         Later and earlier exposure.
     column : float, optional
-        Result of `brightest_column_fraction` for the earlier exposure.
+        Result of `brightest_column_fraction` for the earlier exposure. The default is that of a direct image.
 
     Returns
     -------
     float
-        f_nu in microjansky; infinite if no sources were visible.
+        f_nu in microjansky; infinite if the earlier exposure has no light of the sky. `delay` raises BadInput if
+        `previous` does not begin before `exposure`.
     """
     if not registry.CHANNELS[previous.channel].sees_sky(previous.image_type):
         return float("inf")
@@ -201,14 +224,17 @@ def min_flux(exposure: ExposureRow, previous: ExposureRow, column: float = _COLU
 
 
 def _age_factor(exposure: ExposureRow, previous: ExposureRow) -> float:
-    """Return the delay relative to the reference delay of the limits."""
+    """Return the delay between the starts of two exposures, in units of _REFERENCE_S.
+
+    The electrons that may be neglected in the earlier exposure are proportional to this delay.
+    """
     return delay(exposure, previous) / _REFERENCE_S
 
 
 def total_charge(
     aim: Aim, previous_exposures: Sequence[PreviousExposure | PreviousSky], variant: Variant, seed: int
 ) -> Frame | None:
-    """Charge that earlier exposures release in one exposure.
+    """Return the charge that traps filled in earlier exposures release during one exposure.
 
     Parameters
     ----------
@@ -217,14 +243,14 @@ def total_charge(
     previous_exposures : sequence of PreviousExposure or PreviousSky
         Earlier exposures of the same detector.
     variant : Variant
-        Mission, accuracy and forced effects.
+        Mission database, accuracy, and the effects that the request switches on or off.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the variation of traps from pixel to pixel is drawn.
 
     Returns
     -------
     float array, shape (ny, nx), or None
-        Electrons. None if the channel has no persistence or there are no earlier exposures.
+        Electrons per pixel. None if the channel has no persistence or there are no earlier exposures.
     """
     if aim.channel.persistence_effect is None or not previous_exposures:
         return None
@@ -240,10 +266,12 @@ def total_charge(
 
 
 def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age_factor: float, seed: int) -> Frame:
-    """Return the expected electrons of an earlier exposure: per pixel, or one number for the mean sky.
+    """Return the expected electrons in each pixel of an earlier exposure, or one number if only its mean sky is known.
 
-    The electrons are counted over the exposure time of the signal, for which the parameters of traps are defined.
-    Charge before the first group of a ramp also fills traps, but is not counted separately.
+    `age_factor` is the delay from the start of this exposure to the start of the later one, divided by _REFERENCE_S.
+    The electrons are those collected in the exposure time, which in a ramp begins with the first group of reads. The
+    parameters of traps refer to these electrons. As an approximation, charge collected before this group is not
+    counted, although it also fills traps.
     """
     if isinstance(previous, PreviousSky):
         shines = previous.exposure.image_type not in _STARLESS
@@ -258,19 +286,25 @@ def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age
     for effect in aim.effects:
         if effect is aim.channel.persistence_effect:
             break
-        # Fixed patterns of the detector are not part of the light.
+        # Apply those effects that come before persistence in the channel's list of effects and that add or change
+        # light, such as the sky. Fixed patterns of the detector are omitted, because they do not consist of light.
         if not effect.fixed and effect.is_applied(scene) and effect.contribution(scene) > _MIN_LIGHT:
             frame = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(0))
     return frame
 
 
 def _draw_spectra(aim: Aim, rows: Rows, scene: Scene, age_factor: float, seed: int) -> Frame:
-    """Draw the spectra of sources that leave noticeable charge, with their colours and lines."""
+    """Return the expected electrons [ny, nx] of the slitless spectra of sources that leave noticeable persistence.
+
+    `age_factor` is the delay from the start of this exposure to the start of the later one, divided by _REFERENCE_S.
+    The electrons below which light is neglected are proportional to it.
+    """
     light = visible_spectra(aim, replace(rows, bodies=solar_system.empty_population), scene, seed)
     assert light.dispersed is not None
     assert light.psf is not None
     min_electrons = _MIN_ELECTRONS * _COLUMN_FRACTION * age_factor
-    # The limits are in electrons because the noise passed to `draw` is 1.
+    # The limits `faint` and `edge` are fractions of the pixel noise. Here they are in electrons, because 1 electron is
+    # passed to `draw` as the noise.
     settings = replace(light.dispersed.settings, faint=min_electrons, edge=_EDGE_FRACTION * min_electrons)
     dispersed = replace(light.dispersed, settings=settings)
     return dispersing.draw(light.sources, dispersed, light.psf, (aim.detector.ny, aim.detector.nx), 1.0)
@@ -284,8 +318,9 @@ def _draw_sources(aim: Aim, rows: Rows, scene: Scene, age_factor: float) -> Fram
     if not aim.sees_sky or not len(galaxies) + len(stars):
         return np.zeros((detector.ny, detector.nx))
     noise = _NEGLECTED_ELECTRONS * age_factor
-    # With the PSF of one position the brightest pixels would have an error of 5 %, and their persistence of 3
-    # electrons. With one colour the errors would be 2 % and 1.5 electrons.
+    # Two wavelengths in the passband at which the PSF is computed are enough. With one wavelength, the brightest pixels
+    # would have an error of 2 %, and their persistence one of 1.5 electrons. The number of positions on the detector at
+    # which the PSF is computed is not reduced: with one position, the errors would be 5 % and 3 electrons.
     settings = replace(settings_for(scene.accuracy), colours=2)
     brightest = max(galaxies.max(initial=0.0), stars.max(initial=0.0))
     psf = _simplify_psf(visible_sources.exposure_psf(aim, scene, settings), brightest)
@@ -295,7 +330,11 @@ def _draw_sources(aim: Aim, rows: Rows, scene: Scene, age_factor: float) -> Fram
 
 
 def _simplify_psf(psf: Psf, brightest: float) -> Psf:
-    """Return the PSF with the same colour dependence at all positions, and without spikes if they are negligible."""
+    """Return a simpler PSF, with which an earlier exposure is drawn faster.
+
+    Its dependence on colour is the same at all positions on the detector. Light beyond the border of the PSF images,
+    such as spikes, is omitted if it is negligible for a source with `brightest` electrons.
+    """
     planes = psf.planes
     if planes is None:
         return psf

@@ -1,4 +1,4 @@
-"""Inputs for the rendering of one detector."""
+"""Data classes with the inputs for the simulation of one detector's image: catalogue rows and earlier exposures."""
 
 from __future__ import annotations
 
@@ -21,34 +21,37 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Catalogue rows and other data that affect one detector.
+    """Catalogue rows and other data that affect the image of one detector in one exposure.
 
     Attributes
     ----------
     galaxies, stars : Table
-        Rows with GALAXY_COLUMNS and STAR_COLUMNS of visible_sources.py.
+        Catalogue rows with GALAXY_COLUMNS and STAR_COLUMNS of visible_sources.py.
     galaxy_fluxes, star_fluxes : Table
-        Fluxes f_nu of the same rows in the band, in microjansky.
+        Fluxes f_nu of the same rows, in the same order, in the band of the exposure, microjansky. For spectra, there
+        may also be fluxes in the band by which sources are selected.
     lenses : Table, optional
-        Rows of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies. None without lenses.
+        Rows of the table `strong_lenses` (columns lensed_arcs.ARC_COLUMNS). The lensed sources must be among the
+        galaxies. None without lenses.
     bodies : callable, optional
-        Function that returns the moving bodies of a day (ephemerides.Bodies.on_day). By default the embedded
-        population.
+        Function that returns the bodies of the Solar System on a day (ephemerides.Bodies.on_day). By default the
+        population included in the package.
     galaxy_library, stellar_library : Library, optional
-        Libraries with the spectra to which `sed_1` and `sed_2` of galaxies, and `sed` of stars, refer. By default the
-        embedded ones.
+        Libraries with the spectra to which the columns `sed_1` and `sed_2` of galaxies, and `sed` of stars, refer. By
+        default the libraries included in the package.
     complete_margin_arcsec : float
-        Distance beyond the detector up to which the rows contain every source, in arcsec.
+        Distance beyond the detector up to which the rows contain every source, arcsec.
     previous_exposures : tuple of PreviousExposure or PreviousSky
-        Exposures that leave persistence in the detector.
+        Earlier exposures of this detector, whose light leaves persistence.
     discs : DiscStructure, optional
-        Structure of large discs. By default they are smooth.
+        Spiral arms and knots of large discs. By default discs are smooth.
     stamps : GalaxyStamps, optional
         Images that replace the profiles of galaxies. None to draw profiles only.
     bulge_fractions : float array, shape (n,), optional
-        Fraction of each galaxy's light in its bulge, the same in all bands. By default as in the rows.
+        Fraction of each galaxy's light in its bulge in the catalogue, the same in all bands. By default the fraction in
+        `galaxies`.
     neighbours : tuple of NeighbourDetector
-        Bright stars of detectors on the same readout board.
+        Other detectors on the same readout board, with their bright stars, for crosstalk.
     """
 
     galaxies: pa.Table
@@ -69,7 +72,10 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourDetector:
-    """Another detector of the same exposure, with stars on it and the fluxes of the same rows."""
+    """Another detector of the same exposure, with its bright stars.
+
+    `stars` are catalogue rows, and `fluxes` the fluxes f_nu (microjansky) of the same stars in the same order.
+    """
 
     detector: Detector
     stars: pa.Table
@@ -78,9 +84,10 @@ class NeighbourDetector:
 
 @dataclass(frozen=True, slots=True)
 class PreviousExposure:
-    """Earlier exposure of the same detector, with its bright sources.
+    """Earlier exposure of the same detector, with its bright sources (`rows`), which leave persistence.
 
-    Without `mission`, it has the mission database of the later exposure.
+    `mission` is the mission database (parameters of telescopes and cameras) for this exposure. None means the mission
+    database of the later exposure.
     """
 
     aim: Aim
@@ -94,14 +101,24 @@ class PreviousExposure:
 
 @dataclass(frozen=True, slots=True)
 class PreviousSky:
-    """Earlier exposure of the same detector in a channel that is not rendered: only its mean sky is known."""
+    """Earlier exposure of the same detector that cannot be simulated, so that only its mean sky is known."""
 
     exposure: ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """Mission, accuracy and forced effects (name -> on or off) of one variant of a request."""
+    """Parameters with which an exposure is simulated; a request may define several sets of them (variants).
+
+    Attributes
+    ----------
+    mission : MissionConfiguration
+        Mission database (parameters of telescopes and cameras), with the values that the request changes.
+    accuracy : Accuracy
+        Errors that the request accepts.
+    forced : mapping of str to bool
+        Detector effects that are switched on or off, by name. All other effects are applied if they are noticeable.
+    """
 
     mission: MissionConfiguration
     accuracy: Accuracy

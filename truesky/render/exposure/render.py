@@ -1,4 +1,4 @@
-"""Render one detector of one exposure: from catalogue rows to a raw image and its noise-free truth."""
+"""Simulate (render) one detector of one exposure: from catalogue rows to a raw image and its noise-free truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from truesky.render.exposure.visible_sources import Light, visible_light
 from truesky.render.exposure.visible_spectra import visible_spectra
 from truesky.render.sources.source_list import Sources
 
-# Code of stars in identifiers.
+# Number that stands for stars in the identifiers of sources (`lake_schema.ids.source_id`, argument `kind`).
 _STAR = 5
 
 
@@ -47,7 +47,7 @@ def render(
     progress: Callable[[int], None] | None = None,
     noise_seed: int | None = None,
 ) -> RenderedDetector:
-    """Render one detector.
+    """Simulate the image of one detector in one exposure.
 
     Parameters
     ----------
@@ -56,20 +56,23 @@ def render(
     rows : Rows
         Catalogue rows that may have light on the detector.
     variant : Variant
-        Mission, accuracy and forced effects.
+        Mission database, accuracy, and the effects that the request switches on or off.
     seed : int
         Seed of the request.
     truth : sequence of str, optional
-        Truth maps to make in addition to the noise-free one, from lake_schema.tables.products.CONTENTS.
+        Names of truth maps to make in addition to `noise_free`, from lake_schema.tables.products.CONTENTS. Maps that
+        this kind of image does not have are ignored.
     progress : callable, optional
-        Function that is called from time to time with the number of sources drawn.
+        Function that is called from time to time with the number of stamps (images of single sources) that are drawn.
+        It is not called for spectra.
     noise_seed : int, optional
-        Seed of random numbers that differ between exposures, by default `seed`.
+        Seed of the random numbers that differ between exposures, such as noise. By default `seed`.
 
     Returns
     -------
     RenderedDetector
-        Raw image, truth maps and drawn sources.
+        Raw image, truth maps and drawn sources. BadInput is raised by called functions, for example if the image would
+        need too much memory or time.
     """
     scene = replace(
         scene_factory.from_aim(aim, variant),
@@ -88,20 +91,21 @@ def render(
 
 @dataclass(frozen=True, slots=True)
 class _DrawnLight:
-    """Result of drawing the sources.
+    """Result of drawing the sources of a detector, before detector effects are applied.
 
     Attributes
     ----------
     sources : Sources
-        Sources that have light of their stamps on pixels that are read.
+        The n sources with light of their stamps (square images around them) on pixels that the detector reads. Stars
+        are also included if they are so bright that their light is drawn far beyond their stamps.
     sizes : int array, shape (n,)
-        Sides of their stamps in pixels.
+        Sides of the sources' stamps, pixels.
     electrons : float array, shape (n,)
-        Electrons of each stamp on these pixels.
+        Electrons of each source's stamp on pixels that the detector reads.
     maps : dict of str to array
-        Truth maps by name.
+        Truth maps (ny, nx) by name.
     scene : Scene
-        Scene with the brightest pixel.
+        Properties of the exposure on which effects depend, with the brightest pixel of the drawn image.
     spectra : dict, optional
         Columns of the table `rendered_spectra`. None without a grism.
     """
@@ -117,9 +121,10 @@ class _DrawnLight:
 def _draw_images(
     aim: Aim, light: Light, truth: Sequence[str], progress: Callable[[int], None] | None
 ) -> tuple[_DrawnLight, list[Frame]]:
-    """Draw images of sources. Return the drawn light and a list with one frame of expected electrons.
+    """Draw direct images of all sources, and return the drawn light and a list with one frame of expected electrons.
 
-    The list lets the caller remove the frame, so that its memory is freed as early as possible.
+    The caller can remove the frame (image of the detector) from the list, so that its memory is freed as early as
+    possible.
     """
     sources, sizes, scene, detector = light.sources, light.sizes, light.scene, aim.detector
     if light.psf is None:
@@ -143,7 +148,8 @@ def _draw_images(
         stars, neglected = sources.take(is_star), light.neglected[is_star]
         star_light = stamps.draw(stars, sizes[is_star], light.psf, detector.nx, detector.ny, None, neglected)
         maps["stars"] = star_light.astype(np.float32)
-    # Sources of which only faint wings are on the detector are drawn, but not listed.
+    # A source of which only faint light outside its stamp (the square image around it) reaches the detector is drawn,
+    # but it is not in the list of drawn sources. A star with bright light far beyond its stamp is always listed.
     piece_electrons = sources.electrons / stamp_sizes.piece_count(sources.trail_length)
     is_listed = (drawn_electrons > 0.0) | stamp_sizes.has_far_light(
         piece_electrons, sizes, sources.shape, sources.picture, light.psf
@@ -153,7 +159,11 @@ def _draw_images(
 
 
 def _draw_spectra(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_DrawnLight, list[Frame]]:
-    """Draw spectra as in `_draw_images`. Listed sources have light of some order on the detector."""
+    """Draw slitless spectra of all sources, and return the drawn light and a list with one frame of expected electrons.
+
+    The drawn light lists the sources of which some spectral order has light on the detector. The caller can remove the
+    frame (image of the detector) from the list, so that its memory is freed as early as possible.
+    """
     assert light.dispersed is not None
     assert light.psf is not None
     sources, dispersed, psf, noise = light.sources, light.dispersed, light.psf, light.scene.pixel_noise
@@ -188,7 +198,11 @@ def _apply_effects(
     frame: list[Frame],
     seeds_and_truth: tuple[int, int | None, Sequence[str]],
 ) -> RenderedDetector:
-    """Apply all effects of the channel to the frame, which is removed from its list, and read it out."""
+    """Apply all detector effects of the channel to the drawn image, simulate the readout, and complete truth maps.
+
+    `frame` is a list with one image of expected electrons, which is removed from the list. `seeds_and_truth` are seed,
+    noise seed and names of truth maps, as for `render`.
+    """
     exposure, detector, (seed, noise_seed, truth) = aim.exposure, aim.detector, seeds_and_truth
     scene = scene_factory.with_non_source_light(drawn.scene, aim.channel, aim.effects)
 

@@ -1,4 +1,4 @@
-"""Hold the products of one rendered detector before they are written to files."""
+"""Data class with the simulated image of one detector and its truth, before they are written to files."""
 
 from __future__ import annotations
 
@@ -22,45 +22,45 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class RenderedDetector:
-    """Products of one detector.
+    """Simulated image of one detector in one exposure, with everything that its files contain.
 
     Attributes
     ----------
     exposure : ExposureRow
-        Row of the exposure.
+        Row of the table `exposures`.
     detector : Detector
-        Detector.
+        The detector.
     wcs : WCS
-        World coordinates of the detector.
+        World coordinate system of the detector.
     psf : Psf or None
-        PSF of the detector. None without light of the sky.
+        PSF of the detector. None if the image has no light of the sky.
     readout : Readout
-        Arrays of the detector's file.
+        Result of the readout: arrays of the detector's file.
     maps : mapping of str to array
-        Truth maps (ny, nx) by name: noise_free and the requested maps.
+        Truth maps (ny, nx) by name: `noise_free` and the requested maps.
     sources : Sources
-        Drawn sources by ascending identifier, with light of their stamps on pixels that are read; also stars whose
-        spikes may be noticeable.
+        The n drawn sources by ascending identifier. Their stamps (square images around them) have light on pixels that
+        are read. Stars are also included if their diffraction spikes may be noticeable.
     sizes : int array, shape (n,)
-        Sides of their stamps in pixels.
+        Sides of the sources' stamps, pixels.
     drawn_electrons : float64 array, shape (n,)
-        Electrons of each stamp on the detector.
+        Electrons of each source's stamp on pixels that are read.
     zero_point : float
-        AB magnitude of one electron per second.
+        AB magnitude of a source of one electron per second.
     scene : Scene
-        Scene with the brightest pixel.
+        Properties of the exposure on which effects depend, with the brightest pixel of the drawn image.
     decisions : tuple of Decision
-        Decisions on effects.
+        For each detector effect, whether it was applied.
     accuracy : Accuracy
-        Accuracy of the request.
+        Errors that the request accepts.
     seed : int
         Seed of the request.
     complete_margin_arcsec : float
-        Distance beyond the detector up to which all sources were known, in arcsec.
+        Distance beyond the detector up to which all sources were known, arcsec.
     noise_seed : int, optional
-        Seed of the noise, by default `seed`.
+        Seed of the noise; None if it was `seed`.
     spectra : mapping, optional
-        Columns of the table `rendered_spectra`. None without a grism.
+        Columns of the table `rendered_spectra`, by name. None without a grism.
     """
 
     exposure: ExposureRow
@@ -83,47 +83,50 @@ class RenderedDetector:
 
     @property
     def raw(self) -> Array:
-        """Pixel values in readout order, with prescan and overscan."""
+        """Raw pixel values after the last effect, in the order in which they are read, with prescan and overscan."""
         return self.readout.raw
 
     @property
     def science(self) -> Array:
-        """Pixel values in detector axes without prescan and overscan, shape (ny, nx)."""
+        """Pixel values in the axes of the detector, without prescan and overscan, shape (ny, nx)."""
         return self.readout.pixels
 
     @property
     def noise_free(self) -> Float32:
-        """Expected electrons of the sources alone, float32[ny, nx]."""
+        """Expected electrons of the sources alone, without sky, noise and detector effects, float32[ny, nx]."""
         return self.maps["noise_free"]
 
 
 def random_identity(
     effect: Effect, exposure: ExposureRow, detector: str, seed: int, noise_seed: int | None = None
 ) -> tuple[int | str, ...]:
-    """Identity of the random numbers of an effect.
+    """Return the identity from which the random numbers of a detector effect are drawn.
+
+    Equal identities give equal random numbers, on any machine and in any order.
 
     Parameters
     ----------
     effect : Effect
-        Effect.
+        The effect.
     exposure : ExposureRow
-        Exposure.
+        Row of the table `exposures`.
     detector : str
         Name of the detector.
     seed : int
         Seed of the request.
     noise_seed : int, optional
-        Seed of the noise, by default `seed`.
+        Seed of random numbers that differ between exposures, by default `seed`.
 
     Returns
     -------
     tuple of int or str
-        Identity for `rng.stream`. It is unique except for effects that share a stream, see `Effect.random_stream`.
+        Arguments of `rng.stream`. They differ between effects, unless two effects use the same random numbers
+        (`Effect.random_stream`).
 
     Notes
     -----
-    Fixed patterns of a detector are the same in every exposure, and depend on `seed` even if the noise has another
-    seed.
+    An effect with `fixed` True (a fixed pattern of the detector) has the same identity in every exposure of the camera,
+    and always depends on `seed`. An effect with `shared` True has the same identity in all detectors.
     """
     scope = exposure.camera if effect.fixed else image_types.identity(exposure)
     effect_seed = seed if effect.fixed or noise_seed is None else noise_seed

@@ -1,4 +1,4 @@
-"""Create the scene of an exposure, on which its effects depend."""
+"""Create the scene of a detector in an exposure: the properties on which detector effects depend."""
 
 from __future__ import annotations
 
@@ -19,25 +19,28 @@ from truesky.request.accuracy import Accuracy
 
 
 def with_non_source_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) -> Scene:
-    """Add the light of lamps, injected charge and cosmic rays to the brightest pixels of a scene.
+    """Add the electrons of lamps, injected charge and satellite trails to the brightest pixel of a scene.
+
+    The brightest pixel of cosmic rays is set separately.
 
     Parameters
     ----------
     scene : Scene
-        Scene with the brightest pixel of the sources.
+        Properties of the exposure, with the brightest pixel of the sources in `peak_electrons`.
     channel : Channel
-        Channel of the exposure.
+        Channel (instrument mode) of the exposure.
     effects : sequence of Effect
-        Effects of the image.
+        Effects of the channel for this image type.
 
     Returns
     -------
     Scene
-        Scene with higher `peak_electrons`, and with `track_electrons` if cosmic rays are applied.
+        Scene with higher `peak_electrons`, and with the brightest pixel of cosmic rays in `track_electrons` (0 without
+        cosmic rays).
 
     Notes
     -----
-    Nonlinearity and charge transfer depend on this charge as they do on the charge of stars.
+    Nonlinearity and charge transfer depend on the charge in a pixel, whether it comes from stars, lamps or cosmic rays.
     """
     lamps = [
         effect for effect in effects if effect in channel.non_source_effects and scene.forced.get(effect.name, True)
@@ -53,23 +56,23 @@ def with_non_source_light(scene: Scene, channel: Channel, effects: Sequence[Effe
 def from_exposure(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy
 ) -> Scene:
-    """Create a scene before anything is drawn.
+    """Create the scene of a detector before anything is drawn.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Row of the exposure.
+        Row of the table `exposures`.
     detector : Detector
-        Detector of its camera.
+        Detector of the camera of this exposure.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     accuracy : Accuracy
-        Accuracy of the request.
+        Errors that the request accepts.
 
     Returns
     -------
     Scene
-        Scene with a brightest pixel of 0.
+        Properties on which effects depend; the brightest pixel has 0 electrons.
 
     Notes
     -----
@@ -87,12 +90,19 @@ def from_exposure(
 
 
 def from_aim(aim: Aim, variant: Variant) -> Scene:
-    """Create a scene before anything is drawn, with the passband and forced effects."""
+    """Create the scene of a detector before anything is drawn, with its passband and the switched effects.
+
+    `aim` is an exposure and a detector. `variant` contains the mission database, the accuracy, and the effects that the
+    request switches on or off. `ramp.find_mode` raises BadInput if the exposure time does not fit the channel's ramp.
+    """
     scene = from_exposure(aim.exposure, aim.detector, variant.mission, variant.accuracy)
     return replace(scene, band=aim.band, forced=variant.forced)
 
 
 def with_peak_electrons(scene: Scene, frame: Frame) -> Scene:
-    """Return the scene with the brightest pixel of a frame among the pixels that are read."""
+    """Return the properties of an exposure (scene) with the electrons of the brightest pixel of an image, `frame`.
+
+    Rows that the detector does not read are ignored. The result is 0 electrons if no pixel is positive.
+    """
     halves = frame[: scene.unread_rows[0]], frame[scene.unread_rows[1] :]
     return replace(scene, peak_electrons=max(float(half.max(initial=0.0)) for half in halves))

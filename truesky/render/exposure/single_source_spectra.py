@@ -1,4 +1,4 @@
-"""Draw the dispersed light of single sources on a detector, without all other sources."""
+"""Draw the slitless spectra of single sources on a detector, each without all other sources."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from truesky.render.exposure.visible_spectra import visible_spectra
 
 @dataclass(frozen=True, slots=True)
 class SourceSpectrum:
-    """Dispersed light of a source.
+    """Slitless spectrum of one source on a detector, without noise.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class SourceSpectrum:
     frame : float64 array, shape (ny, nx)
         Expected electrons, the sum of all orders.
     orders : dict of int to float64 array, shape (ny, nx)
-        Expected electrons of each order.
+        Expected electrons of each spectral order of the grism.
     """
 
     id: int
@@ -40,24 +40,27 @@ class SourceSpectrum:
 def draw_sources(
     aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int] | None = None
 ) -> Iterator[SourceSpectrum]:
-    """Draw one source after the other. The float64 frames of all sources add up exactly to the noise-free frame.
+    """Draw the spectra of sources one after the other.
+
+    The float64 frames of all sources add up exactly to the noise-free image of the detector.
 
     Parameters
     ----------
     aim, rows, variant, seed : Aim, Rows, Variant, int
-        Same as in `render`.
+        Exposure and detector; catalogue rows that may have light on the detector; mission database, accuracy and
+        switched effects; and seed of the request. They are the arguments with which `render.render` makes the image.
     ids : sequence of int, optional
         Identifiers of the sources. The default is all sources that may have light on the detector.
 
     Returns
     -------
     iterator of SourceSpectrum
-        Each source with its frame.
+        The source spectra in the order of `ids`. Each is drawn when the iterator reaches it.
 
     Raises
     ------
     BadInput
-        Immediately, if the image has no spectra or a source has no light there.
+        When the function is called, if the exposure has no spectra or a source has no light on the detector.
     """
     exposure = aim.exposure
     if aim.channel.dispersion is None or not aim.sees_sky:

@@ -1,4 +1,8 @@
-"""Compute truth of spectra: traces of each source's orders, their overlaps, and the visibility of emission lines."""
+"""Compute the truth of slitless spectra on a detector, for the table `rendered_spectra`.
+
+The truth is the trace of each spectral order of a source, the overlaps with traces of other sources, and the expected
+electrons and signal-to-noise ratios of emission lines.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +26,15 @@ from truesky.render.exposure.records import Rows
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.sources import colours, galaxy_shapes
 
-# Length in pixels of the bins in which traces are compared; number of points of a trace, between which it is straight;
-# upper limit on the half width of a trace in pixels.
-_BIN, _PLACES, _WIDEST = 8, 33, 20.0
-# Electrons per column above which a trace counts as a contaminant, in units of a pixel's noise. In an extraction that
-# is as long as wide, such as a resolution element, its light then equals the noise: a bias of one sigma.
+# Width of the bins of columns in which traces are compared, pixels.
+_BIN = 8
+# Number of points at which the position of a trace is computed. Between them it is treated as straight.
+_PLACES = 33
+# Largest half width of a trace, pixels; wider traces are treated as having this half width.
+_WIDEST = 20.0
+# Smallest light of a trace with which it counts as a contaminant of other spectra: its electrons per column, divided by
+# the noise of a pixel (electrons rms). In an extraction window of n x n pixels, the light of such a trace equals the
+# noise: a bias of one sigma.
 MIN_CONTAMINATION = 1.0
 
 Columns = dict[str, Any]
@@ -34,20 +42,20 @@ Columns = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TracePaths:
-    """Traces of n orders of sources on a detector.
+    """Traces of n spectra on a detector; each is one spectral order of one source.
 
     Attributes
     ----------
     source : int array, shape (n,)
-        Index of the source.
+        Index of the source in the list of drawn sources.
     order : int array, shape (n,)
-        Order of the grism.
+        Spectral order of the grism.
     along, across : list of float array, length n
-        Polynomial coefficients of the column and of the row in t, from 0 to 1 along the trace.
+        Coefficients of t^i (i from 0) for the column and the row, 0-based pixels, with t from 0 to 1 along the trace.
     half : float64 array, shape (n,)
-        Half widths in pixels.
+        Half widths of the traces, pixels.
     level : float64 array, shape (n,)
-        Mean electrons per column on the detector.
+        Mean electrons of the trace in each column that it covers on the detector.
     """
 
     source: Int
@@ -59,30 +67,31 @@ class TracePaths:
 
 
 def truth_columns(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Columns:
-    """Columns of the table `rendered_spectra`: one row per order of a source with light on the detector.
+    """Return the columns of the table `rendered_spectra`: one row per spectral order of a source on the detector.
 
     Parameters
     ----------
     light : Light
-        Dispersed light on the detector.
+        Sources with their spectra and the orders of the grism.
     tally : Tally
-        Light of each source that was drawn.
+        Electrons of each source and order that were drawn on the detector. Orders with 0 electrons have no row.
     aim : Aim
         Exposure and detector.
     rows : Rows
-        Catalogue rows.
+        Catalogue rows of the sources.
     scene : Scene
-        Scene of the exposure.
+        Properties of the exposure, with the noise of a pixel.
 
     Returns
     -------
     dict of str to array
-        Columns by name, without exposure and detector.
+        Columns by name, sorted by identifier and order. The columns that name the exposure and the detector are not
+        included.
     """
     assert light.dispersed is not None
     sources, orders = light.sources, light.dispersed.orders
     numbers = np.array([order.trace.order for order in orders])
-    # Sort by identifier, then by order.
+    # Rows are sorted by the identifier of the source, then by spectral order.
     by_order = np.argsort(numbers)
     source, at = np.nonzero(tally.electrons[:, by_order] > 0.0)
     order_index = by_order[at]
@@ -138,31 +147,29 @@ def _find_paths(light: Light, tally: Tally, source: Int, order_index: Int, aim: 
     return TracePaths(source, order, along, across, np.minimum(half, _WIDEST)[source], level)
 
 
-# ---------------------------------------------------------------------------------------------- overlaps
-
-
 def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, list[Int]]:
-    """Find first orders that are overlapped by traces of other sources.
+    """Find the first-order spectra that are overlapped by traces of other sources.
 
     Parameters
     ----------
     paths : TracePaths
-        Traces on a detector.
+        All n traces on a detector.
     nx : int
-        Columns of the detector.
+        Number of columns of the detector.
     min_level : float
-        Electrons per column above which a trace counts as a contaminant.
+        Electrons per column from which a trace counts as a contaminant.
 
     Returns
     -------
     covered : float64 array, shape (n,)
-        Fraction of the length of each first order that others overlap; 0 for other orders.
+        Fraction of the length of each first-order trace on the detector that is overlapped; 0 for other orders.
     sources : list of int array, length n
-        Indices of the overlapping sources; empty for other orders.
+        For each first-order trace, indices of the sources that overlap it; empty for other orders.
 
     Notes
     -----
-    The fraction is counted in bins of 8 pixels of the trace's length.
+    Overlaps are found in bins of 8 columns. In a bin, two traces overlap if the distance of their rows is less than the
+    sum of their half widths.
     """
     path, at, row = _bins(paths, nx)
     order = np.argsort(at, kind="stable")
@@ -175,7 +182,8 @@ def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, 
         is_overlapped = np.zeros(len(covered), bool)
         is_overlapped[target] = True
         covered += is_overlapped
-        # Most pairs continue from bin to bin: store a pair only in its first bin.
+        # Most pairs of overlapping traces continue from one bin of columns to the next. To save memory, a pair is
+        # stored only in the first of successive bins.
         pairs = np.unique(target * sources + paths.source[other])
         new_pairs.append(np.setdiff1d(pairs, previous_pairs, assume_unique=True))
         previous_pairs = pairs
@@ -186,7 +194,12 @@ def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, 
 
 
 def _find_neighbours(paths: TracePaths, path: Int, row: Float, min_level: float) -> tuple[Int, Int]:
-    """Return pairs of a first order and a trace of another source that touches it, in one bin of columns."""
+    """Return the pairs of a first-order trace and a trace of another source that overlap in one bin of columns.
+
+    `path` and `row`, both with one element per trace in this bin, are the index of the trace and its row in pixels.
+    Traces with fewer than `min_level` electrons per column are not contaminants. The result is two arrays of indices of
+    traces.
+    """
     bright = np.flatnonzero(paths.level[path] >= min_level)
     bright = bright[np.argsort(row[bright], kind="stable")]
     first = np.flatnonzero(paths.order[path] == 1)
@@ -204,7 +217,12 @@ def _find_neighbours(paths: TracePaths, path: Int, row: Float, min_level: float)
 
 
 def _bins(paths: TracePaths, nx: int) -> tuple[Int, Int, Float]:
-    """Return (path, bin of 8 columns, row in the bin) for all traces on the detector."""
+    """Divide all traces into bins of 8 columns of the detector, and return (trace, bin, row) of each piece.
+
+    A piece is the part of one trace in one bin. The three arrays have one element per piece: the index of the trace,
+    the number of the bin (from 0 at column 0), and the row of the trace in the middle of the bin, pixels. Pieces
+    outside the `nx` columns of the detector are not included.
+    """
     t = np.linspace(0.0, 1.0, _PLACES)
     column, row = (
         np.polynomial.polynomial.polyval(t, _stack_coefficients(part).T) for part in (paths.along, paths.across)
@@ -223,38 +241,38 @@ def _bins(paths: TracePaths, nx: int) -> tuple[Int, Int, Float]:
 
 
 def _stack_coefficients(polynomials: list[Float]) -> Float:
-    """Return the coefficients of polynomials as an array, shape (n, i), padded with 0."""
+    """Return the coefficients of n polynomials in t as one array; column i belongs to t^i and is 0 above the degree."""
     out = np.zeros((len(polynomials), max((len(coefficients) for coefficients in polynomials), default=1)))
     for row, coefficients in zip(out, polynomials, strict=True):
         row[: len(coefficients)] = coefficients
     return out
 
 
-# ---------------------------------------------------------------------------------------------- lines
-
-
 def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim, rows: Rows, scene: Scene) -> Columns:
-    """Columns of emission lines on the detector, for first orders of galaxies whose lines are known.
+    """Return columns with the emission lines of each trace that lie on the detector.
+
+    Only first-order spectra of catalogue galaxies have lines. For other traces the arrays are empty.
 
     Parameters
     ----------
     light : Light
-        Dispersed light on the detector.
+        Sources with their spectra and the orders of the grism.
     source : int array, shape (n,)
-        Index of the source of each trace.
+        Index of the source of each trace in the list of drawn sources.
     paths : TracePaths
-        Traces on the detector.
+        The n traces on the detector.
     aim, rows, scene : Aim, Rows, Scene
-        Same as in `truth_columns`.
+        Exposure and detector; catalogue rows of the sources; and properties of the exposure, with the noise of a pixel.
 
     Returns
     -------
     dict of str to list of float array
-        Columns `line_wavelength` (vacuum, Angstrom), `line_expected` (electrons) and `line_snr`.
+        Columns `line_wavelength` (observed, vacuum, Angstrom), `line_expected` (electrons) and `line_snr`
+        (signal-to-noise ratio), each with one array per trace.
 
     Notes
     -----
-    The error of the signal-to-noise ratio is 20 %, because the image of a galaxy is taken as a Gaussian.
+    The error of the signal-to-noise ratio is 20 %, because the image of a galaxy is treated as a Gaussian.
     """
     assert light.dispersed is not None
     names = ("line_wavelength", "line_expected", "line_snr")
@@ -271,7 +289,8 @@ def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim
     curve = extinction.milky_way(wavelength.ravel()).reshape(wavelength.shape)
     dimmed = galaxies.magnification[:, None] * extinction.transmission(curve, galaxies.a_v[:, None])
     response = np.interp(wavelength, aim.band.wavelength, aim.band.response, left=0.0, right=0.0)
-    # Area times time in cm2 s, derived from the zero point of the exposure as for all drawn light.
+    # Collecting area times exposure time, cm2 s. It is derived from the zero point of the exposure, so that lines agree
+    # with the drawn light.
     area = aim.electrons_per_microjansky / units.electron_rate(1.0, 1.0, passbands.log_width(aim.band))
     electrons = galaxies.lines * dimmed * response * area * wavelength / (units.PLANCK_ERG_S * units.LIGHT_ANGSTROM_S)
     electrons *= light.let_through[source[at]][:, None]
@@ -289,7 +308,11 @@ def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim
 
 
 def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, aim: Aim) -> Bool:
-    """Return True for lines whose centre is on a pixel; `path` contains the polynomials of column and row in t."""
+    """Return the mask of the wavelengths [n], Angstrom, whose light on a trace falls onto a pixel of the detector.
+
+    `path` contains the polynomial coefficients of column and row, pixels, in the variable t. It increases linearly from
+    0 at the wavelength `trace.first` to 1 at the wavelength `trace.last`. `aim` is the exposure and the detector.
+    """
     t = (wavelength - trace.first) / (trace.last - trace.first)
     column, row = (np.polynomial.polynomial.polyval(t, part) for part in path)
     in_columns = (column > -0.5) & (column < aim.detector.nx - 0.5)
@@ -297,7 +320,11 @@ def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, 
 
 
 def _has_lines(light: Light, source: Int, paths: TracePaths, rows: Rows) -> Bool:
-    """Return a mask of the first orders of galaxies with lines. Images of lensed sources have no line columns."""
+    """Return the mask of the traces that are first-order spectra of catalogue galaxies with known emission lines.
+
+    It is False for gravitational arcs, and for rows of the table `galaxies` whose column `kind` has another value than
+    a galaxy. It is False for all traces if the rows lack the columns from which lines are computed.
+    """
     if not len(rows.galaxies) or not set(colours.GALAXY_COLUMNS) <= set(rows.galaxies.column_names):
         return np.zeros(len(source), bool)
     galaxy_kinds = (
@@ -309,17 +336,19 @@ def _has_lines(light: Light, source: Int, paths: TracePaths, rows: Rows) -> Bool
 
 
 def _image_area(light: Light, source: Int) -> Float:
-    """Return the noise area of images in pixels: the inverse sum of squares of an image with unit sum.
+    """Return the effective area of the images of galaxies, pixels, over which noise adds up in an optimal measurement.
 
-    The areas of Gaussians add up.
+    It is 1 / (sum of the squared pixels) of an image with sum 1. The areas of the PSF and of the profile of a galaxy
+    are added, as for Gaussians. `source` are indices of the sources.
     """
     assert light.psf is not None
     assert light.psf.planes is not None
     planes, scale = light.psf.planes, light.psf.pixel_scale
     radius = galaxy_shapes.half_light(light.sources.shapes.take(light.sources.shape[source])) / scale
-    # Mean over all positions of the source within a pixel.
+    # Effective area of the PSF, 1 / (sum of the squared pixels). The PSF is first averaged over all positions of the
+    # source within a pixel.
     pixel = uniform_filter(planes.images.mean(axis=0, dtype=float), planes.samples) * planes.samples**2
     point = planes.samples**2 / float((pixel**2).sum())
-    # Use a Gaussian with the second moments of an exponential disc, whose scale length is the half-light radius /
-    # 1.678.
+    # A galaxy is treated as a Gaussian with the second moments of an exponential disc, whose scale length is the
+    # half-light radius / 1.678.
     return np.asarray(point + 12.0 * np.pi * (radius / 1.678) ** 2)

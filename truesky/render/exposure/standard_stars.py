@@ -1,6 +1,7 @@
-"""Add calibration stars and nebulae to the catalogue rows of an exposure, at five positions on every detector.
+"""Add the target of a calibration exposure to its catalogue rows: copies of a star or nebula on each detector.
 
-The star of a stray-light check is a single one outside the field.
+There are five copies at fixed positions on every detector. The star of a stray-light check is a single one outside the
+field.
 
 References
 ----------
@@ -28,7 +29,8 @@ from truesky.render.camera import astrometry, pointing
 from truesky.render.channels.aim import Aim
 from truesky.render.exposure.records import Rows
 
-# Mission parameter with the magnitude for each image type, and its band ("" for the band of the exposure).
+# For each image type with a calibration target: the name of the parameter in the mission database with the AB magnitude
+# of the target, and the band of this magnitude ("" for the band of the exposure).
 _BRIGHTNESS = {
     "standard_star": ("survey.calibration.standard_magnitude", "euclid_y"),
     "planetary_nebula": ("survey.calibration.standard_magnitude", "euclid_y"),
@@ -36,17 +38,24 @@ _BRIGHTNESS = {
     "white_dwarf": ("survey.white_dwarf.magnitude", ""),
     "stray_light": ("survey.stray_light.magnitude", ""),
 }
+# Image type whose target is a single star outside the field of view: a check of stray light.
 _OUTSIDE = "stray_light"
-# Positions (assumed) as fractions of the detector's sides. If middle rows are not read, no star is in the middle.
+# Assumed positions of the five copies of a calibration star on a detector, as fractions (x, y) of its width and height.
 _PLACES = ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75))
+# Positions of the five copies of a calibration star on a detector whose middle rows are not read, as fractions (x, y)
+# of its width and height: no star is in the middle.
 _PLACES_OF_HALVES = ((0.25, 0.25), (0.75, 0.25), (0.4, 0.4), (0.25, 0.75), (0.75, 0.75))
-# Parts of identifiers: the code of stars, a member number that catalogue stars do not have, and the HEALPix order that
-# has 2^22 cells per generation cell.
-_STAR, _MEMBER, _FINE = 5, 1, GENERATION_ORDER + 11
+# Number that stands for stars in the identifiers of sources (`lake_schema.ids.source_id`, argument `kind`).
+_STAR = 5
+# Last part (member number) of the identifiers of calibration stars; it is 0 in identifiers of catalogue stars.
+_MEMBER = 1
+# HEALPix order of the fine cells by which calibration stars are numbered. A generation cell (HEALPix cell in which the
+# catalogue is generated) has 2^22 of them.
+_FINE = GENERATION_ORDER + 11
 
 
 def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
-    """Add five copies of an exposure's calibration star, or the single star outside the field, to its catalogue rows.
+    """Add the target of a calibration exposure to the stars in its catalogue rows.
 
     Parameters
     ----------
@@ -55,17 +64,18 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     aim : Aim
         Exposure and detector.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras), with the magnitudes of the targets.
 
     Returns
     -------
     Rows
-        Rows with the stars. Exposures of other types have unchanged rows.
+        Rows with five copies of the target on the detector, or with one star outside the field for a stray-light check.
+        Rows of exposures that are no such calibrations are unchanged.
 
     Raises
     ------
     BadInput
-        If the target is not a standard star.
+        If the target of the exposure is not one of `standards.NAMES`.
     """
     if aim.exposure.image_type not in _BRIGHTNESS:
         return rows
@@ -79,7 +89,8 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     number = sky.cell_at(ra, dec, _FINE) - (cell << 2 * (_FINE - GENERATION_ORDER))
     ids = source_id(_STAR, cell, number, _MEMBER)
     library = templates.stellar_library()
-    # Libraries of users contain the same standards.
+    # Every stellar library, also one from a user, contains the standard stars, so that the target has the same row here
+    # as in the library that is used for drawing.
     sed = library.names.index(target)
     magnitude, magnitude_band = brightness(aim.exposure, mission)
     band_flux, reference_flux = (
@@ -87,7 +98,8 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
         for band in (aim.band, aim.band if magnitude_band == aim.exposure.band else passbands.load(magnitude_band))
     )
     f_nu = 10.0 ** (0.4 * (units.AB_UJY - magnitude)) * band_flux / reference_flux
-    # The value of `mag_h` is irrelevant, because only the shape of the spectrum is used.
+    # A row of the table `stars` needs `mag_h`. Its value does not matter, because only the shape of the spectrum is
+    # used, and the flux is given separately.
     star = {"id": ids, "ra": ra, "dec": dec, "sed": sed, "mag_h": magnitude, "a_v": 0.0}
     return replace(
         rows,
@@ -97,16 +109,22 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
 
 
 def brightness(exposure: ExposureRow, mission: MissionConfiguration) -> tuple[float, str]:
-    """Return the AB magnitude of the calibration source of an exposure, and the band of this magnitude."""
+    """Return the AB magnitude of the target of a calibration exposure, and the band of this magnitude.
+
+    KeyError is raised if the image type has no such target.
+    """
     key, band = _BRIGHTNESS[exposure.image_type]
     return mission.value(key, "mag"), band or exposure.band
 
 
 def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Float]:
-    """Return right ascension and declination of the calibration stars in degrees, each of shape (n,)."""
+    """Return right ascension and declination, degrees [n], of the copies of a calibration target for one detector.
+
+    n is 5, or 1 for the star outside the field of a stray-light check.
+    """
     exposure, nx, ny = aim.exposure, aim.detector.nx, aim.detector.ny
     if exposure.image_type == _OUTSIDE:
-        # Distances on the tangent plane are the tangents of angles.
+        # On the tangent plane, the distance of a star from the pointing is the tangent of the angle.
         offset_arcsec = np.tan(mission.value("survey.stray_light.distance", "rad")) / pointing.ARCSEC
         return pointing.sky_of_plane([0.0], [offset_arcsec], exposure.ra, exposure.dec, exposure.position_angle)
     x, y = np.array(_PLACES_OF_HALVES if aim.detector.injection_rows else _PLACES).T
@@ -114,7 +132,10 @@ def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Floa
 
 
 def _append_rows(table: pa.Table, values: Mapping[str, Any]) -> pa.Table:
-    """Return the table with one more row per identifier; columns without a value are null."""
+    """Return the table with additional rows; `values` contains their columns, and `values["id"]` their identifiers.
+
+    A value that is not an array is repeated in all additional rows. Columns that `values` lacks are null.
+    """
     n = len(values["id"])
     columns = [
         pa.array(np.broadcast_to(values[field.name], n)).cast(field.type) if field.name in values

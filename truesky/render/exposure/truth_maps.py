@@ -1,4 +1,7 @@
-"""Record truth maps of an image: diffuse sky, cosmic rays, ghosts, saturated pixels and others."""
+"""Record truth maps of a simulated image: diffuse sky, cosmic rays, ghosts, saturated pixels and others.
+
+A truth map is an image of the detector with the contribution of one detector effect or of a kind of sources.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,23 @@ from truesky.render.effects.scene import Frame, Scene
 
 Maps = dict[str, Array]
 
-# Map with the light of each order of a grism.
+# Name of the truth map with the light of each spectral order of a grism, by number of the order.
 ORDER_MAPS = {1: "order_1", 0: "order_0", 2: "order_2", -1: "order_m1"}
-# Bytes per pixel in the file of each map.
+# Bytes per pixel in the file of each truth map, before compression.
 BYTES_PER_PIXEL = {
     "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "satellites": 4,
     "saturation": 1, "traps": 4, "dipoles": 4,
-    # The number is for the four groups of a photometric ramp.
+    # The map "ramp" contains the groups of reads of an infrared detector. Images without grism have four groups of 2
+    # bytes per pixel.
     "ramp": 8, **dict.fromkeys(ORDER_MAPS.values(), 4),
 }  # fmt: skip
-# Effects that limit pixel values: pixels at the limit are saturated.
+# Names of the effects that simulate an analogue-digital converter. Pixels with its largest number are marked as
+# saturated.
 _CONVERTERS = ("adc", "signal_adc")
-# Effect that is present if a grism is in the beam.
+# Name of an effect that a channel has only if it uses a grism. Only images with this effect have truth maps by spectral
+# order.
 _GRISM = "dispersed_sky"
-# Map to which each effect contributes.
+# Name of the truth map to which each detector effect contributes, by name of the effect.
 _MAP_OF_EFFECT = {
     "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
     "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
@@ -38,21 +44,21 @@ _MAP_OF_EFFECT = {
 
 
 def available_maps(truth: Sequence[str], effects: Sequence[str] | None, sees_sky: bool) -> list[str]:
-    """Select the requested maps that an image has.
+    """Select those of the requested truth maps that an image can have.
 
     Parameters
     ----------
     truth : sequence of str
-        Requested maps.
+        Names of the requested truth maps.
     effects : sequence of str or None
-        Names of the channel's effects. None if they are not known: all maps are then available.
+        Names of the channel's effects for this image type. None if they are not known: all maps are then returned.
     sees_sky : bool
-        True if sources have light on the image.
+        True if light of astronomical sources reaches the detector.
 
     Returns
     -------
     list of str
-        Available maps in the order of `truth`.
+        Names of the maps that the image has, in the order of `truth`.
     """
     available = {_MAP_OF_EFFECT[name] for name in effects or () if name in _MAP_OF_EFFECT}
     available |= {"noise_free", "saturation"} | ({"stars"} if sees_sky else set())
@@ -66,23 +72,23 @@ def available_maps(truth: Sequence[str], effects: Sequence[str] | None, sees_sky
 def map_recorder(
     maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> Callable[[str, Frame, Frame], None]:
-    """Create a callback for `apply_all` that records the truth of each applied effect.
+    """Return a callback for `effect.apply_all` that records truth maps while effects are applied.
 
     Parameters
     ----------
     maps : dict of str to array
-        Maps by name, to which the callback adds.
+        Truth maps by name, to which the callback adds.
     scene : Scene
-        Scene of the exposure.
+        Properties of the exposure on which effects depend.
     truth : sequence of str
-        Requested maps.
+        Names of the requested truth maps. Effects without a requested map are not recorded.
     mode : ReadoutMode
-        Readout of the detector.
+        Readout of the detector, which converts images in readout order to the axes of the detector.
 
     Returns
     -------
     callable
-        Function (name of the effect, frame before, frame after).
+        Function (name of the effect, image before the effect, image after it) -> None.
     """
 
     def record(name: str, frame_before: Frame, frame_after: Frame) -> None:
@@ -106,7 +112,8 @@ def map_recorder(
         if name == "macc" and "ramp" in truth:
             maps["ramp"] = adc.convert_groups(frame_before, scene)
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
-            # Traps may have captured a fraction of an electron: round the difference.
+            # Cosmic rays add whole electrons, but traps may have captured a fraction of an electron. Therefore the
+            # difference is rounded.
             maps["cosmic_rays"] = np.rint(mode.assemble(frame_after - frame_before, scene)).astype(np.int32) + maps.get(
                 "cosmic_rays", 0
             )
@@ -117,26 +124,25 @@ def map_recorder(
 def complete(
     maps: Maps, raw: Array, effects: Sequence[Effect], scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> None:
-    """Add maps of effects that were not needed, and mark pixels above the converter's range as saturated.
+    """Complete the truth maps of an image after all effects have been applied.
+
+    A requested map is 0 everywhere if its effects were not applied. Pixels at the upper limit of the analogue-digital
+    converter are marked as saturated. Maps are set to 0 in rows and pixels that the detector does not read.
 
     Parameters
     ----------
     maps : dict of str to array
-        Recorded maps, which are changed in place.
+        Recorded truth maps by name, which are changed in place. `noise_free` must be among them.
     raw : array
-        Pixel values in ADU.
+        Pixel values after the last effect, ADU, in readout order.
     effects : sequence of Effect
-        Effects of the channel.
+        Effects of the channel for this image type.
     scene : Scene
-        Scene of the exposure.
+        Properties of the exposure on which effects depend.
     truth : sequence of str
-        Requested maps.
+        Names of the requested truth maps.
     mode : ReadoutMode
-        Readout of the detector.
-
-    Notes
-    -----
-    Maps are 0 in rows and pixels that are not read.
+        Readout of the detector, which converts images in readout order to the axes of the detector.
     """
     shape = maps["noise_free"].shape
     requested = available_maps(truth, [effect.name for effect in effects], False)

@@ -1,4 +1,4 @@
-"""Select the catalogue rows that have light on a detector, as sources to draw."""
+"""Select the catalogue rows that have light on a detector in a direct image, as sources to draw."""
 
 from __future__ import annotations
 
@@ -40,41 +40,44 @@ from truesky.render.sources import (
 )
 from truesky.render.sources.source_list import Sources
 
-# Columns of the catalogues that are read. Fluxes are read separately.
+# Columns of the table `galaxies` that describe positions and light profiles; fluxes are in another table.
 SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
 GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
-# Upper limit on the electrons of a source: more would exceed the integer frame, whose unit is a tenth of an electron.
+# Largest allowed number of expected electrons of a source. Light is summed in 64-bit integers, whose unit is coarser
+# for brighter sources; for this number it is 1/16 electron.
 _MAX_ELECTRONS = 1e17
-# Light of a spectrum above which it may be noticeable, in units of a pixel's noise. If all of its light is in one line,
-# the signal-to-noise ratio is 0.7.
+# Smallest total light with which a spectrum counts as noticeable: its electrons divided by the noise of a pixel
+# (electrons rms). If all of this light is in one emission line, its signal-to-noise ratio is 0.7.
 MIN_SPECTRUM_NOISE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Light on a detector.
+    """Sources with light on a detector, and everything that is needed to draw them.
 
     Attributes
     ----------
     sources : Sources
-        Sources to draw.
+        The n sources to draw.
     sizes : int array, shape (n,)
-        Sides of their stamps in pixels.
+        Sides of the stamps (square images) on which the sources are drawn, pixels; 0 for spectra.
     neglected : float64 array, shape (n,)
-        Size of Fourier samples that may be left out.
+        Size up to which samples of a source's Fourier transform may be neglected, as a fraction of its flux; 0 for
+        spectra.
     psf : Psf or None
-        PSF. None if the image has no light of the sky.
+        PSF of the detector. None if the image has no light of the sky.
     scene : Scene
-        Scene with bright sources on and around the detector.
+        Properties of the exposure on which effects depend, with bright sources on and around the detector.
     decisions : tuple of Decision
-        Decisions on effects that act while sources are drawn.
+        For each effect that acts while sources are drawn, whether it is applied.
     dispersed : DispersedSources, optional
-        Dispersion of the sources. None without a grism.
+        Spectra of the sources, and spectral orders of the grism. None without a grism.
     spectrum_rows : int array, shape (n,)
-        Row of each source's spectrum, counted through the galaxies and then the stars; -1 for the Sun's spectrum.
+        For spectra: index of each source's spectrum in the list of all galaxies followed by all stars in the catalogue
+        rows; -1 for the Sun's spectrum. Empty without a grism.
     let_through : float64 array, shape (n,)
-        Fraction of each source's light that the grism transmits.
+        For spectra: fraction of each source's light that is not vignetted by the grism. Empty without a grism.
     """
 
     sources: Sources
@@ -90,7 +93,7 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class CandidateSources:
-    """Galaxies, stars and arcs that may be drawn.
+    """Sources that may have light on a detector: first the galaxies, then the stars, then the gravitational arcs.
 
     Attributes
     ----------
@@ -101,13 +104,14 @@ class CandidateSources:
     electrons : float array, shape (n,)
         Expected electrons.
     shape, picture : int64 array, shape (n,)
-        Same as in `Sources`.
+        Index in `form` (-1 for a source without a profile), and index in `pictures` (-1 for none).
     spectrum_rows : int64 array, shape (n,)
-        Row of each source's spectrum, counted through the galaxies and then the stars.
+        Index of each source's spectrum in the list of all galaxies followed by all stars. An arc has that of its
+        galaxy.
     form : Shapes
-        Shapes of all galaxies, also of galaxies that are drawn as pictures.
+        Bulge and disc parameters of all galaxies, also of galaxies that are drawn as pictures.
     pictures : tuple of Picture
-        Pictures of galaxies and arcs.
+        Images that are drawn instead of profiles, of galaxies and arcs.
     """
 
     ids: Int
@@ -122,10 +126,10 @@ class CandidateSources:
 
 
 def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSources:
-    """Combine all rows into sources that may be drawn.
+    """Combine the galaxies, stars and arcs of catalogue rows into one list of sources that may be drawn.
 
-    `electrons` are the expected electrons of the galaxies and of the stars. Raises BadInput if an identifier occurs
-    twice or a number of electrons is outside its limits.
+    `electrons` are the expected electrons of the galaxies and of the stars. BadInput is raised if an identifier occurs
+    twice, or if a number of electrons is NaN or not between 0 and 1e17.
     """
     catalogue, points = rows.galaxies, rows.stars
     form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
@@ -141,7 +145,7 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
         light,
         np.concatenate([np.where(stamp < 0, np.arange(n), -1), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
         np.concatenate([stamp, np.full(stars, -1), len(stamps) + np.arange(len(arcs.ids))]).astype(np.int64),
-        # Arcs have the spectrum of their source.
+        # An arc is the image of a lensed galaxy and has the spectrum of this galaxy.
         np.concatenate([np.arange(n + stars), arcs.source]).astype(np.int64),
         form,
         (*stamps, *arcs.pictures),
@@ -149,7 +153,7 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
 
 
 def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
-    """Select all light on a detector; there is none if the image type has no light of the sky.
+    """Select all sources with light on a detector in a direct image, and choose the PSF and the stamp sizes.
 
     Parameters
     ----------
@@ -158,14 +162,15 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     rows : Rows
         Catalogue rows that may have light on the detector.
     scene : Scene
-        Scene before anything is drawn.
+        Properties of the exposure before anything is drawn.
     seed : int
-        Seed of the request.
+        Seed of the request, from which moving bodies are drawn.
 
     Returns
     -------
     Light
-        Sources, PSF and scene.
+        Sources, PSF and properties of the exposure. There are no sources and no PSF if the image type has no light of
+        the sky.
     """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
@@ -191,7 +196,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
-    """Adapt catalogue rows to an exposure.
+    """Adapt catalogue rows to the band, the time and the calibration target of an exposure.
 
     Parameters
     ----------
@@ -200,7 +205,7 @@ def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Row
     aim : Aim
         Exposure and detector.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
@@ -222,21 +227,21 @@ def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Row
 
 
 def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
-    """Return the PSF from the exposure's file, or the PSF of its channel.
+    """Return the PSF of a detector, from the user's file if the exposure names one, otherwise from the channel's model.
 
     Parameters
     ----------
     aim : Aim
         Exposure and detector.
     scene : Scene
-        Scene of the exposure.
+        Properties of the exposure, with the mission database.
     settings : Settings
-        Settings with the numbers of positions and colours.
+        Drawing settings, which contain the number of positions on the detector and of colours for the PSF.
 
     Returns
     -------
     Psf
-        PSF of the detector.
+        PSF of the detector. BadInput is raised if a user's file is invalid (`psf.from_file.read`).
     """
     if aim.exposure.psf:
         psf = from_file.read(from_file.path_for_detector(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
@@ -246,7 +251,11 @@ def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
 
 
 def _with_intra_pixel(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
-    """Return the PSF with the intra-pixel response, and the decision; `electrons` are for sources on the frame."""
+    """Add the variation of response inside a pixel (largest at its centre) to the PSF, if this effect is noticeable.
+
+    Returns the PSF and the decision whether the effect is applied. The brightest pixel is estimated from `electrons`,
+    the expected electrons of the sources on the detector.
+    """
     effect = aim.channel.transfer_effect
     if effect is None:
         return psf, ()
@@ -268,17 +277,19 @@ def _no_sources(galaxies: pa.Table) -> Sources:
 
 @dataclass(frozen=True, slots=True)
 class FluxLimits:
-    """Fluxes in microjansky above which sources outside the detector are read; infinite to read none.
+    """Fluxes (microjansky) above which sources outside a detector are read from the catalogue; infinite to read none.
 
     Attributes
     ----------
     min_flux : float
-        Faintest source that reaches the detector from beyond its selection margin. Each fainter source leaves out less
-        than the settings' `edge` of a pixel's noise.
+        Flux of the faintest source that is read from beyond the margin around the detector in which all sources are
+        read. A fainter source would add less than the fraction `settings.Settings.edge` of the noise to a pixel. For
+        spectra: flux of the faintest noticeable spectrum.
     spikes : float
-        Faintest star whose spikes are noticeable from farther out.
+        Flux of the faintest star whose diffraction spikes are noticeable on the detector if it is more than 2048 pixels
+        away (`stamp_sizes.reach`).
     far_galaxy : float
-        Faintest galaxy that is noticeable from farther out.
+        Flux of the faintest galaxy whose outskirts are noticeable on the detector if it is more than 2048 pixels away.
     """
 
     min_flux: float = np.inf
@@ -287,23 +298,23 @@ class FluxLimits:
 
 
 def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, variant: Variant) -> FluxLimits:
-    """Fluxes above which sources outside a detector are read.
+    """Return the fluxes above which sources outside a detector are read from the catalogue.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Exposure.
+        Row of the table `exposures`.
     detector : Detector
-        Detector of its camera.
+        Detector of the camera of this exposure.
     band : Passband
         Passband of the exposure.
     variant : Variant
-        Mission and accuracy.
+        Mission database and accuracy; the effects that the request switches on or off are ignored.
 
     Returns
     -------
     FluxLimits
-        The limits. All are infinite without light of sources: in dark images, or in an exposure of 0 s.
+        The limits. All are infinite if sources have no light: in dark images and in exposures of 0 s.
     """
     time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
     if time == 0.0 or not channel.sees_sky(exposure.image_type):
@@ -324,9 +335,10 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
 def _spike_electrons(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, noise: float
 ) -> float:
-    """Return the electrons of the faintest star whose spikes are noticeable from beyond the reach of stamps.
+    """Return the electrons of the faintest star whose diffraction spikes are noticeable from far outside a detector.
 
-    The number is infinite if the PSF has no spikes.
+    Far means more than 2048 pixels (`stamp_sizes.reach`), up to which all sources are considered. `noise` is that of a
+    pixel, electrons rms. The result is infinite if the PSF has no spikes.
     """
     pupil_of = registry.CHANNELS[exposure.channel].diffraction_edges
     if pupil_of is None or exposure.psf:
@@ -341,7 +353,10 @@ def _spike_electrons(
 def select_sources(
     rows: Rows, electrons: tuple[Float, Float], aim: Aim, psf: Psf, noise: float, settings: Settings
 ) -> tuple[Sources, Int]:
-    """Select everything with light on the detector, within stamps or beyond them.
+    """Select all sources at rest with noticeable light on a detector, and choose the sizes of their stamps.
+
+    A stamp is the square image on which a source is drawn. Light that is drawn outside the stamp, such as diffraction
+    spikes, also counts.
 
     Parameters
     ----------
@@ -354,16 +369,16 @@ def select_sources(
     psf : Psf
         PSF of the detector.
     noise : float
-        Noise of a pixel in electrons.
+        Noise of a pixel, electrons rms.
     settings : Settings
-        Settings of the accuracy.
+        Limits for neglected light, which depend on the accuracy.
 
     Returns
     -------
     sources : Sources
-        Sources by ascending identifier.
+        Sources by ascending identifier, without those of 0 electrons.
     sizes : int array, shape (n,)
-        Sides of their stamps in pixels.
+        Sides of the stamps, pixels.
     """
     detector, wcs, candidates = aim.detector, aim.wcs, list_candidates(rows, electrons)
     light, shape, picture, form = candidates.electrons, candidates.shape, candidates.picture, candidates.form
@@ -404,19 +419,29 @@ def select_sources(
 
 
 def _with_catalogue_bulges(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
-    """Return the shapes with bulge fractions of the catalogue, so that structure is the same in all bands."""
+    """Return the shapes with the bulge fractions of the catalogue instead of the fractions in the exposure's band.
+
+    Spiral arms and knots depend on the bulge fraction, and must be the same in all bands.
+    """
     return form if rows.bulge_fractions is None else replace(form, bulge_fraction=rows.bulge_fractions)
 
 
 def _spike_reach(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
-    """Return the distance in arcsec up to which spikes of point sources are noticeable."""
+    """Return the distance up to which diffraction spikes of each point source are noticeable, arcsec.
+
+    `noise` is that of a pixel in electrons. All distances are 0 for a PSF without spikes.
+    """
     if psf.edges is None:
         return np.zeros(len(electrons))
     return spikes.reach(psf.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
 
 
 def _outskirt_reach(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
-    """Return the distance in arcsec up to which galaxies are noticeable; 0 if it is within the reach of stamps."""
+    """Return the distance up to which each galaxy is noticeable, arcsec; 0 if it is less than 2048 pixels.
+
+    Up to 2048 pixels (`stamp_sizes.reach`), all sources are considered anyway. `electrons` and `form` describe the
+    galaxies. `noise` is that of a pixel in electrons rms.
+    """
     out, min_reach = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
     bright = np.flatnonzero(electrons > outskirts.min_noticeable_electrons(min_reach, detector.pixel_scale, noise))
     out[bright] = outskirts.reach(electrons[bright], form.take(bright), detector.pixel_scale, noise, min_reach)
@@ -426,7 +451,10 @@ def _outskirt_reach(electrons: Float, form: galaxy_shapes.Shapes, detector: Dete
 def _arcs(
     lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: galaxy_shapes.Shapes
 ) -> lensed_arcs.Arcs:
-    """Return the arcs of strong lenses, which magnify the unlensed light of their galaxies."""
+    """Return the gravitational arcs of strong lenses; `electrons` and `form` describe the galaxies.
+
+    The light of an arc is computed from the light that the lensed galaxy would have without magnification.
+    """
     rows = STRONG_LENSES.empty().select(lensed_arcs.ARC_COLUMNS) if lenses is None else lenses
     return lensed_arcs.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
 
@@ -434,9 +462,10 @@ def _arcs(
 def _with_moving(
     fixed: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
 ) -> tuple[Sources, Int, Lights]:
-    """Add moving bodies, which have the largest identifiers.
+    """Add the bodies of the Solar System to the sources at rest `fixed` (sources, sizes of stamps).
 
-    Return sources, sizes of stamps, and bright bodies on and around the frame.
+    Returns the sources, with moving bodies at the end, since they have the largest identifiers; the sizes of their
+    stamps in pixels; and bright bodies on and around the detector, which cause scattered light.
     """
     (sources, sizes), detector = fixed, aim.detector
     reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
@@ -461,26 +490,30 @@ def _with_moving(
 
 
 def touches_detector(sources: Sources, sizes: Int, detector: Detector) -> Bool:
-    """Return a mask of the sources whose stamps overlap the detector.
+    """Find the sources whose stamps (square images around the sources) overlap a detector.
 
     Parameters
     ----------
     sources : Sources
-        Sources.
+        The n sources.
     sizes : int array, shape (n,)
-        Sides of their stamps in pixels.
+        Sides of the stamps, pixels. They are enlarged by the displacement of moving sources.
     detector : Detector
-        Detector.
+        The detector.
 
     Returns
     -------
     bool array, shape (n,)
+        True for sources whose stamps overlap the detector.
     """
     return selection.overlaps_frame(sources.column, sources.row, sizes + sources.trail_length, detector.nx, detector.ny)
 
 
 def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
-    """Return the photon fractions in sub-bands, for rows that count through the galaxies and then the stars."""
+    """Return the fraction of the photons of n sources in each sub-band of a passband [n, sub-bands].
+
+    `spectrum_rows`, shape (n,), are indices in the list of all galaxies followed by all stars in `rows`.
+    """
     of_galaxy = spectrum_rows < len(rows.galaxies)
     out = np.empty((len(spectrum_rows), sub_bands.N_SUB_BANDS))
     out[of_galaxy] = colours.galaxies(rows.galaxies.take(spectrum_rows[of_galaxy]), band, rows.galaxy_library)
@@ -500,16 +533,16 @@ def _check_sources(ids: Int, electrons: Float) -> None:
 
 
 def row_fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
-    """Fluxes of catalogue rows in one band.
+    """Return the fluxes of catalogue rows in one band.
 
     Parameters
     ----------
     rows : Table
         Catalogue rows.
     fluxes : Table
-        Fluxes of the same rows.
+        Table with the fluxes of the same rows, in the same order.
     column : str
-        Column with the fluxes.
+        Name of the column with the fluxes, such as "f_nu_euclid_y".
 
     Returns
     -------
@@ -519,7 +552,7 @@ def row_fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     Raises
     ------
     BadInput
-        If the flux table lacks the column or has other rows.
+        If the flux table does not have the column, or if its identifiers differ from the catalogue's.
     """
     if column not in fluxes.column_names:
         raise BadInput(f"the flux table has no column {column}; it has {', '.join(fluxes.column_names)}")

@@ -1,7 +1,7 @@
-"""Select the catalogue rows whose spectra have light on a detector, as sources to disperse.
+"""Select the catalogue sources whose slitless spectra have light on a detector.
 
-An order displaces a source's light far from its undispersed image. Rows are therefore selected by the undispersed
-positions from which an order sends light onto the detector: a rectangle for each order.
+A spectral order of a grism displaces the light of a source far from its undispersed image. Sources are therefore
+selected by the undispersed positions from which an order sends light onto the detector: a rectangle for each order.
 """
 
 from __future__ import annotations
@@ -35,37 +35,44 @@ from truesky.render.sky.diffuse_light import solar_irradiance
 from truesky.render.sources import selection, solar_system, spectra
 from truesky.render.sources.source_list import Sources
 
-# Distances in pixels from which the wing of a spectrum has light on the detector: for any source, and for sources with
-# more than _BRIGHT electrons.
-_WING, _FAR_WING, _BRIGHT = 64.0, 256.0, 1e6
-# Factor on distances for variations of the plate scale over the field.
+# Distance of a spectrum from the detector, pixels, up to which the PSF wings of any source may have light on the
+# detector.
+_WING = 64.0
+# Distance of a spectrum from the detector, pixels, up to which the PSF wings of bright sources may have light on the
+# detector.
+_FAR_WING = 256.0
+# Sources with more expected electrons than this are bright: their wings are considered up to _FAR_WING.
+_BRIGHT = 1e6
+# Factor by which the radius on the sky is increased in which sources are searched, since the plate scale varies over
+# the field.
 _DISTORTION = 1.02
+# Column of galaxies with the flux of the H alpha line.
 _HALPHA = "flux_halpha"
 
 
 def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
-    """Select all sources whose dispersed light is on a detector.
+    """Select all sources whose dispersed light falls onto a detector, with the data for drawing their spectra.
 
     Parameters
     ----------
     aim : Aim
-        Exposure and detector.
+        Exposure, taken through a grism, and detector.
     rows : Rows
         Catalogue rows that may have light on the detector.
     scene : Scene
-        Scene before anything is drawn.
+        Properties of the exposure before anything is drawn.
     seed : int
-        Seed of the request.
+        Seed of the request, from which moving bodies and the position error of the grism wheel are drawn.
 
     Returns
     -------
     Light
-        Sources with their dispersion.
+        Sources with their spectra and the orders of the grism; `sizes` and `neglected` are 0.
 
     Raises
     ------
     BadInput
-        If the exposure has a PSF file.
+        If the exposure has a PSF from a user's file, which is not supported for spectra.
     """
     exposure, mission, band, dispersion = aim.exposure, scene.mission, aim.band, _dispersion_of(aim)
     if exposure.psf:
@@ -97,21 +104,22 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def make_orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
-    """Create the orders of a grism, with their responses to f_lambda at the wavelengths of `sources.spectra`.
+    """Create the spectral orders of a grism, with their traces and their responses to f_lambda.
 
     Parameters
     ----------
     aim : Aim
-        Exposure and detector.
+        Exposure, taken through a grism, and detector.
     mission : MissionConfiguration
-        Mission database of the exposure.
+        Mission database (parameters of telescopes and cameras) of the exposure.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the position error of the grism wheel is drawn.
 
     Returns
     -------
     tuple of Order
-        Orders with their traces.
+        Orders. Each response is proportional to the detected electrons per f_lambda, at the wavelengths of the
+        passband.
     """
     dispersion, band, exposure = _dispersion_of(aim), aim.band, aim.exposure
     grism_orders = []
@@ -124,25 +132,26 @@ def make_orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Ord
 def margin_arcsec(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, band: Passband, seed: int
 ) -> float:
-    """Distance beyond a detector's circle up to which sources have dispersed light on it.
+    """Return the distance from a detector up to which sources have dispersed light on it.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Row of the exposure.
+        Row of the table `exposures`.
     detector : Detector
-        Detector.
+        The detector.
     mission : MissionConfiguration
-        Mission database.
+        Mission database (parameters of telescopes and cameras).
     band : Passband
         Passband of the exposure.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the position error of the grism wheel is drawn.
 
     Returns
     -------
     float
-        Distance in arcsec, 0 without a grism.
+        Distance beyond the circle through the corners of the detector, arcsec; 0 without a grism or without light of
+        the sky.
     """
     channel = registry.CHANNELS[exposure.channel]
     if channel.dispersion is None or not channel.sees_sky(exposure.image_type):
@@ -152,7 +161,11 @@ def margin_arcsec(
 
 
 def flux_bands(exposure: ExposureRow, columns: Sequence[str]) -> list[str]:
-    """Return the exposure's band, and the selection band of sources if the flux table has a column for it."""
+    """Return the bands in which fluxes of sources are needed: the exposure's band, and possibly a selection band.
+
+    Some channels (instrument modes) with a grism select sources by their flux in another band, the selection band. It
+    is included if the flux of this band is one of `columns`, the columns of the flux table.
+    """
     dispersion = registry.CHANNELS[exposure.channel].dispersion
     selection_band = (
         [] if dispersion is None or f"f_nu_{dispersion.selection_band}" not in columns else [dispersion.selection_band]
@@ -166,20 +179,32 @@ def _dispersion_of(aim: Aim) -> Dispersion:
 
 
 def _rectangles(order_traces: tuple[Trace, ...], detector: Detector, band: Passband) -> Float:
-    """Return the rectangles of undispersed positions in pixels, float64[orders, 4]: left, right, low, high."""
+    """Return, for each order, the rectangle of undispersed positions from which light falls onto the detector.
+
+    The result [orders, 4] contains the smallest and largest column and the smallest and largest row, pixels.
+    """
     ends = float(band.wavelength[0]), float(band.wavelength[-1])
     return np.array([traces.source_rectangle(trace, detector.nx, detector.ny, ends) for trace in order_traces])
 
 
 def _radius(boxes: Float, detector: Detector) -> float:
-    """Return the radius in arcsec of a circle around the detector's centre that contains the rectangles."""
+    """Return the radius, arcsec, of a circle around the detector's centre that contains rectangles with a margin.
+
+    `boxes` has one rectangle per spectral order: smallest and largest column, smallest and largest row, pixels. The
+    margin of 256 pixels contains the PSF wings of bright sources.
+    """
     across = np.abs(boxes[:, :2] - (detector.nx - 1) / 2).max(axis=1)
     up = np.abs(boxes[:, 2:] - (detector.ny - 1) / 2).max(axis=1)
     return float(np.hypot(across + _FAR_WING, up + _FAR_WING).max()) * detector.pixel_scale * _DISTORTION
 
 
 def _select_sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int) -> tuple[Sources, Int]:
-    """Return sources in the rectangles and the rows of their spectra: ascending identifier, then moving bodies."""
+    """Return the sources whose dispersed light falls onto the detector, and the index of each source's spectrum.
+
+    `boxes` are the rectangles from `_rectangles` in which their undispersed positions lie. Sources are sorted by
+    identifier, moving bodies at the end. The index refers to the list of all galaxies followed by all stars in `rows`;
+    it is -1 for a moving body.
+    """
     detector, wcs, column = aim.detector, aim.wcs, f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     factor = electron_rate(aim.exposure) * scene.exposure_time_s
@@ -219,9 +244,11 @@ def _select_sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int)
 
 
 def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scene) -> Bool:
-    """Return a mask of noticeable sources, or the selection of Serrano et al. 2024 if the mission database requests it.
+    """Return the mask of the candidates that are drawn: sources with noticeable light, or sources above flux limits.
 
-    If fluxes in the band of that selection are missing, fluxes in the exposure's band are used.
+    The mission database decides which of the two criteria is used. The flux limits (Serrano et al. 2024) apply to
+    fluxes in the selection band of the channel, or in the band of the exposure if the flux tables lack the selection
+    band.
     """
     if scene.value("spectra.selection", "") < 0.5:
         return np.asarray(candidates.electrons > MIN_SPECTRUM_NOISE * scene.pixel_noise)
@@ -231,7 +258,7 @@ def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scen
         column = f"f_nu_{aim.exposure.band}"
     band_column = f"f_nu_{aim.exposure.band}"
     f_nu, band_f_nu = (np.concatenate([table[name].to_numpy() for table in tables]) for name in (column, band_column))
-    # A standard star has fluxes only in the exposure's band.
+    # A standard star that was added for a calibration has a flux in the band of the exposure only.
     f_nu = np.where(np.isnan(f_nu), band_f_nu, f_nu)
     bright = f_nu >= 10.0 ** (0.4 * (units.AB_UJY - scene.value("spectra.faintest", "mag")))
     if _HALPHA in rows.galaxies.column_names:
@@ -240,9 +267,10 @@ def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scen
 
 
 def _halpha_flux(rows: Rows) -> Float:
-    """Return the observed H alpha flux per galaxy in erg s-1 cm-2, with magnification and Galactic dust.
+    """Return the observed H alpha flux of each galaxy, erg s-1 cm-2, with magnification and extinction by the Galaxy.
 
-    The flux is 0 for galaxies without the line.
+    The flux is 0 for galaxies without the line. Extinction is included only if the rows have the columns `z_obs` and
+    `a_v`.
     """
     flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))
     (with_line,) = np.nonzero(flux > 0.0)
@@ -258,7 +286,12 @@ def _halpha_flux(rows: Rows) -> Float:
 
 
 def _is_inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:
-    """Return a mask of undispersed positions from which some order sends light onto the detector."""
+    """Return the mask of the undispersed positions (x, y) from which some order sends light onto the detector.
+
+    `boxes` has the rectangle of these positions for each order: smallest and largest column, smallest and largest row,
+    pixels. `length` are the lengths of the trails of moving sources, pixels. The rectangles are enlarged for the PSF
+    wings: by 64 pixels, or by 256 pixels for sources with more than 1e6 `electrons`.
+    """
     wing = np.where(electrons > _BRIGHT, _FAR_WING, _WING) + length / 2
     is_inside = np.zeros(len(x), bool)
     for x_min, x_max, y_min, y_max in boxes:

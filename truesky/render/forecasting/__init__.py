@@ -1,1 +1,1 @@
-"""Forecast the cost of a request before it runs: rows, seconds, bytes, and the speed of this machine."""
+"""Forecast the cost of a user's request before it runs (table rows, CPU seconds, bytes), and compare it afterwards."""

@@ -1,4 +1,4 @@
-"""Compare the actual costs of a request's detectors with the forecast: CPU time, memory, bytes, core-hours per deg2."""
+"""Compare the costs of images that have been rendered (CPU time, memory, size) with their forecast."""
 
 from __future__ import annotations
 
@@ -19,37 +19,42 @@ from truesky.render.camera import footprints
 from truesky.render.planning import exposure_chunks
 from truesky.render.products import run_log
 
-# HEALPix order of the cells (0.2 arcmin2) that are counted if a footprint contains their centre. The error of a
-# detector's area is 2 %.
+# HEALPix order of the cells (0.2 arcmin2) with which the area of footprints is measured: cells with their centre in a
+# footprint are counted. The error of a detector's area is 2 %.
 _ORDER = 13
+# Name in place of the channel or camera in a line of the result that adds up several channels or cameras.
 _ALL = "all"
-# Image types of surveys. Other exposures are of bright or dense fields.
+# Image types for which CPU time per area of the sky is computed. Other exposures see special fields, or no sky.
 _SURVEY_TYPES = ("science", "deep")
+# Columns of the table `tasks` (one row per planned detector of an exposure) that are read.
 _TASK_COLUMNS = ("exposure_id", "detector", "channel", "seconds", "bytes", "ra", "dec", "radius", "s_region")
-# Channel, camera and image type.
+# Channel, camera and image type; the costs of all exposures with the same three are added up in one line.
 _Kind = tuple[str, str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One kind of exposure.
+    """CPU time, memory and file size of all images of a channel, camera and image type, or of several such groups.
 
     Attributes
     ----------
     channel, camera, image_type : str
-        Kind of exposure; "all" for camera or channel in sums.
+        Channel, camera and image type. A line that adds up several groups has camera "all" and image type "", and
+        the sum over everything also has channel "all".
     planned, rendered, measured : int
-        Detectors in the plan, detectors with images in the lake, and detectors whose cost is in a log.
+        Number of detector images that are planned, that the lake contains, and whose cost is recorded in a log.
     cpu_s, forecast_s : float
-        Actual and forecast CPU seconds of measured detectors.
+        Actual and forecast CPU seconds of the measured images.
     peak_gb : float
-        Peak memory of a process in GB.
+        Largest peak memory of a process in GB; 0 if unknown.
     gb, forecast_gb : float
-        Actual and forecast size of rendered detectors in GB.
+        Actual and forecast file size of the rendered images in GB.
     deg2 : float
-        Area of the sky in measured detectors of survey exposures, each place counted once. 0 without such exposures.
+        Area of the sky in the measured images of image type "science" or "deep", each place counted once. 0 for other
+        types and for sums.
     core_hours_deg2 : float
-        Core-hours per square degree of this area, with all its exposures; in sums, the sum. 0 without survey exposures.
+        Core-hours per square degree of this area, all its exposures included. It is 0 for other types. A line that adds
+        up several groups has the sum of their values.
     """
 
     channel: str
@@ -68,21 +73,25 @@ class Line:
 
 
 def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> list[Line]:
-    """Compare CPU time, memory and size of a request's images with their forecast.
+    """Compare CPU time, memory and size of a request's rendered images with their forecast.
 
     Parameters
     ----------
     root : Path
-        Folder of the lake.
+        Lake (folder of stored tables and images).
     request : str, optional
-        Name of the request. By default the only one of the lake.
+        Name of the request; None if the lake has only one.
     factor : float, optional
-        CPU seconds of this machine relative to the machine of the forecast.
+        CPU time of this machine relative to the reference machine, whose CPU seconds the stored forecast has.
 
     Returns
     -------
     list of Line
         One line per channel, camera and image type, then one per channel, and one for everything.
+
+    Notes
+    -----
+    An error is raised if the lake has no images of the request.
     """
     products = read.version(root, "products", request=request)
     input_versions = products.manifest["facts"]["inputs"]
@@ -99,7 +108,8 @@ def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> li
     }
     exposure_columns = exposures.rows(("exposure_id", "camera", "image_type"))
     tasks_of_kind: dict[_Kind, list[dict[str, Any]]] = defaultdict(list)
-    # Read only rows of rendered exposures, because a plan may be large. Others are only counted.
+    # Read the rows of rendered exposures only: the tables of all planned exposures may be larger than the memory.
+    # Exposures that are not rendered are only counted.
     exposure_ids = {number for number, _ in rendered}
     exposure_rows = {
         row["exposure_id"]: row
@@ -116,6 +126,8 @@ def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> li
     return [*lines, *sums, _sum(_ALL, lines)]
 
 
+# For each rendered image, by exposure number and detector name: size of its files in bytes, and the CPU time and memory
+# that its log records (empty if unknown).
 RenderedTasks = Mapping[tuple[int, str], tuple[int, Mapping[str, Any]]]
 
 
@@ -124,7 +136,7 @@ def _kind(row: Mapping[str, Any]) -> _Kind:
 
 
 def _planned_counts(tasks: read.Version, exposures: pa.Table) -> dict[_Kind, int]:
-    """Return the number of planned detectors of each kind."""
+    """Return the number of planned detector images for each (channel, camera, image type)."""
     counts: Counter[_Kind] = Counter()
     for table in exposure_chunks.rows_by_partition(tasks, ("exposure_id", "channel")):
         sums = table.join(exposures, "exposure_id").group_by(["channel", "camera", "image_type"])
@@ -163,7 +175,10 @@ def _sum(name: str, lines: Sequence[Line]) -> Line:
 
 
 def _covered_area(tasks: Sequence[dict[str, Any]]) -> float:
-    """Return the area in deg2 that footprints cover together."""
+    """Return the area of the sky in deg2 that the footprints of some detectors cover together, overlaps counted once.
+
+    `tasks` are rows of the table `tasks` with the footprints; without rows the area is 0.
+    """
     footprint_rows = [{name: task[name] for name in ("ra", "dec", "radius", "s_region")} for task in tasks]
     if not footprint_rows:
         return 0.0
@@ -175,7 +190,11 @@ def _covered_area(tasks: Sequence[dict[str, Any]]) -> float:
 
 
 def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
-    """Return the metrics in the logs for each task of a version of `products`; later runs replace earlier ones."""
+    """Return the CPU time and memory in the logs of each detector image, by name of its partition in `products`.
+
+    `key` selects the version of the table `products` (one row per image). A later run replaces an earlier one. Logs
+    that cannot be read and failed images are skipped.
+    """
     metrics: dict[str, Mapping[str, Any]] = {}
     for path in run_log.logs_of_products(root):
         with contextlib.suppress(LakeError, OSError):
@@ -188,7 +207,7 @@ def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
 
 
 def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """Yield the lines of a text table, with a dash for missing values."""
+    """Yield the comparison as lines of a text table, beginning with a title; "-" means 0 in the last two columns."""
     yield (
         f"{'channel':8} {'camera':9} {'image type':17} {'detectors':>9} {'of':>6} {'measured':>8} {'CPU s':>9} "
         f"{'forecast':>9} {'peak GB':>8} {'GB':>8} {'forecast':>8} {'deg2':>7} {'core-h/deg2':>11}"

@@ -1,4 +1,7 @@
-"""Forecast the rows, CPU seconds and bytes of catalogues and their fluxes from area and depth."""
+"""Forecast the table rows, CPU seconds and bytes of simulated catalogues from their area and magnitude limit.
+
+The catalogues are dark-matter halos, galaxies and stars, and the tables of their fluxes.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,11 @@ from truesky.request.area import Area
 from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MissionChoice, Request, Universe
 
-# Lowest HEALPix order of a file of stars, see truesky/catalogue/build_stars.py.
+# HEALPix order of the largest cells that a file of the table `stars` covers (truesky/catalogue/build_stars.py).
 _LOWEST_STAR_ORDER = 3
-# Number of workers of a job, as in spark-defaults.conf.
+# Number of Spark workers (processes) of a job, as in spark-defaults.conf. Each needs CPU time to start.
 WORKERS = 2
+# Names of the catalogue tables that each job makes.
 _TABLES_OF_JOB = {
     "build_galaxies": ("halos", "galaxies"),
     "build_stars": ("stars",),
@@ -39,18 +43,18 @@ _TABLES = ("halos", "galaxies", "stars", *_CATALOGUE_OF_FLUXES)
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Forecast of one job.
+    """Forecast of the rows, CPU time and file size of a job that makes catalogues.
 
     Attributes
     ----------
     job : str
-        Name of the job.
+        Name of the job, such as "build_stars".
     rows : float
-        Rows of its tables.
+        Number of rows that it writes, summed over its tables.
     seconds : float
-        CPU seconds.
+        CPU seconds of the reference machine, multiplied by the factor that was given for this machine.
     gb : float
-        Size of its files in GB.
+        Size of the files that it writes, in GB.
     """
 
     job: str
@@ -60,15 +64,16 @@ class Line:
 
 
 def for_request(request: Request, factor: float = 1.0) -> list[Line]:
-    """Forecast the jobs that draw catalogues for a request.
+    """Forecast rows, CPU time and file size of the jobs that make the catalogues of a request, one line per job.
 
-    External catalogues are left out, because their number of rows is not known. For sources of the user the rows are
-    counted. `factor` is the CPU time of the machine relative to the machine of the channels' costs.
+    `factor` is the CPU time of this machine relative to the reference machine, on which the costs were measured.
+    The user's catalogues of galaxies and of stars are left out, because their number of rows is not known. If the user
+    gives halos, the forecast is that for halos drawn by truesky. The rows of the user's tables of sources are counted.
 
     Notes
     -----
-    Over an area that was not used to derive the costs, errors are 3 % for rows and 2 % for bytes. Errors of seconds are
-    5 % (galaxies) to 30 % (fluxes) if the cache contains the results that each machine computes only once.
+    In a test area, errors were 3 % for rows and 2 % for bytes. Errors of seconds were 5 % (galaxies) to 30 % (fluxes),
+    if the disc cache contains the results that each machine computes only once.
     """
     cells = request.area.cells()
     rows = _drawn_rows(request, cells) if request.sources is None else _given_rows(request.sources, request.area)
@@ -81,9 +86,11 @@ def for_request(request: Request, factor: float = 1.0) -> list[Line]:
 
 
 def for_lake(lake: Folder, factor: float = 1.0) -> list[Line]:
-    """Forecast the jobs whose tables a lake contains, from area and depth in their manifests.
+    """Forecast rows, CPU time and file size of the jobs that made the catalogues of a lake (folder of stored tables).
 
-    Versions of several requests add up; a version that requests share is counted once. `factor` is as in `for_request`.
+    The forecast is for comparison with the logs of these jobs. Area and magnitude limit come from the manifests (stored
+    descriptions) of the tables; missing tables are left out. The tables of several requests add up, and a table that
+    requests share is counted once. `factor` is the CPU time of this machine relative to the reference machine.
     """
     line_of_job: dict[str, Line] = {}
     counted: set[tuple[str, str]] = set()
@@ -117,7 +124,7 @@ def _forecast_versions(versions: Mapping[str, read.Version], factor: float, new_
 
 
 def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """Yield the forecast as lines of a text table."""
+    """Yield the forecast of rows, core-hours and GB as lines of a text table, one per job, beginning with a title."""
     yield f"{'job':16} {'rows':>15} {'core-hours':>11} {'GB':>10}"
     for line in lines:
         yield f"{line.job:16} {line.rows:15,.0f} {line.seconds / 3600.0:11,.3f} {line.gb:10,.3f}"
@@ -135,7 +142,10 @@ def _find_version(lake: Folder, table: str, request: str | None) -> read.Version
 
 
 def _drawn_rows(request: Request, cells: Sequence[int]) -> dict[str, float]:
-    """Return the number of rows of each catalogue that is drawn."""
+    """Return the expected number of rows, by table name, of the catalogues that truesky draws at random.
+
+    `cells` are the order-8 HEALPix cells of the request's area.
+    """
     rows = {} if request.ingest.galaxies else _galaxy_counts(request.universe.galaxy_limit, len(cells))
     if request.stars.catalogue is None:
         mission, universe, brightest = mission_of(request.mission), request.universe, request.stars.bright_limit
@@ -146,7 +156,11 @@ def _drawn_rows(request: Request, cells: Sequence[int]) -> dict[str, float]:
 
 
 def _given_rows(sources: UserSources, area: Area) -> dict[str, float]:
-    """Return the rows of the user's tables; for a grid, the number of grid points in the circle around the area."""
+    """Return the number of rows that the user's own tables of sources give, by table name.
+
+    If the sources are placed on a grid, it is the number of grid points in the circle around the area, divided in
+    proportion to the rows of the tables.
+    """
     files = {"galaxies": sources.galaxies, "stars": sources.stars}
     rows = {name: float(_count_rows(file)) for name, file in files.items() if file is not None}
     if sources.spacing:
@@ -163,10 +177,13 @@ def _count_rows(file: Path) -> int:
 
 
 def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
-    """Return the expected numbers of halos and galaxies in a number of generation cells."""
+    """Return the expected numbers of halos and galaxies brighter than a magnitude limit in `cells` order-8 cells.
+
+    The numbers are means over the sky; a limit outside the tabulated ones is extrapolated.
+    """
     table, area = _costs()["drawn"], cells * sky.cell_area(GENERATION_ORDER)
     limits = np.array(table["limits"])
-    # Outside the tabulated limits, extrapolate from the nearest two.
+    # Interpolate between the two nearest magnitude limits of the table, or extrapolate from them outside the table.
     i = int(np.clip(np.searchsorted(limits, limit) - 1, 0, limits.size - 2))
     s = (limit - limits[i]) / (limits[i + 1] - limits[i])
     logs = {name: np.log(table[name]) for name in ("halos", "galaxies")}
@@ -174,7 +191,7 @@ def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
 
 
 def _star_count(densities: Densities, cells: Sequence[int]) -> float:
-    """Return the number of stars in generation cells from published counts."""
+    """Return the expected number of stars in order-8 HEALPix cells, given the densities of stars on the sky."""
     if not cells:
         return 0.0
     return float(densities.at(*sky.cell_centres(GENERATION_ORDER, cells))[1].sum() * sky.cell_area(GENERATION_ORDER))
@@ -187,7 +204,12 @@ def _make_lines(
     factor: float,
     new_tables: Collection[str] = _TABLES,
 ) -> list[Line]:
-    """Return one line per job, for the tables in `new_tables`."""
+    """Return the forecast (rows, CPU time, file size) of each job that makes tables in `new_tables`.
+
+    Jobs without rows are left out. `rows` and `partition_counts` have the numbers of rows and of files of each table,
+    and `bands` the number of bands of each table of fluxes, by table name. `factor` is the CPU time of this machine
+    relative to the reference machine.
+    """
     lines = []
     for job, tables in _TABLES_OF_JOB.items():
         seconds = size = row_count = 0.0

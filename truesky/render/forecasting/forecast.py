@@ -1,4 +1,4 @@
-"""Summarise the forecast cost of a plan before anything is rendered: exposures, detectors, core-hours and storage."""
+"""Add up the forecast costs of planned images before anything is rendered: core-hours, memory and storage."""
 
 from __future__ import annotations
 
@@ -11,27 +11,30 @@ import pyarrow as pa
 
 from truesky.render.forecasting.speed import Speed
 
-# Columns of `tasks` that a forecast adds up, and the name for all surveys of a channel.
+# Columns of the table `tasks` that a forecast combines over detector images. The numbers of sources, CPU seconds and
+# file bytes are added up. The largest value of the peak memory is taken.
 SUMMED_COLUMNS = ("sources", "seconds", "bytes", "memory")
+# Name in place of the survey in lines of the result that add up all surveys of a channel.
 _ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Forecast for one kind of exposure.
+    """Forecast of CPU time, memory and file size for the exposures of a channel, survey and image type, or for sums.
 
     Attributes
     ----------
     channel, survey, image_type : str
-        Kind of exposure; "all" in sums.
+        Channel, survey and image type. A line that adds up several groups has survey "all" and image type "", and the
+        sum over everything also has channel "all".
     exposures, detectors, sources : int
-        Numbers of exposures, detectors and sources.
+        Numbers of exposures, of detector images, and of galaxies and stars on these images.
     core_hours : float
-        CPU time in hours.
+        CPU time in hours, for the machine to which the argument `factor` of `summarise` belongs.
     gigabytes : float
-        Size of the products in GB.
+        Size of the image files in GB.
     memory_gb : float
-        Peak memory of a task in GB.
+        Largest peak memory for one detector image in GB.
     """
 
     channel: str
@@ -46,16 +49,17 @@ class Line:
 
 
 def summarise(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
-    """Sum up a plan.
+    """Add up the estimated CPU time and file size of planned images, and find their largest memory.
 
     Parameters
     ----------
-    exposures : Table
+    exposures : pyarrow.Table
         Rows of the table `exposures`.
-    tasks : Table
-        Rows of the table `tasks`.
+    tasks : pyarrow.Table
+        Rows of the table `tasks` (one per detector of an exposure) for these exposures.
     factor : float, optional
-        CPU seconds of the machine relative to the machine of the forecast, see `speed.estimate_speed`.
+        CPU time of this machine relative to the reference machine, for which `tasks` has the times; see
+        `speed.estimate_speed`.
 
     Returns
     -------
@@ -79,7 +83,11 @@ def summarise(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list
 
 
 def summarise_chunks(chunks: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
-    """Sum up a plan as in `summarise`, from successive chunks of exposures and their tasks."""
+    """Add up the estimated CPU time and file size of planned images as `summarise` does, from parts of a large plan.
+
+    Each chunk (part of the plan) has some rows of the table `exposures` and all rows of the table `tasks` (one per
+    detector of an exposure) that belong to them.
+    """
     return _add_totals([line for chunk in chunks for line in summarise(*chunk, factor) if line.survey != _ALL])
 
 
@@ -122,7 +130,10 @@ def _line(row: dict[str, Any], factor: float) -> Line:
 
 
 def format_table(lines: list[Line], speed: Speed) -> Iterator[str]:
-    """Yield the forecast as lines of a text table; the last line names the machine of the core-hours."""
+    """Yield the forecast of core-hours, memory and storage as lines of a text table, beginning with a title.
+
+    The last line tells how the speed of this machine, on which the core-hours depend, was estimated.
+    """
     yield (
         f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
         f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"

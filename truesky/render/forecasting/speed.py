@@ -1,6 +1,7 @@
-"""Estimate the speed of this machine relative to the machine of the channels' costs.
+"""Estimate the speed of this machine relative to the reference machine.
 
-The result is a factor on the seconds of a forecast.
+Forecasts contain the CPU seconds of the reference machine (an Intel Xeon with 2.5 GHz), on which the costs of detector
+images were measured. The result of this module is the factor by which they must be multiplied.
 """
 
 from __future__ import annotations
@@ -26,13 +27,21 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.render.products import run_log
 
-# CPU seconds of `run_calibration` on the machine of the channels' costs. It was derived on another machine (AMD EPYC,
-# znver5), which takes 0.13 s, and 0.4 to 0.57 of the costs for detectors.
+# CPU seconds of `run_calibration` on the reference machine, for which all CPU times are forecast. The value was derived
+# from another machine (AMD EPYC, znver5), which needs 0.13 s for `run_calibration`, and for an image 0.4 to 0.57 of the
+# reference machine's time.
 REFERENCE_S = 0.28
-# Lowest number of detectors for an estimate. The first one of each process takes longer: it compiles functions and
-# fills the cache.
+# Smallest number of rendered detector images from which the speed is estimated. It is above 1 because the first image
+# of each process takes longer: functions are compiled and the disc cache is filled.
 _MIN_DETECTORS = 3
-_REPEATS, _SIDE, _STAMPS, _NUMBERS = 5, 128, 192, 2_000_000
+# Number of times that `run_calibration` repeats its typical operations.
+_REPEATS = 5
+# Side in pixels of the stamps (small images) whose Fourier transforms `run_calibration` times.
+_SIDE = 128
+# Number of stamps (small images) to which `run_calibration` applies Fourier transforms.
+_STAMPS = 192
+# Number of random numbers that `run_calibration` draws and sorts.
+_NUMBERS = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +51,9 @@ class Speed:
     Attributes
     ----------
     factor : float
-        CPU seconds on this machine relative to the machine of the forecast.
+        CPU time of this machine divided by that of the reference machine, for which CPU times are forecast.
     source : str
-        Origin of the factor, a clause.
+        How the factor was found, as a clause for messages: "estimated from 5 detectors in this lake".
     """
 
     factor: float
@@ -52,10 +61,12 @@ class Speed:
 
 
 def estimate_speed(lake: Folder) -> Speed:
-    """Estimate the speed of the machine of this process.
+    """Estimate the speed of this machine.
 
-    The factor is the median over the detectors that the lake contains. With too few detectors, it comes from a
-    calibration of one second, which is stored in the cache; its error is 30 % of a detector's seconds.
+    The speed is a factor: the CPU time of this machine divided by that of the reference machine. If the lake (folder of
+    stored tables and images) has at least three images that this kind of machine rendered, the factor is the median of
+    their CPU time divided by its forecast. Otherwise it comes from a calibration of one second, whose result is kept in
+    the disc cache. The forecast time of an image then has an error of 30 %.
     """
     ratios = list(_speed_ratios(lake))
     if len(ratios) >= _MIN_DETECTORS:
@@ -66,9 +77,9 @@ def estimate_speed(lake: Folder) -> Speed:
 
 
 def run_calibration() -> Float:
-    """Return the CPU seconds of a set of typical operations, per repeat.
+    """Return the CPU seconds that a set of typical operations takes, shape (5,), one value per repetition.
 
-    The operations are transforms of stamps, exponentials, random numbers and a sort.
+    The operations are Fourier transforms of stamps, exponentials, Poisson numbers and a sort.
     """
     rng = np.random.default_rng(1)
     waves = (rng.normal(size=(_STAMPS, _SIDE, _SIDE // 2 + 1)) + 0j).astype(np.complex64)
@@ -83,14 +94,17 @@ def run_calibration() -> Float:
 
 
 def _speed_ratios(lake: Folder) -> Iterator[float]:
-    """Yield the CPU time relative to the forecast, for each current detector that this kind of machine rendered."""
+    """Yield the CPU time divided by its forecast for each detector image that this kind of machine rendered.
+
+    Only images of the latest version of the table `products` count. Nothing is yielded if the lake has no images.
+    """
     try:
         version = read.latest_version(lake, "products")
         facts_of_task = {task["name"]: task["facts"] for task in version.manifest["parts"]}
         exposure_ids = {facts["exposure_id"] for facts in facts_of_task.values()}
         planned = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"])
         rendered = pc.field("exposure_id").isin(pa.array([*exposure_ids], pa.int64()))
-        # Read one partition after the other, because a plan may be larger than memory.
+        # Read the table of planned detector images file by file: the whole table may be larger than the memory.
         task_tables = (
             planned.rows(("exposure_id", "detector", "seconds"), [partition], rendered)
             for partition in planned.partitions
@@ -115,7 +129,10 @@ def _speed_ratios(lake: Folder) -> Iterator[float]:
 
 
 def _log_lines(lake: Folder, key: str) -> Iterator[dict[str, Any]]:
-    """Yield the log lines for tasks of a version of `products`. Logs that cannot be read are skipped."""
+    """Yield the log lines, one per detector image, of the runs that made a version of the table `products`.
+
+    `key` names the version. Logs that cannot be read are skipped.
+    """
     for path in run_log.logs_of_products(lake):
         with contextlib.suppress(LakeError, OSError):
             first, *task_lines = run_log.lines(path) or [{}]

@@ -1,1 +1,1 @@
-"""Plan the exposures of a request: what is observed, when, with which detectors, and at what cost."""
+"""Plan the exposures of a user's request: pointings, dates and detectors, and the computing time to simulate them."""

@@ -1,4 +1,4 @@
-"""Plan calibration exposures: bias, dark, flat, charge injection, and observations of calibration targets on the sky.
+"""Plan calibration exposures: bias, dark, flat, charge injection and trap pumping, and calibrators on the sky.
 
 References
 ----------
@@ -25,7 +25,7 @@ from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position
 from truesky.request.observations import Observation
 
 _DAY_S = 86400.0
-# Targets of an image type (two standard stars: Serrano et al. 2024).
+# Names of the calibrators on the sky that each image type observes (two standard stars: Serrano et al. 2024).
 TARGETS = {
     "standard_star": ("Vega", "white dwarf DA"),
     "planetary_nebula": ("planetary nebula",),
@@ -33,38 +33,46 @@ TARGETS = {
     "stray_light": ("Vega",),
     "white_dwarf": ("white dwarf DA",),
 }
-# Parameters of a target that a request may set: attribute of the request, key of the mission, unit.
+# Parameters of a calibrator that a request may set: its AB magnitude, and its distance from the boresight. Each has the
+# attribute of the observation, the end of the parameter's name in the mission database, and the unit.
 _TARGET_PARAMETERS = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
-# Number of trap pumping frames in the mission database.
+# Number of durations of a clock phase of trap pumping that the mission database has. They are used, by default for one
+# frame each, unless the observation gives its own durations.
 _PHASE_TIMES = 4
-# Time from the end of an exposure to the start of the next, s; the slowest read-out determines it.
+# Seconds from the end of the exposure time of a calibration exposure to the start of the next exposure, which suffice
+# for the slowest readout. If a NISP exposure lasts longer, the next one begins when it has ended.
 _PAUSE = 90.0
 
 
 def exposures(
     block: Observation, camera: str, centre: tuple[float, float], mission: MissionConfiguration, seed: int, start: float
 ) -> Iterator[Exposure]:
-    """Generate the exposures of each channel of a calibration block, one after another.
+    """Generate the exposures of a calibration observation, one channel after another.
 
     Parameters
     ----------
     block : Observation
-        Observation block of the request.
+        Observation block of the request, whose image type is a calibration.
     camera : str
-        Camera of the ground survey, used for channel EXT.
+        Name of the ground camera, used for channel EXT; may be "" without this channel.
     centre : tuple of float
-        ICRS ra and dec (deg) of the field of the block, or of the area of the request.
+        ICRS ra and dec (deg) at which the telescope points.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
     seed : int
-        Seed of the request.
+        Seed of the request, used for pointing errors and random dithers.
     start : float
-        Earliest MJD.
+        Earliest MJD. An exposure of the sky by Euclid without a date waits until the Sun constraints allow its
+        position.
 
     Yields
     ------
     Exposure
         One exposure with its date.
+
+    Notes
+    -----
+    BadInput is raised for example if the number of frames is missing, or if the date violates the Sun constraints.
     """
     channels = [registry.CHANNELS[channel] for channel in block.channels]
     bright_sky = block.image_type == "persistence" and block.bright == "sky"
@@ -88,7 +96,8 @@ def exposures(
             continue
         for frame in _frames(template, block, mission, seed):
             yield replace(frame, mjd=now)
-            # A ramp is read out during the exposure. With few groups it takes longer than the exposure time.
+            # A NISP exposure is a ramp of reads, which lasts longer than its exposure time. With few groups of many
+            # reads, the difference may exceed the pause.
             now += max(frame.exposure_time_s + _PAUSE, elapsed_time(frame, mission)) / _DAY_S
 
 
@@ -124,7 +133,13 @@ def _frames(template: Exposure, block: Observation, mission: MissionConfiguratio
 
 
 def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
-    """Generate frames in which all rows are injected; charge accumulates while it is pumped."""
+    """Generate trap pumping frames: charge is injected into all rows and shifted back and forth over the traps.
+
+    A phase time is the duration (s) of one clock phase of a shift. `block.exposures` frames are taken for each.
+
+    The default is one frame per phase time. The phase times come from the observation, or else from the mission
+    database. Each frame records the duration of the pumping as its exposure time.
+    """
     section = image_types.section(frame.camera)
     mission_times = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
     for phase in block.phase_times_s or mission_times:
@@ -137,7 +152,11 @@ def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfigu
 def _defocused_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """Generate exposures with each wavefront in turn at each position."""
+    """Generate defocused exposures: at each dither and in each band, one for each wavefront error (nm).
+
+    A wavefront error is the rms defocus with its sign. The errors come from the observation; by default they are minus
+    and plus the value in the mission database.
+    """
     nominal = mission.value("survey.defocus.wavefront", "nm")
     for frame in _dithered_frames(band_exposures, block, mission, seed):
         key = f"{image_types.section(frame.camera)}.psf.defocus"
@@ -146,7 +165,11 @@ def _defocused_frames(
 
 
 def _with_target_parameters(frame: Exposure, block: Observation) -> Exposure:
-    """Return the exposure with the target parameters of the block, which replace those of the mission."""
+    """Return the exposure with the parameters of its calibrator that the observation sets; others do not change.
+
+    They are the AB magnitude, and the distance from the boresight in degrees. They replace the values of the mission
+    database.
+    """
     values = ((getattr(block, attribute), key, unit) for attribute, key, unit in _TARGET_PARAMETERS)
     parameters = tuple(
         (f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None
@@ -167,7 +190,7 @@ def _seconds(template: Exposure, band: str, block: Observation, mission: Mission
 
 def _bands(template: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
     if template.channel == "NISP-P":
-        # A dark needs no filter. Its closed position of the wheel follows the last filter, or the bands that are named.
+        # A dark needs no filter, so that one band stands for all, unless the observation names bands.
         return FILTERS[-1:] if template.image_type == "dark" and not block.bands else FILTERS
     if template.channel == "NISP-S":
         return (RED,)
@@ -179,9 +202,12 @@ def _bands(template: Exposure, block: Observation, mission: MissionConfiguration
 def _target_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """Generate dithered exposures of each target in each band, or at each grism angle."""
+    """Generate dithered exposures of each calibrator that belongs to the image type of `band_exposures`.
+
+    `band_exposures` has one exposure per band; it determines the bands, or the grism, of the generated exposures.
+    """
     kind, channel = band_exposures[0].image_type, band_exposures[0].channel
-    # A nebula is observed at all grism angles, a star at one angle per dither.
+    # A planetary nebula is observed at all grism angles at each dither, a star at one angle per dither.
     settings = N_GRISM_ANGLES if kind == "planetary_nebula" else 1
     for target in TARGETS[kind]:
         for setting in range(settings):
@@ -194,7 +220,11 @@ def _target_frames(
 def _dithered_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """Generate exposures in all bands at each position of the dither pattern."""
+    """Generate one exposure in each band at each dither (small displacement of the pointing).
+
+    The number of dithers comes from the observation or the mission database. The displacements follow the dither
+    pattern "S" of Euclid, which is repeated after four dithers.
+    """
     kind, channel = band_exposures[0].image_type, band_exposures[0].channel
     steps = offsets("S", mission, seed, kind, channel)
     for i in range(block.exposures or int(mission.value(f"survey.{kind}.dithers"))):
@@ -208,7 +238,11 @@ def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) 
 
 
 def _random_offsets(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
-    """Return offsets in arcsec, shape (dithers, 2), uniform within half a detector and its gap in both directions."""
+    """Return random offsets of the telescope along x and y in arcsec, shape (dithers, 2).
+
+    Each offset is uniform between minus and plus half the distance between the centres of neighbouring detectors along
+    the same axis.
+    """
     fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
     half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]
     return rng.stream(seed, "self_calibration", camera).uniform(-1.0, 1.0, (dithers, 2)) * half

@@ -1,4 +1,7 @@
-"""Estimate the cost of a detector in CPU time, memory and bytes, from numbers measured by benchmarks/planner.py."""
+"""Estimate the CPU time, memory and disc space needed to render the image of a detector.
+
+The numbers were measured with benchmarks/planner.py on the reference machine, an Intel Xeon with 2.5 GHz.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,12 @@ from truesky.render.effects.effect import Effect
 from truesky.render.exposure import truth_maps
 from truesky.request.accuracy import SURVEY, Accuracy
 
-# Bytes of a FITS header with its padding, per image; seconds per byte to write and hash a truth map.
-_HEADER_BYTES, _MAP_S = 8640, 2.5e-9
-# Seconds per pixel of a truth map for each effect in it, and for the frame on which stars are drawn again.
+# Bytes of the FITS header of an image file with its padding, for the estimated file size.
+_HEADER_BYTES = 8640
+# CPU seconds to write and hash a truth map (image of the true signal of one effect), per byte of the map.
+_MAP_S = 2.5e-9
+# CPU seconds per pixel to add the contribution of an effect to a truth map (image of a true signal), by name of the map
+# and then by name of the effect.
 _FILLED_S = {
     "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8, "fringes": 2.5e-8},
     "satellites": {"satellite_trails": 2.5e-8},
@@ -25,23 +31,25 @@ _FILLED_S = {
     "ghosts": {"ghosts": 5e-8},
     "saturation": {"bleeding": 1e-8},
 }
+# CPU seconds per pixel to make the truth map of stars (image of their true signal), for which stars are drawn again.
 _STARS_S = 2e-8
-# Additional bytes per pixel with 32 bits, compared with 16 bits.
+# Bytes per pixel that an image with 32 bits takes in addition to one with 16 bits.
 _WIDE_BYTES = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """Files that are written for a detector.
+    """Format of the image files that are written for a detector.
 
     Attributes
     ----------
     has_exposure_file : bool
-        True if a file with all detectors of the exposure is written, too.
+        True if a second file with all detectors of the exposure is written.
     readout : str
-        Form of the detector image (`truesky.request.schema.READOUTS`).
+        Form of the images of ground cameras: "raw" (one array with all amplifiers), "amplifiers" (one array per
+        amplifier) or "electrons" (electrons in the pixels before readout).
     has_32_bits : bool
-        True if the analogue-to-digital converters have more than 16 bits, so that files store 32 bits.
+        True if the analogue-to-digital converters have more than 16 bits, so that pixels are stored with 32 bits.
     """
 
     has_exposure_file: bool = False
@@ -54,9 +62,11 @@ _DETECTOR_FILES = OutputFiles()
 
 @dataclass(frozen=True, slots=True)
 class CostModel:
-    """Cost of a detector: a fixed cost plus a cost per pixel and per source.
+    """CPU time, memory and file size of a detector as linear functions of its numbers of pixels, galaxies and stars.
 
-    The methods also accept arrays of pixels and sources, shape (n), for n detectors.
+    Fields that end with `_s` are CPU seconds, with `_gb` gigabytes of memory, with `_bytes` bytes of files. They begin
+    with `start_` (per detector), `pixel_` (per pixel of the detector), `read_` (per pixel read out, with prescan and
+    overscan), `galaxy_` or `star_` (per source). The methods also accept arrays of shape (n,) for n detectors.
     """
 
     start_s: float
@@ -70,14 +80,14 @@ class CostModel:
     read_bytes: float
 
     def seconds(self, pixels: Int | int, galaxies: Float | float, stars: Float | float) -> Any:
-        """Return the time on one core in seconds.
+        """Return the CPU time to render a detector, in seconds on one core of the reference machine (Xeon, 2.5 GHz).
 
         Parameters
         ----------
         pixels : int or int array
             Number of pixels of the detector.
         galaxies, stars : float or float array
-            Number of sources on the detector.
+            Expected number of galaxies and of stars on the detector.
 
         Returns
         -------
@@ -87,11 +97,14 @@ class CostModel:
         return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
 
     def memory(self, pixels: Int | int) -> Any:
-        """Return the peak memory in GB."""
+        """Return the peak memory in GB that is needed to render a detector with `pixels` pixels."""
         return self.start_gb + pixels * self.pixel_gb
 
     def bytes(self, pixels: Int | int, read_pixels: Int | int) -> Any:
-        """Return the bytes of the image and its truth maps; `read_pixels` includes prescan and overscan pixels."""
+        """Return the bytes of the files of a detector: its image and truth maps (images of the true signals).
+
+        `pixels` is the number of light-sensitive pixels; `read_pixels` also includes prescan and overscan.
+        """
         return self.start_bytes + np.rint(pixels * self.pixel_bytes + read_pixels * self.read_bytes).astype(np.int64)
 
 
@@ -103,37 +116,42 @@ def cost_model(
     truth: Sequence[str] = (),
     files: OutputFiles = _DETECTOR_FILES,
 ) -> CostModel:
-    """Return the cost model of the detectors of one kind of exposure.
+    """Return the model of CPU time, memory and file size for detectors with one channel, image type and effects.
 
     Parameters
     ----------
     channel : str
-        Name of the channel.
+        Name of the channel: "VIS", "NISP-P", "NISP-S" or "EXT" (ground).
     sees_sky : bool
-        True if sources and sky are drawn.
+        True if the exposure shows the sky, so that sources are drawn.
     effects : sequence of Effect or None
-        Applied effects; None if the channel has no simulator.
+        Detector effects that are applied; None if truesky cannot render the image type.
     accuracy : Accuracy
-        Accuracy of the request.
+        Accuracy of the request, which changes the time per source.
     truth : sequence of str
-        Requested truth maps.
+        Names of the truth maps (images of the true signals of effects) that the request asks for.
     files : OutputFiles
-        Other files that are written.
+        Format of the image files.
 
     Returns
     -------
     CostModel
-        The cost per detector.
+        CPU time, memory and file size per detector.
+
+    Raises
+    ------
+    KeyError
+        If the channel is unknown.
 
     Notes
     -----
-    The error is 30 % for sources like those of the measurement.
+    The true CPU time differs from the model by about 30 %, for sources like those with which the model was measured.
     """
     channel_cost, applied = registry.CHANNELS[channel].cost, effects or ()
     maps = truth_maps.available_maps(truth, None if effects is None else [e.name for e in effects], sees_sky)
     accuracy_factor = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     map_bytes = sum(truth_maps.BYTES_PER_PIXEL[name] for name in maps)
-    # The exposure file contains the science image a second time.
+    # If a file with all detectors of the exposure is written, it contains each science image a second time.
     images = 2 if files.has_exposure_file else 1
     written_bytes = registry.CHANNELS[channel].with_readout(files.readout).readout.file_bytes_per_pixel
     effect_names = [effect.name for effect in applied]

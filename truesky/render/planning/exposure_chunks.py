@@ -1,7 +1,8 @@
-"""Divide a plan into chunks of exposures that can be made independently of one another.
+"""Divide the planned exposures of a request into chunks, each of which becomes one partition of the stored plan.
 
-Chunk limits and exposure numbers depend only on the request. The numbers follow from counts, so that no other chunk has
-to be laid out.
+The plan consists of the tables `exposures` and `tasks` (one row per detector of an exposure). A worker can make a chunk
+without any other chunk: the limits of chunks and the numbers of exposures follow from counts of exposures and
+detectors.
 """
 
 from __future__ import annotations
@@ -28,18 +29,25 @@ from truesky.render.planning.survey import ExposureBlock, ExposureWithMission
 from truesky.render.planning.tasks import TaskSelection, sort_by_cost
 from truesky.request.schema import Request
 
-# Making this number of tasks takes seconds and 200 MB. A smaller plan is a single chunk.
+# Default of the largest number of tasks (detectors of exposures) in a chunk (exposures that one process plans).
+# Planning this many tasks takes seconds and 200 MB of memory.
 MAX_TASKS_PER_CHUNK = 100_000
+# File name of the partition of a plan that is small enough to be stored in a single partition.
 _SINGLE_FILE = "all.parquet"
-# Keys of a chunk's facts: its first and last exposure number, and its date range as MJD.
-_NUMBERS, _DATES = "exposures", "mjd"
-# Columns of `tasks` that a render job needs.
+# Dictionary key of the first and last exposure number of a partition, in its facts (recorded dictionary of its inputs).
+_NUMBERS = "exposures"
+# Dictionary key of the first and last MJD of a partition, in its facts (recorded dictionary of its inputs).
+_DATES = "mjd"
+# Columns of the table `tasks` (one row per detector of an exposure) that render jobs read.
 _TASK_COLUMNS = ("exposure_id", "detector", "channel", "ra", "dec", "radius", "cells", "seconds")
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureRange:
-    """Range of exposures of a block: `first` is included, `last` is excluded."""
+    """Exposures `first` to `last - 1` (from 0) of a block: the exposures of one pointing or observation of a request.
+
+    `block` is the index of the block in the list of all blocks of the request.
+    """
 
     block: int
     first: int
@@ -48,18 +56,19 @@ class ExposureRange:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """One chunk of a plan.
+    """Consecutive exposures of a plan that are stored in one partition; its length is the number of exposures.
 
     Attributes
     ----------
     first : int
-        Number of its first exposure.
+        Number of the first exposure, counted from 1 over all chunks.
     ranges : tuple of ExposureRange
-        Its exposures.
+        The exposures of the chunk.
     previous : tuple of ExposureRange
-        Exposures of earlier chunks that may differ from these only in their noise.
+        Exposures of earlier chunks that begin in the same range of dates. Some may be the same as exposures of this
+        chunk except for their noise, and must be counted to number such repetitions.
     start_mjd, end_mjd : float
-        All exposures begin within this range of MJD.
+        MJDs between which all exposures of the chunk begin. For Euclid fields, the range may be wider than necessary.
     """
 
     first: int
@@ -74,7 +83,12 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """All exposures of a request, divided into chunks. The job sends it to each worker that makes a chunk."""
+    """All planned exposures of a request, in two divisions: blocks and chunks.
+
+    A block has the exposures of one pointing or observation of the request. A chunk has consecutive exposures that one
+    process plans; it becomes one partition of the stored plan. The Spark driver sends this object to each worker that
+    plans a chunk.
+    """
 
     blocks: tuple[ExposureBlock, ...]
     chunks: tuple[Chunk, ...]
@@ -83,27 +97,36 @@ class Layout:
     def from_request(
         cls, request: Request, mission: MissionConfiguration, max_tasks: int = MAX_TASKS_PER_CHUNK
     ) -> Layout:
-        """Lay out the exposures of a request.
+        """Plan the exposures of a request and divide them into chunks (consecutive exposures stored in one partition).
 
         Parameters
         ----------
         request : Request
-            The request.
+            The user's request.
         mission : MissionConfiguration
-            The mission database.
+            Mission database: parameters of the telescopes, cameras and survey.
         max_tasks : int
-            Largest number of detectors per chunk. A chunk with a single field may have more.
+            Largest number of detectors per chunk, summed over its exposures. A chunk with a single Euclid field, or
+            with a single exposure and its repetitions, may have more.
 
         Returns
         -------
         Layout
-            Blocks and chunks. `survey.exposure_blocks` lists the errors.
+            All exposures in blocks (pointings and observations of the request), and their division into chunks.
+
+        Notes
+        -----
+        BadInput is raised by `survey.exposure_blocks`, for example if the Sun constraints forbid an exposure.
         """
         blocks = survey.exposure_blocks(request, mission)
         return cls(tuple(blocks), tuple(_chunks(blocks, max_tasks)))
 
     def parts(self) -> tuple[Task, ...]:
-        """Return the partitions of a table of the plan, one per chunk."""
+        """Return the partitions of the table `exposures` or `tasks`: one per chunk, with its file name and its facts.
+
+        The facts (recorded dictionary) have the first and last exposure number and MJD of the chunk, from which
+        `find_chunk` finds the chunk. They are {} if there is only one chunk.
+        """
         if len(self.chunks) == 1:
             return (Task(_SINGLE_FILE, {}),)
         return tuple(
@@ -115,22 +138,26 @@ class Layout:
         )
 
     def find_chunk(self, facts: Json) -> Chunk:
-        """Return the chunk of a partition from the facts of the partition."""
+        """Return the chunk (consecutive exposures) that belongs to a partition of the table `exposures` or `tasks`.
+
+        `facts` is the dictionary that `parts` returns for the partition; {} gives the first chunk. Raises StopIteration
+        if no chunk begins with the first exposure number in `facts`.
+        """
         if _NUMBERS not in facts:
             return self.chunks[0]
         return next(chunk for chunk in self.chunks if chunk.first == facts[_NUMBERS][0])
 
     def exposures(self, chunk: Chunk, user_passbands: Mapping[str, Passband], seed: int) -> pa.Table:
-        """Return the rows of the table `exposures` of a chunk.
+        """Return the rows of the table `exposures` for a chunk (consecutive exposures that one process plans).
 
         Parameters
         ----------
         chunk : Chunk
-            A chunk of this layout.
+            One of the chunks into which the exposures of the request are divided.
         user_passbands : mapping of str to Passband
-            Passbands by name, in addition to the embedded ones.
+            The user's passbands by name, in addition to the passbands of truesky.
         seed : int
-            Seed of the request.
+            Seed of the request, used to draw the seeing of ground cameras.
 
         Returns
         -------
@@ -149,7 +176,10 @@ class Layout:
         )
 
     def requested_detectors(self, chunk: Chunk) -> list[tuple[str, ...]]:
-        """Return the names of the requested detectors of each exposure of a chunk; () means all detectors."""
+        """Return for each exposure of a chunk the names of the detectors that the request selects; () means all.
+
+        A chunk has consecutive exposures of the plan; the result is in their order.
+        """
         return [
             names
             for exposure_range in chunk.ranges
@@ -159,13 +189,19 @@ class Layout:
         ]
 
     def exposures_near_in_time(self, chunk: Chunk, days_before: float) -> Iterator[Exposure]:
-        """Generate exposures that begin during a chunk or up to `days_before` days earlier, and possibly others."""
+        """Generate all exposures that begin during a chunk (consecutive exposures) or up to `days_before` days earlier.
+
+        Some exposures outside this range may also be generated.
+        """
         for block in self.blocks:
             for exposure_range in block.ranges_between_dates(chunk.start_mjd - days_before, chunk.end_mjd, len(block)):
                 yield from (exposure for exposure, _ in block.exposures(*exposure_range))
 
     def representative_exposures(self) -> Iterator[ExposureWithMission]:
-        """Generate at least one exposure of each kind; the first field of a survey represents all its fields."""
+        """Generate exposures that represent the whole request, for checks that do not need every exposure.
+
+        The first field of a Euclid survey represents all its fields. All other exposures are generated.
+        """
         return chain.from_iterable(
             block.exposures(0, len(block.base_exposures) * block.repetitions) for block in self.blocks
         )
@@ -197,7 +233,11 @@ def _nonempty_range(number: int, start: int, end: int) -> list[ExposureRange]:
 
 
 def _units(block: ExposureBlock) -> Iterator[tuple[int, int]]:
-    """Yield, after each unit of a block, the number of exposures so far and the number of detectors in the unit."""
+    """Yield for each unit of a block (exposures that must stay in one chunk) its end and its number of detectors.
+
+    A unit has all exposures of a Euclid field, or one exposure with its repetitions. Its end is the index (in the
+    block) of the first exposure after the unit. The detectors of all exposures in the unit are summed.
+    """
     camera_sizes = {camera: len(detectors.detectors(camera, mission)) for camera, mission in _cameras(block)}
     tasks = [
         len(dict.fromkeys(exposure.detectors)) or camera_sizes[exposure.camera] for exposure in block.base_exposures
@@ -232,21 +272,21 @@ def _make_chunk(blocks: list[ExposureBlock], first: int, ranges: list[ExposureRa
 def partition_names(
     version: Version, numbers: Iterable[int] = (), dates: tuple[float, float] | None = None
 ) -> list[str]:
-    """Return the names of the partitions of a plan that may contain given exposures or overlap a range of dates.
+    """Return the names of the partitions of a table that may contain given exposures or overlap a range of dates.
 
     Parameters
     ----------
     version : Version
-        Version of the table `exposures` or `tasks`.
+        Stored version of the table `exposures` or `tasks`.
     numbers : iterable of int
-        Exposure numbers.
+        Exposure numbers; () selects no partition by number.
     dates : tuple of float, optional
-        First and last MJD.
+        First and last MJD; None selects no partition by date.
 
     Returns
     -------
     list of str
-        Names of the partitions. Partitions without a range of exposures are always included.
+        Names of the partitions in stored order. The only partition of a small plan is always included.
     """
     sorted_numbers, names = np.unique(np.fromiter(numbers, np.int64)), []
     for part in version.manifest["parts"]:
@@ -269,18 +309,18 @@ def rows(
     where: ds.Expression | None = None,
     columns: Sequence[str] | None = None,
 ) -> pa.Table:
-    """Return rows of the partitions that may contain given exposures or overlap a range of dates.
+    """Return rows of those partitions of a table that may contain given exposures or overlap a range of dates.
 
     Parameters
     ----------
     version : Version
-        Version of the table `exposures` or `tasks`.
+        Stored version of the table `exposures` or `tasks`.
     numbers : iterable of int
-        Exposure numbers.
+        Exposure numbers that select partitions.
     dates : tuple of float, optional
-        First and last MJD.
+        First and last MJD that select partitions, in addition to those selected by number.
     where : pyarrow.dataset.Expression, optional
-        Filter of the rows; None selects all rows.
+        Filter of the rows; None selects all rows of these partitions, including those of other exposures and dates.
     columns : sequence of str, optional
         Names of columns; None selects all columns.
 
@@ -293,14 +333,14 @@ def rows(
 
 
 def rows_of_exposures(version: Version, numbers: Collection[int], columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the rows of given exposures only.
+    """Return the rows of given exposures in a table of the plan, and no other rows.
 
     Parameters
     ----------
     version : Version
-        Version of the table `exposures` or `tasks`.
+        Stored version of the table `exposures` or `tasks`.
     numbers : collection of int
-        Exposure numbers.
+        Exposure numbers. Numbers that the table does not have are ignored.
     columns : sequence of str, optional
         Names of columns; None selects all columns.
 
@@ -319,12 +359,12 @@ def _exposure_filter(numbers: Collection[int]) -> ds.Expression:
 def rows_by_partition(
     version: Version, columns: Sequence[str] | None = None, where: ds.Expression | None = None
 ) -> Iterator[pa.Table]:
-    """Generate the rows of a plan partition by partition, so that a large plan is never in memory as a whole.
+    """Read a table of planned exposures one partition at a time, so that a large table is never in memory as a whole.
 
     Parameters
     ----------
     version : Version
-        Version of the table `exposures` or `tasks`.
+        Stored version of the table `exposures` or `tasks`.
     columns : sequence of str, optional
         Names of columns; None selects all columns.
     where : pyarrow.dataset.Expression, optional
@@ -338,23 +378,21 @@ def rows_by_partition(
     return (version.rows(columns, [part], where) for part in version.partitions)
 
 
-# ------------------------------------------------------------------------------------------------ to be rendered
-
-
 @dataclass(frozen=True, slots=True)
 class RenderSelection:
-    """Rows of a published plan that a run needs; the whole plan may be larger than memory.
+    """Rows of a stored plan that a render job needs; the whole plan may be larger than memory.
 
     Attributes
     ----------
     exposures : pyarrow.Table
-        Exposures of the tasks below.
+        Rows of the table `exposures` to which `tasks` belong.
     tasks : sequence of dict
-        Requested tasks, and all tasks of exposures that the request has already rendered; longest first.
+        Rows of the table `tasks` (one per detector of an exposure) that the request selects. If it restricts detectors
+        or their number, also all rows of exposures of which images exist. Sorted by estimated time, longest first.
     requested : sequence of dict
-        Requested tasks only.
+        The requested rows of the table `tasks` only, longest first.
     detector_counts : mapping of int to int
-        Number of detectors that can be rendered, by exposure number.
+        Number of detectors that the plan has for each exposure of `tasks`, by exposure number.
     """
 
     exposures: pa.Table
@@ -366,16 +404,16 @@ class RenderSelection:
 def select_for_rendering(
     exposures: Version, tasks: Version, request: Request, rendered: Collection[int]
 ) -> RenderSelection:
-    """Select the tasks to render, and the tasks that may already be rendered.
+    """Select the detectors to render from a stored plan, and the detectors of which images may already exist.
 
     Parameters
     ----------
     exposures, tasks : Version
-        Versions of these tables.
+        Stored versions of the tables `exposures` and `tasks` (one row per detector of an exposure).
     request : Request
-        The request; may restrict detectors or their number.
+        The user's request; may restrict the names of detectors, or the number of images.
     rendered : collection of int
-        Exposures of which the request already has images.
+        Numbers of the exposures of which the request already has images.
 
     Returns
     -------
@@ -385,7 +423,8 @@ def select_for_rendering(
     Raises
     ------
     BadInput
-        If no exposure has a simulator, or the request names a detector that is not planned.
+        If truesky can render none of the planned image types. Also if the request names a detector that is not planned,
+        or if its limit on the number of images is below 1.
     """
     renderable = preconditions.renderable_exposures(exposures.rows(["exposure_id", "channel", "image_type"]))
     task_selection, rendered_partitions, rendered_numbers = (
@@ -428,7 +467,11 @@ def select_for_rendering(
 
 
 def _merge_tasks(requested: list[Json], rendered: list[Json]) -> list[Json]:
-    """Return the requested and the rendered tasks without duplicates, longest first."""
+    """Merge rows of the table `tasks`: requested detectors, and detectors of which images already exist.
+
+    The result has no duplicates and is sorted by estimated CPU time, longest first. `requested` must already be sorted
+    in this way.
+    """
     requested_keys = {(task["exposure_id"], task["detector"]) for task in requested}
     additional = [task for task in rendered if (task["exposure_id"], task["detector"]) not in requested_keys]
     if not additional:
@@ -442,25 +485,27 @@ def with_previous_exposures(
     tasks: Iterable[Json],
     mission_for: Callable[[str | None], MissionConfiguration],
 ) -> tuple[pa.Table, dict[tuple[int, str], list[Json]]]:
-    """Find earlier exposures that leave persistence in the detectors of some tasks, even if they are not rendered.
+    """Find the earlier exposures that leave persistence in the detectors to be rendered.
 
     Parameters
     ----------
     inputs : mapping of str to Version
-        Versions of the tables `exposures` and `tasks`.
+        Stored versions of the tables `exposures` and `tasks`, by table name.
     exposures : pyarrow.Table
-        Rows of the table `exposures`.
+        Rows of the table `exposures` for the images to be rendered.
     tasks : iterable of dict
-        Rows of the table `tasks`.
+        Rows of the table `tasks` (one per detector of an exposure) for these images.
     mission_for : callable
-        Returns the mission database for the settings of an exposure.
+        Returns the mission database for the column `settings` of an exposure (JSON of changed parameters, or None).
 
     Returns
     -------
     exposures : pyarrow.Table
-        The given rows and the rows of the earlier exposures.
+        The given rows, followed by those of all other exposures of the same cameras in the range of dates in which
+        earlier exposures may leave persistence. These need not be rendered themselves.
     previous_tasks : dict
-        Earlier tasks of the same detector, by (exposure number, detector name).
+        Earlier rows of `tasks` for the same detector, in order of time, by (exposure number, detector name); {} if the
+        exposures have no persistence.
     """
     affected = [row for row in map(ExposureRow.from_row, exposures.to_pylist()) if persistence.has_persistence(row)]
     if not affected:

@@ -1,4 +1,7 @@
-"""Plan the exposures of ground surveys, from the pattern of each survey or from a table of pointings.
+"""Plan the exposures of ground surveys.
+
+The pointings follow the pattern of the survey, or a user's CSV table of pointings. The table may also list exposures of
+Euclid cameras.
 
 References
 ----------
@@ -28,13 +31,16 @@ from truesky.request.area import Area
 from truesky.request.observations import Observation
 from truesky.request.pointing_tables import Row
 
-_DAY_S, _OVERHEAD_S = 86400.0, 30.0
-# Nautical twilight: the Sun brightens the sky above this altitude, deg.
+_DAY_S = 86400.0
+# Seconds from the end of an exposure to the start of the next one.
+_OVERHEAD_S = 30.0
+# Altitude of the Sun above the horizon at the end of nautical twilight, deg. Exposures of the sky with a higher Sun
+# cause a warning.
 _NIGHT_SUN_ALTITUDE = -12.0
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
-    """Return the camera of a ground survey."""
+    """Return the name of the camera of a ground survey; raises IndexError if the mission database lacks the survey."""
     return _rules(survey, mission)[0]["camera"]
 
 
@@ -48,24 +54,27 @@ def exposures(
     block : Observation
         Observation block of the request, with its survey and bands.
     area : Area
-        Area of the request.
+        Area on the sky to be observed, unless the block gives the position of a single field.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the rules of the survey: bands, pattern of pointings and exposure times.
     seed : int
-        Seed of the request.
+        Seed of the request, used for pointing errors and the shift of the pattern.
     start : float
-        MJD of the first exposure.
+        MJD of the first exposure, or the earliest possible MJD if the block has no date.
 
     Yields
     ------
     Exposure
-        `block.exposures` exposures if the block sets a number, otherwise one layer of the pattern.
+        One exposure per pointing and band, or one per pointing if its bands take turns. If the block sets a number of
+        exposures, each group of bands that share pointings has that many pointings. Otherwise the pattern covers the
+        area as often as the survey defines.
 
     Notes
     -----
-    Bands that the survey observes together share their pointings. The exposures follow one another from `start`. If the
-    block has no date, each exposure waits until its field is next visible at night. The pointings have random errors
-    with the standard deviation given by the survey.
+    Bands that the survey observes together share their pointings. Some surveys use these bands in turn, one per
+    pointing. The exposures follow one another from `start`. If the block has no date, each exposure waits until its
+    field is next visible at night. The pointings have random errors, with the standard deviation that the mission
+    database has for the camera.
     """
     now = start
     rules = _rules(block.survey, mission)
@@ -83,7 +92,7 @@ def exposures(
             else _user_field_pointings(block)
         )
         for i, (ra, dec) in enumerate(places):
-            # If the survey divides its exposures among bands, the bands take turns.
+            # Either every pointing is observed in all bands, or the bands take turns from pointing to pointing.
             all_bands = rule["shared"] == "0" or (block.field_centre is not None and not block.exposures)
             selected_bands = bands if all_bands else (bands[i % len(bands)],)
             for band in selected_bands:
@@ -108,13 +117,19 @@ def exposures(
 
 
 def _seconds(rule: Mapping[str, str], band: str, mission: MissionConfiguration) -> float:
-    """Return the exposure time in seconds: the value of the band if the camera defines one, or else of the survey."""
+    """Return the exposure time in a band, in seconds.
+
+    It is the camera's value for the band if the mission database has one, otherwise the value of the survey.
+    """
     key = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
     return mission.value(key, "s") if key in mission else float(rule["exposure_time_s"])
 
 
 def _with_pointing_error(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a position (deg) with a Gaussian error of `error` arcsec rms in each coordinate."""
+    """Return ra and dec (deg) displaced by a random Gaussian error of `error` arcsec rms along each coordinate.
+
+    `place` is (ra, dec) in degrees.
+    """
     if error == 0.0:
         return place
     east, north = error * rng.standard_normal(2)
@@ -129,7 +144,11 @@ def _rules(survey: str, mission: MissionConfiguration) -> list[Mapping[str, str]
 def _pattern_pointings(
     rule: Mapping[str, str], block: Observation, area: Area, mission: MissionConfiguration, seed: int
 ) -> list[tuple[float, float]]:
-    """Return the pointings of the survey's pattern over the area; if a number is requested, those deepest inside."""
+    """Return the pointings (ra, dec in degrees) of the survey's pattern over the area.
+
+    If the request sets a number of exposures, the pattern is made so dense that it has at least that many pointings.
+    The pointings farthest inside the area are then returned.
+    """
     detectors = camera_detectors.detectors(rule["camera"], mission)
     x, y = pointing.outline(detectors)
     half = [0.5 * float(axis.max() - axis.min()) / 3600.0 for axis in (x, y)]
@@ -137,7 +156,8 @@ def _pattern_pointings(
     if rule["pattern"] == "chips":
         return _chip_pointings(detectors, half, block.exposures, area, margin)
     count = block.exposures
-    # The largest step at which neighbouring round fields just touch, as a fraction of the field.
+    # Distance between neighbouring pointings as a fraction of the side of the field of view, unless the user sets the
+    # number of pointings.
     filled = 0.9
     passes = max(int(rule["passes"]), 1)
     if not count:
@@ -158,7 +178,10 @@ def _pattern_pointings(
 
 
 def _user_field_pointings(block: Observation) -> list[tuple[float, float]]:
-    """Return the position of a user field with its dithers, repeated cyclically if more exposures are requested."""
+    """Return the dithered pointings (ra, dec in degrees) around the field position that the user gives.
+
+    If the request sets a number of exposures, the dithers are repeated in turn until that number is reached.
+    """
     assert block.field_centre is not None
     steps = np.zeros((1, 2)) if isinstance(block.dither, str) else np.array(block.dither)
     ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.field_centre, block.position_angle or 0.0)
@@ -169,7 +192,13 @@ def _user_field_pointings(block: Observation) -> list[tuple[float, float]]:
 def _pattern_pass(
     area: Area, half: list[float], step: float, margin: float, number: int, seed: int, survey: str
 ) -> list[tuple[float, float]]:
-    """Return one pass of the pattern: rows of constant declination, equally spaced, shifted at random for each pass."""
+    """Return the pointings (ra, dec in degrees) of one coverage of the area by the survey's pattern.
+
+    The pattern has equally spaced rows of constant declination. `number` counts the coverages: each has its own random
+    shift of the pattern, drawn with `seed` and `survey`. `half` is half the field of view along x and y (deg), and
+    `step` is the distance of neighbouring pointings as a fraction of the field of view. Pointings up to `margin` (deg)
+    outside the area are included.
+    """
     ra0, dec0, radius = area.bounding_circle()
     reach = radius + margin
     step_x, step_y = 2 * half[0] * step, 2 * half[1] * step
@@ -193,7 +222,11 @@ def _pattern_pass(
 def _chip_pointings(
     detectors: tuple[Detector, ...], half: list[float], count: int, area: Area, margin: float
 ) -> list[tuple[float, float]]:
-    """Return pointings that place each centre on every detector in turn."""
+    """Return pointings (ra, dec in degrees) that place the same positions of the sky on every detector in turn.
+
+    The positions form a grid over the area. `count` is the number of pointings; 0 means that all positions are used.
+    `half` is half the field of view along x and y (deg). Positions up to `margin` (deg) outside the area are included.
+    """
     centres = _pattern_pass(area, half, 1.0, margin, 0, 0, "chips")
     n_centres = int(np.ceil(count / len(detectors))) if count else len(centres)
     lo, hi = 0.02, 20.0
@@ -214,7 +247,11 @@ def _chip_pointings(
 
 
 def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
-    """Return one line that warns of ground exposures dated by day or in twilight, or "" without such exposures."""
+    """Return one line that warns of ground exposures of the sky whose dates are in daylight or twilight.
+
+    The line has the number of these exposures, and an example with the altitude of the Sun. It is "" if no exposure has
+    such a date.
+    """
     daytime, count = [], 0
     sites: dict[str, Site] = {}
     for exposure in exposures:
@@ -237,20 +274,17 @@ def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguratio
     return f"EXT: {summary} ({example}): sunlight is not simulated; omit the date to observe at night"
 
 
-# ------------------------------------------------------------------------------------------------ tables
-
-
 def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
-    """Read the exposures of a table of pointings; values that a row leaves empty come from the block or the mission.
+    """Read the exposures of a user's table of pointings.
 
     Parameters
     ----------
     path : Path
-        CSV table of pointings (`truesky.request.pointing_tables`).
+        CSV table of pointings (`truesky.request.pointing_tables`), of ground or Euclid cameras.
     block : Observation
-        Observation block of the request that names the table.
+        Observation block of the request that names the table; gives the values that a row leaves empty.
     mission : MissionConfiguration
-        The mission database.
+        Mission database; gives the values that neither the row nor the block has.
 
     Returns
     -------
@@ -260,7 +294,12 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     Raises
     ------
     BadInput
-        If a row is invalid; the message names the file, the line and the column.
+        If a row is invalid, for example if its camera lacks the band; the message names the file and the line.
+
+    Notes
+    -----
+    Without a date, a Euclid exposure begins when the Sun constraints allow it, and a ground exposure when its field is
+    next visible at night.
     """
     rows = pointing_tables.read(path, block.channels, block.image_type)
     return [_exposure_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]

@@ -1,4 +1,4 @@
-"""Plan flats with a calibration unit: lamps, the bands in which they are visible, and brightness."""
+"""Plan flat fields lit by the lamps (LEDs) of a calibration unit: which lamp in which band, at which brightness."""
 
 from __future__ import annotations
 
@@ -14,33 +14,34 @@ from truesky.render.effects.light import calibration_lamp
 from truesky.render.planning.planned_exposures import Exposure, through_grism
 from truesky.request.observations import Observation
 
-# Smallest signal of a lamp in a band for which a flat is taken, relative to the peak response of the camera's bands.
+# A flat is taken only if the band detects more than this fraction of the lamp's photons. The fraction is relative to
+# the highest response of the camera's built-in passbands.
 _MIN_RELATIVE_SIGNAL = 0.05
 
 
 def by_lamp(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration
 ) -> list[list[Exposure]]:
-    """Group the flats by lamp: one flat in each band in which the lamp is visible.
+    """Return for each lamp one flat in each band in which the lamp is bright enough.
 
     Parameters
     ----------
     band_exposures : sequence of Exposure
-        One flat per band.
+        One flat per band, all of the same camera; at least one.
     block : Observation
-        Observation block of the request; its lamps, or all lamps of the camera if it names none.
+        Observation block of the request. Its `lamps` are used, or all lamps of the camera if it names none.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the spectra of the lamps.
 
     Returns
     -------
     list of list of Exposure
-        Flats of each lamp. Lamps that are not visible in any band are omitted.
+        One list of flats per lamp. Lamps that are too faint in all bands are omitted.
 
     Raises
     ------
     BadInput
-        If a lamp of the block is not visible in its bands, or no lamp is.
+        If a lamp that the block names is too faint in all bands, or if all lamps are.
     """
     camera, flats = band_exposures[0].camera, []
     curves = {frame.band: passbands.load(frame.band) for frame in band_exposures}
@@ -49,7 +50,7 @@ def by_lamp(
             band: calibration_lamp.led_efficiency(curve, lamp, camera, mission) for band, curve in curves.items()
         }
         frames = [replace(frame, lamp=lamp) for frame in band_exposures if signals[frame.band] > _MIN_RELATIVE_SIGNAL]
-        # Flats of NISP-S are taken with the grism in the beam.
+        # Flats of NISP-S are taken with the grism in the beam. Flats in other channels do not change here.
         lamp_flats = [through_grism(frame, None, mission) for frame in frames]
         if block.lamps and not lamp_flats:
             raise BadInput(f"lamps: {lamp} is not visible in {', '.join(curves)}")
@@ -61,16 +62,17 @@ def by_lamp(
 
 
 def at_levels(flat: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
-    """Yield the flat at each intensity of the block, relative to the signal in the mission database.
+    """Yield the flat once for each intensity of the observation.
 
     Parameters
     ----------
     flat : Exposure
-        A flat.
+        A flat with the signal of the mission database.
     block : Observation
-        Observation block of the request.
+        Observation block of the request. Its `intensities` are relative to the signal in the mission database; none
+        means a single flat with intensity 1.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the signal of a flat in electrons.
 
     Yields
     ------
@@ -84,5 +86,5 @@ def at_levels(flat: Exposure, block: Observation, mission: MissionConfiguration)
 
 
 def select_bands(requested: Sequence[str], channel_bands: Sequence[str]) -> Sequence[str]:
-    """Return the bands of a channel that are requested, or all bands if none of them is requested."""
+    """Return the bands of a channel that are also in `requested`, or all bands of the channel if none is."""
     return [band for band in channel_bands if band in requested] or channel_bands

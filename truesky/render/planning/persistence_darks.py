@@ -1,4 +1,4 @@
-"""Plan bright NISP exposures, each followed by darks that measure its persistence."""
+"""Plan measurements of NISP persistence: bright exposures, each followed by darks with increasing delays."""
 
 from __future__ import annotations
 
@@ -18,18 +18,20 @@ _DAY_S = 86400.0
 
 
 def exposures(template: Exposure, block: Observation, mission: MissionConfiguration, now: float) -> Iterator[Exposure]:
-    """Generate each bright exposure and its darks; the next bright exposure waits until the persistence has faded.
+    """Generate bright exposures, each followed by darks that measure its persistence.
+
+    A bright exposure waits until the persistence of the previous one has faded.
 
     Parameters
     ----------
     template : Exposure
-        Exposure with the pointing and the channel.
+        Exposure with the pointing, camera and channel of all exposures to be made.
     block : Observation
-        Observation block of the request.
+        Observation block of the request: number and brightness of the bright exposures, delays of the darks.
     mission : MissionConfiguration
-        The mission database.
+        Mission database; gives the delays if the block has none.
     now : float
-        MJD of the first bright exposure.
+        MJD at which the first bright exposure begins.
 
     Yields
     ------
@@ -39,7 +41,8 @@ def exposures(template: Exposure, block: Observation, mission: MissionConfigurat
     Raises
     ------
     BadInput
-        If darks overlap, or if one begins so late that persistence is no longer simulated.
+        If darks overlap, or if a dark begins so late that persistence is no longer simulated. Also if lamps or
+        intensities are given although the bright exposures are of the sky.
     """
     band = FILTERS[-1] if template.channel == "NISP-P" else RED
     nominal = exposure_time(template.channel, template.camera, band, mission)
@@ -60,13 +63,17 @@ def exposures(template: Exposure, block: Observation, mission: MissionConfigurat
 
 
 def persistence_end_mjd(exposure: Exposure, mission: MissionConfiguration) -> float:
-    """Return the MJD from which the persistence of an exposure is no longer simulated."""
+    """Return the MJD after which the persistence that an exposure leaves in its detectors is no longer simulated."""
     window = mission.value(f"{exposure.camera}.persistence.window", "d")
     return exposure.mjd + elapsed_time(exposure, mission) / _DAY_S + window
 
 
 def _check_delays(delays: Sequence[float], dark_duration: float, max_delay: float) -> Sequence[float]:
-    """Return the sorted delays (s); a dark takes `dark_duration` s and begins at most after `max_delay` s."""
+    """Return the user's delays of darks in seconds, sorted.
+
+    Raises BadInput if a dark begins before the previous one has ended (after `dark_duration` s), or after `max_delay`
+    s. Delays count from the end of the bright exposure.
+    """
     delays = sorted(delays)
     for delay, next_delay in pairwise(delays):
         if next_delay < delay + dark_duration:
@@ -80,7 +87,10 @@ def _check_delays(delays: Sequence[float], dark_duration: float, max_delay: floa
 
 
 def _mission_delays(dark_duration: float, max_delay: float, mission: MissionConfiguration) -> Sequence[float]:
-    """Return the delays (s) of the mission at which darks of `dark_duration` s fit, up to `max_delay` s."""
+    """Return those delays of darks (s) in the mission database at which darks of `dark_duration` s do not overlap.
+
+    Delays above `max_delay` s are left out. Raises BadInput if none remains.
+    """
     delays: list[float] = []
     names = takewhile(mission.__contains__, (f"nisp.persistence.delay_{i}" for i in count(1)))
     for seconds in (mission.value(name, "s") for name in names):
@@ -92,7 +102,10 @@ def _mission_delays(dark_duration: float, max_delay: float, mission: MissionConf
 
 
 def _bright_exposures(template: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
-    """Generate flats with the lamps and intensities of the block, or a star field in each band."""
+    """Generate the bright exposures: flats with the lamps and intensities of the observation, or images of the sky.
+
+    Raises BadInput if the observation sets lamps or intensities for images of the sky.
+    """
     is_sky, channel = block.bright == "sky", template.channel
     if is_sky and (block.lamps or block.intensities):
         raise BadInput(f"{'lamps' if block.lamps else 'intensities'} must not be set if bright = 'sky'")

@@ -1,4 +1,7 @@
-"""Describe planned exposures, and convert them to rows of the table `exposures` with sky, zero point and seeing."""
+"""Define planned exposures, and convert them to rows of the table `exposures`.
+
+The rows also have the sky background, the photometric zero point and the seeing, which are computed here.
+"""
 
 from __future__ import annotations
 
@@ -28,19 +31,24 @@ from truesky.render.sky.diffuse_light import SkyBand, sky_rate
 from truesky.render.sky.night_sky import Night
 from truesky.request.observations import Observation
 
-# Grisms by the passband in which they are used.
+# Names of the NISP grisms, by the passband in which they are used.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
+# Image types whose exposures contain no light of the sky, so that their column `sky` is 0.
 _DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
-# Columns that `table` computes.
+# Columns of the table `exposures` that are not attributes of `Exposure`, because the function `table` computes them.
 _COMPUTED_COLUMNS = ("exposure_id", "realisation", "airmass", "zenith")
 
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """A planned exposure: channel, position, time and settings.
+    """A planned exposure of a camera.
 
     Attributes
     ----------
+    channel : str
+        "VIS", "NISP-P" (filters), "NISP-S" (grisms) or "EXT" (ground).
+    camera, band, image_type : str
+        Names of the camera and the passband; type of image such as "science", "dark" or "flat".
     ra, dec : float
         ICRS position of the boresight in degrees.
     position_angle : float
@@ -49,20 +57,32 @@ class Exposure:
         Start of the exposure.
     exposure_time_s : float
         Effective exposure time in seconds.
+    survey : str
+        Name of the survey.
+    field, visit, dither : int, optional
+        Numbers from 1 of the field in the survey, of its visit, and of the dither.
+    grism : str, optional
+        Name of the grism; None for an image.
     grism_angle : float, optional
-        Angle in degrees at which spectra run in the focal plane.
+        Direction of the spectra in the focal plane in degrees, from the x axis towards the y axis; None for an image.
+    lamp : int, optional
+        Number from 1 of the lamp of the calibration unit that lights a flat.
+    target : str, optional
+        Name of the calibrator on the sky.
+    psf : str, optional
+        The user's PSF file; None means the PSF model of the camera.
     detectors : tuple of str
         Names of the detectors; () means all detectors of the camera.
     sky : float, optional
-        Sky background in electrons per second and pixel; None means the value of the mission.
+        Sky background in electrons per second and pixel; None means that it is computed.
     seeing : float, optional
-        Seeing in arcsec; None means the value of the mission.
+        Seeing in arcsec; None means that it is drawn at random for ground cameras, and 0 in space.
     zero_point : float, optional
-        AB magnitude of one electron per second; None means the value of the mission.
+        AB magnitude of a source with one electron per second; None means that it is computed.
     settings : str, optional
-        JSON table of the parameters that replace those of the request.
+        JSON table of parameters that replace the values of the request; None if nothing is replaced.
     parameters : tuple of (str, float, str)
-        Key, value and unit of parameters that replace those of the mission database for this exposure.
+        Name, value and unit of parameters that replace the values of the mission database for this exposure alone.
     """
 
     channel: str
@@ -92,14 +112,14 @@ class Exposure:
 
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Return the passbands of a camera.
+    """Return the names of the passbands that a camera has in a channel.
 
     Parameters
     ----------
     channel, camera : str
-        Names of the channel and of the camera.
+        Names of the channel ("VIS", "NISP-P", "NISP-S" or "EXT") and of the camera.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
 
     Returns
     -------
@@ -110,6 +130,8 @@ def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[
     ------
     BadInput
         If the channel has no such camera.
+    KeyError
+        If the channel is unknown.
     """
     bands = registry.CHANNELS[channel].bands(camera, mission)
     if not bands:
@@ -118,29 +140,30 @@ def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[
 
 
 def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfiguration, where: str = "") -> Exposure:
-    """Select the grism of the band whose spectra run closest to an angle; bands without a grism are unchanged.
+    """Return an exposure through the grism of its band whose spectra run closest to an angle.
 
     Parameters
     ----------
     exposure : Exposure
         The exposure.
     angle : float or None
-        Angle of the spectra in the focal plane in degrees; None means 0.
+        Requested direction of the spectra in the focal plane in degrees, from the x axis towards the y axis; None
+        means 0.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the directions of the grisms.
     where : str
-        Key of the request, for the message.
+        Place in the request that gives the angle, quoted in the error message.
 
     Returns
     -------
     Exposure
-        The exposure with `grism` and `grism_angle`.
+        The exposure with `grism` and `grism_angle`; unchanged if its band has no grism and `angle` is None.
 
     Raises
     ------
     BadInput
-        If the band has no grism but an angle is given, or if all grisms would be tilted by more than
-        `grism_wheel.MAX_TILT`.
+        If the band has no grism but an angle is given. Also if every grism of the band would have to be tilted by more
+        than `grism_wheel.MAX_TILT` degrees.
     """
     grisms = GRISMS.get(exposure.band, ())
     if not grisms:
@@ -157,19 +180,19 @@ def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfi
 
 
 def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:
-    """Return the nominal effective exposure time; for a ramp, the time from its first to its last group.
+    """Return the nominal effective exposure time of a camera in the mission database.
 
     Parameters
     ----------
     channel, camera, band : str
-        Names.
+        Names of the channel, of the camera and of the passband. NISP ignores the band, other cameras the channel.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
 
     Returns
     -------
     float
-        Time in seconds.
+        Time in seconds. For NISP, which is read up the ramp, it is the time between the first and last group of reads.
     """
     if camera == "nisp":
         kind = f"nisp.macc.{_ramp_name(channel)}"
@@ -180,25 +203,29 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
 
 
 def elapsed_time(exposure: Exposure, mission: MissionConfiguration) -> float:
-    """Return the seconds until the detectors may be exposed again; a ramp lasts until its last read."""
+    """Return the seconds from the start of an exposure until its detectors may be exposed again.
+
+    For NISP, which is read up the ramp, the result is the time from the reset to the last read. For other cameras it is
+    the exposure time.
+    """
     if exposure.camera != "nisp":
         return exposure.exposure_time_s
     return ramp.duration(_ramp_name(exposure.channel), exposure.exposure_time_s, exposure.camera, mission)
 
 
 def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfiguration, where: str = "") -> None:
-    """Check that the camera has a ramp with the exposure time.
+    """Check that NISP can take an exposure time with its up-the-ramp readout; other cameras are not checked.
 
     Parameters
     ----------
     channel, camera : str
-        Names of the channel and of the camera; only the ramps of NISP are checked.
+        Names of the channel and of the camera.
     seconds : float
         Exposure time in seconds.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the numbers of groups, reads and dropped frames of a ramp.
     where : str
-        Key of the request, for the message.
+        Place in the request that gives the exposure time, quoted in the error message.
 
     Raises
     ------
@@ -213,9 +240,9 @@ def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfig
 
 
 def check_macc(block: Observation, mission: MissionConfiguration) -> None:
-    """Raise BadInput if the ramp of a block does not take the exposure time of the block.
+    """Raise BadInput if an observation sets a NISP ramp and an exposure time that disagree.
 
-    `mission` must contain the ramp of the block.
+    The ramp is `block.macc`: numbers of groups, reads and dropped frames. `mission` must already contain them.
     """
     if not block.macc or block.exposure_time_s is None:
         return
@@ -227,12 +254,19 @@ def check_macc(block: Observation, mission: MissionConfiguration) -> None:
 
 
 def channel_of_macc(block: Observation) -> str:
-    """Return the channel that the ramp of a block applies to: NISP-P if the block has it, otherwise NISP-S."""
+    """Return the NISP channel to which the key `macc` (groups, reads and drops of a ramp) of an observation applies.
+
+    The result is "NISP-P" if this channel is among the channels of the observation, otherwise "NISP-S".
+    """
     return "NISP-P" if "NISP-P" in block.channels else "NISP-S"
 
 
 def ramp_overrides(block: Observation) -> dict[str, tuple[float, str]]:
-    """Return the parameters that the ramp of a block replaces: value and unit by key."""
+    """Return (value, unit) by name for the mission parameters that the ramp of an observation replaces.
+
+    A ramp (up-the-ramp readout of NISP) has these parameters: the number of groups, of averaged reads per group, and of
+    dropped frames between groups. The result is {} if the observation sets no ramp.
+    """
     key = f"nisp.macc.{_ramp_name(channel_of_macc(block))}"
     return {f"{key}.{part}": (n, "") for part, n in zip(("groups", "reads", "drops"), block.macc, strict=False)}
 
@@ -249,27 +283,28 @@ def table(
     first: int = 1,
     previous: Iterable[Exposure] = (),
 ) -> pa.Table:
-    """Make the rows of the table `exposures`, numbered in the order given.
+    """Make the rows of the table `exposures`, numbered in the order in which the exposures are given.
 
     Parameters
     ----------
     exposures : sequence of Exposure
         Planned exposures.
     missions : sequence of MissionConfiguration
-        Mission database of each exposure.
+        Mission parameters of each exposure, same length.
     user_passbands : mapping of str to Passband, optional
-        Passbands by name, in addition to the embedded ones.
+        The user's passbands by name, in addition to the passbands of truesky.
     seed : int
         Seed of the request, used to draw the seeing of ground cameras.
     first : int
         Number of the first exposure.
     previous : iterable of Exposure
-        Earlier exposures, some of which may differ from these only in their noise. They are counted in `realisation`.
+        Exposures before the given ones. The column `realisation` numbers exposures that differ only in their noise; the
+        previous exposures are counted first, but get no rows.
 
     Returns
     -------
     pyarrow.Table
-        One row per exposure.
+        One row per exposure; an empty table without exposures.
     """
     if not exposures:
         return EXPOSURES.empty()
@@ -287,7 +322,11 @@ def table(
 
 
 def _realisation_key(e: Exposure) -> tuple[Any, ...]:
-    """Return the key of an exposure; exposures with the same key would have the same random numbers."""
+    """Return the properties (such as changed parameters, camera, pointing and date) that repetitions have in common.
+
+    Exposures with equal properties are repetitions of one exposure. Different numbers in the column `realisation` give
+    them different noise.
+    """
     angle = _wrap_angle(e.position_angle)
     return e.settings, e.camera, e.band, e.ra % 360.0, e.dec, angle, e.mjd, e.grism, e.grism_angle
 
@@ -298,7 +337,12 @@ def _wrap_angle(angle: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Band:
-    """Properties shared by all exposures of a channel and camera in a band."""
+    """Properties shared by all exposures of a channel and camera in a band.
+
+    `zero_point` is the AB magnitude of one electron per second, and `sky` the model of the sky brightness. `seeing` is
+    the median FWHM (arcsec), and `scatter` its log-normal scatter (dex). Three fields are None for cameras in space:
+    `night` (night sky of the site), `detector` (first one of the camera) and `curve` (passband).
+    """
 
     zero_point: float
     sky: SkyBand
@@ -360,7 +404,10 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
 
 
 def _seeing(e: Exposure, band: _Band, seed: int) -> float:
-    """Draw the seeing (arcsec) from the log-normal distribution of the survey, limited to 3 sigma. It is 0 in space."""
+    """Draw the seeing (arcsec) of a ground camera from a log-normal distribution, limited to 3 sigma.
+
+    The result is 0 in space. The same seed, camera, band, position and date always give the same seeing.
+    """
     if band.scatter == 0.0:
         return band.seeing
     where = (e.camera, e.band, *(value.hex() for value in (e.ra, e.dec, e.mjd)))
@@ -369,9 +416,9 @@ def _seeing(e: Exposure, band: _Band, seed: int) -> float:
 
 
 def untilted_exposure(grism: str, mission: MissionConfiguration) -> ExposureRow:
-    """Return a one-second exposure at (0, 0) deg through a grism that is not tilted.
+    """Return a one-second exposure of the sky at ra = dec = 0 through a grism that is not tilted.
 
-    Parameters are the name of a grism in GRISMS and the mission database.
+    `grism` is a name in `GRISMS`; raises StopIteration for other names.
     """
     camera, band = "nisp", next(band for band, names in GRISMS.items() if grism in names)
     return ExposureRow(
@@ -381,23 +428,24 @@ def untilted_exposure(grism: str, mission: MissionConfiguration) -> ExposureRow:
 
 
 def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> float:
-    """Return the AB magnitude of one electron per second.
+    """Return the photometric zero point of a band: the AB magnitude of a source with one electron per second.
 
     Parameters
     ----------
     prefix : str
-        Prefix of the camera's keys in the mission database.
+        Beginning of the names of the camera's parameters in the mission database, such as "vis" or "ext.decam".
     band : str
         Name of the band.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
     curve : Passband, optional
-        The passband; None means the embedded one.
+        Response of the band; None means the passband of truesky.
 
     Returns
     -------
     float
-        Zero point in magnitudes: the published one for ground cameras, otherwise from throughput and collecting area.
+        Zero point in magnitudes. It is the one in the mission database if the band has one there (ground cameras),
+        otherwise it follows from the passband and the collecting area of Euclid.
     """
     if f"{prefix}.{band}.zero_point" in mission:
         return mission.value(f"{prefix}.{band}.zero_point", "mag")

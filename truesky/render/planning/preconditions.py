@@ -1,4 +1,4 @@
-"""Check before rendering that plan, catalogues and fluxes match the request, and that the area is large enough."""
+"""Check before rendering that the stored tables match the request, and that the catalogues cover all detectors."""
 
 from collections.abc import Mapping
 
@@ -22,28 +22,34 @@ from truesky.request import universe
 from truesky.request.area import Area
 from truesky.request.schema import Request
 
-# Detectors within _LINK deg of one another share one circle; a message lists at most _MAX_PATCHES circles.
-_LINK, _MAX_PATCHES = 5.0, 12
+# If the area of a request is too small, the error message suggests circles on the sky that contain all detectors.
+# Detectors within this distance (deg) share a circle.
+_LINK = 5.0
+# Largest number of circles on the sky that the error message suggests instead of an area that is too small. If there
+# are more circles, detectors at larger distances share a circle.
+_MAX_PATCHES = 12
 
+# Tables of the lake from which images are rendered.
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, mission: MissionConfiguration) -> None:
-    """Check that the plan and the tables were made for this request and its mission, and from one another.
+    """Check that the stored tables were made for this request and these mission parameters, and fit one another.
 
     Parameters
     ----------
     inputs : mapping of str to Version
-        Versions of the tables, by table name.
+        Stored versions of the tables `INPUTS`, and of `strong_lenses` if it exists, by table name.
     request : Request
-        The request.
+        The user's request.
     mission : MissionConfiguration
-        The mission database of the request.
+        Mission parameters of the request.
 
     Raises
     ------
     BadInput
-        If a table belongs to another request, or was made from another version of its input.
+        If a table was made for another request or other mission parameters. Also if fluxes or lenses were computed from
+        another version of the catalogue, or fluxes with other passbands. The message names the job to run.
     """
     universe.check_catalogues([inputs[name] for name in universe.CATALOGUES], request)
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
@@ -65,15 +71,18 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, miss
 
 
 def require_renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
-    """Return the tasks whose exposures have a simulator. Raises BadInput if no exposure has one."""
+    """Return the rows of `tasks` (one per detector of an exposure) whose image type truesky can render.
+
+    Raises BadInput if it can render none of the exposures.
+    """
     renderable_exposures(exposures)
     return renderable_tasks(exposures, tasks)
 
 
 def renderable_exposures(exposures: pa.Table) -> pa.Array | None:
-    """Return the numbers of the exposures that have a simulator, or None if all have one.
+    """Return the numbers of the exposures that truesky can render, or None if it can render every exposure.
 
-    Raises BadInput if no exposure has one.
+    Some image types of a channel can only be planned. Raises BadInput if none of the exposures can be rendered.
     """
     has_simulator = _simulator_flags(exposures)
     if not any(has_simulator.values()):
@@ -84,7 +93,10 @@ def renderable_exposures(exposures: pa.Table) -> pa.Array | None:
 
 
 def renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
-    """Return the tasks whose exposures have a simulator; the table may be empty."""
+    """Return the rows of `tasks` (one per detector of an exposure) whose image type truesky can render.
+
+    The result is empty if it can render none.
+    """
     numbers = _renderable_numbers(exposures, _simulator_flags(exposures))
     return tasks if numbers is None else tasks.filter(pc.is_in(tasks["exposure_id"], numbers))
 
@@ -109,7 +121,7 @@ def _simulator_flags(exposures: pa.Table) -> dict[tuple[str, str], bool]:
 
 
 def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
-    """Raise BadInput if the catalogue does not cover all cells that the detectors observe."""
+    """Raise BadInput if a catalogue lacks some of the order-8 HEALPix cells that the detectors observe."""
     if missing := sorted(cells - catalogue_rows.drawn_cells(catalogue)):
         examples = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
         missing_cells = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors observe ({examples})"
@@ -117,13 +129,11 @@ def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
         raise BadInput(f"table {catalogue.table} lacks {missing_cells}: {remedy}")
 
 
-# ------------------------------------------------------------------------------------------------ before any catalogue
-
-
 def refuse_small_area(area: Area, tasks: pa.Table) -> None:
-    """Raise BadInput if detectors of the tasks see sky outside the area of the catalogues.
+    """Raise BadInput if detectors see sky outside the area for which the request simulates catalogues.
 
-    The message contains an area that is large enough.
+    `tasks` has one row per detector of an exposure; rows without sky cells are ignored. The message contains an area
+    that is large enough.
     """
     sees_sky = pc.greater(pc.list_value_length(tasks["cells"]), 0)
     sky_tasks = tasks.filter(sees_sky)
@@ -147,10 +157,13 @@ def refuse_small_area(area: Area, tasks: pa.Table) -> None:
 
 
 def _is_covered(area: Area, ra: Float, dec: Float, radius: Float) -> Bool:
-    """Return for each circle, shape (n), True if the area has all generation cells that may contain its sources."""
+    """Return for each circle on the sky whether the area has all order-8 cells that may contain its sources; bool[n].
+
+    Positions and radii are in degrees. The circles are enlarged for stars that have moved since the catalogue's epoch.
+    """
     area_cells = set(area.cells())
-    # Cells need not be counted well inside the area. For a box, the depth is no lower limit of the distance to the
-    # edge.
+    # The cells of a circle well inside the area need not be searched. For a box this shortcut is wrong: `depth`
+    # (distance from the edge of the area) may exceed the true distance.
     covered = area.depth(ra, dec) > radius + FARTHEST_MOVED if area.box is None else np.zeros(len(ra), bool)
     for i in np.flatnonzero(~covered):
         place = {"ra": ra[i], "dec": dec[i], "radius": radius[i]}
@@ -159,21 +172,27 @@ def _is_covered(area: Area, ra: Float, dec: Float, radius: Float) -> Bool:
 
 
 def _sufficient_area(ra: Float, dec: Float, radius: Float) -> str:
-    """Return an area that contains all circles, as TOML: one circle, or several if the circles are far apart."""
+    """Return the TOML text of an area of the sky that contains all given circles (ra, dec, radius in degrees).
+
+    The area is one circle. It is a list of circles if these cover less sky than a single one.
+    """
     link, groups = _LINK, _groups(ra, dec, _LINK)
     while len(groups) > _MAX_PATCHES:
         link *= 2.0
         groups = _groups(ra, dec, link)
     circles = [_enclosing_circle(ra[group], dec[group], radius[group]) for group in groups]
     enclosing = _enclosing_circle(ra, dec, radius)
-    # A list is pointless if its circles cover more sky than the single circle.
+    # Prefer the single circle unless several circles together cover less sky.
     if sum(size**2 for *_, size in circles) >= enclosing[2] ** 2:
         return "cone = {{ ra = {:g}, dec = {:g}, radius = {:g} }}".format(*enclosing)
     return f"patches = [{', '.join('[{:g}, {:g}, {:g}]'.format(*circle) for circle in circles)}]"
 
 
 def _groups(ra: Float, dec: Float, link: float) -> list[Int]:
-    """Group positions that lie within `link` deg of the first position of each group."""
+    """Divide positions (deg) into groups, and return each group as an array of indices of its positions.
+
+    All positions of a group lie within `link` deg of its first position.
+    """
     remaining, groups = np.arange(len(ra)), []
     while len(remaining):
         in_group = sky.separation(ra[remaining], dec[remaining], ra[remaining[0]], dec[remaining[0]]) <= link
@@ -183,16 +202,17 @@ def _groups(ra: Float, dec: Float, link: float) -> list[Int]:
 
 
 def _enclosing_circle(ra: Float, dec: Float, radius: Float) -> tuple[float, float, float]:
-    """Return ra, dec and radius (deg) of a circle whose cells contain all sources of the circles.
+    """Return ra, dec and radius (deg) of one circle whose order-8 HEALPix cells contain all sources of the circles.
 
-    The position is rounded to 0.001 deg, the radius up to 0.01 deg.
+    The centre is rounded to 0.001 deg. The radius is rounded up to a multiple of 0.01 deg and at most 180 deg.
     """
     x, y, z = pointing.basis(ra, dec)[2].mean(axis=1)
     lon = round(float(np.degrees(np.arctan2(y, x))) % 360.0, 3) % 360.0
     lat = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 3)
     reach = float((sky.separation(ra, dec, lon, lat) + radius).max()) + FARTHEST_MOVED
     circle_radius = min(np.ceil(100.0 * reach) / 100.0, 180.0)
-    # The cells of a circle may extend beyond it, so that the circle has to grow until its own cells include them.
+    # HEALPix cells of the given circles may extend beyond the enclosing circle. Enlarge the enclosing circle until its
+    # own cells include them.
     while circle_radius < 180.0 and not _is_covered(Area(ra=lon, dec=lat, radius=circle_radius), ra, dec, radius).all():
         circle_radius = min(round(circle_radius + 0.01, 2), 180.0)
     return lon, lat, float(circle_radius)

@@ -1,4 +1,4 @@
-"""Check the user's PSF files while exposures are planned."""
+"""Check that the user's PSF files can be read, before anything is rendered."""
 
 from __future__ import annotations
 
@@ -19,15 +19,21 @@ def check(
     user_passbands: Mapping[str, Passband],
     request_psfs: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Check that the PSF of each detector of the exposures can be read; `psf.from_file.read` raises the errors.
+    """Check that the PSF file of every requested detector of the exposures can be read.
+
     Parameters
     ----------
     exposures : iterable of (Exposure, MissionConfiguration)
-        Exposures of each kind, with the mission that each is planned with.
+        Planned exposures, each with the mission parameters used to plan it. Exposures without a PSF file are ignored.
     user_passbands : mapping of str to Passband
-        Passbands by name, in addition to the embedded ones.
+        The user's passbands by name, in addition to the passbands of truesky.
     request_psfs : sequence of (str, str)
-        Band and PSF file, for each file of the request.
+        Band and PSF file, for each PSF file that the request gives for a whole band. If the file of an exposure is one
+        of several files of its band, all of them are checked.
+
+    Notes
+    -----
+    `truesky.render.psf.from_file.read` raises the errors for missing or invalid files.
     """
     checked: set[tuple[str, str, Path]] = set()
     for exposure, mission in exposures:

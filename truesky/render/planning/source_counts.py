@@ -1,4 +1,7 @@
-"""Predict the density of galaxies and stars at a position, from published catalogues or from count models."""
+"""Predict the number of galaxies and stars per square degree at a position on the sky.
+
+The numbers come from the simulated catalogues of the lake, if it has them, or from tables of number counts.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +18,23 @@ from lake_schema.store import layout
 from lake_schema.store.read import Version
 from truesky.request.schema import Universe
 
-# ------------------------------------------------------------------------------------------------ sources
-
 
 class Densities:
-    """Density of galaxies and stars on the sky.
+    """Number of galaxies and stars per square degree as a function of position on the sky.
 
     Parameters
     ----------
     mission : MissionConfiguration
-        The mission database; provides the count models `survey.galaxy_counts` and `survey.star_counts`.
+        Parameters of the mission, with the tables of number counts `survey.galaxy_counts` and `survey.star_counts`.
     universe : Universe
-        Section of the request; its magnitude limits select the counts.
+        Section `universe` of the user's request; only sources brighter than its magnitude limits are counted.
     catalogues : sequence of Version, optional
-        Published versions of `galaxies` and `stars`: both, or none.
+        Stored versions of the tables `galaxies` and `stars`: both in this order, or none.
 
     Notes
     -----
-    Without catalogues, the galaxy limit is taken as a limit in I_E even if it applies to another band.
+    Without catalogues, the magnitude limit of galaxies is taken as a limit in the Euclid band I_E, even if the request
+    sets it in another band.
     """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
@@ -40,16 +42,17 @@ class Densities:
         counts = np.array(mission.numbers("survey.galaxy_counts"))
         self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
         stars = np.array(mission.numbers("survey.star_counts"))
-        # Columns: Galactic l and b, then counts to H = 8, 10, .., 26.
+        # The table of star counts has the columns Galactic l and b (deg), then stars per deg2 brighter than H = 8, 10,
+        # .., 26 mag. The limits below are these magnitudes.
         limits = 8.0 + 2.0 * np.arange(stars.shape[1] - 2)
         at_limit = [np.interp(universe.star_limit, limits, np.log(row)) for row in stars[:, 2:]]
         self.lon, self.lat = np.unique(stars[:, 0]), np.unique(stars[:, 1])
         self.stars = np.reshape(at_limit, (self.lon.size, self.lat.size))
 
     def at(self, ra: Float, dec: Float) -> Float:
-        """Return the densities of galaxies and stars, shape (2, n), per square degree, at ICRS positions in degrees.
+        """Return the numbers of galaxies and stars per square degree, shape (2, n), at n ICRS positions in degrees.
 
-        Densities come from the published catalogues where they cover the position, otherwise from the count models.
+        They come from the catalogues where both cover the position, otherwise from the tables of number counts.
         """
         model = self._model(ra, dec)
         if not self.published:
@@ -59,7 +62,11 @@ class Densities:
         return np.where(np.isfinite(published).all(axis=0), published, model)
 
     def _model(self, ra: Float, dec: Float) -> Float:
-        """Return densities from the count models: star counts are interpolated bilinearly in (l, b)."""
+        """Return the numbers of galaxies and stars per deg2, shape (2, n), from the tables of number counts.
+
+        The density of galaxies is the same everywhere. The logarithm of that of stars is interpolated bilinearly in
+        Galactic longitude and latitude.
+        """
         lon, lat = sky.galactic(ra, dec)
         wrapped_lon = (lon + 180.0) % 360.0 - 180.0
         i = np.clip(np.searchsorted(self.lon, wrapped_lon, "right") - 1, 0, self.lon.size - 2)
@@ -72,7 +79,11 @@ class Densities:
 
 
 def _catalogue_density(version: Version) -> dict[int, float]:
-    """Return the density (deg-2) in each generation cell that a catalogue covers: the mean of the file of the cell."""
+    """Return the mean number of sources per deg2 by order-8 HEALPix cell, for the cells that a catalogue covers.
+
+    A file of the catalogue contains one HEALPix cell of order 8 or less; all order-8 cells in it get the mean of the
+    file. Raises BadInput if a file lists an order-8 cell that is outside its own cell.
+    """
     density: dict[int, float] = {}
     for part in version.manifest["parts"]:
         cells = part["facts"]["generation_cells"]

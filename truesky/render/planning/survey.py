@@ -1,7 +1,7 @@
-"""Lay out the exposures of a request in the order in which they are taken.
+"""Plan all exposures of a request, in the order in which they are numbered.
 
-Pointings and observation blocks of the request become blocks of exposures. If the request explores parameters, each
-variant has its own set of blocks.
+Each pointing and each observation of the request becomes a block of consecutive exposures. If the request explores
+parameters (simulates the same sky with several values), each combination of values has its own blocks.
 """
 
 from __future__ import annotations
@@ -40,37 +40,45 @@ from truesky.request.area import Area
 from truesky.request.observations import Observation, Pointing
 from truesky.request.schema import Request
 
+# Names of the Euclid Deep Fields.
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
-# Image types that `calibration_frames` lays out.
+# Image types of calibrations, whose exposures the module `calibration_frames` plans.
 _CALIBRATION = tuple(code for code in pointing_tables.IMAGE_TYPES if code not in ("science", "deep"))
-# Tolerance of dates in days: larger than their rounding, shorter than any exposure.
+# Tolerance in days when dates (MJD) of Euclid fields and their exposures are compared: larger than rounding errors, and
+# much shorter than a visit of a field.
 _DATE_TOLERANCE = 1e-7
 
 
+# A planned exposure, and the mission parameters with which it is simulated.
 ExposureWithMission = tuple[Exposure, MissionConfiguration]
-# True for NISP, and the parameters that an exposure overrides.
+# Pair that selects the settings of an exposure: True if its camera is NISP, and the mission parameters (name, value,
+# unit) that are replaced for this exposure alone.
 _SettingsKey = tuple[bool, tuple[tuple[str, float, str], ...]]
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureBlock:
-    """Consecutive exposures: laid out one by one, or Euclid fields whose exposures are laid out on demand.
+    """Consecutive exposures of a pointing or an observation of the request; its length is their number.
+
+    The exposures are stored one by one. For fields of a Euclid survey, only the fields are stored, and their exposures
+    are made when they are needed.
 
     Attributes
     ----------
     request : Request
-        The request.
+        The user's request.
     base_exposures : tuple of Exposure
-        All exposures without their repetitions. Of Euclid fields, only those of the first field, which represents the
-        others.
+        All exposures without their repetitions. For Euclid fields, only the exposures of the first field, which
+        represents the others.
     repetitions : int
         Number of times that each exposure is taken in succession.
     resolved_settings : mapping
-        Settings and mission by (True for NISP, parameters of the exposure).
+        Changed parameters and the resulting mission parameters of each kind of exposure. The key is a pair: True if
+        the camera is NISP, and the parameters that are changed for this exposure alone.
     fields : tuple of Field
-        Fields of a Euclid survey, in order of time.
+        Fields of a Euclid survey in order of time; () for other blocks.
     make_exposures : callable, optional
-        Lays out the exposures of a field; None if the block has no fields.
+        Returns the exposures of a field; None if the block has no fields.
     """
 
     request: Request
@@ -82,14 +90,17 @@ class ExposureBlock:
 
     @property
     def unit(self) -> int:
-        """Number of exposures that are laid out together: all of a field, or the repetitions of an exposure."""
+        """Number of exposures that are planned together: all exposures of a field, or all repetitions of one."""
         return self.repetitions * (len(self.base_exposures) if self.make_exposures is not None else 1)
 
     def __len__(self) -> int:
         return self.unit * (len(self.fields) if self.make_exposures is not None else len(self.base_exposures))
 
     def exposures(self, first: int = 0, last: int | None = None) -> Iterator[ExposureWithMission]:
-        """Generate the exposures with indices `first` to `last - 1`, each with its mission; `last` None means all."""
+        """Generate the exposures with indices `first` to `last - 1`, each with its mission parameters.
+
+        Indices count from 0, with repetitions. `last` None means up to the end of the block.
+        """
         last = len(self) if last is None else last
         start, end = first // self.unit, -(-last // self.unit)
         base = (
@@ -102,7 +113,7 @@ class ExposureBlock:
         return islice(repeated, first - start * self.unit, last - start * self.unit)
 
     def settings_for(self, exposure: Exposure) -> _ResolvedSettings:
-        """Return the settings and the mission of one of the exposures."""
+        """Return the parameters that the request changes for an exposure, and the resulting mission parameters."""
         return self.resolved_settings[exposure.camera == "nisp", exposure.parameters]
 
     def _with_mission(self, exposure: Exposure) -> ExposureWithMission:
@@ -113,34 +124,38 @@ class ExposureBlock:
         return replace(exposure, settings=resolved.settings, psf=psf), resolved.mission
 
     def requested_detectors(self, first: int, last: int) -> list[tuple[str, ...]]:
-        """Return the requested detectors of exposures with indices `first` to `last - 1`; () means all detectors."""
+        """Return for each exposure with index `first` to `last - 1` the names of its requested detectors; () is all."""
         detector_names = [exposure.detectors for exposure in self.base_exposures]
         return [detector_names[i // self.repetitions % len(detector_names)] for i in range(first, last)]
 
     def date_range(self, first: int, last: int) -> tuple[float, float]:
-        """Return the earliest and latest MJD at which the exposures with indices `first` to `last - 1` may begin."""
+        """Return an earliest and a latest MJD between which the exposures `first` to `last - 1` of the block begin.
+
+        The range must not be empty. For Euclid fields the limits may be wider than the true dates.
+        """
         start, end = first // self.unit, -(-last // self.unit)
         if self.make_exposures is None:
             start_mjds = [exposure.mjd for exposure in self.base_exposures[start:end]]
             return min(start_mjds), max(start_mjds)
         duration = max(exposure.mjd for exposure in self.base_exposures) - self.fields[0].mjd
-        # The tolerance is larger than the rounding of a date.
+        # Widen the range a little, because the dates of fields and of exposures are rounded differently.
         return self.fields[start].mjd - _DATE_TOLERANCE, self.fields[end - 1].mjd + duration + _DATE_TOLERANCE
 
     def ranges_between_dates(self, start_mjd: float, end_mjd: float, end_number: int) -> list[tuple[int, int]]:
-        """Find the exposures that begin between two dates.
+        """Find the exposures of the block that begin between two dates.
 
         Parameters
         ----------
         start_mjd, end_mjd : float
-            First and last MJD.
+            First and last MJD, both included.
         end_number : int
-            Only exposures with smaller indices are considered.
+            Only exposures with indices below this number are considered.
 
         Returns
         -------
         list of (int, int)
-            Ranges of indices, the last excluded. Ranges of fields may contain some other exposures.
+            Ranges (first index, last index + 1); [] if no exposure begins between the dates. For fields of a Euclid
+            survey, a range may include some exposures outside the dates.
         """
         if self.make_exposures is None:
             indices = [i for i, exposure in enumerate(self.base_exposures) if start_mjd <= exposure.mjd <= end_mjd]
@@ -154,9 +169,10 @@ class ExposureBlock:
 
 
 def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[ExposureBlock]:
-    """Return the blocks of exposures of a request, in the order in which they are numbered.
+    """Return the blocks of exposures of a request, in the order in which their exposures are numbered.
 
-    Raises BadInput, with the name of the pointing or observation, if an exposure cannot be taken.
+    Raises BadInput if an exposure cannot be taken, for example because the Sun is too close or the camera lacks the
+    band; the message names the pointing or observation. Also if the request has a PSF for a band without exposures.
     """
     blocks: list[ExposureBlock] = []
     for values in request.variants():
@@ -169,12 +185,18 @@ def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[Exp
 
 
 def exposures(request: Request, mission: MissionConfiguration) -> list[ExposureWithMission]:
-    """Return all exposures of a request, each with its mission. Raises BadInput like `exposure_blocks`."""
+    """Return all exposures of a request, each with its mission parameters.
+
+    Raises BadInput if an exposure cannot be taken, like `exposure_blocks`.
+    """
     return [planned_exposure for block in exposure_blocks(request, mission) for planned_exposure in block.exposures()]
 
 
 def _user_psf(exposure: Exposure, request: Request) -> str | None:
-    """Return the request's PSF file for the band of an exposure, drawn at random if there are several."""
+    """Return the PSF file that the request gives for the band of an exposure, or None without such a file.
+
+    If there are several files, one is drawn at random for each position and date.
+    """
     files = [file for band, file in request.psfs if band == exposure.band]
     if len(files) < 2:
         return files[0] if files else None
@@ -184,7 +206,11 @@ def _user_psf(exposure: Exposure, request: Request) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class _ResolvedSettings:
-    """Value of the column `settings` for a variant, and the mission with these settings."""
+    """Parameters with which an exposure is simulated.
+
+    `settings` is a JSON table of the changed parameters, for the column `settings` of the table `exposures`; None
+    without changes. `mission` has all mission parameters after these changes.
+    """
 
     settings: str | None
     mission: MissionConfiguration
@@ -200,16 +226,19 @@ class _ResolvedSettings:
 def _blocks_of_variant(
     request: Request, values: Mapping[str, Any], shared: _ResolvedSettings
 ) -> Iterator[ExposureBlock]:
-    """Generate the blocks of one variant; NISP exposures also have the ramp of their observation.
+    """Generate the blocks of exposures (one per pointing and observation) for one combination of explored parameters.
 
-    If an observation uses both NISP channels, `channel_of_macc` selects the channel that its ramp applies to.
+    `values` has the values of the combination, by name of the parameter. `shared` has the same combination as JSON, and
+    the mission parameters that result from it. If an observation gives its own up-the-ramp readout of NISP, or an
+    exposure its own parameters, these replace the shared ones.
     """
     for i, pointing in enumerate(request.pointings):
         pointed_exposure = _exposure_of_pointing(pointing, f"pointing[{i}]", request, shared.mission)
         yield ExposureBlock(
             request, (pointed_exposure,), pointing.realisations, {(True, ()): shared, (False, ()): shared}
         )
-    # NISP exposures of blocks without a date begin when the earlier blocks have ended and their persistence has faded.
+    # Undated observations with NISP begin when the NISP exposures of earlier calibrations and undated observations have
+    # ended and their persistence has faded. Other dated observations are not considered.
     nisp_free_mjd = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
         where = f"observation[{i}]"
@@ -285,14 +314,14 @@ def check_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
     names : tuple of str
         Names of the detectors.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, which lists the detectors of cameras.
     where : str
-        Key of the request, for the message.
+        Key of the request that has the names, quoted in the error message.
 
     Raises
     ------
     BadInput
-        If the camera has no detector of one of these names.
+        If the camera has no detector of one of these names. No names are always correct.
     """
     available = {detector.name for detector in detectors.detectors(camera, mission)} if names else set()
     unknown = [name for name in names if name not in available]
@@ -301,27 +330,39 @@ def check_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
 
 
 def _is_undated(block: Observation) -> bool:
-    """Return True if the survey determines when a block is observed."""
+    """Return True if an observation has neither a date nor a table of pointings, so that the planner sets its date."""
     return block.mjd is None and not block.pointings
 
 
 @dataclass(frozen=True, slots=True)
 class _ScheduledBlock:
-    """Exposures of an observation, with the same attributes as `ExposureBlock`."""
+    """Exposures of an observation, before the changes of mission parameters for each exposure have been computed.
+
+    `fields` are the Euclid fields of the observation in order of time, () if it has no such fields. `base_exposures`
+    are the exposures of the first field, or all exposures. `make_exposures` returns the exposures of a field; None
+    without fields.
+    """
 
     base_exposures: tuple[Exposure, ...]
     fields: tuple[reference_survey.Field, ...] = ()
     make_exposures: Callable[[reference_survey.Field], Iterable[Exposure]] | None = None
 
     def last_exposures(self) -> Iterable[Exposure]:
-        """Return exposures that include the last one of each channel."""
+        """Return exposures of the observation that include the last one of each channel.
+
+        They are the exposures of the last field, or all exposures if the observation has no fields.
+        """
         return self.base_exposures if self.make_exposures is None else self.make_exposures(self.fields[-1])
 
 
 def _schedule_block(
     block: Observation, request: Request, mission: MissionConfiguration, where: str, nisp_free_mjd: float
 ) -> _ScheduledBlock:
-    """Lay out an observation and check its exposures; NISP is available from `nisp_free_mjd`."""
+    """Plan the exposures of an observation and check detectors, ramps and Sun constraints.
+
+    An undated observation with NISP begins at MJD `nisp_free_mjd`, any other at its date or at the launch. Raises
+    BadInput with `where` (the observation in the request) if an exposure cannot be taken.
+    """
     area = block.area or request.area
     start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
     if _is_undated(block) and {"NISP-P", "NISP-S"} & {*block.channels}:
@@ -329,7 +370,7 @@ def _schedule_block(
     try:
         check_macc(block, mission)
         scheduled = _schedule_exposures(block, area, request.seed, start, mission)
-        # For fields, the first visit with each grism represents all visits.
+        # Check only the first visits with an even and an odd number: visits of Euclid fields differ only in the grism.
         first_visits = (
             ()
             if scheduled.make_exposures is None
@@ -347,7 +388,10 @@ def _schedule_block(
 
 
 def _first_visits(fields: Sequence[reference_survey.Field]) -> Iterator[reference_survey.Field]:
-    """Yield the first even and the first odd visit: the blue grism is used in even visits."""
+    """Yield the first visit with an even number and the first with an odd number, if there are any.
+
+    The two represent all visits, because the blue grism can only be used in even visits.
+    """
     for odd in (0, 1):
         yield from islice((field for field in fields if field.visit % 2 == odd), 1)
 
@@ -389,7 +433,11 @@ def _fields(
 
 
 def deep_area(prefix: str, mission: MissionConfiguration) -> Area:
-    """Return the area of a deep field: its published corners, or a circle with its published area."""
+    """Return the area of a Euclid Deep Field on the sky.
+
+    `prefix` is the beginning of its parameter names, such as "survey.edf_north". The area is the polygon of the
+    published corners, or a circle with the published area if the mission database has no corners.
+    """
     if f"{prefix}.corners" in mission:
         return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in mission.numbers(f"{prefix}.corners")))
     cap = np.arccos(1.0 - mission.value(f"{prefix}.area", "rad2") / (2.0 * np.pi))

@@ -1,6 +1,7 @@
-"""Make the table `tasks`: one row per detector of each exposure, with its sky cells and its cost.
+"""Make the table `tasks`, which has one row per detector of each exposure.
 
-A render job selects its tasks from this table.
+A row has the position of the detector, the HEALPix cells that it sees, and the estimated cost to render its image.
+Render jobs select rows of this table as their tasks.
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ from truesky.request.accuracy import SURVEY, Accuracy
 from truesky.request.schema import Request
 
 _DETECTOR_FILES = OutputFiles()
-# Cells are searched for groups of up to _MAX_GROUP pointings within _GROUP_RADIUS deg of the first.
-_GROUP_RADIUS, _MAX_GROUP = 0.5, 16
+# The HEALPix cells that detectors see are searched at once for several successive pointings. They must be within this
+# distance (deg) of the first of them.
+_GROUP_RADIUS = 0.5
+# Largest number of successive pointings for which the HEALPix cells that detectors see are searched at once.
+_MAX_GROUP = 16
+# Format of an IVOA STC-S region from the ra and dec (deg) of the four corners of a detector.
 _POLYGON = "POLYGON ICRS " + " ".join(["%.7f"] * 8)
-
-# ------------------------------------------------------------------------------------------------ tasks
 
 
 def table(
@@ -54,31 +57,35 @@ def table(
     forced: Mapping[str, bool] | None = None,
     files: OutputFiles = _DETECTOR_FILES,
 ) -> pa.Table:
-    """Make the rows of the table `tasks`, longest first.
+    """Make the rows of the table `tasks` for some exposures, sorted by estimated CPU time, longest first.
 
     Parameters
     ----------
     exposures : pyarrow.Table
         Rows of the table `exposures`.
     detectors : sequence of tuple of str
-        Requested detectors of each exposure; () means all detectors of its camera.
+        Names of the requested detectors for each exposure; () means all detectors of its camera.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
     densities : Densities
-        Densities of galaxies and stars.
+        Numbers of galaxies and stars per square degree, for the estimated CPU time.
     truth : sequence of str
-        Requested truth maps.
+        Names of the truth maps (images of the true signals) that are written for each detector.
     accuracy : Accuracy
-        Accuracy of the request.
+        Accuracy of the request, used unless an exposure has another.
     forced : mapping of str to bool, optional
-        Effects that the request forces on or off.
+        Detector effects that the request forces on (True) or off (False), by name.
     files : OutputFiles
-        Other files that are written.
+        Format of the image files.
 
     Returns
     -------
     pyarrow.Table
-        One row per detector.
+        One row per requested detector of each exposure; an empty table without exposures.
+
+    Notes
+    -----
+    The times do not include earlier exposures that leave persistence: `add_persistence_cost` adds them.
     """
     pairs = set(zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True))
     cameras = {pair: _Camera(*pair, mission) for pair in pairs}
@@ -100,7 +107,7 @@ def table(
 
 
 def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
-    """Return the cameras of the exposures whose detectors have persistence of earlier exposures."""
+    """Return the names of those cameras of the exposures whose images contain persistence of earlier exposures."""
     camera_channels = zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True)
     return {
         camera
@@ -110,9 +117,10 @@ def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
 
 
 def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> float:
-    """Return the longest time, in days, for which the persistence of an exposure is simulated.
+    """Return for how many days after an exposure its persistence (charge that remains in the pixels) is simulated.
 
-    It is the maximum over the cameras of the exposures, and 0 if none of their channels has persistence.
+    The result is the maximum over the cameras in `exposures` (rows of the table `exposures`). It is 0 if no camera has
+    persistence.
     """
     return max(
         (persistence.window_days(camera, mission) for camera in _cameras_with_persistence(exposures)), default=0.0
@@ -122,38 +130,40 @@ def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> floa
 def add_persistence_cost(
     rows: pa.Table, exposures: pa.Table, candidates: Iterable[Exposure], mission: MissionConfiguration
 ) -> pa.Table:
-    """Add the time needed to draw earlier exposures again for their persistence.
+    """Add to estimated CPU times the time needed to draw the earlier exposures that leave persistence in an image.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Rows of the table `tasks`.
+        Rows of the table `tasks`, one per detector of an exposure.
     exposures : pyarrow.Table
-        Rows of the table `exposures` of these tasks.
+        Rows of the table `exposures` to which these tasks belong.
     candidates : iterable of Exposure
-        Exposures that begin during these or up to `persistence_days` earlier.
+        All planned exposures from `persistence_days` days before the first of `exposures` to the last of them. Others
+        may be included.
     mission : MissionConfiguration
-        The mission database.
+        Mission database: parameters of the telescopes, cameras and survey.
 
     Returns
     -------
     pyarrow.Table
-        The rows with the new column `seconds`, longest first.
+        The rows with the new times in column `seconds`, longest first; unchanged if no camera has persistence.
 
     Notes
     -----
-    Each earlier exposure is counted as if it used all detectors.
+    Each earlier exposure of a camera is counted for all its detectors, even if it was requested only for some.
     """
     if not (cameras := _cameras_with_persistence(exposures)):
         return rows
     redraw_cost: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
     for candidate in candidates:
         channel = registry.CHANNELS[candidate.channel]
-        # Exposures that begin at the same time count once.
+        # Store the CPU times by date, so that repetitions of an exposure (same camera and date) count only once.
         if candidate.camera in cameras and channel.sees_sky(candidate.image_type):
             redraw_cost[candidate.camera][candidate.mjd] = channel.cost.redraw_s
     extra_seconds = {}
-    # With integer microseconds, the sums of a chunk and of the whole plan agree.
+    # Sum integer microseconds: the rounding of sums of floats would depend on how exposures are divided into
+    # partitions.
     for camera, cost_by_mjd in redraw_cost.items():
         days = persistence.window_days(camera, mission)
         start_mjds = np.array(sorted(cost_by_mjd))
@@ -169,12 +179,18 @@ def add_persistence_cost(
 
 
 def _pointing_key(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
-    """Return the key of an exposure; the detectors of exposures with the same key observe the same positions."""
+    """Return a dictionary key for the pointing of an exposure.
+
+    Exposures with equal keys have the same camera, position and angle, so that their detectors see the same sky cells.
+    """
     return row.camera, cameras[row.camera, row.channel].margin, row.ra, row.dec, row.position_angle
 
 
 def sort_by_cost(tasks: pa.Table) -> pa.Table:
-    """Sort rows from several partitions, longest first; a single partition is already sorted."""
+    """Sort rows of the table `tasks` by estimated CPU time to render the detector, longest first.
+
+    Rows from a single partition (one Arrow chunk) are returned as they are, because partitions are stored sorted.
+    """
     return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else _longest_first(tasks)
 
 
@@ -184,9 +200,11 @@ def _longest_first(tasks: pa.Table) -> pa.Table:
 
 
 def select_requested(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
-    """Return the rows of the requested detectors, limited to the first `request.limit` by exposure and detector name.
+    """Return the rows of the table `tasks` that a request selects, as dicts in their stored order.
 
-    Raises BadInput if no exposure has a detector that the request names, or if the limit is below 1.
+    They are the rows of the detectors that `request.detectors` names, or all rows if it is empty. If `request.limit` is
+    not None, only this number of rows is kept, the first ones by exposure number and detector name. Raises BadInput if
+    no row has a detector that the request names, or if the limit is below 1.
     """
     selection = TaskSelection(request)
     rows: list[dict[str, Any]] = selection.select(tasks).to_pylist()
@@ -195,9 +213,10 @@ def select_requested(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
 
 
 class TaskSelection:
-    """Select the requested tasks from partitions that arrive in the order of their exposures.
+    """Select the rows of the table `tasks` that a request asks for, partition by partition.
 
-    Raises BadInput if the limit of the request is below 1.
+    Partitions must be given in the order of their exposure numbers, so that the limit on the number of rows keeps the
+    first ones. Raises BadInput if this limit is below 1.
     """
 
     def __init__(self, request: Request) -> None:
@@ -208,16 +227,16 @@ class TaskSelection:
 
     @property
     def is_restricted(self) -> bool:
-        """True if the request may exclude tasks."""
+        """True if the request names detectors or limits the number of rows, so that it may exclude tasks."""
         return bool(self.request.detectors) or self.request.limit is not None
 
     @property
     def is_done(self) -> bool:
-        """True if no remaining task is requested."""
+        """True if the limit on the number of rows is reached and all requested detectors have been found."""
         return self._remaining == 0 and {*self.request.detectors} <= self._planned_names
 
     def select(self, tasks: pa.Table) -> pa.Table:
-        """Return the rows of the requested detectors, up to the limit of the request."""
+        """Return the requested rows of one partition; the limit of the request counts the rows of all calls."""
         if self.request.detectors:
             self._planned_names |= {*tasks["detector"].unique().to_pylist()}
             tasks = tasks.filter(pc.is_in(tasks["detector"], pa.array(self.request.detectors, pa.string())))
@@ -228,7 +247,10 @@ class TaskSelection:
         return tasks
 
     def refuse_unknown(self) -> None:
-        """Raise BadInput if no task had one of the requested detectors."""
+        """Raise BadInput if the request names a detector that none of the given partitions had.
+
+        Call this method after all partitions have been given to `select`.
+        """
         if unknown := sorted({*self.request.detectors} - self._planned_names):
             plan_name = f"the plan of request {self.request.name}"
             examples = ", ".join(sorted(self._planned_names)[:4])
@@ -237,7 +259,13 @@ class TaskSelection:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Positions of the detectors of a camera at one pointing; `first` is the index of the first one in the plan."""
+    """Positions of all detectors of a camera at one pointing.
+
+    `ra`, `dec` and `radius` (deg) are one circle per detector, which contains it and the sky around it from which
+    sources are read. `cells` are the order-8 HEALPix cells that overlap each circle, and `regions` the outlines of the
+    detectors as STC-S polygons. `density` has the galaxies and stars per deg2, shape (2, n). `first` is the index of
+    the first detector in a list of the detectors of all pointings.
+    """
 
     first: int
     names: list[str]
@@ -251,7 +279,11 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _ExposureTasks:
-    """Requested detectors of an exposure: number of each position and cost of each detector."""
+    """Requested detectors of an exposure with the estimated cost to render each, as arrays with one value per detector.
+
+    `place_numbers` are indices of the detectors in a list of the detectors of all pointings. `sources` is the expected
+    number of galaxies and stars. The costs are `seconds` (CPU time), `memory` (GB) and `bytes` (of the files).
+    """
 
     exposure_id: int
     channel: str
@@ -284,7 +316,11 @@ class _ExposureTasks:
 
 
 def _rows(planned: Sequence[_ExposureTasks], places: Sequence[_Places]) -> pa.Table:
-    """Return the rows of all exposures, longest first."""
+    """Return the rows of the table `tasks` for all exposures, longest estimated CPU time first.
+
+    `places` has the positions of the detectors, one item per pointing. `place_numbers` of an exposure are indices into
+    the list of the detectors of all these items.
+    """
     if not planned:
         return TASKS.empty()
     numbers = np.array([item.exposure_id for item in planned], np.int64)
@@ -319,23 +355,40 @@ def _rows(planned: Sequence[_ExposureTasks], places: Sequence[_Places]) -> pa.Ta
 
 
 def _ranks(names: npt.NDArray[np.object_]) -> Int:
-    """Return the alphabetical rank of each name."""
+    """Return the alphabetical rank of each name from 0; equal names have equal ranks."""
     return np.unique(names.astype(str), return_inverse=True)[1]
 
 
 def _cell_lists(cells: Sequence[Int]) -> tuple[pa.ListArray, int]:
-    """Return lists of cells followed by an empty list, and the index of the empty list."""
+    """Return an Arrow array with one list of HEALPix cells per detector and an empty list at the end, and its index.
+
+    The index is that of the empty list, which serves for all detectors that do not see the sky.
+    """
     ends = np.cumsum([0, *map(len, cells), 0], dtype=np.int32)
     return pa.ListArray.from_arrays(ends, np.concatenate([*cells, np.empty(0, np.int64)])), len(cells)
 
 
 class _Camera:
-    """Detectors of a camera and their properties that do not depend on the pointing.
+    """Detectors of a camera, and their properties that do not depend on the pointing.
 
     Attributes
     ----------
+    detectors : tuple of Detector
+        The detectors.
+    names : list of str
+        Their names.
+    index : dict of str to int
+        Index of each detector by name.
+    x, y : float array, shape (n, 5)
+        Centre and four corners of each detector on the tangent plane, in arcsec.
     margin : float
-        Distance in arcsec beyond a detector up to which the channel reads all sources.
+        Distance in arcsec beyond a detector up to which all sources are read from the catalogue.
+    radius : float array, shape (n,)
+        Radius in degrees of the circle that contains a detector and the margin.
+    pixels, read_pixels : int array, shape (n,)
+        Number of light-sensitive pixels, and number with prescan and overscan.
+    area : float array, shape (n,)
+        Area of each detector in deg2.
     """
 
     def __init__(self, camera: str, channel: str, mission: MissionConfiguration) -> None:
@@ -344,7 +397,8 @@ class _Camera:
         self.index = {name: i for i, name in enumerate(self.names)}
         self.x, self.y = pointing.outline(self.detectors)
         self.margin = registry.CHANNELS[channel].margin(self.detectors[0].section, mission)
-        # On the tangent plane, distortion can make a detector larger than its nominal size.
+        # Distance of the farthest corner from the centre of each detector, arcsec. On the tangent plane, distortion can
+        # make a detector larger than its nominal size.
         corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
         reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
         self.radius = (reach + self.margin) / 3600.0
@@ -356,10 +410,10 @@ class _Camera:
 
 
 def _places(camera_by_pointing: Mapping[tuple[Any, ...], _Camera], densities: Densities) -> Iterator[_Places]:
-    """Yield the positions of the detectors for each pointing."""
+    """Yield the positions of the detectors of a camera on the sky, for each pointing in the given order."""
     first, waiting = 0, list(camera_by_pointing.items())
     while waiting:
-        # The detectors of neighbouring dithers share most of their cells.
+        # Search sky cells for a group of close pointings at once: dithers share most of their cells.
         _, _, ra, dec, _ = waiting[0][0]
         close_flags = (float(sky.separation(ra, dec, *place[2:4])) < _GROUP_RADIUS for place, _ in waiting[:_MAX_GROUP])
         n_close = sum(1 for _ in takewhile(bool, close_flags))
@@ -388,9 +442,12 @@ def _places(camera_by_pointing: Mapping[tuple[Any, ...], _Camera], densities: De
 
 
 def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], files: OutputFiles) -> CostModel:
-    """Return the cost model of the detectors of an exposure.
+    """Return the model of CPU time, memory and file size for the detectors of an exposure.
 
-    An exposure of the sky is assumed to have enough light for every effect. The scene of other frames is known.
+    For an exposure of the sky, the CPU time of every detector effect is included, unless the request switches it off.
+    For other exposures (such as darks) the light is known before rendering, so that effects without influence on the
+    image are left out unless the request switches them on. `truth` has the names of the truth maps (images of true
+    signals) to write.
     """
     channel, kind = row.channel, row.image_type
     sees_sky = kind in registry.CHANNELS[channel].sky_types

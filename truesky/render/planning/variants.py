@@ -1,4 +1,8 @@
-"""Apply explored parameters: each variant of a request has its own mission, accuracy and effects."""
+"""Apply changed parameters to an exposure.
+
+A request may simulate the same sky with several values of mission parameters, accuracies or detector effects. Each
+combination is a variant. The column `settings` of the table `exposures` has its values as JSON.
+"""
 
 from __future__ import annotations
 
@@ -17,28 +21,29 @@ from truesky.request.schema import Request
 def variant(
     settings: str | None, mission: MissionConfiguration, accuracy: Accuracy, forced: Mapping[str, bool]
 ) -> Variant:
-    """Return the mission, accuracy and forced effects of an exposure.
+    """Return the mission parameters, accuracy, and effects switched on or off, with which an exposure is simulated.
 
     Parameters
     ----------
     settings : str or None
-        Column `settings` of the exposure: a JSON table of the changed parameters, or None.
+        Column `settings` of the exposure: a JSON table of its changed parameters, or None.
     mission : MissionConfiguration
-        Mission database of the request.
+        Mission parameters of the request.
     accuracy : Accuracy
-        Accuracy of the request.
+        Accuracy of the request, used unless `settings` has another.
     forced : mapping of str to bool
-        Effects that the request forces on or off.
+        Detector effects that the request forces on (True) or off (False), by name.
 
     Returns
     -------
     Variant
-        Mission, accuracy and effects with the settings applied.
+        Mission parameters, accuracy, and effects that are switched on or off, after the changes in `settings`.
     """
     values: dict[str, Any] = json.loads(settings) if settings else {}
     parameters = {k: (v[0], v[1]) for k, v in values.items() if k != "accuracy" and not k.startswith("effects.")}
     explored = {k: v for k, v in parameters.items() if not k.startswith(EXPOSURE_ONLY_PREFIX)}
-    # Parameters set for a single exposure take precedence over explored parameters.
+    # A parameter may be explored (varied over all exposures) and also set for this exposure alone. The value for this
+    # exposure is then used.
     overrides = {
         **explored,
         **{
@@ -54,15 +59,22 @@ def variant(
 
 
 def mission_lookup(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
-    """Return a cached function from the settings of an exposure to its mission, based on the mission of the request."""
+    """Return a cached function that returns the mission parameters of an exposure, given its column `settings`.
+
+    `mission` has the parameters of the request, to which the function applies the changes in `settings`.
+    """
     return cache(lambda settings: variant(settings, mission, SURVEY, {}).mission)
 
 
 def exposure_overrides(parameters: Mapping[str, tuple[float, str]]) -> dict[str, tuple[float, str]]:
-    """Return parameters that an exposure overrides, with the keys that the column `settings` uses for them."""
+    """Return the given mission parameters with the prefix "own:" in front of their names.
+
+    In the column `settings` of table `exposures`, this prefix marks parameters that apply to a single exposure only.
+    Values are (value, unit).
+    """
     return {f"{EXPOSURE_ONLY_PREFIX}{key}": value for key, value in parameters.items()}
 
 
 def forced_effects(request: Request) -> dict[str, bool]:
-    """Return the effects that a request forces on (True) or off (False)."""
+    """Return the detector effects that a request forces on (True) or off (False), by name; others are absent."""
     return {**dict.fromkeys(request.effects.on, True), **dict.fromkeys(request.effects.off, False)}

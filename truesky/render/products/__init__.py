@@ -1,1 +1,1 @@
-"""Write a rendered detector to files, and read it back."""
+"""Write the image of a rendered detector to FITS files, read it back, and draw pictures of it."""

@@ -1,4 +1,4 @@
-"""Make the header cards that distinguish calibration exposures of the same image type."""
+"""Make FITS cards with the parameters of calibration exposures, such as injected charge, defocus or the calibrator."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from lake_schema.tables.exposures import ExposureRow
 from truesky.render.effects.scene import Scene
 from truesky.render.exposure import standard_stars
 
+# Image types in which the electronics inject charge into the detector.
 _INJECTED = ("charge_injection", "trap_pumping")
 
 
 def cards(exposure: ExposureRow, scene: Scene) -> tuple[Card, ...]:
-    """Return the cards of the parameters of an image type, or () if it has none; without lamp and target name."""
+    """Return the cards with the parameters of a calibration exposure, or () for image types without parameters.
+
+    The number of the lamp and the name of the calibrator have cards elsewhere (`headers`).
+    """
     kind = exposure.image_type
     type_cards: tuple[Card, ...] = ()
     if kind in _INJECTED:

@@ -1,4 +1,4 @@
-"""Make the header cards that the pipeline of a ground survey expects in raw images of its camera.
+"""Make the FITS cards that only raw images of certain ground cameras (DECam, LSSTCam) have, for their pipelines.
 
 References
 ----------
@@ -17,18 +17,21 @@ from truesky.render.camera.amplifiers import Amplifier
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import headers
 
-# DECam's names of the image types.
+# Values of the keyword OBSTYPE with which DECam names the image types of truesky.
 _OBSTYPES = {"science": "object", "deep": "object", "flat": "dome flat", "dark": "dark", "bias": "zero"}
 
 
 def cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the additional cards of a science file, or () for cameras without camera-specific keywords."""
+    """Return the cards that raw images of the detector's camera have in addition to the cards of every camera.
+
+    The result is () for all cameras but DECam and LSSTCam.
+    """
     make_cards = _CARDS_BY_CAMERA.get(rendered.exposure.camera)
     return make_cards(rendered) if make_cards else ()
 
 
 def _decam(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the cards of a CCD and of its amplifiers A and B, whose letters end the keywords."""
+    """Return the cards of a DECam CCD, and of its amplifiers A and B, whose letters are the ends of keywords."""
     exposure = rendered.exposure
     return (
         ("OBSTYPE", _OBSTYPES[exposure.image_type], "type of observation"),
@@ -43,7 +46,7 @@ def _decam(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the cards of a sensor; ROTPA is the position angle of the exposure, since the rotator turns the camera."""
+    """Return the cards of an LSSTCam sensor; ROTPA is the position angle to which the rotator turns the camera."""
     exposure, (raft, sensor) = rendered.exposure, rendered.detector.name.split("_")
     seconds = exposure.exposure_time_s
     return (
@@ -72,7 +75,10 @@ def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the file name that imSim 0.6 uses; it has no name for one array with prescan and overscan."""
+    """Return card FILENAME with the name that the simulator imSim 0.6 would give to the file of an LSSTCam sensor.
+
+    The result is () for a file with all amplifiers in one array in ADU, a format that imSim does not have.
+    """
     exposure, arrays = rendered.exposure, rendered.readout.extensions
     kind = "eimage" if arrays[0].unit == "electron" else "amp" if len(arrays) > 1 else ""
     if not kind:
@@ -84,18 +90,24 @@ def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:
     return (("FILENAME", name, "imSim file name"),)
 
 
+# Values of the keyword IMGTYPE with which LSSTCam names the image types of truesky.
 _IMAGE_TYPES = {"science": "SKYEXP", "deep": "SKYEXP", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"}
+# Functions that make the FITS cards that only certain cameras have, by name of the camera.
 _CARDS_BY_CAMERA: Mapping[str, Callable[[RenderedDetector], tuple[Card, ...]]] = {"decam": _decam, "lsstcam": _lsstcam}
 
 
 def _detector_number(rendered: RenderedDetector) -> int:
-    """Return the index of a detector in the layout of its camera, from 0."""
+    """Return the index, from 0, of a detector in the list of the detectors of its camera."""
     all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
     return [detector.name for detector in all_detectors].index(rendered.detector.name)
 
 
 def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return sections and values of each amplifier in one array, as far as the readout has no cards for them."""
+    """Return cards with sections, gain and noise of each amplifier of a DECam CCD.
+
+    They are the cards that DECam has in addition to the amplifier cards of all ground cameras. The result is () unless
+    all amplifiers are in one array in ADU.
+    """
     layout, arrays = rendered.scene.layout, rendered.readout.extensions
     if layout is None or len(arrays) > 1 or arrays[0].unit != "adu":
         return ()
@@ -123,6 +135,8 @@ def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     return tuple(letter_cards)
 
 
+# Gain, read noise and saturation level in DECam headers: beginning of the keyword (the letter of the amplifier
+# follows), keyword of the same quantity for other cameras, and comment of the card.
 _NUMBERS = (
     ("GAIN", "GAIN", "[electron/adu] conversion gain"),
     ("RDNOISE", "RDNOISE", "[electron] rms read noise"),
@@ -131,7 +145,10 @@ _NUMBERS = (
 
 
 def _readout_section(amplifier: Amplifier) -> str:
-    """Return the section of an amplifier's pixels in the order in which they are read."""
+    """Return the rectangle of an amplifier's pixels on the detector as a FITS section, in the order of the readout.
+
+    For example, "[2048:1025,1:4096]" is read from column 2048 down to column 1025.
+    """
     (x, y), pixels = (axis + 1 for axis in (amplifier.pixels.x, amplifier.pixels.y)), amplifier.pixels
     columns, rows = (x, x + pixels.nx - 1), (y, y + pixels.ny - 1)
     columns = columns[::-1] if amplifier.read_right else columns

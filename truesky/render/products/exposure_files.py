@@ -1,4 +1,7 @@
-"""Join the science images of an exposure's detectors in one file: a primary header and the arrays of each detector."""
+"""Join the science images of all detectors of an exposure in one FITS file, and make the table `exposure_files`.
+
+The file has a primary header for the exposure, followed by the arrays of each detector as extensions.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,8 @@ from truesky.render.planning.exposure_chunks import rows as planned_rows
 from truesky.render.products import head_files, headers
 from truesky.render.products.keys import part_name
 
-# Keywords of detector headers that apply to the whole exposure.
+# Keywords in the headers of detector files whose cards go to the primary header of the file with all detectors, if they
+# are equal for all detectors. The keywords `headers.PER_ARRAY_KEYWORDS` also stay in the headers of the arrays.
 _EXPOSURE_KEYWORDS = (
     "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
     "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
@@ -36,19 +40,20 @@ _EXPOSURE_KEYWORDS = (
 
 
 def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
-    """Plan the table `exposure_files`: one task per exposure, with the detectors that `products` contains.
+    """Plan the table `exposure_files`: one partition per exposure that has images in the table `products`.
 
     Parameters
     ----------
     products : Plan
-        Plan of the table `products`.
+        Plan of the table `products`, with one partition per detector image.
     detector_counts : mapping of int to int
-        Number of planned detectors by exposure number.
+        Number of planned detectors of each exposure, by exposure number.
 
     Returns
     -------
     Plan
-        The plan.
+        One partition per exposure, with the names of its detectors and a key: a hash that is computed from the hashes
+        of the inputs of its images. The file of an exposure is written again only if this key changes.
     """
     keys_by_exposure: dict[int, dict[str, str]] = defaultdict(dict)
     for part in products.tasks:
@@ -63,10 +68,15 @@ def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
 
 
 def make_exposure_file(lake: Path, facts: Json) -> Output:
-    """Make the file of one exposure from the files of its detectors. Raises Damaged if `products` lacks one of them."""
+    """Join the image files of an exposure's detectors in one file.
+
+    `facts` has the exposure number, the names of the detectors, and the version of the table `products`. The result has
+    the row of the table `exposure_files`, and functions that write the FITS file and its head file (true WCS as text).
+    Raises Damaged if the table `products` lacks the image of one of these detectors.
+    """
     products = read.version(lake, "products", facts["products"])
     in_exposure = pc.field("exposure_id") == facts["exposure_id"]
-    # Open only the partitions of this exposure; there may be 100,000.
+    # Open only the partitions of this exposure: the table has one partition per image, perhaps 100,000.
     part_names = {part_name({"exposure_id": facts["exposure_id"], "detector": name}) for name in facts["detectors"]}
     partitions = [name for name in products.partitions if name in part_names]
     science_rows = products.rows(partitions=partitions, where=in_exposure & (pc.field("content") == "science"))
@@ -98,7 +108,7 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
 
 
 def _sort_detectors(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
-    """Return the detectors in the order of the camera's layout."""
+    """Return the given names of detectors in the order in which the mission database lists them for the camera."""
     mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
     return [detector.name for detector in detectors.detectors(camera, mission) if detector.name in names]
 

@@ -1,7 +1,7 @@
-"""Write a rendered detector to FITS files, and make its rows of the table `products`.
+"""Write the science image and the truth maps of a detector to FITS files, and make their rows of the table `products`.
 
-A detector that is read out as one array is a file with one image. Several arrays are extensions of a file, whose
-primary header applies to each of them.
+If a detector has one array, its file has a single image. If it has several (such as one per amplifier), they are
+extensions of a file whose primary header has no data and applies to every extension.
 """
 
 from __future__ import annotations
@@ -19,31 +19,34 @@ from truesky.render.camera import astrometry, observatories, tpv
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import camera_cards, head_files, headers, raw_pointing
 
+# Function that writes a file to the given path.
 Writer = Callable[[Path], None]
 
 
 def products(
     rendered: RenderedDetector, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str | None = None
 ) -> tuple[pa.Table, dict[str, Writer]]:
-    """Return the rows of `products` and a writer for each file. Each image also has a head file (`head_files`).
+    """Return the rows of the table `products` for a detector, and functions that write its files.
 
     Parameters
     ----------
     rendered : RenderedDetector
-        The detector.
+        The rendered detector.
     truth : sequence of str
-        Requested truth maps.
+        Names of the requested truth maps; maps that the detector does not have are left out.
     rice : bool
-        True to compress integer images with Rice.
+        True to compress integer images with the Rice algorithm.
     wcs : str, optional
-        Convention for the optical distortion, one of `tpv.CONVENTIONS`; None means that of the instrument's pipeline.
+        Convention for the optical distortion in headers, one of `tpv.CONVENTIONS`; None means that of the instrument's
+        pipeline.
 
     Returns
     -------
     rows : pyarrow.Table
-        Rows of the table `products`, one per image.
+        One row per image: the science image and each truth map.
     writers : dict of str to callable
-        Function that writes each file, by path relative to the version.
+        Function that writes each file to a given path, by path relative to the folder of the table `products`. Each
+        two-dimensional image with a WCS also has a head file, a text with its true WCS.
     """
     images = {"science": _science_images(rendered)}
     for content in truth:
@@ -91,12 +94,13 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 
 
 def _science_images(rendered: RenderedDetector) -> list[Image]:
-    """Return the image, or a primary header and an extension for each array of the readout."""
+    """Return the images of the science file: a single one, or a primary header and one extension per array."""
     readout = rendered.readout
     cards = (*headers.science_cards(rendered), *camera_cards.cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
         (array,) = readout.extensions
-        # Cards of the array replace those of the detector: its WCS also counts the pixels of prescan and overscan.
+        # If the primary header and the array have the same keyword, keep the card of the array: the pixel coordinates
+        # in the WCS of the array count from its first column and row, including prescan and overscan.
         array_cards = (*array.cards, *headers.section_cards(rendered, array))
         array_keywords = {keyword for keyword, *_ in array_cards}
         return [Image(array.data, (*(card for card in cards if card[0] not in array_keywords), *array_cards))]

@@ -1,7 +1,8 @@
-"""Write the WCS of a file's images as text for SExtractor, SCAMP and SWarp, which do not support SIP.
+"""Write and read head files: the true WCS of the images in a FITS file as text, for SExtractor, SCAMP and SWarp.
 
-These tools read a file with the name of the image and the ending .head next to it. It contains the cards of each image
-in turn, which replace those in the image. The distortion is written as TPV.
+These tools do not support the SIP distortion of the FITS headers. They read a text file with the name of the FITS file
+and the ending .head next to it. It has the cards of each image in turn, which replace those in the FITS file. The
+distortion is written as TPV.
 
 References
 ----------
@@ -17,27 +18,30 @@ from lake_schema.fits import images
 from lake_schema.fits.images import Card, Image
 from truesky.render.camera import tpv
 
-# WCS keywords that a head file contains.
+# WCS keywords in a head file, without the digits and underscores at their end.
 _WCS_KEYWORDS = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
 
 
 def head_path(path: str) -> str:
-    """Return the path of the head file of an image."""
+    """Return the path of the head file that belongs to a FITS file: the same with the ending .head."""
     return str(PurePosixPath(path).with_suffix(".head"))
 
 
 def text(units: Sequence[Image]) -> str:
-    """Return the cards of each two-dimensional image in file order, or "" if no image has a WCS."""
+    """Return the text of a head file: the WCS cards of each two-dimensional image in file order.
+
+    Images without a WCS are skipped; the text is "" if no image has one.
+    """
     return "".join(_image_text(unit) for unit in units if unit.data is not None and unit.data.ndim == 2)
 
 
 def write(texts: Iterable[str], path: Path) -> None:
-    """Write the texts of a file's images one after another."""
+    """Write the texts of head files one after another to one head file `path`."""
     path.write_text("".join(texts), encoding="ascii")
 
 
 def first_cards(path: Path) -> tuple[Card, ...]:
-    """Return the WCS cards of the first image from the head file of an image, or () if there is no head file."""
+    """Return the WCS cards of the first image in the head file of a FITS file `path`, or () without a head file."""
     head_file = path.with_suffix(".head")
     if not head_file.is_file():
         return ()
@@ -47,7 +51,7 @@ def first_cards(path: Path) -> tuple[Card, ...]:
 
 
 def is_wcs(keyword: str) -> bool:
-    """Return True if a keyword belongs to the WCS."""
+    """Return True if a FITS keyword belongs to the WCS cards of head files, such as CRVAL1, CD1_1 or PV1_4."""
     return keyword.rstrip("0123456789_") in _WCS_KEYWORDS
 
 
@@ -55,5 +59,5 @@ def _image_text(unit: Image) -> str:
     cards = [card for card in tpv.from_sip(unit.cards) if is_wcs(card[0])]
     if not cards:
         return ""
-    # These tools have no ICRS; J2000 is the closest system.
+    # SExtractor, SCAMP and SWarp do not know ICRS. J2000 is the closest system.
     return f"{images.cards_to_text([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"

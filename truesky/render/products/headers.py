@@ -1,4 +1,4 @@
-"""Make the FITS headers of the science image and of the truth maps."""
+"""Make the FITS headers of science images and of truth maps (images of the true signal of one effect or source)."""
 
 from __future__ import annotations
 
@@ -24,32 +24,40 @@ from truesky.render.exposure.rendered_detector import RenderedDetector, random_i
 from truesky.render.products import calibration_cards
 from truesky.request import accuracy
 
-# Sigma of the noise below which almost no saturated pixel is read.
+# The saturation level in the header is the mean value of a full pixel minus this number of standard deviations of the
+# noise. Almost no saturated pixel is then read below the level.
 _NOISE_SIGMAS = 5.0
-# Effects that add dark current.
+# Names of the effects that add dark current.
 _DARK_EFFECTS = {"dark_current", "dark_map"}
-# Keywords repeated in the header of each array. Few tools apply INHERIT to read them from the primary header.
+# Keywords of the primary header that are repeated in the header of each array: few tools obey INHERIT and read them
+# from the primary header.
 _REPEATED_KEYWORDS = ("EXPTIME", "FILTER", "DATE-OBS", "MJD-OBS", "TIMESYS")
-# Keywords also repeated in arrays that are read by amplifiers.
+# Keywords of the primary header that are repeated in the header of each array of the file whose pixels are in ADU.
 _READOUT_KEYWORDS = ("GAIN", "RDNOISE", "RDNDRAWN", "SATURATE")
+# Keywords that the header of each array of a file has, because they are repeated or may differ between arrays.
 PER_ARRAY_KEYWORDS = (*_REPEATED_KEYWORDS, *_READOUT_KEYWORDS, "BUNIT")
-# Cards of images in electrons, which are not read out.
+# Cards of images that contain electrons in pixels before readout, hence no gain, read noise or bias.
 _UNREAD_CARDS: tuple[Card, ...] = (
     ("GAIN", 1.0, "[electron/electron] gain; pixels in electrons"),
     ("RDNOISE", 0.0, "[electron] rms read noise"),
     ("RDNDRAWN", 0.0, "[electron] rms read noise added to the image"),
     ("BIAS", 0.0, "[electron] bias level"),
 )
-# For each component of an accuracy: end of its keywords, and template of their comments.
+# Errors that `Accuracy` limits, by field name. Each has the end of its two keywords, such as FLUX in ACCFLUX (allowed
+# error) and ERRFLUX (expected error), and a template of their comments.
 _ERRORS = {
     "flux": ("FLUX", "{} relative error of flux"),
     "shape": ("SHAPE", "{} error of a reduced-shear component"),
     "position": ("POS", "[pix] {} error of position"),
     "background": ("BACK", "{} error of sky / noise of a pixel"),
 }
-# Keywords of the readout and of amplifiers that apply to groups, which have no border of reference pixels.
+# Header keywords of the readout mode and times of an up-the-ramp image. They are also written to the header of the
+# truth map "ramp", whose planes are the groups of averaged reads.
 _RAMP_KEYWORDS = {"READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"}
+# Header keywords of gain, noise per read and bias. They are also written to the header of the truth map "ramp", whose
+# planes are the groups of averaged reads of an up-the-ramp exposure.
 _GROUP_KEYWORDS = {"GAIN", "FRNOISE", "BIAS"}
+# Cards of the third axis of the truth map "ramp" (one plane per group of averaged reads); the axis counts the groups.
 _GROUP_AXIS: tuple[Card, ...] = (
     ("WCSAXES", 3, "number of world coordinate axes"),
     ("CTYPE3", "GROUP", "group number"),
@@ -57,11 +65,15 @@ _GROUP_AXIS: tuple[Card, ...] = (
     ("CRPIX3", 1.0, "plane of the first group, counted from 1"),
     ("CD3_3", 1.0, ""),
 )
+# Calendar date of MJD 0, to write dates in headers.
 _MJD_ZERO = datetime(1858, 11, 17)
 
 
 def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the header of the science image: calibration data, and the settings of the simulation."""
+    """Return the cards of the primary header of a science image.
+
+    They describe the exposure, the calibration (gain, noise, zero point, WCS), the sky, and the simulated effects.
+    """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
@@ -80,9 +92,10 @@ def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the values shared by all amplifiers.
+    """Return the cards of gain, read noise, bias and saturation level that apply to all amplifiers of a detector.
 
-    If one array has several amplifiers, these are the mean values and the lowest saturation level.
+    If amplifiers differ and share one array, the cards have the means, and the lowest saturation level. If each has its
+    own array, values that differ are left out here.
     """
     if rendered.readout.unit == "electron":
         return (
@@ -98,26 +111,26 @@ def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def unit_cards(unit: str | None) -> tuple[Card, ...]:
-    """Return the card of the pixel unit, or no card if the arrays have no unit or different units."""
+    """Return the card BUNIT with the pixel unit, or () if `unit` is None (different units) or "" (no unit)."""
     return (("BUNIT", unit, "pixel unit"),) if unit else ()
 
 
 def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequence[Card]) -> tuple[Card, ...]:
-    """Return the header of one of several arrays.
+    """Return the header of a FITS extension, for an image file with several arrays.
 
     Parameters
     ----------
     rendered : RenderedDetector
-        The detector.
+        The rendered detector.
     extension : Extension
-        The array.
+        The array of the extension, with its own cards.
     common : sequence of Card
-        Cards of the primary header.
+        Cards of the primary header, of which some are repeated.
 
     Returns
     -------
     tuple of Card
-        The cards.
+        Cards of the extension: repeated ones, unit, sections, and values of its amplifier.
     """
     repeated = (*_REPEATED_KEYWORDS, *(_READOUT_KEYWORDS if extension.unit == "adu" else ()))
     return (
@@ -131,7 +144,11 @@ def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequen
 
 
 def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Card, ...]:
-    """Return the sections with the detector's pixels: in the array, on the detector, and in the mosaic."""
+    """Return the cards that tell which part of an array has pixels of the detector, and where these belong.
+
+    DATASEC and TRIMSEC are the part of the array, and BIASSEC its overscan. CCDSEC is the place on the detector, and
+    DETSEC the place in the mosaic of all detectors. The result is () if the sections of the array are unknown.
+    """
     array_sections = extension.sections
     if array_sections is None:
         return ()
@@ -151,9 +168,10 @@ def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Car
 
 
 def amplifier_cards(rendered: RenderedDetector, number: int | None) -> tuple[Card, ...]:
-    """Return the values of an amplifier that are not in the primary header because they differ between amplifiers.
+    """Return the cards of an amplifier (gain, noise, bias, saturation) whose values differ between amplifiers.
 
-    `number` is the amplifier of the array. It is None for an array of several amplifiers, which has no such cards.
+    `number` is the index of the amplifier, from 0. It is None for an array of several amplifiers; the result is then
+    ().
     """
     if number is None:
         return ()
@@ -166,9 +184,9 @@ def _mosaic_size(rendered: RenderedDetector) -> str:
 
 
 def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
-    """Return (keyword, value, comment) of the values that may differ between amplifiers.
+    """Return (keyword, value, comment) for gain, read noise, bias and saturation level.
 
-    A value is a single number, or an array of shape (n_amplifiers,).
+    A value is one number if it is the same for all amplifiers, otherwise an array of shape (n_amplifiers,).
     """
     scene = rendered.scene
     saturated = "[adu] lowest level of a saturated pixel"
@@ -183,9 +201,10 @@ def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Flo
 
 
 def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
-    """Return the read noise of the image, and the read noise that was drawn.
+    """Return (keyword, value, comment) for the read noise of the detector, and for the part that is in the image.
 
-    An image of a ramp's signal also has the noise of a single read. Read noise is not drawn if other noise hides it.
+    The read noise in the image is 0 if other noise is so large that read noise is not drawn. An up-the-ramp image also
+    has the noise of a single read. Values are in electrons rms: one number, or one per amplifier.
     """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
@@ -202,6 +221,7 @@ def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, s
     )
 
 
+# Value and comment of the card BUNIT (pixel unit) for each truth map, by name of the map.
 _TRUTH_UNITS = {
     "noise_free": ("electron", "pixel unit; expected signal of sources"),
     "stars": ("electron", "pixel unit; expected signal of stars"),
@@ -222,15 +242,19 @@ _TRUTH_UNITS = {
 
 
 def truth_cards(rendered: RenderedDetector, content: str) -> tuple[Card, ...]:
-    """Return the header of a truth map: the contribution of one component before the remaining detector effects."""
+    """Return the header of a truth map (image of the true signal of one effect or of sources).
+
+    `content` is the name of the map, one of `_TRUTH_UNITS`; other names raise KeyError.
+    """
     map_cards = _group_cards(rendered) if content == "ramp" else _common_cards(rendered)
     return (*map_cards, ("BUNIT", *_TRUTH_UNITS[content]))
 
 
 def _group_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the header of the groups of a ramp.
+    """Return the header of the truth map "ramp", which has the groups of reads of an up-the-ramp exposure as planes.
 
-    It has the common cards with a third axis for the groups, the readout mode, and the values of the amplifiers.
+    It consists of the cards that all truth maps have, cards of a third axis that counts the groups, and cards with the
+    readout mode, gain, noise and bias.
     """
     out: list[Card] = []
     for card in _common_cards(rendered):
@@ -293,9 +317,10 @@ def _lamp_cards(lamp: int, rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return the allowed errors (ACC*) and the expected errors (ERR*) of drawing and, if applied, of charge transfer.
+    """Return the cards with the errors of the simulation: errors that the request allows (ACC*), expected ones (ERR*).
 
-    The causes are independent, so that errors are added in quadrature.
+    Expected errors come from drawing sources (if the image has a PSF) and from the charge transfer effects, if applied.
+    They are independent and are added in quadrature.
     """
     causes = [] if rendered.psf is None else [asdict(accuracy.expected_errors(rendered.accuracy))]
     applied = [decision.name for decision in rendered.decisions if decision.applied]
@@ -309,26 +334,28 @@ def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _object_name(exposure: ExposureRow) -> str:
-    """Return the calibration target, or the survey and its field."""
+    """Return the name of the calibrator, or else that of the survey with the number of the field (if it has one)."""
     if exposure.target:
         return exposure.target
     return exposure.survey if exposure.field is None else f"{exposure.survey} {exposure.field}"
 
 
 def _iso_date(mjd: float) -> str:
-    """Return the date as ISO 8601 with milliseconds."""
+    """Return an MJD as a date in ISO 8601 with milliseconds, without a time zone."""
     return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
 
 
 def _saturation(rendered: RenderedDetector) -> float | Float:
-    """Return the lowest level (ADU) of a saturated pixel, one value or one per amplifier.
+    """Return the lowest value in ADU at which a pixel may be saturated: one number, or one per amplifier.
 
-    Transfer losses and nonlinearity reduce the charge of a full pixel; `_NOISE_SIGMAS` sigma of noise are subtracted.
+    It is the value of a full pixel after the losses by charge transfer and nonlinearity, minus five times the noise of
+    readout (read noise and bias structure, added linearly), rounded down and within the range of the converter.
     """
     full = rendered.scene.value("full_well", "electron")
     scene = replace(rendered.scene, peak_electrons=full)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
-    # The first pixel of a column or row finds all traps empty and loses most.
+    # Sum the largest charge losses that a pixel may have by charge transfer. The first pixel of a column or row has
+    # them, because it finds all traps empty.
     losses = (
         charge_transfer.PARALLEL, charge_transfer.SERIAL, charge_transfer.PARALLEL_LOSS, charge_transfer.SERIAL_LOSS
     )  # fmt: skip
@@ -353,9 +380,10 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
 
 
 def _effect_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Return EFFECTn and EFKEYn: name, state and margin of each effect, and the key of its random numbers.
+    """Return the cards EFFECTn and EFKEYn, which describe the effects of the image in the order of their application.
 
-    The margin is the contribution of the effect over the smallest noticeable one.
+    EFFECTn has the name of effect number n, whether it was applied, and its margin: its largest contribution to a pixel
+    divided by the smallest noticeable one. EFKEYn has the key of its random numbers, if the effect was applied.
     """
     cards: list[Card] = []
     exposed = rendered.exposure

@@ -1,4 +1,7 @@
-"""Compute the key of each product, a digest of all its inputs, and the name of its partition."""
+"""Compute the key of the images of each detector (a hash of everything that determines them), and their names.
+
+An image is rendered again only if its key changes.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,6 +29,8 @@ from truesky.render.sources import catalogue_rows, ephemerides, galaxy_stamps, s
 from truesky.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
 from truesky.request.accuracy import SURVEY
 
+# Function of an exposure and the name of a detector. It returns the checksums of the catalogue files of stars on
+# neighbouring detectors, as a dictionary for the recorded inputs of the image.
 NeighbourFiles = Callable[[ExposureRow, str], Json]
 
 
@@ -37,27 +42,28 @@ def product_keys(
     mission: MissionConfiguration,
     previous_tasks: Mapping[tuple[int, str], Sequence[Json]] = MappingProxyType({}),
 ) -> list[str]:
-    """Return the key of each task's products, a digest of all inputs that determine them and of nothing else.
+    """Return for each detector the key of its images: a hash of all inputs that determine them, and of nothing else.
 
     Parameters
     ----------
     facts : dict
-        Facts of the plan: request, mission, code, and checksums of user files.
+        Recorded inputs of all images: settings of the request, mission, code version, and checksums of user files.
     exposures : pyarrow.Table
-        Rows of the table `exposures`.
+        Rows of the table `exposures` for the detectors and for the earlier exposures.
     tasks : sequence of dict
-        Rows of the table `tasks` to render.
+        Rows of the table `tasks`, one per detector to be rendered.
     inputs : mapping of str to Version
-        Versions of the input tables, by table name.
+        Stored versions of the input tables, by table name.
     mission : MissionConfiguration
-        The mission database.
-    previous_tasks : mapping
-        Tasks that leave persistence in a detector, by (exposure number, detector name).
+        Mission database: parameters of the telescopes, cameras and survey.
+    previous_tasks : mapping of (int, str) to sequence of dict
+        Rows of the table `tasks` for earlier exposures that leave persistence in a detector, by (exposure number,
+        detector name).
 
     Returns
     -------
     list of str
-        One key per task.
+        One key per row of `tasks`, in the same order.
     """
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {key: facts[key] for key in ("request", "mission", "code")}
@@ -76,7 +82,8 @@ def product_keys(
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
         channel = registry.CHANNELS[exposure.channel]
-        # Only stars have diffraction spikes; a grism displaces the light of every source.
+        # The image also depends on files of stars far from the detector if diffraction spikes are drawn, or if a grism
+        # displaces light.
         if channel.diffraction_edges is not None or channel.dispersion is not None:
             reaches["stars"] = max(FARTHEST, reach)
         if channel.dispersion is not None:
@@ -111,21 +118,26 @@ def product_keys(
 
 
 def part_name(task: Json) -> str:
-    """Return the name of the partition of `products` that a task makes."""
+    """Return the name of the partition of the table `products` for a detector, such as "000012-3-4.parquet".
+
+    `task` has the exposure number and the name of the detector.
+    """
     return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
 
 
 def exposures_of(names: Iterable[str]) -> set[int]:
-    """Return the exposure numbers of partitions of `products`."""
+    """Return the exposure numbers in names of partitions of the table `products`; other names are ignored."""
     return {int(number) for name in names if (number := name.partition("-")[0]).isdigit()}
 
 
 def _neighbour_files(
     stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration
 ) -> NeighbourFiles:
-    """Return a function that lists the star files which affect an image through crosstalk between detectors.
+    """Return a function that lists the files of stars which change an image by crosstalk from other detectors.
 
-    `stars` contains the largest deflection of a star (deg) and the checksums of the files by cell.
+    These are catalogue files with stars on detectors that share a readout board with the image's detector. `stars` is a
+    pair: the largest distance (deg) between a star and the order-8 HEALPix cell under which it is stored, and the
+    checksums of the star files by number of the cell.
     """
     boards: dict[tuple[str, str, str | None], tuple[Detector, ...]] = {}
 
@@ -147,7 +159,10 @@ def _neighbour_files(
 
 
 def _user_file_checksums(facts: Json, exposure: ExposureRow, detector: str) -> Json:
-    """Return the sha256 of the user's files that an image is made from."""
+    """Return the SHA-256 of the user's files from which an image is made: PSF, moving bodies and galaxy stamps.
+
+    `facts` has the checksums of all user files of the request; only those that matter for this detector are returned.
+    """
     files = {}
     if psf := exposure.psf:
         files["psf"] = facts["psf"][str(from_file.path_for_detector(psf, detector))]
@@ -159,7 +174,11 @@ def _user_file_checksums(facts: Json, exposure: ExposureRow, detector: str) -> J
 
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
-    """Return the sha256 of the PSF files that the tasks' exposures use, by path."""
+    """Return the SHA-256 of the user's PSF files for some detectors, by path.
+
+    `tasks` are rows of the table `tasks`. The result is {} if their exposures use no PSF files; a missing file raises
+    an error.
+    """
     psf_by_exposure = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
     pairs = {(psf_by_exposure[task["exposure_id"]], task["detector"]) for task in tasks}
     files = [from_file.path_for_detector(psf, detector) for psf, detector in pairs if psf]
@@ -167,7 +186,10 @@ def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
 
 
 def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
-    """Return the sha256 of the user's table of moving bodies, by path. Raises an error if the table is invalid."""
+    """Return the SHA-256 of the user's table of Solar System bodies, as {path: hash}.
+
+    Raises BadInput if the table is invalid, or has no bodies on the days of the exposures that show such bodies.
+    """
     sha256 = file_sha256(user_files.check_file(file, "table of bodies", "solar_system.bodies"))
     rows = map(ExposureRow.from_row, exposures.to_pylist())
     dates = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
@@ -176,14 +198,21 @@ def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
 
 
 def stamp_files(file: Path) -> dict[str, str]:
-    """Return the sha256 of the user's library of galaxy images, by path. Raises an error if the library is invalid."""
+    """Return the SHA-256 of the user's library of galaxy images, as {path: hash}.
+
+    Raises BadInput if the library is invalid.
+    """
     sha256 = file_sha256(user_files.check_file(file, galaxy_stamps.KIND, "structure.stamps.file"))
     galaxy_stamps.read(file, sha256)
     return {str(file): sha256}
 
 
 def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
-    """Return the sha256 of the files that contain each generation cell, one per table."""
+    """Return for each order-8 HEALPix cell the SHA-256 of the catalogue files with its sources.
+
+    `tables` are a catalogue and tables with the same partitions, such as its fluxes. Each partition that contains the
+    cell gives one tuple, with the hash of its file in each table.
+    """
     files_by_cell: dict[int, list[tuple[str, ...]]] = defaultdict(list)
     for part in tables[0].manifest["parts"]:
         checksums = tuple(table.partition_sha256(part["name"]) for table in tables)

@@ -1,6 +1,6 @@
-"""Draw preview pictures of rendered images: asinh stretch, labels of bright sources, scale bar, compass and close-ups.
+"""Draw preview pictures (PNG) of rendered images: asinh stretch, labels of sources, scale bar, compass, close-ups.
 
-Cosmic rays are removed from the pictures if the lake has their truth maps.
+Cosmic rays are removed from the pictures if the lake has truth maps of them (images of their true signal).
 """
 
 from __future__ import annotations
@@ -22,18 +22,30 @@ from truesky.render.camera import astrometry
 from truesky.render.products import preview_labels, read_back
 from truesky.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
 
-_INCHES, _DPI = (13.2, 9.6), 100
-# Largest side of the overview in pixels. Close-ups have full resolution.
+# Width and height of a preview picture in inches.
+_INCHES = (13.2, 9.6)
+# Pixels per inch of a preview picture.
+_DPI = 100
+# Largest side in pixels of the overview, which shows the whole image. Close-ups have full resolution.
 _OVERVIEW = 1000
-# Space for a label, as fractions of the width and height of the image.
+# Space for the label of a source, as fractions of the width and of the height of the image. Labels whose spaces overlap
+# that of a brighter source are not drawn.
 _LABEL_SIZE = (0.14, 0.035)
-# Pixels on each side whose median replaces a cosmic ray.
+# A pixel hit by a cosmic ray is replaced by the median of pixels up to this number of rows and columns away.
 _MEND_RADIUS = 2
-# Step between the pixels that are used to measure sky and noise of a whole image.
+# Only every n-th row and column of the whole image is used to measure its sky level and noise for a close-up. For the
+# overview they are measured in the reduced image.
 _STRIDE = 8
-# Sigma relative to the sky: black at _BLACK; linear up to _KNEE, logarithmic above; white at _WHITE.
-_BLACK, _KNEE, _WHITE = -1.5, 4.0, 400.0
+# Signal above the sky, in rms noise of a sky pixel, at and below which a preview picture is black.
+_BLACK = -1.5
+# Signal above the sky, in rms noise of a sky pixel, up to which the brightness of a preview picture is about linear in
+# the signal. Above it, the brightness is logarithmic.
+_KNEE = 4.0
+# Signal above the sky, in rms noise of a sky pixel, that a preview picture shows in white, as all brighter pixels.
+_WHITE = 400.0
+# Colours of lines and text, of the background, and of the labels of galaxies and stars.
 _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
+# Possible lengths of a scale bar, arcsec.
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
@@ -43,18 +55,18 @@ def previews(root: Path, out: Path, max_images: int | None = None, request: str 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Lake (folder of stored tables and images).
     out : Path
-        Folder of the PNG files.
+        Folder of the PNG files, which is made if necessary.
     max_images : int, optional
-        Number of images, chosen by `select_images`; None means all.
+        Largest number of images, of as many channels and bands as possible; None means all images.
     request : str, optional
         Name of the request; required if the lake has several.
 
     Returns
     -------
     list of Path
-        The PNG files.
+        The PNG files; [] if the request has no science images.
     """
     version = read.version(root, "products", request=request)
     input_keys = version.manifest["facts"]["inputs"]
@@ -72,7 +84,10 @@ def previews(root: Path, out: Path, max_images: int | None = None, request: str 
 
 
 def select_images(rows: Sequence[dict[str, Any]], max_images: int | None) -> list[dict[str, Any]]:
-    """Select at most `max_images` rows of `products`, in order: each channel and band once before any is repeated."""
+    """Select at most `max_images` rows of the table `products` (None: all) and return them in their order.
+
+    Each pair of channel and band is selected once before any is selected twice, and so on.
+    """
     counts: Counter[tuple[str, str]] = Counter()
     order = []
     for i, row in enumerate(rows):
@@ -87,14 +102,17 @@ def _detector_key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def repair_cosmic_rays(image: Float, hit_pixels: Bool) -> Float:
-    """Replace pixels hit by cosmic rays with the median of the neighbouring pixels that were not hit."""
+    """Replace pixels hit by cosmic rays with the median of the pixels around them that were not hit.
+
+    `image` and `hit_pixels` have the shape (ny, nx). A pixel whose 24 neighbours were all hit keeps its value.
+    """
     rows, columns = np.nonzero(hit_pixels)
     masked = np.where(hit_pixels, np.nan, image)
     step = np.arange(-_MEND_RADIUS, _MEND_RADIUS + 1)
     r = np.clip(rows[:, None, None] + step[:, None], 0, image.shape[0] - 1)
     c = np.clip(columns[:, None, None] + step, 0, image.shape[1] - 1)
     neighbours = np.sort(masked[r, c].reshape(len(rows), step.size**2), axis=1)
-    # NaN values are last after sorting.
+    # Count the neighbours that were not hit: pixels hit by cosmic rays are NaN, which sorting has moved to the end.
     count = np.isfinite(neighbours).sum(axis=1)
     median = neighbours[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
     out = image.copy()
@@ -102,24 +120,21 @@ def repair_cosmic_rays(image: Float, hit_pixels: Bool) -> Float:
     return out
 
 
-# ------------------------------------------------------------------------------------------------ drawing
-
-
 def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Label]) -> None:
-    """Draw one image.
+    """Draw the preview picture of one image: an overview with labels, and close-ups of galaxies.
 
     Parameters
     ----------
     path : Path
-        PNG file to write.
+        PNG file to write; its folder is made if necessary.
     image : array, shape (ny, nx)
         Pixels in electrons or ADU.
     cards : sequence of Card
-        FITS header of the image.
+        FITS header of the image, with its WCS.
     names : sequence of Label
-        Sources to label, brightest first.
+        Bright sources in the image, brightest first. Only those whose labels do not overlap are labelled.
     """
-    # A separate canvas needs no window system and shares no state with the figures of the caller.
+    # Use the Agg canvas directly: pyplot may need a window system, and shares its state with figures of the caller.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -168,7 +183,11 @@ def _show_image(axes: Any, image: Float, block: int, shape: tuple[int, ...], ups
 
 
 def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_down: bool) -> None:
-    """Set the limits of the axes. A detector that is mounted upside down is rotated by 180 deg, so that north is up."""
+    """Set the limits of the axes to pixels `x` and `y`, and remove ticks.
+
+    If `upside_down` is set, the image is rotated by 180 deg. This brings north up for detectors that are mounted upside
+    down.
+    """
     axes.set_xlim(x[::-1] if upside_down else x)
     axes.set_ylim(y[::-1] if upside_down else y)
     axes.set_anchor("W")
@@ -180,14 +199,20 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_dow
 
 
 def _sky_and_noise(image: Array) -> tuple[float, float]:
-    """Return sky level and noise, from the median and the pixels below it."""
+    """Return the sky level (median) and the noise (rms of the pixels below the median) of an image.
+
+    The noise is 1.0 if no pixel is below the median.
+    """
     level = float(np.median(image))
     below = image[image < level] - level
     return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
 
 
 def _stretch(image: Array, level: float, noise: float) -> Float:
-    """Scale electrons or ADU to 0 .. 1 with an asinh stretch."""
+    """Scale pixels to brightness 0 (black) to 1 (white) with an asinh stretch of the signal above the sky `level`.
+
+    `noise` is the noise of the sky; all three have the same unit.
+    """
     signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
@@ -201,7 +226,7 @@ def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_
         if upside_down:
             across, up = 1 - across, 1 - up
         if up < 0.12 and not 0.25 < across < 0.85:
-            # The scale bar and the compass are here.
+            # Draw no label in the lower corners, which have the scale bar and the compass.
             continue
         colour = _GALAXY if label.kind == "galaxy" else _STAR
         circle = Circle(
@@ -221,14 +246,17 @@ def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_
 
 
 def _outline() -> list[Any]:
-    """Return a dark outline that makes text legible on a bright star."""
+    """Return a matplotlib effect that draws a dark outline around text, which makes it legible on a bright star."""
     from matplotlib import patheffects
 
     return [patheffects.withStroke(linewidth=2.0, foreground=_PAPER)]
 
 
 def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: float) -> None:
-    """Draw a scale bar in the lower left corner, at most `longest` pixels long."""
+    """Draw a scale bar in the lower left corner of an image, with its length in arcsec or arcmin.
+
+    The bar is the longest of `_SCALE_BARS` that is at most `longest` pixels long. `pixel_scale` is in arcsec.
+    """
     arcsec = max((bar for bar in _SCALE_BARS if bar <= longest * pixel_scale), default=_SCALE_BARS[0])
     width = arcsec / pixel_scale / shape[1]
     axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
@@ -238,12 +266,15 @@ def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: f
 
 
 def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
-    """Draw the directions of north and east at the image centre in the lower right corner."""
+    """Draw arrows to the north and east in the lower right corner of an image, with the directions at its centre.
+
+    `shape` is the number of rows and columns. The limits of the axes must be set before, since they may be reversed.
+    """
     x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     inverse = matrices.inverse(astrometry.jacobian(system, [x], [y])[0])
     flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
     origin = np.array([0.93, 0.05])
-    # The u axis points west.
+    # Letters of the arrows, and their directions on the sky as (west, north).
     for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
         step = matrices.matmul(inverse, np.array(world)) * flip
         step = step / np.hypot(*step) * 0.055

@@ -1,4 +1,4 @@
-"""Select the sources that a preview labels and the sources that it enlarges."""
+"""Select the bright sources that are labelled in the preview picture of an image, and the galaxies that it enlarges."""
 
 from __future__ import annotations
 
@@ -18,19 +18,25 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.render.camera import astrometry
 
-LABELS, CLOSE_UPS = 8, 3
-# Height of a close-up in arcsec, and its width / height.
-CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE = 14.0, 1.145
+# Largest number of galaxies that are labelled in a preview picture, and largest number of labelled stars. The brightest
+# sources are labelled.
+LABELS = 8
+# Largest number of close-ups (enlarged galaxies) in a preview picture.
+CLOSE_UPS = 3
+# Height of a close-up (picture of an enlarged galaxy), arcsec.
+CLOSE_UP_ARCSEC = 14.0
+# Width of a close-up (picture of an enlarged galaxy) on the sky divided by its height.
+CLOSE_UP_SHAPE = 1.145
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """Label of a source.
+    """Label of a source in the preview picture of an image.
 
     Attributes
     ----------
     column, row : float
-        Pixel position, from 0.
+        Pixel position of the source, counted from 0.
     kind : str
         "galaxy" or "star".
     mag : float
@@ -47,23 +53,23 @@ class Label:
 
 
 def labels(root: Path, product: dict[str, Any], image: images.Image, input_keys: Mapping[str, str]) -> list[Label]:
-    """Return the labels of the brightest sources inside an image, brightest first.
+    """Return labels for the brightest galaxies and stars inside an image.
 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Lake (folder of stored tables and images).
     product : dict
-        Row of the table `products`.
+        Row of the table `products` for the image.
     image : Image
-        Pixels and header of the image.
+        Pixels and FITS header of the image, with its WCS.
     input_keys : mapping of str to str
-        Key of the version of each table that the product was made from.
+        Version (hash) of each table from which the image was made, by table name.
 
     Returns
     -------
     list of Label
-        The labels.
+        At most 32 galaxies and 32 stars, brightest first. They may overlap.
     """
     system = astrometry.from_cards(image.cards)
     ny, nx = np.asarray(image.data).shape
@@ -98,16 +104,16 @@ def _labels_of(kind: str, rows: pa.Table, flux: Float, system: WCS, shape: tuple
 
 
 def without_overlaps(names: Sequence[Label], width: float, height: float, max_per_kind: int) -> list[Label]:
-    """Select labels that do not overlap.
+    """Select labels that do not overlap, beginning with the brightest source.
 
     Parameters
     ----------
     names : sequence of Label
         Labels, brightest first.
     width, height : float
-        Size of a label in pixels.
+        Size of the space for a label in pixels.
     max_per_kind : int
-        Largest number of labels of a kind.
+        Largest number of galaxies, and largest number of stars.
 
     Returns
     -------
@@ -123,21 +129,21 @@ def without_overlaps(names: Sequence[Label], width: float, height: float, max_pe
 
 
 def close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float) -> list[Label]:
-    """Select the brightest galaxies that lie well inside the image.
+    """Select the brightest galaxies for close-ups, which must lie well inside the image and not overlap.
 
     Parameters
     ----------
     names : sequence of Label
-        Labels, brightest first.
+        Labels of galaxies and stars, brightest first.
     shape : tuple of int
-        Number of rows and columns of the image.
+        Numbers of rows and columns of the image.
     pixel_scale : float
-        Pixel scale in arcsec.
+        Arcsec per pixel.
 
     Returns
     -------
     list of Label
-        At most CLOSE_UPS labels.
+        At most CLOSE_UPS galaxies, brightest first.
     """
     half = CLOSE_UP_ARCSEC / pixel_scale / 2
     inside = [

@@ -1,6 +1,6 @@
 """Add a pointing error to the headers of raw images, since telescopes know their pointing only to some arcseconds.
 
-The head file next to the image has the true solution, and so have all tables.
+The true WCS is in the head file, a text file next to the image; all tables of truesky have the true pointing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from truesky.render.camera import astrometry, pointing
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types
 
-# Keywords of the WCS error in a header without the true pointing (FITS, paper I).
+# Keywords with the rms error of the coordinates (Greisen & Calabretta 2002). Only headers with a pointing error have
+# them.
 ERRORS = ("CSYER1", "CSYER2")
 _TEXT = "[deg] rms error of CRVAL; true WCS in .head"
 
@@ -24,28 +25,28 @@ _TEXT = "[deg] rms error of CRVAL; true WCS in .head"
 def commanded_pointing(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int
 ) -> tuple[float, float, float]:
-    """Return the boresight and position angle that all raw headers of an exposure have.
+    """Return the boresight and the position angle with the pointing error that raw headers of an exposure have.
 
     Parameters
     ----------
     exposure : ExposureRow
-        Row of the table `exposures`.
+        Row of the table `exposures`, with the true pointing.
     detector : Detector
-        A detector of the camera.
+        Any detector of the camera; the result is the same for every detector.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the rms pointing errors of cameras.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the errors are drawn.
 
     Returns
     -------
     ra, dec, position_angle : float
-        Angles in degrees; the true ones if the camera has no error.
+        Angles in degrees; the true ones if the camera has no pointing error.
 
     Notes
     -----
-    Offset and rotation are drawn from normal distributions with the rms errors of the camera. They are the same for
-    exposures that differ only in their noise.
+    Offset and rotation have normal distributions. They are the same for repetitions of an exposure that differ only in
+    their noise.
     """
     true = exposure.ra, exposure.dec, exposure.position_angle
     offset, rotation = _rms_errors(detector, mission)
@@ -53,7 +54,8 @@ def commanded_pointing(
         return true
     draws = rng.stream(seed, "exposures.header", image_types.identity(replace(exposure, realisation=None)))
     x, y, turn = (float(normal) for normal in draws.standard_normal(3))
-    # Treat the position (x, y) of the field as its centre. This is correct at the poles, too.
+    # The boresight with the error is the one for which the true boresight lies at the offset (x, y) in the focal plane.
+    # Adding the offset to ra and dec would be wrong near the poles.
     shifted_detector = replace(detector, x=offset * x, y=offset * y, distortion_terms=())
     ra, dec, angle = pointing.boresight_for(shifted_detector, true[0], true[1], true[2] + rotation * turn / 3600.0)
     return ra, dec, angle
@@ -62,25 +64,26 @@ def commanded_pointing(
 def cards(
     header: Sequence[Card], exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int
 ) -> tuple[Card, ...]:
-    """Return the header of a raw image: boresight and linear terms have the pointing error, the distortion is true.
+    """Return a header in which the boresight and the linear terms of the WCS have the pointing error of a raw image.
 
     Parameters
     ----------
     header : sequence of Card
-        Header with the true WCS and the distortion as SIP.
+        Header with the true WCS and the distortion as SIP, which does not change.
     exposure : ExposureRow
-        Row of the table `exposures`.
+        Row of the table `exposures`, with the true pointing.
     detector : Detector
-        The detector.
+        Detector to which the header belongs.
     mission : MissionConfiguration
-        The mission database.
+        Mission database, with the rms pointing errors of cameras.
     seed : int
-        Seed of the request.
+        Seed of the request, from which the errors are drawn.
 
     Returns
     -------
     tuple of Card
-        The header with the pointing error and its rms, or the given header if the camera has no error.
+        The header with the pointing error, and with its rms in the cards CSYER1 and CSYER2. It is the given header if
+        the camera has no pointing error.
     """
     offset, rotation = _rms_errors(detector, mission)
     if offset == rotation == 0.0:
@@ -101,12 +104,15 @@ def cards(
 
 
 def _depends_on_pointing(keyword: str) -> bool:
-    """Return True if a WCS keyword depends on the boresight. Pixels and distortion depend only on the detector."""
+    """Return True for the WCS keywords CRVALi and CDi_j, which depend on the boresight and not only on the detector."""
     return keyword.startswith(("CRVAL", "CD"))
 
 
 def _rms_errors(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
-    """Return the rms errors (arcsec) of each coordinate and of the position angle; 0 if the database has no value."""
+    """Return the rms error of each pointing coordinate and the rms error of the position angle, both in arcsec.
+
+    A value that the mission database does not have is 0.
+    """
     keys = (f"{detector.section}.header.{name}" for name in ("offset", "rotation"))
     offset, rotation = (mission.value(key, "arcsec") if key in mission else 0.0 for key in keys)
     return offset, rotation

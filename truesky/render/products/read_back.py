@@ -1,4 +1,7 @@
-"""Read the pixels and the header of a detector from its files."""
+"""Read the pixels and the FITS header of a detector from its image file and its head file.
+
+The head file lies next to the image and has the true WCS as text; the header of a raw image has a pointing error.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,29 @@ from truesky.render.channels import registry
 from truesky.render.channels.readout import ReadoutMode
 from truesky.render.products import head_files, raw_pointing
 
-# Keyword of the section with the pixels of the detector, if the array also contains prescan or overscan.
+# Keyword of the card that tells which part of an array contains the pixels of the detector. The card is present if the
+# array also has prescan or overscan.
 _DATA = "DATASEC"
 
 
 def frame(path: Path) -> images.Image:
-    """Return the pixels, shape (ny, nx), as stored, without prescan and overscan, and the header of the detector."""
+    """Return the pixels of a detector as stored, without prescan and overscan.
+
+    Parameters
+    ----------
+    path : Path
+        The image file.
+
+    Returns
+    -------
+    Image
+        The pixels, shape (ny, nx), and the header with the true WCS of these pixels.
+
+    Raises
+    ------
+    BadInput
+        If the file has several arrays, prescan or overscan, and its card CHANNEL is not the name of a channel.
+    """
     read = images.read_images(path)
     if read[0].data is not None and _DATA not in _header(read):
         return images.Image(read[0].data, with_true_wcs(path, read[0].cards))
@@ -29,14 +49,41 @@ def frame(path: Path) -> images.Image:
 
 
 def header(path: Path) -> tuple[images.Card, ...]:
-    """Return the cards of the primary header, with the WCS of the pixels of the detector."""
+    """Return the primary header of an image for its pixels without prescan and overscan.
+
+    Parameters
+    ----------
+    path : Path
+        The image file.
+
+    Returns
+    -------
+    tuple of Card
+        The cards, with the true WCS of these pixels.
+    """
     return _trim_header(with_true_wcs(path, images.read_images(path)[0].cards))
 
 
 def electrons(path: Path) -> images.Image:
-    """Return the pixels, shape (ny, nx), in electrons as float64; the bias of a science file is subtracted.
+    """Return the pixels of a detector in electrons, without prescan and overscan.
 
-    Raises BadInput for a map without unit, such as that of saturated pixels.
+    The bias of a science image is subtracted.
+
+    Parameters
+    ----------
+    path : Path
+        The image file.
+
+    Returns
+    -------
+    Image
+        The pixels, float64 with shape (ny, nx), and the header with their true WCS.
+
+    Raises
+    ------
+    BadInput
+        If the file is a truth map without a unit, such as that of saturated pixels, or if the card CHANNEL of a science
+        image is unknown.
     """
     read = images.read_images(path)
     unit = _header(read).get("BUNIT")
@@ -50,7 +97,24 @@ def electrons(path: Path) -> images.Image:
 
 
 def with_true_wcs(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
-    """Return the cards of a header; the true WCS of the head file replaces the WCS of a raw header."""
+    """Return the cards of an image header with the true WCS instead of the one with the pointing error of a raw image.
+
+    The true WCS is that of the first image in the head file next to `path`. Its distortion is given as TPV, not SIP.
+    CRPIX is kept, RA and DEC become CRVAL of the true WCS, and the cards of the pointing error (CSYER1, CSYER2) are
+    removed.
+
+    Parameters
+    ----------
+    path : Path
+        The image file of a detector.
+    cards : sequence of Card
+        Cards of its first image.
+
+    Returns
+    -------
+    tuple of Card
+        The cards. They are unchanged if the header has no pointing error or there is no head file.
+    """
     if all(key not in raw_pointing.ERRORS for key, *_ in cards):
         return tuple(cards)
     true = {card[0]: card for card in head_files.first_cards(path) if not card[0].startswith("CRPIX")}
@@ -66,7 +130,11 @@ def with_true_wcs(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card
 
 
 def _trim_header(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
-    """Return the header of the pixels without prescan and overscan; CRPIX counts from the first of these pixels."""
+    """Return the header for an array from which prescan and overscan have been cut off.
+
+    CRPIX then counts from the first remaining pixel. The card DATASEC, which has the rectangle of the remaining pixels,
+    is removed; without it the cards are unchanged.
+    """
     section = next((str(value) for key, value, _ in cards if key == _DATA), None)
     if section is None:
         return tuple(cards)

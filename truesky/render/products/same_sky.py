@@ -1,4 +1,4 @@
-"""Draw one patch of sky as several cameras observe it, with north up, and as a colour image.
+"""Draw one small patch of sky as several cameras observe it, with north up, and as a colour image.
 
 References
 ----------
@@ -23,42 +23,67 @@ from truesky.render.camera import astrometry, footprints, pointing
 from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import read_back
 
-# Side of a patch in arcsec; pixels of a picture, and of the larger colour picture.
-SIDE, _PIXELS, _COLOUR_PIXELS = 100.0, 440, 1000
-# Each camera is shown in the band closest to this wavelength in A, the longest that silicon detects.
+# Side of the patch of sky that is drawn for all cameras, arcsec.
+SIDE = 100.0
+# Pixels along a side of the picture of the patch in one camera.
+_PIXELS = 440
+# Pixels along a side of the colour picture of the patch.
+_COLOUR_PIXELS = 1000
+# Each camera is shown in the band whose wavelength is closest to this value, Angstrom. Silicon detectors and infrared
+# cameras both have bands near it.
 _WAVELENGTH = 9000.0
-# Number of trial positions of a patch along the side of a detector.
+# Number of trial positions along each side of an image. At each, the cameras that observe a whole patch of sky are
+# counted.
 _GRID_SIZE = 9
-# Red, green, blue: the first set of which the lake has all bands.
+# Sets of bands shown as red, green and blue. The first set is used of which the patch has been observed in all bands.
 _COLOURS = (("euclid_h", "euclid_y", "euclid_vis"), ("lsst_i", "lsst_r", "lsst_g"), ("des_i", "des_r", "des_g"))
-# Black (sigma below the sky), start of the logarithmic range, and white (sigma above the sky).
-_BLACK, _KNEE, _WHITE = -1.5, 4.0, 150.0
-# Distance from the median of a normal distribution to its quartile, in sigma.
+# Signal above the sky, in rms noise of a sky pixel, that the picture of a camera shows in black.
+_BLACK = -1.5
+# Signal above the sky, in rms noise of a sky pixel, up to which the brightness of the picture is about linear in the
+# signal. Above it, the brightness is logarithmic.
+_KNEE = 4.0
+# Signal above the sky, in rms noise of a sky pixel, that the picture of a camera shows in white.
+_WHITE = 150.0
+# Distance from the median of a normal distribution to its quartile, in standard deviations. It converts the measured
+# distance in an image to the rms noise.
 _QUARTILE = 0.6745
-# Colour picture: softening of the stretch, and signal in sigma that is shown at half of white.
-_SOFTENING, _STRETCH = 8.0, 12.0
+# Parameter Q of the asinh stretch of colour pictures by Lupton et al. 2004: a larger Q compresses bright pixels more.
+_SOFTENING = 8.0
+# Parameter `stretch` of the asinh stretch of colour pictures by Lupton et al. 2004, in rms noise of a sky pixel: a
+# larger value makes faint pixels darker.
+_STRETCH = 12.0
+# Colours of the text and of the background of the figure.
 _INK, _PAPER = "#e8e6df", "#0b0d12"
-_COLUMNS, _INCHES, _DPI = 3, (13.2, 9.35), 100
+# Number of pictures (one per camera) side by side in the figure; more pictures continue in the next row.
+_COLUMNS = 3
+# Width and height in inches of a figure with two rows of pictures.
+_INCHES = (13.2, 9.35)
+# Pixels per inch of the figure.
+_DPI = 100
 
+# A science image: its columns in the tables `exposures` and `tasks` by name, and its path under the key "file".
 Row = dict[str, Any]
 
 
 def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
-    """Draw `same_sky.png` if more than two cameras share a patch, and `colour.png` if three bands do.
+    """Draw the same patch of sky in all cameras of a request that observe it.
+
+    The file `same_sky.png` has one picture per camera, `colour.png` one picture of three bands.
 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Lake (folder of stored tables and images).
     out : Path
-        Folder of the PNG files.
+        Folder of the PNG files, which is made if necessary.
     request : str, optional
         Name of the request; required if the lake has several.
 
     Returns
     -------
     list of Path
-        The PNG files.
+        The PNG files that were written. There is no `same_sky.png` if fewer than three cameras observe the patch, and
+        no `colour.png` without a set of three bands. It is [] if the request has fewer than three cameras.
     """
     rows = _rows(root, request)
     order = [channel for channel, _ in CHANNELS]
@@ -85,28 +110,28 @@ def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
 
 
 def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Float:
-    """Return the pixels of a patch of side SIDE about a position, with north up and east to the left.
+    """Resample a patch of sky, `SIDE` arcsec wide, from an image, with north up and east to the left.
 
     Parameters
     ----------
     file : Path
-        An image file.
+        Image file of a detector.
     place : tuple of float
-        ICRS ra and dec in degrees.
+        ICRS ra and dec of the centre of the patch in degrees.
     pixels : int
-        Pixels along each side of the patch.
+        Pixels along each side of the result.
     order : int
-        Order of the spline interpolation; 0 takes the nearest pixel.
+        Order of the spline interpolation, 0 to 5; 0 takes the nearest pixel.
 
     Returns
     -------
     float array, shape (pixels, pixels)
-        Electrons; NaN outside the image.
+        Values in electrons per pixel of the image; NaN outside the image. The first row is the southernmost.
     """
     image = read_back.electrons(file)
     data = np.asarray(image.data, float)
     step = SIDE * ((np.arange(pixels) + 0.5) / pixels - 0.5)
-    # The x axis points west in a plane without rotation, like u.
+    # Offsets in arcsec from the centre: `across` to the west, `up` to the north.
     across, up = np.meshgrid(step, step)
     ra, dec = pointing.sky_of_plane(across.ravel(), up.ravel(), *place, 0.0)
     column, row = astrometry.pixel_of_sky(astrometry.from_cards(image.cards), ra, dec)
@@ -115,17 +140,17 @@ def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Fl
 
 
 def colours(red: Float, green: Float, blue: Float) -> Array:
-    """Combine three images into a colour picture.
+    """Combine images in three bands into a colour picture with the stretch of Lupton et al. 2004.
 
     Parameters
     ----------
     red, green, blue : float array, shape (ny, nx)
-        Fluxes above the sky in units of the noise of each image.
+        Signal above the sky, divided by the noise of each image; NaN counts as 0.
 
     Returns
     -------
     uint8 array, shape (ny, nx, 3)
-        RGB values.
+        RGB values, 0 to 255.
     """
     from astropy.visualization import make_lupton_rgb
 
@@ -134,7 +159,10 @@ def colours(red: Float, green: Float, blue: Float) -> Array:
 
 
 def _rows(root: Path, request: str | None) -> list[Row]:
-    """Return the science images of the sky with their footprints and exposures."""
+    """Return the science images of the sky that a request has, each with its file, its footprint and its exposure.
+
+    A row is a dict of the columns of the tables `exposures` and `tasks`, and of the path of the image as "file".
+    """
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
     product_rows = version.rows()
@@ -153,7 +181,7 @@ def _rows(root: Path, request: str | None) -> list[Row]:
 
 
 def _wavelength_offset(row: Row) -> float:
-    """Return the distance (A) between the wavelength of a band and _WAVELENGTH."""
+    """Return how far the pivot wavelength of an image's band is from `_WAVELENGTH`, in angstrom."""
     return abs(passbands.pivot_wavelength(passbands.load(row["band"])) - _WAVELENGTH)
 
 
@@ -162,9 +190,10 @@ def _camera(row: Row) -> tuple[str, str]:
 
 
 def _best_place(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tuple[float, float]:
-    """Return the position whose patch most cameras observe completely.
+    """Return the position (ra, dec in degrees) of the patch that the largest number of cameras observe completely.
 
-    Candidates lie on a grid over each detector of the camera with the fewest images.
+    The trial positions lie on a grid over each image of the camera with the fewest images. If several positions are
+    observed by equally many cameras, the one nearest to the centre of its image is returned.
     """
     rows_by_camera = {camera: [row for row in rows if _camera(row) == camera] for camera in cameras}
     fewest = rows_by_camera[min(cameras, key=lambda camera: (len(rows_by_camera[camera]), camera))]
@@ -174,21 +203,22 @@ def _best_place(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tupl
     ra, dec = (np.concatenate([place[i] for place in candidates]) for i in (0, 1))
     corners = _corners(ra, dec)
     n_cameras = np.sum([_contains_patch(rows_by_camera[camera], corners) for camera in cameras], axis=0)
-    # Ties are resolved by the distance from the centre of the detector.
+    # Distance of each trial position from the centre of its image (arcsec). It decides between positions that equally
+    # many cameras observe.
     distance = np.tile(np.hypot(across, up), len(fewest))
     best = int(np.lexsort((distance, -n_cameras))[0])
     return float(ra[best]), float(dec[best])
 
 
 def _corners(ra: Float, dec: Float) -> Float:
-    """Return the corners (ra, dec in deg), shape (n, 4, 2), of patches about positions."""
+    """Return the corners (ra, dec in degrees), shape (n, 4, 2), of patches centred on n positions (in degrees)."""
     half = 0.5 * SIDE
     x, y = np.array([-half, half, -half, half]), np.array([-half, -half, half, half])
     return np.array([np.transpose(pointing.sky_of_plane(x, y, a, d, 0.0)) for a, d in zip(ra, dec, strict=True)])
 
 
 def _contains_patch(rows: Sequence[Row], corners: Float) -> Int:
-    """Return for each patch, shape (n), 1 if one of the images contains it completely, otherwise 0."""
+    """Return for n patches, given by their corners, 1 if a single image contains the patch completely, otherwise 0."""
     flat = corners.reshape(-1, 2)
     contained = np.zeros(len(corners), bool)
     for row in rows:
@@ -197,7 +227,7 @@ def _contains_patch(rows: Sequence[Row], corners: Float) -> Int:
 
 
 def _rows_with_patch(place: tuple[float, float], rows: Sequence[Row]) -> list[Row]:
-    """Return the images that contain the patch about a position completely."""
+    """Return the images that contain the whole patch centred on a position (ra, dec in degrees)."""
     corners = _corners(np.array([place[0]]), np.array([place[1]]))
     return [row for row in rows if _contains_patch([row], corners)[0]]
 
@@ -207,9 +237,9 @@ def _footprint(row: Row) -> pa.Table:
 
 
 def _sky_and_noise(image: Float) -> tuple[float, float]:
-    """Return sky and noise, from the median and the lower quartile.
+    """Return the sky level (median) and the noise of an image, from the distance of its lower quartile to the median.
 
-    Few pixels lie in gaps between detectors or are hit by cosmic rays.
+    NaN is ignored. Sources and cosmic rays hardly change the result, because they only make few pixels brighter.
     """
     finite = image[np.isfinite(image)]
     low, level = np.quantile(finite, (0.25, 0.5))
@@ -240,16 +270,19 @@ def _draw_panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[f
 
 
 def _draw_colours(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float, float]) -> Path:
-    """Draw the median of each band's exposures; with three or more, it is free of cosmic rays."""
+    """Draw a colour picture of the patch from three bands (red, green, blue) and return its path.
+
+    The picture of a band is the median of its exposures, which is free of cosmic rays if there are at least three.
+    """
     from matplotlib.image import imsave
 
     layers = []
     for rows in bands.values():
-        # Scale to the flux of an AB magnitude, equal in all bands.
+        # Factors that convert electrons to flux density f_nu, with the same unit in all bands.
         scale = [10.0 ** (-0.4 * row["zero_point"]) / row["exposure_time_s"] for row in rows]
         patches = [patch(row["file"], place, _COLOUR_PIXELS, order=1) for row in rows]
         above = np.sort([s * (p - _sky_and_noise(p)[0]) for s, p in zip(scale, patches, strict=True)], axis=0)
-        # For two exposures, take the lower value.
+        # Take the median of each pixel, or the lower of the two middle values for an even number of exposures.
         layers.append(above[(len(above) - 1) // 2])
     picture = colours(*(layer / _sky_and_noise(layer)[1] for layer in layers))
     path.parent.mkdir(parents=True, exist_ok=True)

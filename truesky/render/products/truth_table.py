@@ -1,4 +1,4 @@
-"""Make the rows of the tables `rendered_truth` and `rendered_spectra` of a detector."""
+"""Make the tables `rendered_truth` (sources drawn on a detector) and `rendered_spectra` (spectra drawn on it)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.psf import centroids
 from truesky.render.sources.source_list import Sources
 
-# Codes of `method` in the table `rendered_truth`.
+# Codes of the column `method` in the table `rendered_truth`, which tells how a source was drawn: as a point source, as
+# a galaxy profile, from an image, or as the trail of a moving body.
 POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 
 
 def truth(rendered: RenderedDetector) -> pa.Table:
-    """Return one row of `rendered_truth` per drawn source, sorted by id."""
+    """Return the rows of the table `rendered_truth` for a detector: one per drawn source, sorted by its identifier.
+
+    A row has the position in pixels, the expected and drawn electrons, and the magnitude.
+    """
     sources, n, (psf_x, psf_y) = rendered.sources, len(rendered.sources), _centroids(rendered)
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
     return RENDERED_TRUTH.build(
@@ -41,7 +45,10 @@ def truth(rendered: RenderedDetector) -> pa.Table:
 
 
 def _centroids(rendered: RenderedDetector) -> tuple[Float | None, Float | None]:
-    """Return the PSF centroid of each source's colour, pixels from its position; None without PSF or with spectra."""
+    """Return the offsets (columns, rows) in pixels of each source's light from its position, due to the PSF.
+
+    The PSF is that for the colour and place of the source. Both results are None if there is no PSF, or for spectra.
+    """
     sources, psf = rendered.sources, rendered.psf
     if psf is None or rendered.spectra is not None:
         return None, None
@@ -49,7 +56,10 @@ def _centroids(rendered: RenderedDetector) -> tuple[Float | None, Float | None]:
 
 
 def _magnitudes(rendered: RenderedDetector) -> Float:
-    """Return the magnitudes for zero point and exposure time of the header; masked if no electrons are expected."""
+    """Return the AB magnitudes that follow from the expected electrons, the zero point and the exposure time.
+
+    They are masked for sources without expected electrons.
+    """
     electrons = rendered.sources.electrons
     shines = electrons > 0.0
     rate = np.where(shines, electrons, 1.0) / rendered.scene.exposure_time_s
@@ -57,7 +67,10 @@ def _magnitudes(rendered: RenderedDetector) -> Float:
 
 
 def spectra(rendered: RenderedDetector) -> pa.Table | None:
-    """Return one row of `rendered_spectra` per source and order with light on the detector, or None without a grism."""
+    """Return the rows of the table `rendered_spectra`: one per source and spectral order with light on the detector.
+
+    Return None for a detector without a grism.
+    """
     if rendered.spectra is None:
         return None
     n = len(rendered.spectra["id"])

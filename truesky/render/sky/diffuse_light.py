@@ -1,4 +1,8 @@
-"""Diffuse light of the sky in electrons per second and pixel: zodiacal light, scattered starlight, thermal light."""
+"""Diffuse light of the sky in a camera, in electrons per second and pixel.
+
+It consists of zodiacal light, starlight that the telescope scatters, and thermal light; ground cameras have a published
+sky level instead.
+"""
 
 from __future__ import annotations
 
@@ -19,35 +23,42 @@ from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector
 from truesky.render.sky import thermal
 
+# MJD of the epoch J2000.
 _MJD_J2000 = 51544.5
-# Mean longitude and mean anomaly (value at J2000 and rate per day) and equation of the centre, deg: The Astronomical
-# Almanac, low-precision formula for the Sun (0.01 deg, 1950-2050). The general precession per day converts from the
-# equinox of date to J2000.
+# Mean longitude of the Sun at J2000 (deg) and its rate (deg per day), from the low-precision formula of The
+# Astronomical Almanac, which is accurate to 0.01 deg from 1950 to 2050.
 _SUN_LONGITUDE = (280.460, 0.9856474)
+# Mean anomaly of the Sun at J2000 (deg) and its rate (deg per day).
 _SUN_ANOMALY = (357.528, 0.9856003)
+# Coefficients of the Sun's equation of the centre (deg), for the sine of the mean anomaly and of twice the anomaly.
 _SUN_CENTRE = (1.915, 0.020)
+# General precession in deg per day, which converts longitudes from the equinox of date to J2000.
 _PRECESSION = 1.39697 / 36525.0
-# Unit of the table of Leinert et al. 1998.
+# Unit of the intensity of zodiacal light in the table of Leinert et al. 1998, W m-2 sr-1 um-1.
 _TABLE_UNIT = 1e-8
-# Band of the scattered light in the mission database.
+# Name of the VIS passband, for which the mission database gives the starlight that the telescope scatters.
 _VIS = "euclid_vis"
+# One arcsec in radians.
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class SkyBand:
-    """Terms of a band's sky that depend neither on position nor on date, in electrons per second and pixel.
+    """Coefficients from which the diffuse light of the sky in a band is computed at any position and date.
+
+    All are in electrons per second and pixel.
 
     Attributes
     ----------
     constant : float
-        Thermal light, or the sky of a ground camera.
+        Thermal light, or the whole sky of a ground camera.
     zodi : float
-        Light with the Sun's spectrum, for a unit of intensity (W m-2 sr-1 um-1) at 500 nm.
+        Zodiacal light with exactly the Sun's spectrum, for an intensity of 1 W m-2 sr-1 um-1 at 500 nm.
     red, blue : float
-        The same, with the spectrum multiplied by the decades of wavelength from 500 nm, above and below 500 nm.
+        Zodiacal light as in `zodi`, but with the Sun's spectrum multiplied by log10(wavelength / 500 nm). `red` is the
+        sum over wavelengths above 500 nm, and `blue` (negative) below. They describe the reddening of zodiacal light.
     stars : float
-        Scattered light of the stars at a Galactic latitude of 60 deg.
+        Starlight that the telescope scatters, for the mean star density at a Galactic latitude of 60 deg.
     """
 
     constant: float
@@ -58,48 +69,49 @@ class SkyBand:
 
 
 def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, and starlight that the telescope scatters.
+    """Return the sky of a camera without thermal light (VIS): zodiacal light, and starlight scattered by the telescope.
 
     Parameters
     ----------
     detector : Detector
-        Detector of the camera.
+        Any detector of the camera.
     band : str
         Name of the band.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the scattered light, the zodiacal light and the collecting area.
     curve : Passband, optional
-        The passband; by default the embedded one.
+        Response of the band; None means the passband of truesky.
 
     Returns
     -------
     SkyBand
-        Terms of the sky.
+        Coefficients of the sky in electrons per second and pixel.
     """
     rate = mission.value(f"{detector.section}.scattered_light", "electron / (s pix)")
-    # The scattered light in a band is proportional to its width, for flat f_nu.
+    # Scale the scattered light of the VIS band to another band by the width of the passbands, for light with flat f_nu.
     part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
     return SkyBand(0.0, *_zodiacal_terms(detector, band, mission, curve), rate * part)
 
 
 def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, thermal light of telescope and instrument, and starlight that they scatter.
+    """Return the sky of an infrared camera: zodiacal light, thermal light, and starlight that the telescope scatters.
 
     Parameters
     ----------
     detector : Detector
-        Detector of the camera.
+        Any detector of the camera.
     band : str
         Name of the band.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the temperatures, the scattered light, the zodiacal light and the collecting area.
     curve : Passband, optional
-        The passband; by default the embedded one.
+        Response of the band; None means the passband of truesky.
 
     Returns
     -------
     SkyBand
-        Terms of the sky.
+        Coefficients of the sky in electrons per second and pixel. A band without scattered light in the mission
+        database has none.
     """
     section, key = detector.section, f"{detector.section}.{band}.scattered_light"
     warm = thermal.rate(section, band, curve or passbands.load(band), mission)
@@ -108,23 +120,23 @@ def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
 
 
 def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Dark-sky rate of a band from the mission database, or from its surface brightness and zero point.
+    """Return the sky of a ground camera in a band: the published rate, or that from the published surface brightness.
 
     Parameters
     ----------
     detector : Detector
-        Detector of the camera.
+        Any detector of the camera.
     band : str
         Name of the band.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the rate of the sky, or else its surface brightness and the zero point.
     curve : Passband, optional
-        Not used, since the sky of a band is a published value.
+        Not used, because the sky of a band is a published value.
 
     Returns
     -------
     SkyBand
-        A constant sky.
+        Sky that depends neither on position nor on date, in electrons per second and pixel.
     """
     section = detector.section
     if f"{section}.{band}.sky" in mission:
@@ -135,18 +147,18 @@ def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, cur
 
 
 def sky_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons per second and pixel of a band's sky, at a position and date.
+    """Return the rate of the diffuse sky at a position and date.
 
     Parameters
     ----------
     sky_band : SkyBand
-        Terms of the sky.
+        Coefficients of the sky in a band.
     ra, dec : float
-        Position, deg.
+        ICRS position in degrees.
     mjd : float
-        Date.
+        Date (MJD), on which the zodiacal light depends.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the tables of zodiacal light and of starlight.
 
     Returns
     -------
@@ -158,24 +170,24 @@ def sky_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: Miss
 
 
 def photons(section: str, rate: float, band: Passband, mission: MissionConfiguration) -> Float:
-    """Spectrum of the sky: electrons per second and pixel at the wavelengths of a band, which are 1 Angstrom apart.
+    """Return the spectrum of the sky at the wavelengths of a band, which are 1 Angstrom apart.
 
     Parameters
     ----------
     section : str
-        Prefix of the camera in the mission database.
+        Beginning of the camera's parameter names in the mission database, such as "nisp".
     rate : float
-        Total rate of the sky, electrons per second and pixel.
+        Total rate of the sky in the band, electrons per second and pixel.
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     mission : MissionConfiguration
         Mission database, with the temperatures of the camera.
 
     Returns
     -------
     float array, shape (n,)
-        Electrons per second and pixel. Light that is not thermal has the spectrum of zodiacal light 90 deg from the
-        Sun.
+        Electrons per second and pixel in each Angstrom. The thermal light is that of the mission database. The rest of
+        `rate` has the spectrum of zodiacal light 90 deg from the Sun; it is 0 if `rate` is below the thermal light.
     """
     warm_light = thermal_photons(section, band, mission)
     red, blue = _reddening_slopes(90.0, mission)
@@ -186,21 +198,21 @@ def photons(section: str, rate: float, band: Passband, mission: MissionConfigura
 
 
 def thermal_photons(section: str, band: Passband, mission: MissionConfiguration) -> Float:
-    """Thermal part of the spectrum of the sky.
+    """Return the spectrum of thermal light at the wavelengths of a band, which are 1 Angstrom apart.
 
     Parameters
     ----------
     section : str
-        Prefix of the camera in the mission database.
+        Beginning of the camera's parameter names in the mission database, such as "nisp".
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the temperatures of the camera.
 
     Returns
     -------
     float array, shape (n,)
-        Electrons per second and pixel; 0 if the mission database has no thermal light in the band.
+        Electrons per second and pixel in each Angstrom; 0 if the mission database has no thermal light in the band.
     """
     if f"{section}.{band.name}.thermal" not in mission:
         return np.zeros(len(band.wavelength))
@@ -208,19 +220,20 @@ def thermal_photons(section: str, band: Passband, mission: MissionConfiguration)
 
 
 def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:
-    """Light of a field's stars, relative to the mean at a Galactic latitude of 60 deg.
+    """Return the total light of the stars around a position, relative to the mean at a Galactic latitude of 60 deg.
 
     Parameters
     ----------
     ra, dec : float
-        Position, deg.
+        ICRS position in degrees.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with a table of the light as a function of Galactic longitude and latitude.
 
     Returns
     -------
     float
-        Ratio, from bilinear interpolation of the logarithm.
+        Ratio, from bilinear interpolation of the logarithm of the table. The table is symmetric about the Galactic
+        plane and about the Galactic centre.
 
     Notes
     -----
@@ -235,14 +248,20 @@ def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:
 
 @lru_cache(maxsize=8)
 def _starlight_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float, Float]:
-    """Longitudes [l] (0 to 180 deg), latitudes [b] (deg) and logarithms of the light [l, b]."""
+    """Convert rows (Galactic longitude, latitude, light of stars) to a grid.
+
+    Returns n longitudes (0 to 180 deg), m latitudes (deg), and the natural logarithm of the light, shape (n, m).
+    """
     table = np.array(sorted(rows))
     longitudes, latitudes = np.unique(table[:, 0]), np.unique(table[:, 1])
     return longitudes, latitudes, np.log(table[:, 2]).reshape(len(longitudes), len(latitudes))
 
 
 def sun_longitude(mjd: float) -> float:
-    """Ecliptic longitude of the Sun from the Earth, deg, mean equinox J2000, to 0.02 deg between 1950 and 2050."""
+    """Return the ecliptic longitude of the Sun as seen from the Earth in degrees, 0 to 360 (mean equinox J2000).
+
+    The error is 0.02 deg between 1950 and 2050.
+    """
     days = mjd - _MJD_J2000
     longitude = _SUN_LONGITUDE[0] + (_SUN_LONGITUDE[1] - _PRECESSION) * days
     anomaly = np.radians(_SUN_ANOMALY[0] + _SUN_ANOMALY[1] * days)
@@ -250,22 +269,22 @@ def sun_longitude(mjd: float) -> float:
 
 
 def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfiguration) -> float:
-    """Zodiacal light at 500 nm from the Earth.
+    """Return the intensity of zodiacal light at 500 nm as seen from the Earth.
 
     Parameters
     ----------
     from_sun : float
-        Ecliptic longitude minus that of the Sun, deg.
+        Ecliptic longitude of the position minus that of the Sun, deg.
     latitude : float
-        Ecliptic latitude, deg.
+        Ecliptic latitude of the position, deg.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the table of zodiacal light.
 
     Returns
     -------
     float
-        Intensity, W m-2 sr-1 um-1, to 10 %. Within 15 deg of the Sun, where the table is empty, its nearest value is
-        used.
+        Intensity in W m-2 sr-1 um-1, with an error of 10 %. Within 15 deg of the Sun, where the table is empty, its
+        next value away from the Sun is used.
 
     Raises
     ------
@@ -289,12 +308,16 @@ def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfigu
     return float(np.exp(mean)) * _TABLE_UNIT
 
 
-# Ecliptic latitudes of the table's columns, deg.
+# Ecliptic latitudes of the columns of the table of zodiacal light, deg.
 _LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0, 90.0])
 
 
 def _zodiacal_table(mission: MissionConfiguration) -> tuple[Float, Float]:
-    """Longitudes from the Sun [19], deg, and values [19, 11]; empty entries have the next value away from the Sun."""
+    """Return the table of zodiacal light: longitudes from the Sun in deg, shape (19,), and intensities, shape (19, 11).
+
+    Intensities are in 1e-8 W m-2 sr-1 um-1, with one column per latitude in `_LATITUDES`. Entries that are empty in the
+    mission database have the next value away from the Sun.
+    """
     return _fill_table(mission.numbers("env.zodi.map"))
 
 
@@ -309,23 +332,24 @@ def _fill_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
 
 
 def zodiacal_sky(band: Passband, area: float, pixel_scale: float, mission: MissionConfiguration) -> SkyBand:
-    """Zodiacal light through a passband, without other light.
+    """Return the zodiacal light through a passband, without other light.
 
     Parameters
     ----------
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     area : float
         Collecting area, m^2.
     pixel_scale : float
         Arcsec per pixel.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the spectrum of the Sun.
 
     Returns
     -------
     SkyBand
-        Terms of the sky. The spectrum is that of the Sun, reddened depending on wavelength and elongation.
+        Coefficients of the sky in electrons per second and pixel. The spectrum is that of the Sun, reddened depending
+        on wavelength and elongation.
 
     References
     ----------
@@ -357,7 +381,7 @@ def _zodiacal_integrals(
     reference = mission.value("env.zodi.reference_wavelength", "nm")
     spectrum = solar_irradiance(wavelength, mission) / solar_irradiance(np.array([reference]), mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
-    # The spectrum is in W m-2 sr-1 um-1, in steps of 1 A = 1e-4 um.
+    # Convert an intensity in W m-2 sr-1 um-1 to detected photons per second, pixel and Angstrom (1e-4 um).
     photons = spectrum * band.response / energy * (1e-4 * area * (pixel_scale * _ARCSEC) ** 2)
     decades = np.log10(wavelength / reference)
     weights = (np.ones_like(decades), np.maximum(decades, 0.0), np.minimum(decades, 0.0))
@@ -366,12 +390,12 @@ def _zodiacal_integrals(
 
 
 def solar_irradiance(wavelength: Float, mission: MissionConfiguration) -> Float:
-    """Solar spectral irradiance at wavelengths in nm, W m-2 nm-1, averaged over 25 nm.
+    """Return the spectral irradiance of the Sun in W m-2 nm-1, averaged over 25 nm, at an array of wavelengths in nm.
 
     Raises
     ------
     BadInput
-        If the wavelengths exceed the range of the spectrum.
+        If a wavelength is outside the spectrum in the mission database.
 
     References
     ----------
@@ -385,7 +409,10 @@ def solar_irradiance(wavelength: Float, mission: MissionConfiguration) -> Float:
 
 
 def _reddening_slopes(elongation: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Slopes k of f_co = 1 + k log10(lambda / 500 nm) of Leinert et al. 1998, above and below 500 nm."""
+    """Return the slopes of the reddening of zodiacal light above and below 500 nm, at an angle from the Sun (deg).
+
+    A slope k changes the solar spectrum by the factor 1 + k log10(wavelength / 500 nm) of Leinert et al. 1998.
+    """
     ends = [mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far")]
     red, blue = (
         float(np.interp(elongation, ends, [mission.value(f"env.zodi.colour_{side}_{end}") for end in ("near", "far")]))

@@ -1,7 +1,8 @@
-"""Night sky of a ground site (airglow, zodiacal light and moonlight), and extinction of sources.
+"""Night sky of a ground camera (airglow, zodiacal light and moonlight), and atmospheric extinction of sources.
 
-If the level of a band in the mission database is the mean of a survey (`sky_model` 0), it is used unchanged. Otherwise
-it is the level of a dark zenith, and depends on airmass, date and Moon.
+The mission database has one sky level per band. If it is the mean of a survey (parameter `sky_model` 0), it is used
+unchanged. Otherwise it is the level at the zenith of a dark night, from which the sky at other airmasses, dates and
+Moon phases is computed.
 """
 
 from __future__ import annotations
@@ -22,11 +23,19 @@ from truesky.render.sky import diffuse_light, observatory
 from truesky.render.sky.diffuse_light import SkyBand
 from truesky.render.sky.observatory import Site
 
-# Ecliptic latitude with the least zodiacal light, deg; smallest fraction of a dark sky that is airglow.
-_POLE, _MIN_AIRGLOW = 90.0, 0.2
-# V band: nanolamberts are B = 34.08 exp(20.7233 - 0.92104 V); and its wavelength, Angstrom.
-_NANOLAMBERTS, _V_ZERO, _V = 34.08, 20.7233, 5510.0
-# Smallest distance of the Moon at which the model is evaluated, deg. Smaller distances use this value.
+# The published sky level of a dark night is assumed to contain the zodiacal light at this ecliptic latitude, deg.
+_POLE = 90.0
+# Smallest fraction of the published sky level that is airglow. The zodiacal light in this level is reduced if it would
+# leave less airglow.
+_MIN_AIRGLOW = 0.2
+# Factor in the conversion of a V surface brightness (mag per arcsec2) to nanolamberts, 34.08 exp(20.7233 - 0.92104 V).
+_NANOLAMBERTS = 34.08
+# Constant in the exponent of the conversion of a V surface brightness (mag per arcsec2) to nanolamberts, 34.08
+# exp(20.7233 - 0.92104 V).
+_V_ZERO = 20.7233
+# Wavelength of the V band, angstrom.
+_V = 5510.0
+# Smallest distance from the Moon (deg) for which moonlight is computed; nearer fields have the light at this distance.
 _NEAREST_MOON = 5.0
 
 
@@ -37,21 +46,23 @@ class Night:
     Attributes
     ----------
     level : float
-        Level in the mission database, electrons per second and pixel.
+        Brightness of the sky in the mission database, electrons per second and pixel.
     modelled : bool
-        True if the level is that of a dark zenith.
+        True if `level` is the sky at the zenith of a dark night, and the sky of an exposure is computed from it. False
+        if `level` is used for all exposures.
     zodiacal : float
-        Part of the level that is zodiacal light at the ecliptic pole.
+        Zodiacal light that is contained in `level` (that of the ecliptic pole), electrons per second and pixel.
     moon : float
-        Electrons per second and pixel for one nanolambert of moonlight in V.
+        Electrons per second and pixel for one nanolambert of moonlight in the V band.
     sky : SkyBand
-        Zodiacal light for the passband and the collecting area.
+        Coefficients that give the zodiacal light at any position and date, from the passband and the collecting area.
     scale : float
-        Electrons of the camera, divided by those expected from passband and area.
+        Electrons of a source according to the published zero point, divided by those expected from passband and
+        collecting area. Zodiacal light from `sky` is multiplied by it.
     extinction : float
-        Extinction, mag per airmass.
+        Atmospheric extinction in the band, mag per airmass.
     reference_airmass : float
-        Airmass of the zero point.
+        Airmass for which the published zero point is valid.
     site : Site
         The observatory.
     """
@@ -71,26 +82,26 @@ class Night:
         cls, detector: Detector, band: str, photometry: tuple[float, float], mission: MissionConfiguration,
         curve: Passband | None,
     ) -> Night:  # fmt: skip
-        """Read the properties for a detector's camera.
+        """Compute the properties of the night sky for the camera of a detector.
 
         Parameters
         ----------
         detector : Detector
-            Detector of the camera.
+            Any detector of the ground camera.
         band : str
             Name of the passband.
         photometry : (float, float)
-            AB magnitude of 1 electron per second, and level of the sky in the mission database, electrons per second
-            and pixel.
+            Zero point (AB magnitude of a source with 1 electron per second), and sky level in the mission database
+            (electrons per second and pixel).
         mission : MissionConfiguration
-            Mission database.
+            Mission database, with site, collecting area and extinction of the camera.
         curve : Passband or None
-            The passband; None for the embedded one.
+            Response of the band; None for the passband of truesky.
 
         Returns
         -------
         Night
-            The properties.
+            The properties. A band without extinction in the mission database has 0.
         """
         (zero_point, level), section, curve = photometry, detector.section, curve or passbands.load(band)
         area, pixel = mission.value(f"{section}.collecting_area", "m2"), detector.pixel_scale
@@ -108,28 +119,29 @@ class Night:
 
 
 def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons per second and pixel of the night sky.
+    """Return the rate of the night sky for a ground exposure.
 
     Parameters
     ----------
     night : Night
-        Properties of the band.
+        Properties of camera and band.
     ra, dec : float
-        Position, deg.
+        ICRS position of the field in degrees.
     mjd : float
-        Date.
+        Date (MJD).
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the table of zodiacal light.
 
     Returns
     -------
     float
-        Electrons per second and pixel.
+        Electrons per second and pixel: airglow, zodiacal light and moonlight, or `night.level` unless
+        `night.modelled`.
 
     Notes
     -----
-    The error is 10 % of the dark sky, whose airglow changes by half with the Sun's activity. It is 20 % of moonlight,
-    which is too bright by a half if the air absorbs light (y band).
+    The dark sky has an error of 10 %; changes of the airglow with the activity of the Sun (by half) are neglected.
+    Moonlight has an error of 20 %. In the y band, where the air absorbs light, it is 50 % too bright.
 
     References
     ----------
@@ -145,28 +157,33 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
 
 
 def extra_extinction(night: Night, airmass: float) -> float:
-    """Additional extinction of a source, relative to the airmass of the zero point, mag."""
+    """Return by how many magnitudes a source at an airmass is fainter than at the airmass of the zero point.
+
+    The result is negative at a lower airmass.
+    """
     return night.extinction * (airmass - night.reference_airmass)
 
 
 def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -> float:
-    """Moonlight in a V band with the extinction of this band.
+    """Return the surface brightness of moonlight scattered by the atmosphere.
+
+    It is computed with the published formula for the V band, but with the extinction in the band of `night`.
 
     Parameters
     ----------
     night : Night
-        Properties of the band.
+        Properties of camera and band.
     ra, dec : float
-        Position of the field, deg.
+        ICRS position of the field in degrees.
     mjd : float
-        Date.
+        Date (MJD).
     airmass : float
         Airmass of the field.
 
     Returns
     -------
     float
-        Nanolamberts; 0 if the Moon is below the horizon.
+        Surface brightness in nanolamberts; 0 if the Moon is below the horizon.
 
     References
     ----------
@@ -185,7 +202,9 @@ def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -
 
 
 def _path_length(altitude: float) -> float:
-    """Path length through a layer high above the ground, relative to its thickness, at an altitude in radian.
+    """Return the path length of light through a thin layer high in the atmosphere, in units of the layer's thickness.
+
+    `altitude` is the angle of the field above the horizon in radians.
 
     References
     ----------
@@ -195,7 +214,7 @@ def _path_length(altitude: float) -> float:
 
 
 def _sun_colour(band: Passband, mission: MissionConfiguration) -> float:
-    """AB magnitude of sunlight in a band minus that at the wavelength of V."""
+    """Return the colour of sunlight: its AB magnitude in a band minus its AB magnitude at the wavelength of V."""
     photons = band.response / band.wavelength
 
     def f_nu(wavelength: Float) -> Float:

@@ -1,4 +1,4 @@
-"""Airmass and zenith of fields, positions of the Sun and the Moon, and dark time at an observatory."""
+"""Compute airmass and direction of the zenith for a field, Sun and Moon positions, and dark time at an observatory."""
 
 from __future__ import annotations
 
@@ -13,39 +13,53 @@ from lake_schema.sky import separation
 from lake_schema.sky.ecliptic import equatorial
 from truesky.render.sky.diffuse_light import sun_longitude
 
+# MJD of the epoch J2000.
 _MJD_J2000 = 51544.5
-# Earth rotation angle, turns (IAU 2000). Its origin moves with the equinox, unlike right ascensions in ICRS.
-_TURN, _TURNS_A_DAY = 0.7790572732640, 1.00273781191135448
-# Terms of the Moon's longitude and latitude, deg: amplitude, phase, rate per century (The Astronomical Almanac, low
-# precision); its mean longitude and rate; general precession per century.
+# Earth rotation angle at J2000, in turns (IAU 2000).
+_TURN = 0.7790572732640
+# Rate of the Earth rotation angle, in turns per day.
+_TURNS_A_DAY = 1.00273781191135448
+# Terms of the Moon's ecliptic longitude (deg), a sin(p + r t) with t in Julian centuries since J2000: amplitude a
+# (deg), phase p (deg) and rate r (deg per century) of each; low precision formula of The Astronomical Almanac.
 _MOON_LONGITUDE = (
     (6.29, 135.0, 477198.87), (-1.27, 259.3, -413335.36), (0.66, 235.7, 890534.22), (0.21, 269.9, 954397.74),
     (-0.19, 357.5, 35999.05), (-0.11, 186.5, 966404.03),
 )  # fmt: skip
+# Terms of the Moon's ecliptic latitude (deg), a sin(p + r t) with t in Julian centuries since J2000: amplitude a (deg),
+# phase p (deg) and rate r (deg per century) of each; low precision formula of The Astronomical Almanac.
 _MOON_LATITUDE = (
     (5.13, 93.3, 483202.02), (0.28, 228.2, 960400.89), (-0.28, 318.3, 6003.15), (-0.17, 217.6, -407332.21),
 )  # fmt: skip
-_MOON_MEAN, _PRECESSION = (218.32, 481267.881), 1.39697
-# Parallax of the Moon, deg.
+# Mean longitude of the Moon at J2000 (deg) and its rate (deg per century).
+_MOON_MEAN = (218.32, 481267.881)
+# General precession in longitude, deg per century.
+_PRECESSION = 1.39697
+# Mean horizontal parallax of the Moon, deg: by how much it appears lower on the horizon than from the Earth's centre.
 _PARALLAX = 0.95
-# Limits of observations: largest altitude of the Sun and smallest distance from the Moon, deg; largest airmass.
-_TWILIGHT, _FROM_MOON, _MAX_AIRMASS = -15.0, 30.0, 2.0
-# Largest airmass of a field. Beyond it, the highest altitude of the field is used, with at most this airmass.
+# Largest altitude of the Sun (deg) at which a ground exposure is scheduled.
+_TWILIGHT = -15.0
+# Smallest distance from the Moon (deg) at which a ground exposure is scheduled while the Moon is up.
+_FROM_MOON = 30.0
+# Largest airmass at which a ground exposure is scheduled.
+_MAX_AIRMASS = 2.0
+# Largest airmass with which an exposure is simulated. A field that is lower is simulated at its highest altitude.
 HIGHEST_AIRMASS = 3.0
-# Step and length of the search for dark time, days.
-_STEP, _DAYS = 1.0 / 96.0, 400
+# Step in days with which dark time (night with the Moon down or far away) is searched: a quarter of an hour.
+_STEP = 1.0 / 96.0
+# Number of days after the earliest date in which dark time (night with the Moon down or far away) is searched.
+_DAYS = 400
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Position of an observatory.
+    """Position of an observatory on the Earth.
 
     Attributes
     ----------
     latitude, longitude : float
-        Geographic position, deg north and east.
+        Geographic latitude (deg north) and longitude (deg east).
     height : float
-        Height, m.
+        Height above sea level in metres.
     """
 
     latitude: float
@@ -54,43 +68,47 @@ class Site:
 
     @classmethod
     def from_mission(cls, section: str, mission: MissionConfiguration) -> Site:
-        """Read the site of a ground camera from its section of the mission database."""
+        """Read the observatory of a ground camera from the mission database.
+
+        `section` is the beginning of the camera's parameter names, such as "ext.decam".
+        """
         latitude, longitude = (mission.value(f"{section}.site.{key}", "deg") for key in ("latitude", "longitude"))
         return cls(latitude, longitude, mission.value(f"{section}.site.height", "m"))
 
     def altitude(self, ra: npt.ArrayLike, dec: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
-        """Altitude above the horizon without refraction.
+        """Return the altitude of positions above the horizon, without refraction.
 
         Parameters
         ----------
         ra, dec : array_like
-            Positions, deg.
+            ICRS positions in degrees.
         mjd : array_like
-            Dates.
+            Dates (MJD). The three arguments are broadcast against one another.
 
         Returns
         -------
         float array
-            Altitude, deg, to 0.2 deg because precession and nutation since 2000 are neglected.
+            Altitude in degrees, negative below the horizon. The error is 0.2 deg, because precession and nutation
+            since 2000 are neglected.
         """
         hour, dec, latitude = self._hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
         sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
         return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
     def zenith(self, ra: float, dec: float, mjd: float) -> float:
-        """Parallactic angle: position angle of the zenith from a field.
+        """Return the position angle of the zenith as seen from a field (the parallactic angle).
 
         Parameters
         ----------
         ra, dec : float
-            Position of the field, deg.
+            ICRS position of the field in degrees.
         mjd : float
-            Date.
+            Date (MJD).
 
         Returns
         -------
         float
-            Angle, deg from north through east.
+            Angle in degrees from north through east, -180 to 180.
         """
         hour, latitude, declination = float(self._hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
         east = np.sin(hour) * np.cos(latitude)
@@ -103,13 +121,13 @@ class Site:
 
 
 def sun_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
-    """Altitude of the Sun above the horizon of a site, deg."""
+    """Return the altitude of the Sun above the horizon of an observatory in degrees, for an array of dates (MJD)."""
     sun = _sun_longitudes(np.asarray(mjd, float))
     return site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd)
 
 
 def airmass(altitude: npt.ArrayLike) -> Float:
-    """Airmass at an altitude in deg; altitudes below 0 are set to 0.
+    """Return the airmass at altitudes in degrees. Below the horizon it is that of the horizon (about 38).
 
     References
     ----------
@@ -120,26 +138,27 @@ def airmass(altitude: npt.ArrayLike) -> Float:
 
 
 def airmass_and_zenith(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
-    """Airmass of a field, and position angle of the zenith, at a date.
+    """Return the airmass of a field and the position angle of the zenith at a date.
 
     Parameters
     ----------
     ra, dec : float
-        Position of the field, deg.
+        ICRS position of the field in degrees.
     mjd : float
-        Date.
+        Date (MJD).
     site : Site
         The observatory.
 
     Returns
     -------
     (float, float)
-        Airmass, and position angle in deg from north through east.
+        Airmass, at most `HIGHEST_AIRMASS`; position angle of the zenith in degrees from north through east.
 
     Notes
     -----
-    If the field is below the horizon or too low, its highest altitude is used, since dates of a plan may define only
-    the order of exposures.
+    The date of a planned exposure may be nominal: it gives the place in a sequence, not a time at which the field is
+    visible. If the field is below the horizon or its airmass exceeds `HIGHEST_AIRMASS`, the results are therefore the
+    values at its highest altitude (on the meridian).
     """
     altitude = float(site.altitude(ra, dec, mjd))
     field_airmass = float(airmass(altitude))
@@ -151,9 +170,10 @@ def airmass_and_zenith(ra: float, dec: float, mjd: float, site: Site) -> tuple[f
 
 
 def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """Right ascension, declination and phase angle of the Moon, deg; the phase angle is 0 at full moon.
+    """Return the right ascension, declination and phase angle of the Moon in degrees, for an array of dates (MJD).
 
-    The position is geocentric, with an error of 0.5 deg.
+    The phase angle is 0 at full moon and 180 at new moon. The position is geocentric and in ICRS, with an error of 0.5
+    deg.
     """
     century = (np.asarray(mjd, float) - _MJD_J2000) / 36525.0
 
@@ -170,32 +190,35 @@ def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 
 def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
-    """Altitude of the Moon above the horizon of a site, corrected for parallax, deg."""
+    """Return the altitude of the Moon above the horizon in degrees, corrected for parallax, for an array of MJD."""
     ra, dec, _ = moon_position(mjd)
     high = site.altitude(ra, dec, mjd)
     return np.asarray(high - _PARALLAX * np.cos(np.radians(high)))
 
 
 def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
-    """First date at which a field is high enough at night and away from the Moon.
+    """Return the first date at which a field can be observed in the dark.
+
+    The Sun must be more than 15 deg below the horizon, the airmass at most 2, and the Moon below the horizon or more
+    than 30 deg away.
 
     Parameters
     ----------
     ra, dec : float
-        Position of the field, deg.
+        ICRS position of the field in degrees.
     start : float
-        Earliest date, MJD.
+        Earliest date (MJD).
     site : Site
         The observatory.
 
     Returns
     -------
     float
-        MJD, to a quarter of an hour; `start` if there is no such date.
+        MJD, found in steps of a quarter of an hour; `start` if there is no such date within 400 days.
     """
     if float(airmass(90.0 - abs(dec - site.latitude))) > _MAX_AIRMASS:
         return start
-    # Most exposures directly follow another one in the same night.
+    # Test `start` before the search: most exposures directly follow another one in the same night.
     if _is_dark(ra, dec, np.array([start]), site)[0]:
         return start
     for day in range(_DAYS):
@@ -207,7 +230,7 @@ def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
 
 
 def _sun_longitudes(mjd: Float) -> Float:
-    """Ecliptic longitudes of the Sun, deg."""
+    """Return the ecliptic longitudes of the Sun in degrees, in an array with the shape of the dates (MJD)."""
     return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
 
 

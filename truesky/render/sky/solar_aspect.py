@@ -1,4 +1,6 @@
-"""Angle between pointings of Euclid and the Sun, and the dates at which a pointing is allowed.
+"""Compute the angle between a pointing of Euclid and the Sun, and the dates at which the pointing is allowed.
+
+The sunshield protects the telescope only within a range of this angle.
 
 References
 ----------
@@ -21,57 +23,64 @@ from truesky.numerics import matrices
 from truesky.render.camera import pointing
 from truesky.render.sky.diffuse_light import sun_longitude
 
-# Tolerance of the limits, deg; the low-precision position of the Sun has an error of 0.02 deg.
+# Angle in deg by which the allowed range of the angle from the Sun is widened at both ends, because the approximate
+# position of the Sun has an error of 0.02 deg.
 _TOLERANCE = 0.05
-# Length, step and accuracy of the search for allowed dates, days. A year contains all seasons, and the shortest lasts
-# two weeks.
-_SPAN, _STEP, _EXACT = 400.0, 1.0, 1e-3
-# Calendar date of MJD 0.
+# Dates at which Euclid may observe a position are searched within this number of days. It exceeds a year, which has all
+# seasons of visibility.
+_SPAN = 400.0
+# Step in days of the search for dates at which Euclid may observe a position. The shortest season of visibility is two
+# weeks.
+_STEP = 1.0
+# Largest error in days of the first and last date of a season in which Euclid may observe a position.
+_EXACT = 1e-3
+# Calendar date of MJD 0, to write dates in messages.
 _FIRST_DAY = np.datetime64("1858-11-17")
 
 
 def sun_vector(mjd: float) -> Float:
-    """Unit vector from the Earth to the Sun, ICRS, with an error of 0.02 deg."""
+    """Return the unit vector from the Earth to the Sun in ICRS, shape (3,), with an error of 0.02 deg."""
     return sky.unit_vectors(*equatorial(sun_longitude(mjd), 0.0))
 
 
 def solar_aspect(ra: float, dec: float, mjd: float) -> float:
-    """Angle between a pointing and the Sun.
+    """Return the angle between a pointing and the Sun.
 
     Parameters
     ----------
     ra, dec : float
-        Pointing, deg.
+        ICRS pointing in degrees.
     mjd : float
-        Date.
+        Date (MJD).
 
     Returns
     -------
     float
-        Angle, deg.
+        Angle in degrees, 0 to 180.
     """
     return float(np.degrees(np.arccos(np.clip(matrices.matmul(sky.unit_vectors(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
 
 
 def position_angle(ra: float, dec: float, mjd: float) -> float:
-    """Position angle of the focal plane's y axis, with the sunshield towards the Sun.
+    """Return the position angle of Euclid's focal plane if the sunshield faces the Sun.
 
     Parameters
     ----------
     ra, dec : float
-        Pointing, deg.
+        ICRS pointing in degrees.
     mjd : float
-        Date.
+        Date (MJD).
 
     Returns
     -------
     float
-        Angle, deg from north through east. The axis is perpendicular to the direction of the Sun, z x p.
+        Position angle of the y axis in degrees from north through east, -180 to 180. The y axis is perpendicular to
+        the pointing and to the direction of the Sun.
 
     Raises
     ------
     BadInput
-        If the pointing is parallel to the direction of the Sun.
+        If the pointing is towards the Sun or opposite to it, where no position angle is defined.
     """
     p, s = sky.unit_vectors(ra, dec), sun_vector(mjd)
     towards = s - matrices.matmul(s, p) * p
@@ -84,26 +93,26 @@ def position_angle(ra: float, dec: float, mjd: float) -> float:
 
 
 def limits(mission: MissionConfiguration) -> tuple[float, float]:
-    """Smallest and largest angle from the Sun at which Euclid observes, deg."""
+    """Return the smallest and the largest angle from the Sun at which Euclid may observe, in degrees."""
     return mission.value("svm.solar_aspect_min", "deg"), mission.value("svm.solar_aspect_max", "deg")
 
 
 def is_allowed(ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> bool:
-    """Return True if the sunshield allows a pointing.
+    """Return True if Euclid may observe a pointing at a date without exposing the telescope to the Sun.
 
     Parameters
     ----------
     ra, dec : float
-        Pointing, deg.
+        ICRS pointing in degrees.
     mjd : float
-        Date.
+        Date (MJD).
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the limits on the angle from the Sun.
 
     Returns
     -------
     bool
-        True if the angle from the Sun is within the limits.
+        True if the angle from the Sun is within the limits, or at most 0.05 deg outside.
     """
     lowest, highest = limits(mission)
     return lowest - _TOLERANCE <= solar_aspect(ra, dec, mjd) <= highest + _TOLERANCE
@@ -112,21 +121,22 @@ def is_allowed(ra: float, dec: float, mjd: float, mission: MissionConfiguration)
 def allowed_intervals(
     ra: float, dec: float, start: float, mission: MissionConfiguration
 ) -> Iterator[tuple[float, float]]:
-    """Yield the intervals within 400 days in which a position is visible.
+    """Yield the intervals of dates, within 400 days, in which Euclid may observe a position.
 
     Parameters
     ----------
     ra, dec : float
-        Position, deg.
+        ICRS position in degrees.
     start : float
-        Earliest date, MJD.
+        Earliest date (MJD).
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the limits on the angle from the Sun.
 
     Yields
     ------
     (float, float)
-        First and last MJD, to 0.001 d.
+        First and last MJD of an interval, to 0.001 d; nothing if the position is never visible. The first interval
+        begins at `start` if the position is visible then.
     """
     lowest, highest = limits(mission)
     days, suns = _sun_directions(start)
@@ -145,13 +155,19 @@ def allowed_intervals(
 
 @lru_cache(maxsize=8)
 def _sun_directions(start: float) -> tuple[Float, Float]:
-    """Dates [n], MJD, from `start`, and directions of the Sun [n, 3] at these dates."""
+    """Return the daily dates (MJD) for 400 days from `start`, shape (n,), and the directions of the Sun, shape (n, 3).
+
+    Directions are unit vectors in ICRS.
+    """
     days = start + np.arange(0.0, _SPAN + _STEP, _STEP)
     return days, np.stack([sun_vector(float(day)) for day in days])
 
 
 def _edge(ra: float, dec: float, forbidden: float, free: float, mission: MissionConfiguration) -> float:
-    """Allowed date next to the limit between an allowed and a forbidden date."""
+    """Return the end of an interval in which a position is visible, by bisection between two dates (MJD).
+
+    The position is visible at `free` and not at `forbidden`, in either order of time. The result is a visible date.
+    """
     while abs(free - forbidden) > _EXACT:
         middle = 0.5 * (free + forbidden)
         forbidden, free = (forbidden, middle) if is_allowed(ra, dec, middle, mission) else (middle, free)
@@ -159,21 +175,21 @@ def _edge(ra: float, dec: float, forbidden: float, free: float, mission: Mission
 
 
 def next_allowed(ra: float, dec: float, start: float, mission: MissionConfiguration) -> float:
-    """First date at which a position is visible.
+    """Return the first date at which Euclid may observe a position.
 
     Parameters
     ----------
     ra, dec : float
-        Position, deg.
+        ICRS position in degrees.
     start : float
-        Earliest date, MJD.
+        Earliest date (MJD).
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the limits on the angle from the Sun.
 
     Returns
     -------
     float
-        MJD.
+        MJD; `start` if the position is visible then.
 
     Raises
     ------
@@ -189,23 +205,23 @@ def next_allowed(ra: float, dec: float, start: float, mission: MissionConfigurat
 
 
 def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguration, where: str) -> None:
-    """Refuse a pointing that the sunshield forbids.
+    """Check that Euclid may observe a pointing at a date.
 
     Parameters
     ----------
     ra, dec : float
-        Pointing, deg.
+        ICRS pointing in degrees.
     mjd : float
-        Date.
+        Date (MJD).
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the limits on the angle from the Sun.
     where : str
-        Place in the user's input, for the message.
+        Place in the user's input that gives the pointing, quoted in the error message.
 
     Raises
     ------
     BadInput
-        If the pointing is not allowed; the message contains the next allowed dates.
+        If the angle from the Sun is outside the limits; the message contains the next allowed dates.
     """
     if is_allowed(ra, dec, mjd, mission):
         return
@@ -222,6 +238,9 @@ def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguratio
 
 
 def _date(mjd: float, towards: str) -> str:
-    """Text of a date inside an interval: the first date is rounded up, the last one down."""
+    """Return a date as text, such as "60000.0 (2023-02-25)", rounded to 0.1 day.
+
+    It is rounded up if `towards` is "up", otherwise down, so that the ends of an interval stay inside it.
+    """
     tenth = (np.ceil if towards == "up" else np.floor)(mjd * 10.0) / 10.0
     return f"{tenth:.1f} ({_FIRST_DAY + int(tenth)})"

@@ -1,1 +1,1 @@
-"""Sources of light from catalogue rows: selection, shapes, colours and pictures."""
+"""Prepare the sources of light on a detector: read catalogue rows, and compute shapes, colours and pictures."""

@@ -1,4 +1,8 @@
-"""Read the catalogue rows of a task: sources in its circle, bright sources beyond it, with proper motions of stars."""
+"""Read the rows of galaxies, stars and strong lenses that may shine on a detector.
+
+A task is a detector of an exposure, with a circle on the sky that contains the detector and its surroundings. All
+sources in the circle are read, and outside only bright ones. Stars are moved by their proper motion.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,34 +19,47 @@ from lake_schema.tables.stars import EPOCH
 from truesky.render.psf import spikes
 from truesky.render.sources import lensed_arcs, selection
 
-# Tables of sources, each with its table of fluxes.
+# Names of the tables of sources, each followed by the name of the table with its fluxes.
 CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
-# Optional table of strong lenses.
+# Name of the table of strong lenses, which a lake may lack.
 LENSES = "strong_lenses"
-# Largest distance from a detector of sources that may shine on it, arcsec: spikes of stars, outskirts of galaxies.
+# Largest distance from a detector, in arcsec, up to which diffraction spikes of stars and outskirts of galaxies are
+# drawn on it.
 FARTHEST = max(spikes.FARTHEST, selection.FARTHEST)
-# Largest displacement of a star by proper motion, deg: 3 arcsec/yr over 12 years. Julian year and MJD of J2000.
+# Largest displacement of a star by proper motion that is allowed for, deg: 3 arcsec/yr over 12 years.
 FARTHEST_MOVED = 0.01
-_JULIAN_2000, _MJD_2000, _DAYS_A_YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
-# Key of the cells among the facts of a catalogue's parts.
+# Epoch J2000 as a Julian year.
+_JULIAN_2000 = 2000.0
+# Epoch J2000 as MJD.
+_MJD_2000 = 51544.5
+# Days in a Julian year.
+_DAYS_A_YEAR = 365.25
+# Milliarcseconds in a degree.
+_MAS_A_DEG = 3.6e6
+# Key of the list of order-8 HEALPix cells in the facts of a catalogue file (recorded dictionary of its inputs).
 CELLS = "generation_cells"
 
 
 def drawn_cells(catalogue: read.Version) -> set[int]:
-    """Order-8 cells for which a catalogue was drawn."""
+    """Return the order-8 HEALPix cells for which a catalogue was simulated, including cells without sources."""
     return {cell for part in catalogue.manifest["parts"] for cell in part["facts"][CELLS]}
 
 
 def max_deflection(catalogue: read.Version) -> float:
-    """Largest distance between a source's position and its cell, deg: stars move, galaxies do not.
+    """Return the largest distance, in degrees, of a source outside the HEALPix cell under which it is stored.
 
-    Stars that have moved farther are missed if their cell is not read.
+    Stars are stored under their position at the catalogue's epoch and move; a star that has moved farther than the
+    result may be missed. The result is 0 for catalogues without proper motions, such as galaxies.
     """
     return FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
 
 
 def apply_proper_motion(stars: pa.Table, mjd: float) -> pa.Table:
-    """Return rows of the table `stars` with positions at a date (MJD) from proper motions; parallaxes are neglected."""
+    """Return rows of the table `stars` with their positions moved by proper motion to a date (MJD).
+
+    Missing proper motions count as 0, and parallaxes are neglected. Rows without the columns `pm_ra` and `pm_dec` are
+    returned unchanged.
+    """
     if not {"pm_ra", "pm_dec"} <= set(stars.column_names):
         return stars
     years = _JULIAN_2000 + (mjd - _MJD_2000) / _DAYS_A_YEAR - EPOCH
@@ -65,31 +82,32 @@ def read_sources(
     min_flux: float,
     min_bright_flux: float = float("inf"),
 ) -> tuple[pa.Table, pa.Table, float]:
-    """Read the sources that a task may draw, and their fluxes.
+    """Read the sources that may shine on a detector, and their fluxes.
 
     Parameters
     ----------
     catalogue, fluxes : read.Version
-        Versions of the two tables.
+        Stored versions of a table of sources and of its table of fluxes.
     task : mapping
-        Row of the task.
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     columns : sequence of str
-        Columns of the catalogue to read.
+        Names of the columns of the catalogue to read.
     bands : sequence of str
-        Bands of the fluxes to read. The flux limits apply to the first band.
+        Names of the bands of the fluxes to read, at least one. The flux limits apply to the first band.
     reach_arcsec : float
-        Distance beyond the task's circle up to which sources may reach the detector, arcsec.
+        Distance beyond the circle, in arcsec, up to which sources are read if they exceed `min_flux`.
     min_flux : float
-        Smallest flux of sources outside the cells of the circle, microjansky; infinite if no source is visible at all.
+        Smallest flux in microjansky of sources outside the HEALPix cells that overlap the circle. Sources inside these
+        cells are read at any flux. If it is infinite (for exposures without sources), no source of either kind is read.
     min_bright_flux : float
-        Smallest flux of sources still farther out, up to the reach of spikes and outskirts, microjansky; infinite to
-        read none of these.
+        Smallest flux in microjansky of sources still farther out, up to 1200 arcsec, from where diffraction spikes and
+        outskirts may reach the detector. Infinite to read none of these.
 
     Returns
     -------
     (pyarrow.Table, pyarrow.Table, float)
-        Rows of the catalogue, their fluxes, and the distance beyond the task's circle up to which they are complete,
-        arcsec.
+        Rows of the catalogue; rows of their fluxes; and a distance in arcsec. Up to this distance beyond the circle,
+        the catalogue has all HEALPix cells; it is at most `reach_arcsec`.
     """
     deflection, flux = max_deflection(catalogue), ["id", *(f"f_nu_{band}" for band in bands)]
     inner_cells: list[int] = []
@@ -118,20 +136,20 @@ def read_sources(
 
 @dataclass(frozen=True, slots=True)
 class BrightQuery:
-    """Query for the bright sources in a task's circle.
+    """Query for the bright sources around a detector.
 
     Attributes
     ----------
     task : mapping
-        Row of the task.
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     columns : sequence of str
-        Columns of the catalogue to read.
+        Names of the columns of the catalogue to read.
     band : str
-        Band of the fluxes.
+        Name of the band of the fluxes.
     min_flux : float
-        Smallest flux, microjansky; infinite if no source is visible.
+        Smallest flux in microjansky; infinite to read nothing.
     reach_arcsec : float
-        Distance beyond the circle up to which sources are included, arcsec.
+        Distance beyond the circle, in arcsec, up to which sources are included.
     """
 
     task: Mapping[str, Any]
@@ -144,19 +162,19 @@ class BrightQuery:
 def read_bright(
     catalogue: read.Version, fluxes: read.Version, queries: Sequence[BrightQuery]
 ) -> list[tuple[pa.Table, pa.Table]]:
-    """Read the bright sources of several queries; rows that several queries need are read once.
+    """Read the bright sources around several detectors; rows that several queries need are read only once.
 
     Parameters
     ----------
     catalogue, fluxes : read.Version
-        Versions of the two tables.
+        Stored versions of a table of sources and of its table of fluxes.
     queries : sequence of BrightQuery
-        The queries.
+        One query per detector.
 
     Returns
     -------
     list of (pyarrow.Table, pyarrow.Table)
-        Rows of the catalogue, and their fluxes, for each query.
+        Rows of the catalogue, and rows of their fluxes, for each query; [] without queries.
     """
     if not queries:
         return []
@@ -174,7 +192,8 @@ def read_bright(
         for query, query_cells in zip(queries, cells, strict=True)
     ]
     bright_ids = light["id"].filter(pa.array(np.logical_or.reduce(shows)))
-    # Fluxes are small and read first, so that only the parts of the catalogue with bright sources are read.
+    # The small tables of fluxes have been read before. Read files of the large catalogue only if at least one source is
+    # bright enough.
     parts = [
         part["name"] for part in catalogue.manifest["parts"] if not set(all_cells).isdisjoint(part["facts"][CELLS])
     ]
@@ -191,20 +210,20 @@ def read_bright(
 def read_lenses(
     table: read.Version, task: Mapping[str, Any], deflection: float, reach_arcsec: float, min_flux: float
 ) -> pa.Table:
-    """Read the strong lenses in a task's circle, and beyond it up to a given distance.
+    """Read the strong lenses around a detector.
 
     Parameters
     ----------
     table : read.Version
-        Version of the table `strong_lenses`.
+        Stored version of the table `strong_lenses`.
     task : mapping
-        Row of the task.
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     deflection : float
-        Largest deflection of the galaxies, deg.
+        Largest distance of a galaxy from the HEALPix cell under which it is stored, deg.
     reach_arcsec : float
-        Distance beyond the circle up to which lenses are read, arcsec.
+        Distance beyond the circle, in arcsec, up to which lenses are read.
     min_flux : float
-        Infinite if no source is visible, see `read_sources`.
+        Infinite if no source is visible, so that no lens is read; other values are ignored.
 
     Returns
     -------
@@ -216,7 +235,7 @@ def read_lenses(
     ra, dec = (positions[name].to_numpy() for name in ("ra", "dec"))
     reach = task["radius"] + reach_arcsec / 3600.0
     lens_ids = positions["id"].filter(pa.array(selection.within_radius(ra, dec, (task["ra"], task["dec"]), reach)))
-    # Pictures are large, so only those of visible lenses are read.
+    # The images of arcs in the table are large. Read them only for the lenses whose positions are near the detector.
     parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
     return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(lens_ids) else [], pc.field("id").isin(lens_ids))
 
@@ -229,32 +248,33 @@ def add_lensed_galaxies(
     task: Mapping[str, Any],
     reach_arcsec: float,
 ) -> tuple[pa.Table, pa.Table]:
-    """Add galaxies behind lenses that would be too faint to be read without the lens.
+    """Add the galaxies behind strong lenses that were not read before because they are too faint.
 
     Parameters
     ----------
     galaxies : (pyarrow.Table, pyarrow.Table)
-        Rows of galaxies and their fluxes.
+        Rows of the table `galaxies` that have been read, and rows of their fluxes.
     lenses : pyarrow.Table
-        Rows of the table `strong_lenses`.
+        Rows of the table `strong_lenses` around the detector.
     catalogue, fluxes : read.Version
-        Versions of the two tables.
+        Stored versions of the table `galaxies` and of its table of fluxes.
     task : mapping
-        Row of the task.
+        Row of the table `tasks`: the detector, with the `ra`, `dec` and `radius` (deg) of a circle around it.
     reach_arcsec : float
-        Distance beyond the circle up to which lenses were read, arcsec.
+        Distance beyond the circle, in arcsec, up to which lenses were read.
 
     Returns
     -------
     (pyarrow.Table, pyarrow.Table)
-        Rows and fluxes with the additional galaxies.
+        Rows and fluxes, followed by those of the missing galaxies; `galaxies` itself if none is missing.
     """
     rows, light = galaxies
     missing = pc.unique(lenses["source_id"]).to_numpy()
     missing = missing[~np.isin(missing, rows["id"].to_numpy())]
     if not len(missing):
         return galaxies
-    # A lens and the galaxy behind it belong to the same cell.
+    # Search for the galaxies that have not been read yet in the HEALPix cells in which lenses were searched: a lens and
+    # the galaxy behind it are stored under the same cell.
     cells = set(selection.cells_within_reach(task, max_deflection(catalogue), reach_arcsec))
     parts = [part["name"] for part in catalogue.manifest["parts"] if not cells.isdisjoint(part["facts"][CELLS])]
     is_missing = pc.field("id").isin(pa.array(missing))

@@ -1,6 +1,7 @@
-"""Colours of sources within a band: fractions of their photons in the sub-bands of the PSF.
+"""Compute the colours of sources within a passband, on which the shape of their PSF depends.
 
-Sources without a spectrum in the table have flat f_nu.
+A passband is divided into eight sub-bands in which the PSF is treated as constant. The colour of a source is the
+fraction of its detected photons in each sub-band. Sources without a spectrum in their table have flat f_nu.
 """
 
 from __future__ import annotations
@@ -23,35 +24,40 @@ from truesky.fluxes.tables.build_tables import Setting
 from truesky.render.psf import sub_bands
 from truesky.render.psf.sub_bands import N_SUB_BANDS
 
-# Resolution of the tables of f_nu by redshift and dust: an error of 1e-3 of a fraction is 1e-5 of the second moments.
+# Resolution of the tables of f_nu from which colours are interpolated: step in ln(1 + z), and numbers of Chebyshev
+# coefficients in E(B-V) and in A(V). The fraction of photons in a sub-band has an error of 1e-3, which changes the
+# second moments of the PSF by 1e-5.
 _SETTING = Setting(0.01, 4, 3)
-# Columns of the galaxy catalogue.
+# Columns of the table `galaxies` that define spectra.
 GALAXY_COLUMNS = (
     *("z_obs", "abs_mag_r01", "mag_r01", "a_v", "kappa", "gamma1", "gamma2"),
     *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS),
     *sorted({line.column for line in line_list()}),
 )
-# Columns that a star needs for a spectrum. User catalogues do not have a second template.
+# Columns of the table `stars` that define a spectrum by a single template. Stars from a user's catalogue have no other
+# columns for spectra.
 ONE_TEMPLATE_COLUMNS = ("sed", "mag_h", "a_v")
+# Columns of the table `stars` that define spectra, including those that are mixtures of templates.
 STAR_COLUMNS = (*ONE_TEMPLATE_COLUMNS, *(f"{name}_{k}" for k in STAR_COMPONENTS for name in ("sed", "frac")))
 
 
 def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
-    """Fractions of the detected photons of galaxies by sub-band.
+    """Return the fractions of the detected photons of galaxies in the sub-bands of a passband.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Rows of the table `galaxies`.
+        n rows of the table `galaxies`.
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     library : Library, optional
-        Library to which sed_1 and sed_2 refer; by default the embedded galaxies.
+        Library of spectral templates to which the columns sed_1 and sed_2 refer; None means the galaxies of truesky.
 
     Returns
     -------
     float array, shape (n, N_SUB_BANDS)
-        Fractions, with an rms error of 1e-3 from the coarse tables, which is 1e-5 of the second moments.
+        Fractions, with the sum 1 for each galaxy and an rms error of 1e-3. They are equal (flat f_nu) if `rows` lacks
+        columns of spectra, or for a galaxy without light in the band.
     """
     if not len(rows) or not set(GALAXY_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
@@ -67,7 +73,10 @@ def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> 
 
 
 def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
-    """Values of f_nu for galaxies whose spectra are in the galaxy library."""
+    """Return f_nu in each sub-band for galaxies with templates in the library, shape (n, number of sub-bands).
+
+    Values are interpolated in tables where these cover the parameters of a galaxy, otherwise integrated.
+    """
     parameters = galaxies_from_table(rows, library)
     tabulated = flux_tables.covered_galaxies(parameters)
     f_nu = np.empty((len(parameters), len(parts)))
@@ -80,21 +89,22 @@ def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library)
 
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
-    """Fractions of the detected photons of stars by sub-band.
+    """Return the fractions of the detected photons of stars in the sub-bands of a passband.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Rows of the table `stars`.
+        n rows of the table `stars`.
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     library : Library, optional
-        Library to which the templates refer; by default the embedded stars.
+        Library of spectral templates to which the rows refer; None means the stars of truesky.
 
     Returns
     -------
     float array, shape (n, N_SUB_BANDS)
-        Fractions.
+        Fractions, with the sum 1 for each star. They are equal (flat f_nu) if `rows` lacks columns of spectra, or for a
+        star without light in the band.
     """
     if not len(rows) or not set(ONE_TEMPLATE_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
@@ -109,7 +119,10 @@ def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Flo
 
 
 def spectrum_fractions(band: Passband, f_lambda: Float) -> Float:
-    """Fractions [N_SUB_BANDS] of the detected photons of a spectrum f_lambda at the band's wavelengths."""
+    """Return the fractions of the detected photons of a spectrum in the sub-bands of a band, shape (N_SUB_BANDS,).
+
+    `f_lambda` has the flux per wavelength at the wavelengths of the band, in any unit.
+    """
     parts = sub_bands.sub_bands(band)
     f_nu = np.array([[passbands.ab_flux(part, band.wavelength, f_lambda) for part in parts]])
     return np.asarray(_shares(f_nu, parts)[0])

@@ -1,8 +1,8 @@
-"""Spiral arms and knots of discs, as pictures of light added to and removed from a smooth disc.
+"""Draw spiral arms and knots of galaxy discs, as images of the light that is added to and removed from a smooth disc.
 
 On every circle about the middle of a disc, the structure adds and removes the same amount of light. Flux and half-light
-radius therefore remain those of the profile. The random numbers depend on the galaxy's identifier only, so that the
-structure is the same in every band and exposure.
+radius therefore remain those of the smooth profile. The random numbers depend on the galaxy's identifier and the seed
+only, so that the structure is the same in every band and exposure.
 
 References
 ----------
@@ -26,40 +26,67 @@ from truesky.render.sources.lensed_arcs import Picture
 from truesky.render.sources.source_list import Sources
 from truesky.request.structure import Arms
 
-# Half the side of a picture, scale lengths of the disc; preferred pixel size, arcsec; and available sides, pixels.
+# Half the side of the image of a disc's structure (spiral arms and knots), in scale lengths of the disc.
 REACH = 5.0
+# Preferred pixel size of the image of a disc's structure (arms and knots), arcsec.
 _FINE = 0.05
+# Possible sides of the image of a disc's structure (arms and knots), pixels. The smallest one with pixels of at most
+# `_FINE` is used, or the largest if none is large enough.
 _SIDES = np.array([128, 192, 256, 384, 512])
-# Ranges, in scale lengths, in which the structure begins and fades; and its largest width, arcsec, which is limited by
-# the largest stamp of the finest pixels.
-_INNER, _OUTER, _WIDEST = (0.3, 0.9), (3.6, 4.9), 180.0
-# Bulge fraction from which a disc is smooth.
+# Range of radii (scale lengths) over which the structure of a disc rises from nothing to its full strength.
+_INNER = (0.3, 0.9)
+# Range of radii (scale lengths) over which the structure of a disc fades to nothing.
+_OUTER = (3.6, 4.9)
+# Discs for which the image of arms and knots would be wider (arcsec) are smooth. The limit is below the side of
+# the largest stamp (square image in which a source is drawn) of the camera with the finest pixels.
+_WIDEST = 180.0
+# Galaxies with at least this fraction of their light in the bulge have discs without spiral arms and knots.
 _SMOOTH = 0.5
-# Pitch angles, deg: without a bulge, and for the bulge fraction `_SMOOTH`; their scatter and limits.
-_OPEN, _TIGHT, _SCATTER, _PITCHES = 26.0, 13.0, 4.0, (10.0, 30.0)
-# Numbers of arms, and fractions of galaxies with these numbers.
-_ARMS, _ODDS = (2, 3, 4), (0.65, 0.15, 0.20)
-# Range of the narrowness of arms: half the natural logarithm of the ratio of ridge and trough.
+# Mean pitch angle of spiral arms in a galaxy without a bulge, deg.
+_OPEN = 26.0
+# Mean pitch angle of spiral arms in a galaxy with the bulge fraction `_SMOOTH`, deg.
+_TIGHT = 13.0
+# Standard deviation of the pitch angles of spiral arms about their mean, deg.
+_SCATTER = 4.0
+# Smallest and largest pitch angle of spiral arms, deg.
+_PITCHES = (10.0, 30.0)
+# Possible numbers of spiral arms of a galaxy.
+_ARMS = (2, 3, 4)
+# Fractions of galaxies that have each of the numbers of spiral arms in `_ARMS`.
+_ODDS = (0.65, 0.15, 0.20)
+# Range of the narrowness of spiral arms: half the natural logarithm of the brightness at their ridge divided by that at
+# their trough.
 _NARROW = (1.3, 2.4)
-# Spurs and patches between the arms: number of waves, and their scatter in the logarithm of the light.
-_WAVES, _PATCHY = 14, 0.28
-# Knots: flux ratio of the brightest and the faintest; widths in scale lengths; fraction at any angle; scatter about an
-# arm as a fraction of the angle to the next arm.
-_RANGE, _WIDTHS, _FIELD, _ASTRAY = 30.0, (0.030, 0.075), 0.2, 0.07
-# Width of the rings on which light is balanced, scale lengths.
+# Number of random waves whose sum gives spurs and patches between spiral arms.
+_WAVES = 14
+# Standard deviation of the natural logarithm of the light due to spurs and patches between spiral arms, for arms with
+# contrast 1 (the ridge is twice as bright as the mean).
+_PATCHY = 0.28
+# Flux ratio of the brightest and the faintest possible knot (star-forming region) of a disc.
+_RANGE = 30.0
+# Range of the Gaussian widths (standard deviations) of star-forming knots with the mean flux, in scale lengths of the
+# disc.
+_WIDTHS = (0.030, 0.075)
+# Fraction of star-forming knots that lie at any angle, between the arms too; the others lie near an arm.
+_FIELD = 0.2
+# Standard deviation of the angle between a star-forming knot and the ridge of its spiral arm, as a fraction of the
+# angle to the next arm.
+_ASTRAY = 0.07
+# Width (Gaussian standard deviation) of the rings, in scale lengths of the disc, on which its structure adds as much
+# light as it removes.
 _RING = 0.12
 
 
 @dataclass(frozen=True, slots=True)
 class DiscStructure:
-    """Options for the structure of discs.
+    """Options for the structure (spiral arms and star-forming knots) that is added to smooth galaxy discs.
 
     Attributes
     ----------
     arms : Arms
-        Options of the request.
+        Options of the request: contrast of arms, light in knots, and size of the smallest disc with structure.
     seed : int
-        Seed of the request.
+        Seed of the request, used to draw the structure of each galaxy.
     """
 
     arms: Arms
@@ -67,13 +94,14 @@ class DiscStructure:
 
 
 def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
-    """Widths of the structures of galaxies [n], arcsec; 0 for galaxies without structure.
+    """Return the width in arcsec of the image of each disc's structure (arms and knots), shape (n,); 0 means none.
 
-    Large discs without a dominant bulge have a structure, if it fits on the largest stamp.
+    A disc has structure if its half-light radius is at least that in the request, less than half of the galaxy's light
+    is in the bulge, and the image is less than 180 arcsec wide. `discs` None means that no disc has structure.
     """
     if discs is None:
         return np.zeros(len(shape))
-    # Apparent half-light radius of the disc, without the bulge, along the major axis.
+    # Half-light radius (arcsec) of the disc alone after lensing, along its major axis.
     half_light_radius = galaxy_shapes.half_light(replace(shape, bulge_fraction=np.zeros(len(shape))))
     wide = 2 * REACH / EXPONENTIAL_RADIUS * half_light_radius
     has_structure = (shape.disk_radius >= discs.arms.least_radius) & (shape.bulge_fraction < _SMOOTH) & (wide < _WIDEST)
@@ -81,21 +109,21 @@ def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
 
 
 def add_structure(sources: Sources, shape: Shapes, discs: DiscStructure | None) -> Sources:
-    """Add pictures of the structure of discs to the sources.
+    """Give the galaxies with large discs an image of their structure (spiral arms and knots).
 
     Parameters
     ----------
     sources : Sources
-        The sources.
+        Sources to be drawn.
     shape : Shapes
-        Shapes of all galaxies.
+        Shapes of the galaxies, to which `sources.shape` refers.
     discs : DiscStructure or None
-        Options; None returns the sources unchanged.
+        Options; None means that no disc has structure.
 
     Returns
     -------
     Sources
-        Sources with the additional pictures.
+        The same sources with the additional images; `sources` itself if `discs` is None.
     """
     if discs is None:
         return sources
@@ -119,23 +147,23 @@ def _pictures(ids: Int, shape: Shapes, discs: DiscStructure) -> tuple[Picture, .
 
 
 def arms_and_knots(side: int, bulge_fraction: float, arms: Arms, generator: np.random.Generator) -> Float32:
-    """Structure of a face-on exponential disc of flux 1.
+    """Draw the structure (spiral arms and knots) of a face-on exponential disc of flux 1.
 
     Parameters
     ----------
     side : int
-        Side of the picture, pixels; it is 2 REACH scale lengths wide.
+        Side of the image in pixels; it spans 2 REACH = 10 scale lengths of the disc.
     bulge_fraction : float
-        Fraction of the galaxy's light in the bulge.
+        Fraction of the galaxy's light in the bulge, on which the mean pitch angle depends.
     arms : Arms
-        Options of the request.
+        Options of the request: contrast of arms, number of knots and their light.
     generator : numpy.random.Generator
         Source of random numbers.
 
     Returns
     -------
     float32 array, shape (side, side)
-        Structure with the sum 0.
+        Light that the structure adds (positive) or removes (negative) in each pixel; its sum is 0.
     """
     step = 2 * REACH / side
     at: Float = (np.arange(float(side)) - 0.5 * (side - 1)) * step
@@ -152,18 +180,19 @@ def arms_and_knots(side: int, bulge_fraction: float, arms: Arms, generator: np.r
 
 @dataclass(frozen=True, slots=True)
 class _Winding:
-    """Logarithmic spirals with small random deviations.
+    """Logarithmic spiral arms with small random deviations.
 
     Attributes
     ----------
     arms : int
-        Number of arms.
+        Number of arms, equally spaced in angle.
     slope : float
-        Change of the angle with the logarithm of the radius, radian.
+        Change of an arm's angle (radians) per unit of the natural logarithm of the radius; its sign is the handedness.
     first : float
-        Angle of the first arm at radius 1, radian.
+        Angle of the first arm at a radius of one scale length, radians.
     wander : float array, shape (2, 3)
-        Amplitudes of the deviations.
+        Random numbers from -1 to 1. With rows c and s, an arm deviates from the spiral by the angle sum_k (c_k cos(k ln
+        r) + s_k sin(k ln r)) / (4 k) in radians, for k = 2, 3, 4 and the radius r in scale lengths.
     """
 
     arms: int
@@ -181,7 +210,7 @@ class _Winding:
         return cls(arms, slope, first, generator.uniform(-1.0, 1.0, (2, 3)))
 
     def angle(self, log_radius: Float) -> Float:
-        """Angle of the first arm, radian."""
+        """Return the angle of the first arm in radians, at natural logarithms of the radius in scale lengths."""
         arm_angle = self.first + self.slope * log_radius
         for wave, (cosine, sine) in enumerate(self.wander.T, start=2):
             arm_angle = arm_angle + (0.25 / wave) * (
@@ -193,13 +222,19 @@ class _Winding:
 def _pattern(
     log_radius: Float, angle: Float, winding: _Winding, contrast: float, generator: np.random.Generator
 ) -> Float:
-    """Light of arms with spurs and patches, relative to about the mean of its circle."""
+    """Return the light of spiral arms with spurs and patches in each pixel, on a scale with a mean of about 1.
+
+    The mean is that of the pixels at the same radius. `log_radius` is the natural logarithm of the radius in scale
+    lengths, and `angle` is in radians. `contrast` is about the brightness at the ridge of an arm divided by the mean,
+    minus 1; each disc has 0.7 to 1.1 times this value.
+    """
     narrow = generator.uniform(*_NARROW)
     mean = i0e(narrow)
     strength = contrast * generator.uniform(0.7, 1.1) / (1.0 / mean - 1.0)
     phase = angle - winding.angle(log_radius)
     ridge = np.exp(narrow * (np.cos(winding.arms * phase) - 1.0)) / mean
-    # The brightness differs between arms and along each arm.
+    # Random factor of the brightness of a spiral arm at each pixel: arms differ from one another, and each arm varies
+    # along its length.
     uneven = 1.0 + 0.35 * np.cos(phase + generator.uniform(0, 2 * np.pi) + 1.3 * log_radius)
     pattern = 1.0 + min(strength, 0.95) * (ridge * uneven - 1.0)
     patches = np.zeros_like(pattern)
@@ -211,14 +246,18 @@ def _pattern(
 
 
 def _knots(at: Float, winding: _Winding, arms: Arms, generator: np.random.Generator) -> Float:
-    """Light of knots along the arms; `at` [side] are the columns and rows of the picture in scale lengths."""
+    """Return an image with the light of the knots (star-forming regions) along the arms of a disc of flux 1.
+
+    `at`, shape (side,), has the distances of columns and of rows from the middle in scale lengths. `winding` defines
+    the arms; `arms` has the number of knots and the fraction of the disc's light in them.
+    """
     light, count = np.zeros((len(at), len(at))), arms.number
     if not count or not arms.knots:
         return light
     step = at[1] - at[0]
     steps = np.linspace(0.0, REACH, 501)
     inside = np.cumsum(steps * np.exp(-steps))
-    # The number of knots at each radius is proportional to the light of the disc.
+    # Draw the radii of knots so that their density is proportional to the light of the disc.
     radius = np.interp((np.arange(count) + generator.random(count)) / count, inside / inside[-1], steps)
     flux = 1.0 / (1.0 - generator.random(count) * (1.0 - 1.0 / _RANGE))
     width = generator.uniform(*_WIDTHS, count) * (flux / flux.mean()) ** 0.2
@@ -238,7 +277,12 @@ def _knots(at: Float, winding: _Winding, arms: Arms, generator: np.random.Genera
 
 
 def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, step: float) -> Float32:
-    """Light [side, side] minus the smooth disc, after scaling it to the same sum on all circles."""
+    """Return the structure of a disc: `light` scaled to the sum of `smooth` on every circle, minus `smooth`.
+
+    `light` is the disc with arms and knots, and `smooth` the disc without them; all images have the shape (side, side).
+    `radius` is the distance of each pixel from the middle and `step` the pixel size, in scale lengths. `window`, 0 to
+    1, is the strength of the structure in each pixel, by which the difference is multiplied.
+    """
     ring = (radius / step).astype(np.int64).ravel()
     ring_light, smooth_light = (
         gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth)
@@ -246,7 +290,8 @@ def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, st
     middles = (np.arange(len(ring_light)) + 0.5) * step
     light = light * np.interp(radius, middles, smooth_light / ring_light)
     structure = window * (light - smooth)
-    # Remaining imbalance, because rings have a finite width, is removed inside and outside the half-light radius.
+    # Rings have a finite width, so that the sum of the structure is not exactly 0. Correct it separately inside and
+    # outside the half-light radius.
     within = radius < EXPONENTIAL_RADIUS
     for weight in (window * smooth * within, window * smooth * ~within):
         structure -= weight * (structure.sum(where=weight > 0.0) / weight.sum())
@@ -254,6 +299,6 @@ def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, st
 
 
 def _rise(radius: Float, low: float, high: float) -> Float:
-    """Rise smoothly from 0 at `low` to 1 at `high`."""
+    """Return a function of the radius that rises smoothly from 0 at `low` to 1 at `high`; constant outside."""
     part = np.clip((radius - low) / (high - low), 0.0, 1.0)
     return np.asarray(part**2 * (3.0 - 2.0 * part))

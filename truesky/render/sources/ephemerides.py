@@ -1,15 +1,15 @@
-"""Moving bodies from a user's table, which replace the embedded population.
+"""Read Solar System bodies from a user's table, which replace the random population of truesky.
 
-A table is a Parquet, CSV or FITS file with the columns of KEYS and one row per body and day:
+The table is a Parquet, CSV or FITS file with the columns of KEYS and one row per body and day:
 
-- mjd: date (UTC).
+- mjd: date (MJD, UTC).
 - lon, lat: ecliptic longitude and latitude at this date (deg, mean equinox J2000).
-- east, north: motion in these directions (arcsec / h).
-- mag: I_E (AB).
+- east, north: motion along longitude (times the cosine of the latitude) and latitude (arcsec / h).
+- mag: AB magnitude in the Euclid band I_E.
 
-An exposure uses the rows of the day on which it begins. If there is a column `name` (texts or integers), each row must
-have a name, and no name may occur twice on a day. From an hourly ephemeris, select one row per day. Other columns are
-ignored.
+An exposure uses the rows of the UTC day on which it begins. If there is a column `name` (texts or integers), each row
+must have a name, and no name may occur twice on a day. From an hourly ephemeris, select one row per day. Other columns
+are ignored.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from lake_schema.ids import GENERATION_ORDER, source_id
 from lake_schema.sky.ecliptic import equatorial
 from truesky.render.sources.solar_system import KIND, Population
 
-# Smallest and largest value of each column. A day must fit into an identifier.
+# Smallest and largest allowed value of each column in a user's table of bodies. The largest MJD has 18 bits, as many as
+# source identifiers have for the day.
 KEYS = {
     "mjd": (0.0, 2.0**18 - 1.0),
     "lon": (-360.0, 720.0),
@@ -40,36 +41,40 @@ KEYS = {
     "north": (-1e5, 1e5),
     "mag": (-30.0, 60.0),
 }
+# Optional column of a user's table with the name of each Solar System body.
 _NAME = "name"
-# Every worker stores the table within the memory of its task (2 GB): 0.2 kB per row, 0.3 kB while reading.
+# Largest number of rows in a user's table of bodies. Every worker keeps the table in its memory (2 GB), with 0.2 kB per
+# row, and 0.3 kB while the table is read.
 _MOST_ROWS = 1 << 21
 
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """Moving bodies by day.
+    """Solar System bodies of a user's table.
 
     Attributes
     ----------
     day : int array, shape (n,)
-        MJD of each row.
+        UTC day of each row, as whole MJD.
     rows : Population
-        Rows of the table.
+        Bodies in the order of the table; a body has one row per day.
     """
 
     day: Int
     rows: Population
 
     def on_day(self, day: int) -> Population:
-        """Bodies of one day (MJD)."""
+        """Return the bodies that the table has for a day (whole MJD); there may be none."""
         return self.rows.take(self.day == day)
 
 
 @lru_cache(maxsize=2)
 def read(file: Path, sha256: str) -> Bodies:
-    """Read and check a table of bodies; `sha256` is the checksum of the file.
+    """Read and check a user's table of Solar System bodies.
 
-    `external_rows` raises BadInput with the file, column and row of a wrong value.
+    `sha256` is the checksum of the file, which selects the cached result; it is not checked. BadInput is raised if a
+    column is missing, a value is out of bounds, there are more than 2^21 rows, or a name is missing or occurs twice on
+    a day. The message has the file, and the column and row of a wrong value.
     """
     values, names = _table(file)
     for key, bounds in KEYS.items():
@@ -85,16 +90,16 @@ def read(file: Path, sha256: str) -> Bodies:
 
 
 def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
-    """Refuse a table without bodies on the day of any exposure.
+    """Check that a table has bodies on at least one day on which an exposure begins.
 
     Parameters
     ----------
     bodies : Bodies
-        The bodies.
+        The bodies of the table.
     file : Path
-        Their file, for the message.
+        File of the table, quoted in the error message.
     mjd : iterable of float
-        Starts of the exposures.
+        Starts of the exposures (MJD); without exposures nothing is checked.
 
     Raises
     ------
@@ -108,7 +113,10 @@ def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
 
 
 def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
-    """Columns of KEYS, and names if the table has a column for them."""
+    """Read the columns `KEYS` of a table of bodies by name, and its column of names (None if it has none).
+
+    Raises BadInput if the table has too many rows.
+    """
     parts: dict[str, list[Float]] = {key: [np.zeros(0)] for key in KEYS}
     names, rows = [], 0
     for piece in external_rows.read_batches(file, list(KEYS), text_columns=[_NAME], kind="table of bodies"):
@@ -123,14 +131,14 @@ def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
 
 
 def _refuse_duplicates(file: Path, names: pa.ChunkedArray, day: Int) -> None:
-    """Raise BadInput if a name is missing, or occurs twice on a day."""
+    """Raise BadInput if a body in the table has no name, or if a name occurs twice on a day (whole MJD)."""
     if (absent := pc.index(names, "").as_py()) >= 0:
         raise BadInput(f"{file}: {_NAME} of row {absent + 1} is missing")
     body = names.combine_chunks().dictionary_encode().indices.to_numpy()
     order = np.lexsort((body, day))
     same = np.flatnonzero((np.diff(body[order]) == 0) & (np.diff(day[order]) == 0))
     if len(same):
-        # Sorting is stable, so the second of two equal rows is reported.
+        # Report the later of two rows with the same name and day; the sort is stable and keeps their order.
         row = int(order[same + 1].min())
         problem = f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which already has a row for MJD {day[row]}"
         raise BadInput(f"{file}: {problem} ({len(same)} of {len(day)} rows like it)")

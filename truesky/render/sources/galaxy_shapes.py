@@ -1,7 +1,7 @@
-"""Convert catalogue rows to lensed light profiles on the sky.
+"""Convert rows of the table `galaxies` to gravitationally lensed light profiles (Sersic bulge and inclined disc).
 
-The world frame is that of galsim: u to the west, v to the north, in arcsec. An axis at the position angle PA (north
-through east) lies at 90 deg + PA from u.
+Positions on the sky are (u, v) in arcsec as in galsim: u to the west and v to the north. An axis with the position
+angle PA (from north through east) has the angle 90 deg + PA from u towards v.
 """
 
 from __future__ import annotations
@@ -20,21 +20,27 @@ from truesky.numerics import matrices
 from truesky.render.sources import sersic
 from truesky.request.schema import MAX_SHEAR
 
-# Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
+# Half-light radius of a face-on exponential disc in scale lengths, the solution of (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
-# Smallest inverse magnification near a critical line. Below it, or beyond MAX_SHEAR, the image is not an ellipse.
+# Lower limit of the inverse magnification by lensing, so that the magnification is at most 1000. It is reached near
+# critical lines, where no image is an ellipse.
 _MIN_DETERMINANT = 1e-3
-# Smallest axis ratio; a thinner ellipse would be a line without area.
+# Smallest axis ratio of a bulge; a thinner ellipse would be a line without area.
 _SLIMMEST = 1e-4
-# Smallest index for which Sersic's b_n is computed from its series.
+# Smallest Sersic index n for which b_n is computed from a series; below, it is computed from an inverse gamma function.
+# The profile is exp(-b_n (r / r_e)^(1/n)), where r is the radius and r_e the half-light radius.
 _SERIES = 0.8
-# Step and number of the nodes t for integrals along a line; the distance of a node is proportional to cosh t.
-_LINE_STEP, _LINE_NODES = 0.35, 12
-# Area, in square pixels, below which a component has negligible light outside any stamp.
+# Step of the variable t for integrals of a galaxy's light along a line at the distance d from its middle. The points on
+# the line are at d cosh(t) from the middle.
+_LINE_STEP = 0.35
+# Number of values of the variable t, from 0 in steps of `_LINE_STEP`, for integrals of a galaxy's light along a line.
+_LINE_NODES = 12
+# A bulge or disc with a smaller area than this, in square pixels, has no light in `real_space_profile`, because its
+# light far from the middle is negligible.
 _NO_AREA = 1e-8
 
 
-# Columns of the galaxy catalogue.
+# Columns of the table `galaxies` from which shapes are computed.
 COLUMNS = (
     "bulge_half_light_radius",
     "disk_half_light_radius",
@@ -51,26 +57,26 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """Structure of n galaxies, as arrays [n].
+    """Shapes of n galaxies with bulge and disc, as arrays of shape (n,); its length is n.
 
     Attributes
     ----------
     bulge_radius, disk_radius : float array
-        Half-light semi-major axes before lensing, arcsec.
+        Half-light semi-major axes of bulge and disc before lensing, arcsec.
     bulge_fraction : float array
-        Fraction of the light in the bulge.
+        Fraction of the light in the bulge, 0 to 1.
     sersic_index : float array
         Sersic index of the bulge.
     bulge_axis_ratio : float array
-        Axis ratio of the bulge.
+        Axis ratio of the bulge, minor to major.
     inclination : float array
-        Inclination of the disc, deg.
+        Inclination of the disc in degrees; 0 is face-on.
     beta : float array
-        Angle of the major axis from u towards v, radian.
+        Angle of the major axis of both bulge and disc in radians, from west (u) towards north (v).
     g1, g2 : float array
-        Reduced shear in the world frame.
+        Reduced shear. Positive g1 stretches images along west (u), positive g2 along north-west (45 deg from u to v).
     magnification : float array
-        Magnification, positive. It affects sizes only, since catalogue fluxes already include it.
+        Magnification by lensing, positive. It affects sizes only, since catalogue fluxes already include it.
     """
 
     bulge_radius: Float
@@ -88,17 +94,18 @@ class Shapes:
         return len(self.beta)
 
     def take(self, chosen: Int) -> Shapes:
-        """Return the selected galaxies."""
+        """Return the galaxies with the indices `chosen`, in the order of the indices."""
         return Shapes(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def shapes(galaxies: pa.Table) -> Shapes:
-    """Convert rows of the table `galaxies` to shapes.
+    """Convert rows of the table `galaxies` to shapes, one per row.
 
     Notes
     -----
-    The reduced shear is g = gamma / (1 - kappa), limited to MAX_SHEAR. The magnification is mu = 1 / |(1 - kappa)^2 -
-    gamma^2|, with a determinant of at least 1e-3.
+    The shear gamma and the convergence kappa are columns of the table. The reduced shear is g = gamma / (1 - kappa), at
+    most 0.9 in absolute value. The magnification is mu = 1 / |(1 - kappa)^2 - gamma^2|, at most 1000. Sersic indices of
+    bulges outside 0.3 to 6.2 and axis ratios of bulges outside 1e-4 to 1 are set to the nearest limit.
     """
     columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in COLUMNS}
     stretch = 1.0 - columns["kappa"]
@@ -115,7 +122,7 @@ def shapes(galaxies: pa.Table) -> Shapes:
         inclination=columns["inclination"],
         beta=np.radians(90.0 + columns["position_angle"]),
         g1=np.nan_to_num(columns["gamma1"] * reduced),
-        # Positive gamma2 stretches along north-east, which in (west, north) is the second quadrant.
+        # Change the sign: positive gamma2 stretches images along north-east, but positive g2 along north-west.
         g2=np.nan_to_num(-columns["gamma2"] * reduced),
         magnification=1.0 / determinant,
     )
@@ -123,15 +130,17 @@ def shapes(galaxies: pa.Table) -> Shapes:
 
 @dataclass(frozen=True, slots=True)
 class Forms:
-    """Sizes and orientations of n galaxies in Fourier space, for k in radian / pixel.
+    """Sizes and orientations of n lensed galaxies in pixels, in the form in which their Fourier transforms need them.
 
     Attributes
     ----------
     bulge, disk : float array, shape (n, 2, 2)
-        k @ matrix is k along and across the major axis times the radius: the half-light radius of the bulge, or the
-        scale length of the disc. Both are foreshortened across the axis.
+        Lensed vectors (columns of each matrix) along the major and minor axis of bulge and disc in pixels. Before
+        lensing, their lengths are the half-light radius of the bulge, or the scale length of the disc, foreshortened
+        along the minor axis. For a wave vector k in radian / pixel, the profile is round in k @ matrix.
     thick : float array, shape (n, 2)
-        k @ vector is (pi / 2) (h / r) sin(inclination) times k r across the axis, with the scale length r.
+        Vector along the minor axis in pixels that describes the thickness of an inclined disc: its product with k is
+        q = (pi / 2) (h / r) sin(inclination) k r, for scale height h, scale length r and k along the minor axis.
     """
 
     bulge: Float
@@ -140,11 +149,16 @@ class Forms:
 
 
 def forms(shape: Shapes, jacobian: Float) -> Forms:
-    """Compute the forms of shapes [n] at positions with the Jacobians [n, 2, 2], in arcsec per pixel.
+    """Return sizes and orientations in pixels for n lensed galaxies.
+
+    `jacobian`, shape (n, 2, 2), has the arcsec to the west and north (rows) for a step of one column and one row
+    (columns) at each galaxy.
 
     Notes
     -----
-    An inclined disc with the vertical profile sech^2(z / h) has the transform (1 + k_p^2)^-3/2 q / sinh q.
+    An inclined disc with the density profile sech^2(z / h), at a height z above its plane and with the scale height h,
+    has the Fourier transform (1 + k_p^2)^-3/2 q / sinh q. For a wave vector k in radian / pixel, k_p is the length of
+    `k @ disk`, and q is `k @ thick`.
 
     References
     ----------
@@ -169,21 +183,21 @@ def _matrices(a: Float, b: Float, c: Float, d: Float) -> Float:
 
 
 def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
-    """Profile of one galaxy of flux 1 in the world frame, arcsec.
+    """Return the lensed light profile of one galaxy as a galsim object with flux 1.
 
     Parameters
     ----------
     shape : Shapes
         Shapes of galaxies.
     i : int
-        Number of the galaxy.
+        Index of the galaxy in `shape`.
     smallest : float
-        Components with a smaller half-light radius are point sources, arcsec.
+        Half-light radius in arcsec below which the bulge or the disc is a point source.
 
     Returns
     -------
     galsim.GSObject
-        The profile.
+        The profile in arcsec, with u to the west and v to the north.
     """
     fraction = float(shape.bulge_fraction[i])
     parts = []
@@ -198,7 +212,7 @@ def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 
 def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
-    # galsim's shear preserves the area, so the radius of the initial circle is the geometric mean of the axes.
+    # The shear of galsim preserves the area. Begin with a circle whose radius is the geometric mean of the axes.
     q = float(shape.bulge_axis_ratio[i])
     radius = float(shape.bulge_radius[i]) * np.sqrt(q)
     if radius < smallest:
@@ -221,23 +235,20 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
     )
 
 
-# ------------------------------------------------------------------------------------------------ extent
-
-
 def surface_brightness(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux per arcsec^2 along the major axis, which is an upper limit for all directions.
+    """Return the surface brightness of galaxies along their major axis, an upper limit for all other directions.
 
     Parameters
     ----------
     shape : Shapes
         Shapes of n galaxies.
     radius : float array, shape (m,)
-        Radii, arcsec.
+        Distances from the middle in arcsec.
 
     Returns
     -------
     float array, shape (n, m)
-        Fractions.
+        Surface brightness after lensing, as a fraction of the galaxy's flux per arcsec^2.
     """
     stretch = _lensed_stretch(shape)
     area = 1.0 / shape.magnification
@@ -250,23 +261,26 @@ def surface_brightness(shape: Shapes, radius: Float) -> Float:
 
 
 def line_brightness(shape: Shapes, distance: float) -> Float:
-    """Fraction of the flux per arcsec on a line parallel to the minor axis, an upper limit for all directions.
+    """Return the light of each galaxy integrated along a straight line at a given distance from its middle.
+
+    The line is parallel to the minor axis, and the result is an upper limit for lines of all other directions.
 
     Parameters
     ----------
     shape : Shapes
         Shapes of n galaxies.
     distance : float
-        Distance of the line from the middle along the major axis, arcsec, positive.
+        Distance of the line from the middle in arcsec, positive.
 
     Returns
     -------
     float array, shape (n,)
-        Fractions, with an error of 1 %.
+        Light as a fraction of the galaxy's flux per arcsec across the line, with an error of 1 %.
     """
     t = _LINE_STEP * np.arange(_LINE_NODES)
     radius, stretch = distance * np.cosh(t), _lensed_stretch(shape)
-    # Trapezoidal rule on both sides of the nearest point, with x = distance sinh t and dx = radius dt.
+    # Weights of the trapezoidal rule in t for both halves of the line. The position along the line is x = distance
+    # sinh(t), and the distance from the galaxy's middle is radius = distance cosh(t), so that dx = radius dt.
     weights = 2.0 * _LINE_STEP * radius
     weights[0] *= 0.5
     ones, parts = np.ones(len(shape)), ((shape.bulge_radius, shape.sersic_index), (shape.disk_radius, None))
@@ -278,19 +292,21 @@ def line_brightness(shape: Shapes, distance: float) -> Float:
 
 
 def flux_outside(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux outside an ellipse with a given semi-major axis, an upper limit for that outside the circle.
+    """Return the fraction of a galaxy's flux outside ellipses with the shapes of its bulge and its disc.
+
+    It is an upper limit for the flux outside the circle with the same radius.
 
     Parameters
     ----------
     shape : Shapes
         Shapes of n galaxies.
     radius : float array, shape (n,)
-        Radii along the major axis, arcsec.
+        Semi-major axis of the ellipses in arcsec, after lensing.
 
     Returns
     -------
     float array, shape (n,)
-        Fractions.
+        Fractions of the flux, 0 to 1.
     """
     stretch, n = _lensed_stretch(shape), shape.sersic_index
     bulge_radius, disk_radius = (np.maximum(r * stretch, 1e-6) for r in (shape.bulge_radius, shape.disk_radius))
@@ -301,28 +317,30 @@ def flux_outside(shape: Shapes, radius: Float) -> Float:
 
 
 def real_space_profile(shape: Shapes, form: Forms) -> Float:
-    """Parameters of the light at any position, for flux 1, as used by drawing/kernels/frame.py.
+    """Return the parameters from which drawing/kernels/frame.py computes the light of a galaxy at any pixel.
 
     Parameters
     ----------
     shape : Shapes
         Shapes of n galaxies.
     form : Forms
-        Their forms.
+        Sizes and orientations of these galaxies in pixels.
 
     Returns
     -------
     float array, shape (n, 11)
-        Columns: light in the middle of the bulge and of the disc, per square pixel; four elements (rows first) of the
-        bulge's matrix, and its exponent p; four elements of the disc's matrix.
+        Columns 0 and 1: light in the middle of the bulge and of the disc per square pixel, for a galaxy of flux 1.
+        Columns 2 to 5: matrix of the bulge, row by row; column 6: its exponent p. Columns 7 to 10: matrix of the disc.
 
     Notes
     -----
-    The matrices convert pixels (x, y) from the middle to (u, v). The light of the bulge is proportional to exp(-(u^2 +
-    v^2)^p) and that of the disc to exp(-sqrt(u^2 + v^2)). The disc is treated as thin, with its apparent axis ratio.
+    The matrices convert offsets (x, y) from the galaxy's middle in pixels to coordinates (s, t) without unit in which
+    bulge or disc is round. The light of the bulge is proportional to exp(-(s^2 + t^2)^p), with p = 1 / (2 n) for the
+    Sersic index n, and that of the disc to exp(-sqrt(s^2 + t^2)). The disc is treated as thin, with its apparent axis
+    ratio. A bulge or disc with almost no area has no light.
     """
     n, b = shape.sersic_index, _b(shape.sersic_index)
-    # The width of an edge-on disc is given by its scale height.
+    # Apparent minor axis of the disc: foreshortened radius and scale height are added in quadrature.
     across = form.disk[:, :, 1], form.thick * (2 / np.pi)
     disk = np.stack([form.disk[:, :, 0], np.copysign(np.hypot(*across), across[0] + across[1])], -1)
     areas = [
@@ -349,13 +367,17 @@ def real_space_profile(shape: Shapes, form: Forms) -> Float:
 
 
 def half_light(shape: Shapes) -> Float:
-    """Half-light radius after lensing along the major axis, arcsec: the mean of bulge and disc, weighted by light."""
+    """Return the half-light semi-major axis of galaxies after lensing in arcsec, shape (n,).
+
+    It is approximated by the mean of the half-light radii of bulge and disc, weighted by their light. Lensing is
+    assumed to stretch the galaxy along its major axis.
+    """
     fraction = shape.bulge_fraction
     return _lensed_stretch(shape) * (fraction * shape.bulge_radius + (1 - fraction) * shape.disk_radius)
 
 
 def _lensed_stretch(shape: Shapes) -> Float:
-    """Largest linear stretch by lensing."""
+    """Return the factor by which lensing stretches galaxies along the direction of the largest stretch."""
     g = np.hypot(shape.g1, shape.g2)
     return np.asarray(np.sqrt(shape.magnification * (1 + g) / (1 - g)))
 
@@ -366,7 +388,7 @@ def _apparent_axis_ratio(shape: Shapes) -> Float:
 
 
 def _b(index: Float) -> Float:
-    """Sersic's b_n, with an error of 3e-5.
+    """Return the constant b_n of Sersic profiles for arrays of the index n, with an error of 3e-5.
 
     References
     ----------
@@ -379,7 +401,12 @@ def _b(index: Float) -> Float:
 
 
 def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Float) -> Float:
-    """Surface brightness [n, m] per arcsec^2 of the unlensed circle, without axis ratio and magnification."""
+    """Return the unlensed surface brightness of round Sersic profiles of flux 1 at lensed radii, shape (n, m).
+
+    It is the flux per arcsec^2 before lensing. `radius`, shape (m,), is where it is computed, and `half_light`, shape
+    (n,), is the half-light radius; both are in arcsec after lensing. `stretch` is the factor by which lensing has
+    enlarged `half_light`, and `index` is the Sersic index, shape (n,).
+    """
     r_e = np.maximum(half_light, 1e-6)[:, None]
     n, b = index[:, None], _b(index)[:, None]
     log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])

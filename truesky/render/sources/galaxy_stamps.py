@@ -1,10 +1,12 @@
-"""Galaxies from a user's library of stamps, which are drawn instead of profiles.
+"""Draw galaxies from a user's library of postage stamps (small galaxy images) instead of Sersic profiles.
 
 A library is a FITS file whose first image has three axes: columns, rows and stamps. The column `stamp` of the table
-`galaxies` contains the number of a stamp, counted from 0. A stamp contains a galaxy at its middle, without background
-and with margins up to where it is visible. Its scale, flux and orientation are arbitrary. It is drawn with the flux of
-the row, and its half-light semi-major axis becomes the mean of the row's bulge and disc. Its major axis is turned to
-the row's position angle, and it is lensed. Axis ratio and handedness do not change. All bands have the same picture.
+`galaxies` contains the number of a stamp, counted from 0. A stamp contains a galaxy at its middle, without background,
+and large enough for all its visible light. Its scale, flux and orientation are arbitrary.
+
+The galaxy of a table row is drawn with the flux of the row. The half-light semi-major axis of the stamp is scaled to
+the mean of the row's bulge and disc, weighted by their light. Its major axis is turned to the row's position angle, and
+the image is lensed. Axis ratio and handedness of the stamp do not change otherwise. All bands have the same picture.
 """
 
 from __future__ import annotations
@@ -28,37 +30,53 @@ from truesky.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS, Shapes
 from truesky.render.sources.lensed_arcs import Picture
 from truesky.request.structure import Stamps
 
-# Largest value of a pixel, so that sums are finite.
+# Limit of the absolute value of a pixel in a user's galaxy images, so that sums are finite.
 _LARGEST = 1e30
-# Kind of file in lake_schema.user_files, and column with the number of the stamp.
-KIND, COLUMN = "library of galaxies", "stamp"
-# Smallest and largest side of a stamp, pixels; largest fraction of negative light; smallest half-light radius, pixels.
-_SIDE_BOUNDS, _BELOW, _COARSEST = (16, 1024), 0.01, 1.5
-# Adaptive moments: largest number of iterations, tolerance, side to which stamps are binned, and smallest axis ratio.
-_ROUNDS, _TOLERANCE, _MAX_REBINNED_SIDE, _SLIMMEST = 60, 1e-5, 128, 0.05
-# Number of stamps nearest in shape from which one is drawn; largest width, arcsec, which is limited by the largest
-# stamp of the finest pixels.
-_NEAREST, _WIDEST = 8, 180.0
+# Name of this kind of user file in error messages and in lake_schema.user_files.
+KIND = "library of galaxies"
+# Column of the table `galaxies` with the number of the stamp (galaxy image in a user's library) to draw.
+COLUMN = "stamp"
+# Smallest and largest allowed side of a stamp (galaxy image in a user's library), pixels.
+_SIDE_BOUNDS = (16, 1024)
+# Largest allowed sum of negative pixels in a stamp (galaxy image), as a fraction of its light.
+_BELOW = 0.01
+# Smallest allowed half-light radius of the galaxy on a stamp, pixels.
+_COARSEST = 1.5
+# Largest number of iterations in which the weighted second moments of a galaxy image are measured; after them the last
+# values are used.
+_ROUNDS = 60
+# Change of the second moments of a galaxy image, relative to their sum, below which their iteration ends.
+_TOLERANCE = 1e-5
+# Galaxy images with at least twice this number of pixels per side are binned before their moments are measured.
+_MAX_REBINNED_SIDE = 128
+# Lower limit of the measured axis ratio (minor to major) of a galaxy image; smaller values are set to this limit.
+_SLIMMEST = 0.05
+# Number of stamps (galaxy images) nearest to a galaxy in axis ratio and concentration. If its row has no stamp number,
+# one of them is chosen at random.
+_NEAREST = 8
+# Largest diagonal in arcsec of a galaxy image on the sky; wider galaxies are drawn as profiles. The limit is below
+# the side of the largest square in which the camera with the finest pixels draws a source.
+_WIDEST = 180.0
 
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """A library of n stamps.
+    """A library of n stamps (galaxy images) with their measured shapes; its length is n.
 
     Attributes
     ----------
     file : Path
-        The file.
+        File of the library.
     images : float32 array, shape (n, ny, nx)
-        Stamps with the sum 1.
+        Stamps without negative pixels, each with the sum 1.
     radius : float array, shape (n,)
-        Half-light semi-major axis, pixels.
+        Half-light semi-major axis of each galaxy in pixels of its stamp.
     ratio : float array, shape (n,)
-        Axis ratio.
+        Axis ratio, minor to major, at most 1.
     angle : float array, shape (n,)
-        Angle of the major axis from the columns towards the rows, radian.
+        Angle of the major axis in radians, from the direction of increasing column to that of increasing row.
     inner : float array, shape (n,)
-        Fraction of the light within half of the radius.
+        Fraction of the light within half of `radius`, a measure of concentration.
     """
 
     file: Path
@@ -74,17 +92,20 @@ class Library:
 
 @lru_cache(maxsize=1)
 def read(file: Path, sha256: str) -> Library:
-    """Read, check and measure a library of stamps; `sha256` is the checksum of the file.
+    """Read, check and measure a library of stamps (galaxy images).
+
+    `sha256` is the checksum of the file, which selects the cached result; it is not checked.
 
     Raises
     ------
     BadInput
-        If the file is not a valid library; the message contains the file and the stamp.
+        If the file is not an image with three axes or a stamp is too small, too large, noisy or without light. The
+        message contains the file and the number of the stamp.
 
     Notes
     -----
-    The half-light radius of a stamp has an error of 1 % if it is 3 pixels or more; light beyond the margins is not
-    included.
+    The half-light radius of a stamp has an error of 1 % if it is 3 pixels or more. Light outside the stamp is not
+    counted.
     """
     data, _ = external.read_planes(file, "", KIND)
     try:
@@ -105,7 +126,12 @@ def read(file: Path, sha256: str) -> Library:
 
 
 def _measure_stamp(number: int, stamp: Float) -> tuple[float, float, float, float]:
-    """Radius, ratio, angle and inner fraction of a stamp, see `Library`."""
+    """Measure the galaxy on a stamp: half-light radius (pixels), axis ratio, angle (rad) and inner fraction of light.
+
+    The radius is the half-light semi-major axis. The angle is that of the major axis, from increasing column to
+    increasing row. The inner fraction is the light within half of the half-light radius. Raises BadInput, which quotes
+    the index `number` of the stamp, if its pixels are not valid.
+    """
     if not (np.abs(stamp) < _LARGEST).all():
         raise BadInput(f"stamp {number} contains values that are not numbers below {_LARGEST:g}")
     total = float(stamp.sum())
@@ -128,12 +154,16 @@ def _measure_stamp(number: int, stamp: Float) -> tuple[float, float, float, floa
 
 
 def _places(light: Float) -> Float:
-    """Rows and columns of pixels [2, ny, nx] from the middle."""
+    """Return the row and the column of each pixel relative to the middle of an image, shape (2, ny, nx)."""
     return np.asarray(np.mgrid[: light.shape[0], : light.shape[1]] - 0.5 * (np.array(light.shape)[:, None, None] - 1))
 
 
 def _rebin(light: Float) -> Float:
-    """Bin the pixels of a large stamp about the same middle."""
+    """Add up square blocks of pixels of a large stamp, so that its shorter side has 128 to 191 blocks.
+
+    Pixels that do not fill a block are cut off at opposite edges, so that the middle of the stamp stays. Stamps with a
+    shorter side below 256 pixels are returned unchanged.
+    """
     factor = max(min(light.shape) // _MAX_REBINNED_SIDE, 1)
     cut = [(side % factor) // 2 for side in light.shape]
     rows, columns = (side // factor for side in light.shape)
@@ -142,7 +172,11 @@ def _rebin(light: Float) -> Float:
 
 
 def _ellipse(light: Float) -> tuple[float, float]:
-    """Axis ratio and angle of the major axis, with a Gaussian weight of the same shape.
+    """Return the axis ratio and the angle of the major axis (rad) of the galaxy on a stamp.
+
+    The angle is measured from the direction of increasing column to that of increasing row. Both come from second
+    moments with a Gaussian weight that has the shape of the galaxy. If this weight contains no light, the galaxy counts
+    as round (1.0, 0.0).
 
     References
     ----------
@@ -158,7 +192,7 @@ def _ellipse(light: Float) -> tuple[float, float]:
         if not total > 0.0:
             return 1.0, 0.0
         xx, xy, yy = (2.0 * float((weight * part).sum() / total) for part in (x * x, x * y, y * y))
-        # A Gaussian narrower than a pixel would have no weight.
+        # Keep the Gaussian weight wider than a pixel. Otherwise it could miss all pixels.
         xx, yy = max(xx, 0.5), max(yy, 0.5)
         xy = float(np.clip(xy, -0.99 * np.sqrt(xx * yy), 0.99 * np.sqrt(xx * yy)))
         if max(abs(now - then) for now, then in zip((xx, xy, yy), previous, strict=True)) < _TOLERANCE * (xx + yy):
@@ -170,16 +204,16 @@ def _ellipse(light: Float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class GalaxyStamps:
-    """Stamps that are drawn instead of profiles.
+    """Library of stamps (galaxy images) with the options of a request for their use.
 
     Attributes
     ----------
     library : Library
-        The stamps.
+        The stamps with their measured shapes.
     options : Stamps
-        Options of the request.
+        Options of the request: the file, and which galaxies without a stamp number get a stamp.
     seed : int
-        Seed of the request.
+        Seed of the request, used to draw stamps for these galaxies.
     """
 
     library: Library
@@ -188,26 +222,26 @@ class GalaxyStamps:
 
 
 def from_file(options: Stamps, seed: int, sha256: str) -> GalaxyStamps:
-    """Read the stamps from a file that must not have changed.
+    """Read a library of stamps (galaxy images), after a check that the file has not changed.
 
     Parameters
     ----------
     options : Stamps
         Options of the request, with the file.
     seed : int
-        Seed of the request.
+        Seed of the request, used to draw stamps for galaxies without a stamp number.
     sha256 : str
-        Original checksum of the file.
+        Checksum that the file had when the rendering began.
 
     Returns
     -------
     GalaxyStamps
-        The stamps.
+        The stamps with the options.
 
     Raises
     ------
     BadInput
-        If the file has changed.
+        If the file has changed. `read` raises it if the file is not valid.
     """
     if file_sha256(options.file) != sha256:
         raise BadInput(f"{options.file}: has changed since the rendering began")
@@ -215,25 +249,26 @@ def from_file(options: Stamps, seed: int, sha256: str) -> GalaxyStamps:
 
 
 def assign_pictures(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> tuple[Int, tuple[Picture, ...]]:
-    """Assign pictures of stamps to galaxies.
+    """Choose a stamp (galaxy image) for each galaxy that has one, and scale, turn and lens it.
 
     Parameters
     ----------
     galaxies : pyarrow.Table
-        Rows of the table `galaxies`.
+        n rows of the table `galaxies`.
     shape : Shapes
-        Their shapes.
+        Shapes of these galaxies.
     stamps : GalaxyStamps or None
-        The stamps; None to draw profiles only.
+        Library of stamps; None if all galaxies are drawn as profiles.
 
     Returns
     -------
-    (int array, tuple of Picture)
-        Number of the picture of each galaxy, -1 for none; and the pictures.
+    (int array, shape (n,), tuple of Picture)
+        Index of each galaxy's picture in the tuple, -1 for galaxies that are drawn as profiles; and the pictures.
 
     Notes
     -----
-    `_stamps_in_rows` raises BadInput if a galaxy has the number of a stamp that does not exist.
+    BadInput is raised if a row has the number of a stamp that does not exist. A galaxy whose picture would be wider
+    than 180 arcsec is drawn as a profile.
     """
     number = np.full(len(galaxies), -1)
     if stamps is None or not len(galaxies):
@@ -256,7 +291,10 @@ def assign_pictures(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | No
 
 
 def _stamps_in_rows(galaxies: pa.Table, library: Library) -> Int:
-    """Numbers of the stamps in the rows [n], -1 for none."""
+    """Return the number of the stamp in each row of the table `galaxies`, -1 for rows without one.
+
+    Raises BadInput if the library has no stamp of that number.
+    """
     if COLUMN not in galaxies.column_names:
         return np.full(len(galaxies), -1)
     named: Array = galaxies[COLUMN].fill_null(-1).to_numpy().astype(np.int64)
@@ -268,7 +306,10 @@ def _stamps_in_rows(galaxies: pa.Table, library: Library) -> Int:
 
 
 def _draw_stamps(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
-    """Draw one of the stamps nearest in axis ratio and concentration for each galaxy."""
+    """Return for each galaxy the number of one of the eight stamps nearest in shape, drawn at random.
+
+    Shape means axis ratio and concentration. The same galaxy identifier and seed always give the same stamp.
+    """
     fraction = shape.bulge_fraction
     disk = np.hypot(np.cos(np.radians(shape.inclination)), DISK_SCALE_HEIGHT)
     ratio = fraction * shape.bulge_axis_ratio + (1 - fraction) * np.minimum(disk, 1.0)
@@ -283,7 +324,11 @@ def _draw_stamps(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
 
 
 def _matrices(shape: Shapes, library: Library, stamp: Int) -> Float:
-    """Matrices of `Picture` [n, 2, 2] for stamps [n] on galaxies [n]."""
+    """Return the matrices that place stamps (galaxy images) on the sky, arcsec per pixel, shape (n, 2, 2).
+
+    The columns of a matrix are a step of one column and of one row of the stamp, its rows the offsets to the west and
+    north. `stamp` has the number of the stamp in `library` for each of the n galaxies in `shape`.
+    """
     half_light_radius = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
     face_on = Shapes(
         np.zeros(len(half_light_radius)),

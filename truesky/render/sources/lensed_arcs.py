@@ -1,4 +1,4 @@
-"""Sources that are pictures, and the lensed images of galaxies behind strong lenses."""
+"""Define sources that are drawn from an image instead of a profile, such as arcs of galaxies behind strong lenses."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ import pyarrow as pa
 from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.errors import BadInput
 
-# Columns of the table `strong_lenses`, and the pixel size of its pictures according to the table, arcsec.
+# Columns of the table `strong_lenses` that are needed to draw arcs.
 ARC_COLUMNS = ("id", "source_id", "ra", "dec", "stamp_side", "stamp")
+# Pixel size in arcsec of the images of arcs in the table `strong_lenses`.
 ARC_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Image that is drawn by itself or on top of a disc.
+    """Image from which a source is drawn, or which adds structure (spiral arms) to the smooth disc of a galaxy.
 
     Attributes
     ----------
     image : float32 array, shape (ny, nx)
-        Pixels of sum 1, centred on the source; of sum 0 for the structure of a disc.
+        Pixels, centred on the source. Their sum is 1 for a source, and 0 for the structure of a disc.
     matrix : float array, shape (2, 2)
-        Arcsec to the west and north (rows) for a step of one column and one row (columns).
+        Arcsec to the west and north (rows of the matrix) for a step of one column and one row (columns of the matrix).
     thick : float array, shape (2,), or None
-        For the structure of a disc, the vector of `galaxy_shapes.Forms` in arcsec, which gives it the thickness of the
-        disc.
+        Vector along the minor axis in arcsec that describes the thickness of an inclined disc, defined as in
+        `galaxy_shapes.Forms.thick`; None for the image of a source.
     """
 
     image: Float32
@@ -36,19 +37,25 @@ class Picture:
 
     @classmethod
     def from_sky_image(cls, image: Float32, scale: float) -> Picture:
-        """Picture from an image of sum 1, south to north and west to east, with `scale` arcsec per pixel."""
+        """Return a picture from an image of sum 1 whose rows run from south to north and columns from west to east.
+
+        `scale` is its pixel size in arcsec.
+        """
         return cls(image, np.array([[-scale, 0.0], [0.0, scale]]))
 
     @property
     def diagonal(self) -> float:
-        """Upper limit of the distance between opposite corners, arcsec."""
+        """Upper limit of the distance between opposite corners of the image on the sky, arcsec."""
         west, north = np.abs(self.matrix)
         rows, columns = self.image.shape
         return float(np.hypot(west[0] * columns + west[1] * rows, north[0] * columns + north[1] * rows))
 
     @property
     def half_light(self) -> float:
-        """Radius about its middle that contains half of its light, arcsec, to half a pixel."""
+        """Radius in arcsec of the circle about the middle that contains half of the image's light.
+
+        The error is half a pixel of the image. The radius is meaningful only for an image of sum 1.
+        """
         (a, b), (c, d) = self.matrix
         step = 0.5 * float(abs(a * d - b * c)) ** 0.5
         up, across = (np.arange(n) - (n - 1) / 2 for n in self.image.shape)
@@ -58,26 +65,26 @@ class Picture:
 
     @property
     def is_structure(self) -> bool:
-        """True if the picture only redistributes the light of a disc."""
+        """True if the image is the structure of a disc, which only redistributes its light; False for a source."""
         return self.thick is not None
 
 
 @dataclass(frozen=True, slots=True)
 class Arcs:
-    """Images of n lensed galaxies.
+    """Arcs around n strong lenses: the lensed images of the galaxies behind them.
 
     Attributes
     ----------
     ids : int array, shape (n,)
-        Identifiers of the lenses.
+        Identifiers of the lenses (deflectors).
     ra, dec : float array, shape (n,)
-        Positions, deg.
+        ICRS positions of the middle of the images in degrees.
     electrons : float array, shape (n,)
-        Expected electrons.
+        Expected electrons of all arcs of a lens.
     source : int array, shape (n,)
-        Row of the lensed galaxy.
+        Index of the galaxy behind the lens in the list of galaxies.
     pictures : tuple of Picture
-        The images.
+        Image of all arcs of each lens, with the sum 1.
     """
 
     ids: Int
@@ -89,26 +96,27 @@ class Arcs:
 
 
 def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
-    """Convert rows of the table `strong_lenses` to arcs.
+    """Convert rows of the table `strong_lenses` to the arcs that are drawn.
 
     Parameters
     ----------
     rows : pyarrow.Table
-        Rows of the table.
+        n rows of the table, with the columns `ARC_COLUMNS`.
     ids : int array, shape (m,)
-        Identifiers of galaxies.
+        Identifiers of the galaxies that have been read, in any order.
     electrons : float array, shape (m,)
-        Their expected electrons, without the magnification that catalogue fluxes include.
+        Expected electrons of these galaxies without lensing, whereas catalogue fluxes include the magnification.
 
     Returns
     -------
     Arcs
-        The arcs.
+        One set of arcs per row. Its electrons are the electrons of the galaxy times the sum of the image in the row,
+        which is the magnification.
 
     Raises
     ------
     BadInput
-        If the source of a lens is not among the galaxies.
+        If the galaxy behind a lens is not among `ids`, or if an image has a wrong size or no light.
     """
     source_ids, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
     at = np.searchsorted(ids, source_ids, sorter=order)
@@ -132,7 +140,11 @@ def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
 
 
 def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
-    """Return the image of the arcs of a strong lens, and the sum of its pixels."""
+    """Return the image of the arcs of a strong lens, scaled to the sum 1, and the original sum of its pixels.
+
+    `lens` is the identifier of the lens for messages. `pixels` has `side` rows of `side` pixels, one after another.
+    Raises BadInput for another number of pixels, or if the sum is not positive and finite.
+    """
     total = float(pixels.sum(dtype=float))
     if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
         actual = f"got {len(pixels)} pixels of sum {total:g}"

@@ -1,7 +1,8 @@
-"""Select the catalogue cells and rows that a detector needs.
+"""Select the HEALPix cells and the sources of a catalogue that may shine on a detector.
 
-Galaxies belong to the cells of their observed positions. Stars move: circles are enlarged by the largest distance
-between a star's position and its cell.
+A task is a row of the table `tasks`, with a circle on the sky that contains a detector and its surroundings. Galaxies
+are stored under the cells of their observed positions. Stars move away from the cell under which they are stored, so
+that circles are enlarged by their largest motion.
 """
 
 from __future__ import annotations
@@ -16,38 +17,41 @@ from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
 
-# Largest distance up to which galaxies are drawn, arcsec: the same as for spikes of stars.
+# Largest distance from a detector, in arcsec, up to which the outskirts of galaxies are drawn on it; diffraction spikes
+# of stars have the same limit.
 FARTHEST = 1200.0
-# Margin of circles, deg: more than the rounding error of the largest deflection.
+# Enlargement in degrees of circles on the sky for which HEALPix cells are searched; it exceeds rounding errors.
 _ROUNDING = 1e-9
-# Steps of the completeness beyond a detector, arcsec.
+# A catalogue may lack HEALPix cells around a detector. The distance at which the first cell is missing is searched with
+# this step, arcsec.
 _STEP = 1.0
 
 
 def cells_of_task(task: Mapping[str, Any], deflection: float) -> list[int]:
-    """Order-8 cells of all sources in a task's circle.
+    """Return the order-8 HEALPix cells under which the sources in the circle of a task may be stored.
 
-    The task is a row with `ra`, `dec` and `radius` (deg); `deflection` is the largest of the catalogue, deg.
+    The circle is `ra`, `dec` and `radius` (deg) of the task. `deflection` is the largest distance (deg) of a source
+    from the cell under which it is stored.
     """
     return _cells(task, deflection)
 
 
 def cells_within_reach(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
-    """Order-8 cells of all sources whose light may fall on the detector.
+    """Return the order-8 HEALPix cells under which sources in an enlarged circle of a task may be stored.
 
     Parameters
     ----------
     task : mapping
-        Row of the task.
+        Row of the table `tasks`, with `ra`, `dec` and `radius` (deg) of a circle around a detector.
     deflection : float
-        Largest deflection of the catalogue, deg.
+        Largest distance of a source from the cell under which it is stored, deg.
     reach : float
-        Distance up to which sources shine, arcsec.
+        Distance beyond the circle up to which sources may shine on the detector, arcsec.
 
     Returns
     -------
     list of int
-        The cells.
+        Nested indices of the cells.
     """
     return _cells(task, deflection + reach / 3600.0)
 
@@ -55,24 +59,24 @@ def cells_within_reach(task: Mapping[str, Any], deflection: float, reach: float)
 def cells_beyond_task(
     task: Mapping[str, Any], deflection: float, reach_arcsec: float, catalogue_cells: Set[int]
 ) -> tuple[list[int], float]:
-    """Order-8 cells of a catalogue outside the cells of the circle, up to the distance at which sources shine.
+    """Return the order-8 HEALPix cells of a catalogue around the circle of a task, without the cells of the circle.
 
     Parameters
     ----------
     task : mapping
-        Row of the task.
+        Row of the table `tasks`, with `ra`, `dec` and `radius` (deg) of a circle around a detector.
     deflection : float
-        Largest deflection of the catalogue, deg.
+        Largest distance of a source from the cell under which it is stored, deg.
     reach_arcsec : float
-        Distance beyond the task's circle up to which a source may reach the detector, arcsec.
+        Distance beyond the circle up to which a source may shine on the detector, arcsec.
     catalogue_cells : set of int
-        Order-8 cells of the catalogue.
+        Order-8 cells for which the catalogue was simulated.
 
     Returns
     -------
     (list of int, float)
-        The cells, and the distance beyond the circle up to which the catalogue is complete: at most `reach_arcsec`,
-        rounded down to 1 arcsec.
+        Sorted cells, and the distance beyond the circle in arcsec up to which the catalogue has all cells. It is
+        `reach_arcsec`, or a smaller multiple of 1 arcsec if the catalogue lacks cells.
     """
     inner = set(_cells(task, deflection))
     cells = set(_cells(task, deflection + reach_arcsec / 3600.0))
@@ -93,21 +97,26 @@ def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
 
 @lru_cache(maxsize=256)
 def _in_circle(ra: float, dec: float, radius: float) -> tuple[int, ...]:
-    """Cells in a circle, cached because every table needs the same few circles of a detector."""
+    """Return the order-8 HEALPix cells that overlap a circle (degrees; the radius is limited to 180).
+
+    Results are cached, because several tables are read for the same few circles of a detector.
+    """
     return tuple(sky.cells_in_cone(ra, dec, min(radius, 180.0), GENERATION_ORDER).tolist())
 
 
 def within_radius(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
-    """Find positions within a radius of a centre, for which a gnomonic projection is safe.
+    """Find positions within a radius of a centre.
+
+    It is used to leave out positions more than 90 deg away, which a gnomonic projection would mirror.
 
     Parameters
     ----------
     ra, dec : float array, shape (n,)
-        Positions, deg.
+        ICRS positions in degrees.
     centre : (float, float)
-        Right ascension and declination of the centre, deg.
-    radius : float or float array
-        Radius, deg.
+        Right ascension and declination of the centre in degrees.
+    radius : float or float array, shape (n,)
+        Radius in degrees, for all or for each position.
 
     Returns
     -------
@@ -118,21 +127,21 @@ def within_radius(ra: Float, dec: Float, centre: tuple[float, float], radius: fl
 
 
 def overlaps_frame(column: Float, row: Float, sizes: Int | Float, nx: int, ny: int) -> Bool:
-    """Find stamps that overlap a frame.
+    """Find sources whose stamps (square images in which they are drawn) overlap a detector.
 
     Parameters
     ----------
     column, row : float array, shape (n,)
-        Middles of the stamps, pixels.
+        Pixel positions of the middles of the stamps, counted from 0.
     sizes : int or float array, shape (n,)
         Sides of the stamps, pixels.
     nx, ny : int
-        Columns and rows of the frame.
+        Numbers of columns and rows of the detector.
 
     Returns
     -------
     bool array, shape (n,)
-        True for stamps that overlap the frame.
+        True for stamps that overlap the detector, or miss it by less than half a pixel.
     """
     half = sizes / 2 + 1
     across = (column + half > 0) & (column - half < nx - 1)

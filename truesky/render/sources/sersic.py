@@ -1,7 +1,8 @@
-"""Fourier transforms of Sersic profiles, in a cached table by index and k^2.
+"""Fourier transforms of round Sersic profiles, tabulated by Sersic index and squared wavenumber k^2.
 
-The transforms are for flux 1 and half-light radius 1. The nodes in k^2 are the numbers whose single-precision form ends
-with 16 zero bits: 128 per octave. The segment of a sample therefore follows from its bits.
+The transforms are for flux 1 and half-light radius 1. The tabulated values of k^2 are all numbers whose
+single-precision form ends with 16 zero bits, 128 per factor of 2. The table column of any k^2 therefore follows from
+its upper bits.
 """
 
 from __future__ import annotations
@@ -15,28 +16,40 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
-# Range of the index that galsim.Sersic, the reference, accepts.
+# Smallest and largest Sersic index, the range that galsim.Sersic accepts.
 INDEX_LO, INDEX_HI = 0.3, 6.2
-# Number of rows, uniform in ln n: 4-point interpolation has an error of 1e-7
-# (tests/truesky/render/sources/test_sersic.py).
+# Number of Sersic indices for which the Fourier transform is tabulated, uniform in the logarithm. Interpolation between
+# four of them has an error of 1e-7 (tests/truesky/render/sources/test_sersic.py).
 ROWS = 96
-# k^2 ranges from 2^-30, where 1 - S is below 1e-7 for every n, to 2^26.
+# Base-2 logarithms of the smallest and largest squared wavenumber k^2 for which the Fourier transform is tabulated. At
+# smaller k^2 it differs from 1 by less than 1e-7.
 OCTAVE_LO, OCTAVE_HI = -30, 26
-# Top bits of float32(2^OCTAVE_LO). Kernels contain this constant, and naming truesky.numerics.compiling here makes
-# this file part of the key of the machine code.
+# Upper 16 bits of 2^OCTAVE_LO as a float32. Compiled functions contain this number. Naming truesky.numerics.compiling
+# in this comment makes the cache of machine code depend on this file.
 FIRST_BITS = (127 + OCTAVE_LO) << 7
+# Number of intervals of the squared wavenumber k^2 in the table, 128 per factor of 2.
 _SEGMENTS = 128 * (OCTAVE_HI - OCTAVE_LO)
-# Grid of the Hankel transform: number of points, and ratio of the largest radius to 1 and of 1 to the smallest.
-_POINTS, _REACH = 1 << 15, 1e12
-_LOG_LO, _LOG_STEP = float(np.log(INDEX_LO)), float(np.log(INDEX_HI / INDEX_LO) / (ROWS - 1))
+# Number of radii, uniform in the logarithm, at which a Sersic profile is sampled for its Hankel transform.
+_POINTS = 1 << 15
+# Largest radius at which a Sersic profile is sampled for its Hankel transform, in half-light radii. The smallest one is
+# 1 / _REACH.
+_REACH = 1e12
+# Natural logarithm of the Sersic index in the first row of the table.
+_LOG_LO = float(np.log(INDEX_LO))
+# Step of the natural logarithm of the Sersic index from row to row.
+_LOG_STEP = float(np.log(INDEX_HI / INDEX_LO) / (ROWS - 1))
 
 
 def table() -> Float32:
-    """Transforms S(k) at the nodes, float32[ROWS, segments + 1]; the first column is 1, the flux.
+    """Return the Fourier transforms S(k) of Sersic profiles with flux 1 and half-light radius 1, from the disc cache.
+
+    The array has one row per Sersic index (`ROWS`, uniform in its logarithm) and one column per value of k^2 in
+    `nodes`. The first column is exactly 1 (the flux), although its k^2 is 2^-30, not 0.
 
     Notes
     -----
-    The error is 1e-7 at the nodes and 6e-6 between them (tests/truesky/render/sources/test_sersic.py).
+    The error is 1e-7 at the tabulated k^2 and 6e-6 after interpolation between them
+    (tests/truesky/render/sources/test_sersic.py).
 
     References
     ----------
@@ -47,7 +60,11 @@ def table() -> Float32:
 
 
 def interpolation_weights(index: Float) -> tuple[Int, Float]:
-    """First of four rows [n], and their weights [n, 4], for cubic interpolation in ln n at given indices."""
+    """Return how to interpolate the table of Fourier transforms (`table`) at Sersic indices, shape (n,).
+
+    The result is the first of four successive rows, shape (n,), and the weights of the four rows, shape (n, 4). Indices
+    outside the table are moved to its ends.
+    """
     position = (np.log(np.clip(index, INDEX_LO, INDEX_HI)) - _LOG_LO) / _LOG_STEP
     first = np.clip(np.floor(position).astype(np.int64) - 1, 0, ROWS - 4)
     t = position - first - 1.0
@@ -61,7 +78,7 @@ def interpolation_weights(index: Float) -> tuple[Int, Float]:
 
 
 def nodes() -> Float:
-    """Values of k^2 for the columns of `table`."""
+    """Return the values of k^2 for the columns of `table`, with k in radian per half-light radius."""
     bits = (np.arange(_SEGMENTS + 1, dtype=np.int32) + FIRST_BITS) << 16
     return bits.astype(np.int32).view(np.float32).astype(float)
 
@@ -74,11 +91,16 @@ def _make_table() -> Float32:
 
 
 def transform(index: float, log_k: Float) -> Float:
-    """Transform S(k) for flux 1 and half-light radius 1 at ln k."""
+    """Compute the Fourier transform S(k) of a Sersic profile with flux 1 and half-light radius 1.
+
+    `index` is the Sersic index, `log_k` an array with the natural logarithms of wavenumbers k in radian per half-light
+    radius.
+    """
     step = 2 * np.log(_REACH) / _POINTS
     offset = scipy.fft.fhtoffset(step, 0.0)
     log_r = (np.arange(_POINTS) - (_POINTS - 1) / 2) * step
-    # The incomplete gamma function of order 2n is the fraction of light inside a radius.
+    # Constant b_n of the Sersic profile: the incomplete gamma function of order 2n is the light inside a radius, which
+    # must be half at radius 1.
     b = float(gammainccinv(2 * index, 0.5))
     log_flux = np.log(2 * np.pi * index) - 2 * index * np.log(b) + gammaln(2 * index)
     light = np.exp(log_r - b * np.exp(log_r / index) - log_flux)

@@ -1,8 +1,8 @@
-"""Solar System objects: an embedded population of small bodies, each a straight trail during an exposure.
+"""Draw a random population of small Solar System bodies, each of which leaves a straight trail in an exposure.
 
-The density is highest near the ecliptic. Most bodies move along it at the pace of the main belt; a few are fast and
-move in any direction. They have the colour of the Sun. The population is drawn by day and order-5 cell, so that all
-exposures of a day contain the same bodies. At midnight UTC another population begins.
+The density is highest near the ecliptic. Most bodies move along it at the pace of the main asteroid belt; a few are
+fast and move in any direction. They have the colour of the Sun. The population is drawn separately for each day and
+each order-5 HEALPix cell, so that all exposures of a day contain the same bodies. At midnight UTC it is replaced.
 """
 
 from __future__ import annotations
@@ -29,32 +29,34 @@ from truesky.render.sources import colours
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Kind in an identifier; the member in it is the day.
+# Code of Solar System bodies in source identifiers (`lake_schema.ids.source_id`, argument `kind`).
 KIND = 6
 _DAY_S, _HOUR_S = 86400.0, 3600.0
+# First part of the names of the parameters in the mission database that describe Solar System bodies.
 _KEY = "env.solar_system"
-# Band of the magnitudes.
+# Band in which Solar System bodies have their magnitudes (I_E).
 _BAND = "euclid_vis"
-# Smallest cosine of the latitude for motion along a circle of latitude.
+# Smallest cosine of the ecliptic latitude with which motion is converted to a change of longitude; it avoids a division
+# by 0 at the poles.
 _LEAST_COSINE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """n bodies on one day.
+    """n Solar System bodies on one day.
 
     Attributes
     ----------
     ids : int array, shape (n,)
-        Identifiers.
+        Source identifiers.
     lon, lat : float array, shape (n,)
-        Ecliptic positions, deg.
+        Ecliptic longitude and latitude at the time `hour`, deg.
     east, north : float array, shape (n,)
-        Motion in these directions, arcsec / h.
+        Motion along ecliptic longitude (times the cosine of the latitude) and latitude, arcsec / h.
     mag : float array, shape (n,)
-        I_E, AB.
+        AB magnitude in the Euclid band I_E.
     hour : float or float array, shape (n,)
-        Time of the positions, hours after noon UTC.
+        Time of the positions in hours after noon UTC of the day, for all or for each body.
     """
 
     ids: Int
@@ -66,7 +68,7 @@ class Population:
     hour: float | Float = 0.0
 
     def positions_after(self, hours: float | Float) -> tuple[Float, Float]:
-        """Right ascensions and declinations [n], deg, at a number of hours after noon."""
+        """Return the right ascensions and declinations of the bodies in degrees, `hours` hours after noon UTC."""
         across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
         elapsed = (hours - self.hour) / 3600.0
         return equatorial(
@@ -74,14 +76,14 @@ class Population:
         )
 
     def take(self, selected: Bool | Int) -> Population:
-        """Return the selected bodies."""
+        """Return the bodies that a mask selects, or the bodies with given indices in the order of the indices."""
         return Population(
             *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[selected] for field in fields(Population))
         )
 
 
 def empty_population(day: int) -> Population:
-    """Population without bodies."""
+    """Return a population without bodies, so that none are drawn on any day; `day` (MJD) is not used."""
     empty = np.zeros(0)
     return Population(np.zeros(0, np.int64), empty, empty, empty, empty, empty)
 
@@ -89,30 +91,31 @@ def empty_population(day: int) -> Population:
 def population(
     ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
 ) -> Population:
-    """Bodies that are within a radius of a position at some time of a day.
+    """Draw all bodies that may come within a radius of a position on a day.
 
     Parameters
     ----------
     ra, dec : float
-        Position, deg.
+        ICRS position in degrees.
     radius : float
-        Radius, deg.
+        Radius in degrees.
     day : int
-        MJD.
+        MJD of the day.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with density, magnitudes and motions of the bodies.
     seed : int
-        Seed of the request.
+        Seed of the request. The same seed, day and position on the sky always give the same bodies.
     hours : float
-        Largest time before or after noon, h.
+        Largest time before or after noon UTC for which bodies are needed, h.
 
     Returns
     -------
     Population
-        The bodies.
+        All these bodies, and others that stay farther away, with positions at noon UTC. Empty if the mission database
+        has no faintest magnitude of bodies, or if its density of bodies is 0.
     """
     fastest = max(mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_max", "fast_rate_max"))
-    # Bodies may have moved by this distance from their positions at noon.
+    # Enlarge the radius by the largest distance that bodies move within `hours` of their positions at noon.
     reach = min(radius + hours * fastest / 3600.0, 180.0)
     # A mission database without a faintest magnitude has no Solar System objects.
     has_bodies = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
@@ -125,7 +128,7 @@ def population(
 
 
 def density(latitude: npt.ArrayLike, mission: MissionConfiguration) -> Float:
-    """Density of bodies down to the faintest magnitude at an ecliptic latitude in deg, deg-2."""
+    """Return the number of bodies per square degree, down to the faintest magnitude, at ecliptic latitudes in deg."""
     value = {name: mission.value(f"{_KEY}.latitude_{name}", "deg") for name in ("zero", "scale", "cap")}
     fainter = mission.value(f"{_KEY}.faintest", "mag") - mission.value(f"{_KEY}.reference_magnitude", "mag")
     total = mission.value(f"{_KEY}.density", "deg-2") * 10.0 ** (_slope(mission) * fainter)
@@ -138,7 +141,11 @@ def _slope(mission: MissionConfiguration) -> float:
 
 
 def _draw_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> tuple[Any, ...]:
-    """Draw the columns of `Population`, without hours, for an order-5 cell."""
+    """Draw the Solar System bodies of a day (MJD) in an order-5 HEALPix cell.
+
+    The result has one array per attribute of `Population`, in the same order and without `hour`. Positions are those at
+    noon UTC.
+    """
     generator = rng.stream(seed, "solar_system", day, cell)
     centre = ecliptic(*sky.cell_centre(FILE_ORDER, cell))[1]
     max_density = float(density(max(abs(float(centre)) - sky.cell_radius(FILE_ORDER), 0.0), mission))
@@ -152,10 +159,11 @@ def _draw_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) ->
         mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_min", "rate_max", "fast_rate_max")
     )
     is_fast = fast < mission.value(f"{_KEY}.fast_fraction", "")
-    # The rates of fast bodies are uniform in the logarithm.
+    # Speed of each body in arcsec / h from a random number `pace`: uniformly distributed in the logarithm for fast
+    # bodies, uniformly in the speed for the others.
     rate = np.where(is_fast, usual * (fastest / usual) ** pace, slow + (usual - slow) * pace)
     turn = np.where(is_fast, 2.0 * np.pi * angle, 0.0)
-    # 1 - u lies in (0, 1].
+    # `brightness` is a random number in [0, 1), so that the logarithm of 1 - `brightness` is finite.
     mag = mission.value(f"{_KEY}.faintest", "mag") + np.log10(1.0 - brightness) / _slope(mission)
     sub_cells = 4 ** (GENERATION_ORDER - FILE_ORDER)
     ids = source_id(KIND, cell * sub_cells, np.arange(len(accepted)), day)
@@ -170,27 +178,27 @@ def trailed_sources(
     shapes: Shapes,
     day_population: Callable[[int], Population] | None = None,
 ) -> Sources:
-    """Bodies whose trails come close to a detector during an exposure, as sources in ascending order of identifiers.
+    """Return the Solar System bodies whose trails come close to a detector during an exposure.
 
     Parameters
     ----------
     aim : Aim
         Exposure and detector.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the parameters of the random population and the spectrum of the Sun.
     seed : int
-        Seed of the request.
+        Seed of the request, used to draw the random population.
     reach : float
-        Largest distance from the detector's centre, deg.
+        Largest distance of a trail from the centre of the detector, deg.
     shapes : Shapes
-        Shapes of the other sources in the same list.
+        Shapes of the galaxies to which the bodies will be appended; the bodies themselves are point sources.
     day_population : callable, optional
-        (MJD) -> bodies of a day, to replace the embedded population.
+        Function (MJD of a day) -> bodies of this day, which replace the random population.
 
     Returns
     -------
     Sources
-        The bodies.
+        The bodies in ascending order of identifiers, each with its trail in pixels.
 
     Notes
     -----
@@ -200,7 +208,7 @@ def trailed_sources(
     exposure, system, band = aim.exposure, aim.wcs, aim.band
     start, seconds = exposure.mjd, exposure.exposure_time_s
     centre = astrometry.centre(aim.detector, system)
-    # An exposure belongs to the day on which it begins.
+    # Use the bodies of the UTC day on which the exposure begins, even if it ends after midnight.
     day = int(np.floor(start))
     start_hours = 24.0 * (start - day - 0.5)
     end_hours = max(12.0, start_hours + seconds / _HOUR_S)
@@ -234,7 +242,11 @@ def trailed_sources(
 def _bodies_in_reach(
     begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
 ) -> tuple[Int, Float, Float]:
-    """Indices of bodies that come within `reach` deg of a centre, and the fractions between which trails are kept."""
+    """Find bodies that come within `reach` deg of `centre` between their positions `begin` and `end` (ra, dec in deg).
+
+    Return their indices, and two fractions of the exposure between which each trail is kept: 0 and 1, or a part of
+    length 2 `reach` about the point closest to the centre.
+    """
     there, start, stop = (pointing.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
     way = stop - start
     length = np.sqrt(np.sum(way**2, axis=0))
@@ -249,21 +261,21 @@ def _bodies_in_reach(
 
 
 def flux(mag: Float, band: Passband, mission: MissionConfiguration) -> Float:
-    """Flux f_nu of bodies in a band.
+    """Return the flux f_nu of Solar System bodies in a band, for the colour of the Sun.
 
     Parameters
     ----------
     mag : float array, shape (n,)
-        Magnitudes in I_E, AB.
+        AB magnitudes in the Euclid band I_E.
     band : Passband
-        The passband.
+        Response of the band as a function of wavelength.
     mission : MissionConfiguration
-        Mission database.
+        Mission database, with the spectrum of the Sun.
 
     Returns
     -------
     float array, shape (n,)
-        Flux, microjansky.
+        Flux in microjansky.
     """
     band_flux, reference_flux = (_sun_flux(b, mission) for b in (band, passbands.load(_BAND)))
     return np.asarray(10.0 ** (0.4 * (units.AB_UJY - mag)) * band_flux / reference_flux)

@@ -1,4 +1,4 @@
-"""List of sources to be drawn, column by column."""
+"""Define the list of sources (galaxies, stars, moving bodies) to be drawn on a detector, as arrays."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ from truesky.render.sources.lensed_arcs import Picture
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """n sources in the order in which they are drawn (ascending identifiers).
+    """n sources of light on a detector, in the order in which they are drawn (ascending identifiers).
 
     Attributes
     ----------
     ids : int array, shape (n,)
-        Identifiers.
+        Source identifiers.
     column, row : float array, shape (n,)
-        Positions, 0-based pixels.
+        Pixel positions on the detector, counted from 0; they may lie outside it.
     jacobian : float array, shape (n, 2, 2)
-        d(u, v) / d(column, row), arcsec.
+        Arcsec to the west and north (rows) for a step of one column and one row (columns), at each source.
     electrons : float array, shape (n,)
-        Expected electrons.
+        Expected electrons during the exposure.
     shape : int array, shape (n,)
-        Row of `shapes`, -1 for a point source or a picture without a profile.
+        Index of the galaxy in `shapes`; -1 for a point source, or for a source that is drawn from a picture alone.
     shapes : Shapes
-        Shapes of galaxies.
+        Shapes (Sersic bulge and exponential disc) of galaxies.
     photons : float array, shape (n, w), or None
-        Fraction of the photons in each sub-band of the PSF; None for flat f_nu.
+        Fraction of the detected photons in each of the w sub-bands of the passband, in which the PSF differs; None if
+        all sources have flat f_nu.
     picture : int array, shape (n,), or None
-        Number of the picture, -1 for none; None if no source has a picture. For a source with a shape, the picture is
-        the structure of its disc, which is drawn on top of the profile.
+        Index of the source's image in `pictures`, -1 for none; None if no source has an image. If the source also has a
+        shape, the image is the structure of its disc, which is added to the smooth profile.
     pictures : tuple of Picture
-        The pictures.
+        Images of sources.
     trail : float array, shape (n, 2), or None
-        Displacement of a point source during the exposure, centred on its position, pixels; None if no source moves.
+        Motion (columns, rows) of a point source during the exposure in pixels, with its position in the middle; None if
+        no source moves.
     """
 
     ids: Int
@@ -57,7 +59,7 @@ class Sources:
         return len(self.ids)
 
     def take(self, chosen: Bool | Int) -> Sources:
-        """Return the selected sources."""
+        """Return the sources that a mask selects, or the sources with given indices in the order of the indices."""
         return Sources(
             self.ids[chosen],
             self.column[chosen],
@@ -73,11 +75,14 @@ class Sources:
         )
 
     def picture_of(self, i: int) -> Picture | None:
-        """Picture of source `i`, or None."""
+        """Return the image of source number `i` (from 0), or None if it has none."""
         return None if self.picture is None or self.picture[i] < 0 else self.pictures[self.picture[i]]
 
     def with_moving(self, moving: Sources) -> Sources:
-        """Append moving point sources, with later identifiers and the same shapes, to these sources at rest."""
+        """Return these sources, which are at rest, followed by moving point sources.
+
+        The identifiers of `moving` must be larger and its `shapes` the same; this is not checked.
+        """
         names = ("ids", "column", "row", "jacobian", "electrons", "shape")
         columns: dict[str, Any] = {n: np.concatenate([getattr(self, n), getattr(moving, n)]) for n in names}
         photons = None if self.photons is None else np.concatenate([self.photons, moving.photons])
@@ -89,10 +94,10 @@ class Sources:
 
     @property
     def has_structure(self) -> Bool:
-        """Mask [n] of the galaxies whose disc has a structure."""
+        """True for galaxies that have an image of the structure of their disc (spiral arms and knots), shape (n,)."""
         return np.zeros(len(self), bool) if self.picture is None else (self.shape >= 0) & (self.picture >= 0)
 
     @property
     def trail_length(self) -> Float:
-        """Lengths of the trails [n], pixels."""
+        """Length of each source's trail during the exposure in pixels, shape (n,); 0 for sources at rest."""
         return np.zeros(len(self)) if self.trail is None else np.hypot(*self.trail.T)

@@ -1,4 +1,4 @@
-"""Spectra of the sources of a detector over a passband, for dispersion by a grism."""
+"""Compute the spectra of galaxies, stars and Solar System bodies over a passband, for images through a grism."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from truesky.fluxes.sources import GALAXY_KINDS, galaxies_from_table, stars_from
 from truesky.numerics import matrices
 from truesky.render.sources import colours
 
+# Function (indices of k sources) -> their spectra over the passband, shape (k, wavelengths).
 Spectra = Callable[[Int], Float32]
 
 
@@ -28,25 +29,28 @@ def spectrum_function(
     Parameters
     ----------
     spectrum_rows : int array, shape (n,)
-        Row of each source's spectrum, counted from the galaxies on to the stars; -1 for the spectrum of the Sun.
+        Row that has the spectrum of each of the n sources, in the list of all galaxies followed by all stars; -1 for
+        the spectrum of the Sun (Solar System bodies).
     galaxies, stars : pyarrow.Table
-        Rows of the catalogues.
+        Rows of the tables `galaxies` and `stars`.
     band : Passband
-        The passband.
+        Response of the band at w wavelengths.
     sun : float array, shape (w,)
-        f_lambda of the Sun on any scale.
+        f_lambda of the Sun at these wavelengths, on any scale.
     libraries : (Library or None, Library or None)
-        Libraries to which the templates of galaxies and stars refer; None for the embedded ones.
+        Libraries of spectral templates to which the rows of galaxies and stars refer; None means the library of
+        truesky.
 
     Returns
     -------
     callable
-        (numbers of k sources) -> float32[k, w] f_lambda over the band, scaled to one detected photon.
+        Function (indices of k sources, int array) -> f_lambda over the band, float32 array of shape (k, w). Each
+        spectrum is scaled so that the band detects one photon; a spectrum without light in the band is 0.
 
     Notes
     -----
-    Because of the scaling, sources have the brightness of the table of fluxes. Sources without a spectrum in the tables
-    have flat f_nu.
+    The brightness of sources comes from the tables of fluxes, hence the scaling. If a table lacks the columns of
+    spectra, its sources have flat f_nu.
     """
     count, weights = len(band.wavelength), band.response * band.wavelength
     of_galaxy, of_star = _galaxies(galaxies, band, libraries[0]), _stars(stars, band, libraries[1])
