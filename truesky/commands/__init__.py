@@ -1,1 +1,1 @@
-"""The command `truesky`. Each subcommand runs a module that python -m or spark-submit can also run."""
+"""The command `truesky` with its subcommands. Each subcommand runs a module that `python -m` or Spark can also run."""

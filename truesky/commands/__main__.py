@@ -30,7 +30,7 @@ from typing import NoReturn
 from lake_schema import __version__, command
 from truesky.commands import submit
 
-# Modules of the jobs of each command, in the order in which they run.
+# Modules that define the jobs (programs that make tables, with Spark) of each command, in the order in which they run.
 JOBS = {
     "build": ("truesky.catalogue.build_galaxies", "truesky.catalogue.build_stars"),
     "fluxes": ("truesky.fluxes.compute_fluxes",),
@@ -39,7 +39,8 @@ JOBS = {
     "plan": ("truesky.commands.plan",),
     "render": ("truesky.render.render_exposures",),
 }
-# Module whose `main` runs each command, and True if `main` requires the command's name as first argument.
+# Commands that are not jobs: the module whose `main` runs the command, and True if `main` requires the name of the
+# command as first argument.
 MODULES = {
     "check": ("truesky.commands.check", False),
     "sql": ("truesky.explore.__main__", False),
@@ -57,21 +58,24 @@ MODULES = {
     "page": ("truesky.page.__main__", False),
     "examples": ("truesky.commands.examples", False),
 }
-# Optional dependencies (extras of the package) that a command requires.
+# Extra of the package (name of a group of optional dependencies) that must be installed for a command.
 EXTRAS = {"masters": "reduction", "page": "page", "push": "s3", "reduce": "reduction", "stack": "reduction"}
 EXTRAS |= {"validate": "reduction"}
-# With one of these options a job does not use Spark.
+# Options with which a job does not need Spark, so that it runs in this process.
 _OPTIONS_WITHOUT_SPARK = {"-h", "--help", "--dry-run"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status, or 2 if there is no such command."""
+    """Run the subcommand in the arguments (by default sys.argv), and return its exit status.
+
+    It is 2 if there is no such subcommand. Without arguments, the help text is printed.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     is_local = arguments[:1] == ["--local"]
     command_name, *rest = arguments[is_local:] or ["--help"]
     if command_name in ("-h", "--help", "--version"):
         text = f"truesky {__version__}" if command_name == "--version" else f"{__doc__}\ntruesky {__version__}"
-        # The reader of a pipe may close it after the first lines, which command.run handles.
+        # Print inside `command.run`, which handles the error if the reader of a pipe closes it after the first lines.
         return command.run("truesky", lambda: print(text) or 0)
     if command_name in MODULES:
         return _module_command(command_name, rest)
@@ -92,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _module_command(command_name: str, arguments: Sequence[str]) -> int:
-    """Run the command of a module and return its exit status, or 2 if an optional package is missing."""
+    """Run one of the commands in `MODULES` and return its exit status, or 2 if an optional package is missing."""
     module, takes_command_name = MODULES[command_name]
     try:
         status: int = import_module(module).main([command_name, *arguments] if takes_command_name else arguments)
@@ -121,7 +125,10 @@ def _run_jobs(command_name: str, job_arguments: Sequence[str], spark_options: Se
 def _run_in_order(
     start: Callable[[str, Sequence[str]], int], modules: Sequence[str], job_arguments: Sequence[str]
 ) -> int:
-    """Run the jobs in order and return the exit status of the first that fails, else 0."""
+    """Run jobs in order, all with the same arguments, until one fails; return its exit status, or 0 if none fails.
+
+    `start` runs the job of a module with command-line arguments and returns its exit status.
+    """
     # Accept the request as first argument without --request, as `truesky run` and `truesky check` do.
     job_arguments = (
         ["--request", *job_arguments] if job_arguments and not job_arguments[0].startswith("-") else job_arguments
@@ -130,7 +137,7 @@ def _run_in_order(
 
 
 def entry() -> NoReturn:
-    """Entry point of the installed command `truesky`."""
+    """Run the installed command `truesky` with the arguments in sys.argv, and end the process with its exit status."""
     command.exit_with_status(main)
 
 

@@ -1,6 +1,6 @@
-"""Check a request as completely as the jobs do: truesky check REQUEST [--plan].
+"""Check a request (a user's TOML file) as completely as the jobs that run it: truesky check REQUEST [--plan].
 
-With --plan only the checks of planning are made.
+With --plan only the checks of the plan of exposures are made, not those of the catalogues.
 """
 
 from __future__ import annotations
@@ -17,7 +17,11 @@ from truesky.request.schema import Request
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Check a request; return 0 and print a summary if it is valid, else return 2 and print the wrong key."""
+    """Check the request that the arguments (by default sys.argv) name, and return the exit status.
+
+    The status is 0 if the request is valid, which prints a summary. It is 2 for a wrong request, which prints the key
+    and the problem, and for wrong arguments.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     plan_only = arguments[1:] == ["--plan"]
     if len(arguments) != 1 + plan_only or arguments[0].startswith("--"):
@@ -41,21 +45,22 @@ def _check(path: Path, plan_only: bool) -> int:
 
 
 def check_request(request: Request, plan_only: bool = False) -> None:
-    """Raise BadInput if any job would refuse the request.
+    """Check that no job (for catalogues, fluxes, the plan of exposures or images) would refuse a request.
 
     Parameters
     ----------
     request : Request
-        The parsed request.
+        The parsed request, whose single keys are valid.
     plan_only : bool, optional
-        Check the plan only, not the catalogues.
+        Check only the plan of exposures, not the catalogues. Without pointings and observations, the catalogues are
+        always checked.
 
     Raises
     ------
     BadInput
         If a job would refuse the request. The message names the key.
     """
-    # These modules take seconds to import, so import them only after the keys of the request are found valid.
+    # Import here, because these modules take seconds to import and a request with a wrong key does not need them.
     from truesky.commands import plan
     from truesky.render.plan_exposures import Planner
 

@@ -1,4 +1,4 @@
-"""Simulate a small field on one machine: `truesky run` of the demo request, with lake and pictures in one folder.
+"""Simulate a small field on one machine: run all jobs of the example request `demo`, with all results in one folder.
 
 Usage: python -m truesky.commands.demo [--request requests/demo.toml] [--out out/demo]
 """
@@ -15,7 +15,11 @@ from truesky.request.from_toml import parse
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the demo and return the exit status: 0, or that of the first job that fails, or 130/143 after a signal."""
+    """Run the demo with the given arguments (by default sys.argv), and return the exit status.
+
+    It is 0, that of the first job that fails, or 2 for a wrong request. After Ctrl-C or SIGTERM the process ends with
+    status 130 or 143.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.commands.demo",
         description="Simulate a small field: run five jobs, print a table and draw pictures.",

@@ -10,25 +10,29 @@ from pathlib import Path
 from lake_schema import __version__, command, user_files
 from lake_schema.errors import BadInput
 
-# Folders with examples, and the suffix of the files to copy.
+# Names of the folders with examples, and the suffix of the files in each that are copied.
 SUFFIXES = {"requests": ".toml", "notebooks": ".ipynb"}
-# Notebooks that compare truesky with other programs. They require a clone of the repository.
+# Notebooks that are not copied. They compare truesky with other programs, and require a clone of the repository.
 _CLONE_ONLY = ("02_speed_for_accuracy.ipynb",)
 
 
 def example_files() -> list[Path]:
-    """Return the example files that can be copied."""
+    """Return the paths of all example requests (.toml) and notebooks (.ipynb) that can be copied."""
     paths = [path for name, suffix in SUFFIXES.items() for path in sorted(_folder(name).glob(f"*{suffix}"))]
     return [path for path in paths if path.name not in _CLONE_ONLY]
 
 
 def request_file(name: str) -> Path:
-    """Return the path of an example request by its name, such as "demo"."""
+    """Return the path of an example request by its name, such as "demo"; it is not checked that the file exists."""
     return _folder("requests") / f"{name}.toml"
 
 
 def _folder(name: str) -> Path:
-    """Folder of requests or notebooks: in the package if installed from a wheel, else at the top of the clone."""
+    """Return the folder `name` ("requests" or "notebooks") with examples.
+
+    It is inside the installed package, or next to it in a clone of the repository. Raises StopIteration if neither
+    exists.
+    """
     package = Path(__file__).resolve().parents[1]
     return next(folder for folder in (package / name, package.parent / name) if folder.is_dir())
 
@@ -39,7 +43,7 @@ def copy_examples(folder: Path) -> list[Path]:
     Parameters
     ----------
     folder : Path
-        Target folder. It is created if it does not exist.
+        Target folder. It is created if it does not exist, with the folders "requests" and "notebooks" in it.
 
     Returns
     -------
@@ -49,7 +53,7 @@ def copy_examples(folder: Path) -> list[Path]:
     Raises
     ------
     BadInput
-        If one of the files exists already. Nothing is copied then.
+        If one of the files exists already in the target folder. Nothing is copied then.
     """
     source_by_target = {
         user_files.check_folder(folder) / path.parent.name / path.name: path for path in example_files()
@@ -63,7 +67,10 @@ def copy_examples(folder: Path) -> list[Path]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command and return its exit status: 0, or 2 if a file exists already."""
+    """Copy the examples, print the paths of the copies, and return the exit status: 0, or 2 if a file already exists.
+
+    `argv` has the target folder and options. Wrong options end the process with status 2.
+    """
     parser = argparse.ArgumentParser(prog="truesky examples", description=__doc__, epilog=f"truesky {__version__}")
     parser.add_argument("folder", type=Path, help="target folder (created if it does not exist)")
     options = parser.parse_args(argv)

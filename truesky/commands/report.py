@@ -1,8 +1,8 @@
-"""Report time, memory and size of all runs of a lake, compared with the forecast.
+"""Report time, memory and size of all runs of a lake (the folder of a simulation), compared with the forecast.
 
 Usage: truesky report LAKE [--json], or python -m truesky.commands.report LAKE [--json].
 
-The table has one line per job and a last line with the totals.
+The report is a table with one line per job (such as "build_stars") and a last line with the totals.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _DESCRIPTION = (
 
 @dataclass(slots=True)
 class JobTotals:
-    """Totals of all runs of one job in a lake.
+    """Totals of all runs of one job in a lake. A job makes tables; each of its tasks makes one file of a table.
 
     Attributes
     ----------
     job : str
         Name of the job, or "all" for the sum of all jobs.
     runs : int
-        Number of runs. A run that makes several tables counts once.
+        Number of runs. A run of a job that makes several tables counts once.
     failed_runs : int
         Number of runs that ended with an error.
     stopped : int
@@ -47,11 +47,12 @@ class JobTotals:
     parts : int
         Number of tasks that succeeded.
     failed : int
-        Number of failed attempts of tasks.
+        Number of tasks that failed, added over all runs. Failed attempts that Spark repeated within a run are not
+        included.
     rows : int
         Number of rows written.
     seconds : float
-        Wall time of the runs, in seconds.
+        Wall time of the runs, in seconds. If the log of a run has no end, only the time of preparation is included.
     cpu_s : float
         CPU time of the tasks and of the preparation of the runs, in seconds.
     forecast_s : float
@@ -100,7 +101,8 @@ def job_totals(root: Folder) -> list[JobTotals]:
         If a line of a log is invalid. The message names the line.
     """
     totals_by_job: dict[str, JobTotals] = {}
-    # A job writes one log per table. If the log names a table that the process has already made, a new run begins.
+    # Tables of the current run, by job and process number. A job writes one log per table. If a process writes another
+    # log for the same table, a new run has begun.
     tables_by_process: dict[tuple[str, str], set[str]] = {}
     for path in run_log.logs_of_lake(root):
         if lines := run_log.lines(path):
@@ -125,9 +127,14 @@ def job_totals(root: Folder) -> list[JobTotals]:
 
 
 def _forecast(root: Folder, factor: float) -> dict[str, tuple[float, float]]:
-    """Forecast by job the CPU time (s) and size (GB) to make the present content of the lake once."""
+    """Return the forecast CPU time (s) and size (GB) of making the present content of the lake once, by job.
+
+    `factor` is the CPU time of this machine relative to the machine on which the costs were measured. The images are
+    left out if their plans are missing or unreadable.
+    """
     jobs = {line.job: (line.seconds, line.gb) for line in catalogue_forecast.for_lake(root, factor)}
-    # Two requests share an image if all facts that determine its bytes are equal. Count such an image once.
+    # Count an image that several requests share only once. Two requests share an image if all facts (JSON values) that
+    # determine its bytes are equal.
     tasks_by_facts: dict[bytes, dict[str, Any]] = {}
     try:
         requests: list[str | None] = [*request_links.request_names(root)]
@@ -177,7 +184,7 @@ def _sum_jobs(lines: Sequence[JobTotals]) -> JobTotals:
 
 
 def text(totals: Sequence[JobTotals]) -> Iterator[str]:
-    """Yield the lines of the report as a table."""
+    """Yield the lines of the report as text: a header, then one line of fixed width per entry; "-" for NaN."""
     yield (
         f"{'job':20} {'runs':>5} {'failed':>7} {'stopped':>8} {'parts':>8} {'failed':>7} {'rows':>13} {'seconds':>10} "
         f"{'CPU s':>10} {'forecast':>10} {'GB':>9} {'forecast':>9} {'peak GB':>8}"
@@ -195,7 +202,11 @@ def _format_number(value: float, width: int, digits: int) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0, 1 if a log is damaged, or 2 if there is no log."""
+    """Print the report of the lake in the arguments (by default sys.argv), and return the exit status.
+
+    It is 0, 1 if a log is damaged, or 2 if there is no log or no such lake. Wrong options end the process with
+    status 2.
+    """
     parser = argparse.ArgumentParser(prog="truesky report", description=_DESCRIPTION, epilog=f"truesky {__version__}")
     parser.add_argument("lake", help="folder of the lake")
     parser.add_argument("--json", action="store_true", help="print one JSON object per line, null for unknown values")

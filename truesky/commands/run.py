@@ -1,4 +1,4 @@
-"""Run all jobs of a request in order, then print a table and draw pictures.
+"""Run all jobs of a request (a user's TOML file) in order, then print a table and draw pictures.
 
 Usage: truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
 """
@@ -26,27 +26,27 @@ from truesky.request import universe
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
 
-# Each picture takes about 3 s to draw.
+# Largest number of pictures of detectors. Each takes about 3 s to draw.
 _MAX_PICTURES = 12
 _COMPILATION_NOTE = (
     "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
 )
-# Function that runs a job: (name of its module, its arguments) -> exit status.
+# Type of a function that runs a job: (name of the job's module, command-line arguments) -> exit status.
 Start = Callable[[str, Sequence[str]], int]
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One job of a run.
+    """One job of a run, such as the making of the star catalogue.
 
     Attributes
     ----------
     module : str
-        Name of the module that has the job as `JOB`.
+        Name of the module that defines the job as `JOB`.
     tables : tuple of str
-        Tables that the summary at the end of the run lists.
+        Names of the tables of this job that are listed at the end of the run.
     changes : tuple of (str, tuple of str or int)
-        Fields of the request that have another value for this job, with that value.
+        Pairs (field of the request, value) for fields that have another value in this job than in the user's file.
     """
 
     module: str
@@ -55,17 +55,17 @@ class Stage:
 
     @property
     def name(self) -> str:
-        """Name of the job."""
+        """Return the name of the job, the last part of the name of its module."""
         return self.module.rpartition(".")[2]
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Return the changes as options of the job's command line."""
+        """Return the changed fields of the request as options of the job's command line, such as "--limit", "3"."""
         words = ((f"--{name}", *(value if isinstance(value, tuple) else (str(value),))) for name, value in self.changes)
         return tuple(chain.from_iterable(words))
 
     def request(self, request: Request) -> Request:
-        """Return the request with the changes."""
+        """Return a copy of the request in which this job's `changes` replace the values of the request."""
         return replace(request, **dict(self.changes))  # type: ignore[arg-type]
 
 
@@ -88,11 +88,12 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
     Parameters
     ----------
     request : Request
-        The request. Without pointings and observations there is no plan and nothing is rendered.
+        The request. Without pointings and observations, the jobs that plan and render exposures are left out.
     lenses : bool, optional
-        Also make the table of strong lenses.
+        Add the job that makes the table of strong lenses.
     with_gaia : bool, optional
-        Also make the table of stars as Gaia would list them. Fluxes are then computed in the bands of Gaia, too.
+        Add the job that makes a table of the stars as Gaia would list them. Fluxes are then also computed in the bands
+        of Gaia.
 
     Returns
     -------
@@ -121,15 +122,15 @@ def main(argv: Sequence[str], start: Start) -> int:
     Parameters
     ----------
     argv : sequence of str
-        Arguments of the command.
+        Arguments of the command, without its name.
     start : callable
-        Function that runs a job: (name of its module, its arguments) -> exit status.
+        Function that runs a job: (name of the job's module, command-line arguments) -> exit status.
 
     Returns
     -------
     int
-        0; the exit status of the first job that fails; 2 if the options or the request are invalid, or if the disc
-        has too little free space.
+        0, the exit status of the first job that fails, or 2 if the request is invalid or the disc has too little free
+        space. Wrong options end the process with status 2.
     """
     parser = argparse.ArgumentParser(
         prog="truesky run",
@@ -160,27 +161,27 @@ def main(argv: Sequence[str], start: Start) -> int:
 def run(
     root: Path, file: Path, job_stages: Sequence[Stage], request: Request, start: Start, pictures_folder: Path
 ) -> int:
-    """Check a request and the free space, run its jobs, then print a table and draw pictures.
+    """Check a request and the free space, run its jobs, then print a table and draw pictures of some images.
 
     Parameters
     ----------
     root : Path
-        Folder of the lake.
+        Folder of the lake, in which the tables are made.
     file : Path
         File of the request.
     job_stages : sequence of Stage
-        Jobs of the request in order, see `stages`.
+        Jobs of the request in order, from `stages`.
     request : Request
-        The request of the file, with the selection of detectors to render.
+        The parsed request, with the detectors to render from the command line.
     start : callable
-        Function that runs a job: (name of its module, its arguments) -> exit status.
+        Function that runs a job: (name of the job's module, command-line arguments) -> exit status.
     pictures_folder : Path
         Folder for the pictures.
 
     Returns
     -------
     int
-        Exit status of the first job that fails, else 0.
+        Exit status of the first job that fails (later jobs do not run), else 0.
 
     Raises
     ------
@@ -189,7 +190,7 @@ def run(
     """
     # Find mistakes in the request and a lack of free space before the first job runs.
     universe.check_lake(root, request)
-    # Look for compiled kernels first, because planning compiles some.
+    # Look for the renderer's compiled functions before planning, because planning compiles a part of the renderer.
     is_compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
     plan = checked_plan(root, request, job_stages)
     required_gb, free_gb = space.check(root, request, plan)
@@ -209,21 +210,27 @@ def run(
 
 
 def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple[pa.Table, pa.Table] | None:
-    """Raise BadInput if any of the stages would refuse the request.
+    """Check that no job would refuse a request, and plan its exposures.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     request : Request
-        The request, with the selection of detectors to render.
+        The request, with the detectors to render from the command line.
     stages : sequence of Stage
-        Jobs of the request.
+        Jobs of the request, at least one.
 
     Returns
     -------
     tuple of pyarrow.Table or None
-        Rows of the tables `exposures` and `tasks` if images are rendered, else None.
+        Rows of the tables `exposures` (planned exposures) and `tasks` (their detectors) if the last job renders images,
+        else None.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request.
     """
     if stages[-1].name == IMAGES[-1].name:
         return planning.check(request, root)
@@ -234,9 +241,10 @@ def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple
 def _print_forecast(
     root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, required_gb: float, free_gb: float
 ) -> int:
-    """Print the forecast of the whole run and return the number of detectors.
+    """Print the forecast of time and size of the whole run, and return the number of detectors to render.
 
-    Only `required_gb` accounts for tables and images that the lake has already.
+    `required_gb` and `free_gb` are the size of the files to write and the free space, in GB. The printed time includes
+    tables and images that the lake already contains, although they will not be made again.
     """
     machine = speed.estimate_speed(root)
     seconds = sum(line.seconds for line in catalogue_forecast.for_request(request, machine.factor))
@@ -268,7 +276,7 @@ def _print_table(root: Path, request: str, stages: Sequence[tuple[Stage, float]]
 
 
 def _print_results(root: Path, pictures_folder: Path, request: str) -> None:
-    # Importing the renderer takes seconds, so import it only after the jobs have run.
+    # Import here, because importing the renderer takes seconds and runs without images do not need it.
     from truesky.render.forecasting import actual_costs
     from truesky.render.products import preview, same_sky
 

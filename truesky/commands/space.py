@@ -1,4 +1,8 @@
-"""Compare the forecast size of a request's tables and images with the free space on the disc of the lake."""
+"""Compare the forecast size of a request's tables and images with the free space on the disc.
+
+Tables and images are written to a lake, a folder with one subfolder per table. Files that the lake already contains are
+not written again.
+"""
 
 from __future__ import annotations
 
@@ -25,18 +29,18 @@ _GB = 1e9
 
 
 def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> tuple[float, float]:
-    """Raise BadInput if the free space is smaller than the forecast of a run.
+    """Check that the free space on the disc is sufficient for all jobs of a request.
 
-    Tables and images of the lake that the run can reuse are subtracted from the forecast.
+    The forecast size does not include tables and images that the lake already contains and that can be reused.
 
     Parameters
     ----------
     root : Path
         Folder of the lake. It need not exist.
     request : Request
-        The request, with the selection of detectors to render.
+        The request, with the detectors to render from the command line.
     plan : tuple of pyarrow.Table or None
-        Rows of the tables `exposures` and `tasks`; None if nothing is rendered.
+        Rows of the tables `exposures` (planned exposures) and `tasks` (their detectors); None if nothing is rendered.
 
     Returns
     -------
@@ -66,22 +70,26 @@ def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) 
 
 
 def _reusable_bytes(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> float:
-    """Size in bytes of the tables and images in the forecast that the run will reuse.
+    """Return the size in bytes of the forecast tables and images that the lake already contains and a run reuses.
 
-    Catalogues that another run is still writing count as 0.
+    It is 0 for a new lake. Catalogues that another run is still writing count as 0.
     """
     size = 0.0
     with contextlib.suppress(LakeError):
         for folder in _reusable_versions(root, request):
             size += _folder_bytes(folder)
-        # Images can be reused only if the catalogues are reused, too.
+        # Images can be reused only if all catalogues are reused, too. If a catalogue cannot be reused,
+        # `_reusable_versions` has raised LakeError.
         if plan is not None:
             size += _reusable_image_bytes(root, request, *plan)
     return size
 
 
 def _reusable_versions(root: Path, request: Request) -> Iterator[Path]:
-    """Yield the reusable versions of the catalogues and fluxes; raise LakeError at the first one that is outdated."""
+    """Yield the folders of the catalogues and fluxes that a run of the request can reuse.
+
+    Raises LakeError at the first table that does not exist, or was made by other code or for another universe or area.
+    """
     for kind, table in compute_fluxes.CATALOGUES:
         version = read.input_version(root, table, request.name)
         universe.check_catalogues([version], request)
@@ -96,8 +104,11 @@ def _reusable_versions(root: Path, request: Request) -> Iterator[Path]:
 
 
 def _reusable_image_bytes(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:
-    """Size in bytes of the requested images that need not be rendered."""
-    # Importing the renderer takes seconds, so import it only if there are images.
+    """Return the size in bytes of the requested images in the lake that need not be rendered again.
+
+    `exposures` and `tasks` are the rows of the plan. Files of whole exposures are included if the request has them.
+    """
+    # Import here, because importing the renderer takes seconds and requests without images do not need it.
     from truesky.render import product_plan
     from truesky.render.planning.exposure_chunks import RenderSelection
     from truesky.render.products import exposure_files
@@ -129,11 +140,17 @@ def _reusable_image_bytes(root: Path, request: Request, exposures: pa.Table, tas
 
 
 def _reusable_output_bytes(root: Path, request: Request, plan: Plan, parts: Sequence[Task]) -> float:
-    """Size in bytes of those tasks of a plan that need not run."""
+    """Return the size in bytes of the files of those tasks in `parts` that need not run again.
+
+    `plan` is the plan of the table to which the tasks belong. A task need not run again if the request's present
+    version of the table has its file, made from the same inputs, or if an interrupted run of this plan has written its
+    file. If the files of the interrupted run are larger, the result is their size, with the files of other tasks.
+    """
     table = plan.table.name
     reusable = reuse.reusable_tasks(root, table, request.name)
     reusable_names = {part.name for part in parts if reusable.get(part.name) == part.facts[reuse.PRODUCT]}
-    # The folder of an interrupted run contains reused files as well as new ones, so do not add both sizes.
+    # Take the larger size instead of the sum: the folder of an interrupted run also contains the files that it has
+    # reused from the published version.
     return max(
         _folder_bytes(layout.stage_folder(root, table, plan.key)),
         _published_bytes(root, request, table, reusable_names) if reusable_names else 0.0,

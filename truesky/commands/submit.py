@@ -1,4 +1,4 @@
-"""Start jobs: with the spark-submit of this environment, or in a Spark session of this process."""
+"""Start jobs (programs that make tables), with the spark-submit of this Python environment or in this process."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from lake_schema.errors import BadInput
 from truesky.commands import prepare_spark
 from truesky.numerics import cache
 
-# spark-submit runs this file for every job.
+# Script that spark-submit runs for every job. The name of the job's module is its first argument.
 _JOB_SCRIPT = Path(__file__).resolve().parents[1] / "running" / "spark_entry.py"
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -> int:
-    """Run a job with the spark-submit of this environment.
+    """Run a job with the spark-submit of this Python environment, and wait for its end.
 
     Parameters
     ----------
     module : str
-        Name of the module that has the job as `JOB`.
+        Name of the module that defines the job as `JOB`.
     arguments : sequence of str
-        Command line of the job.
+        Command-line arguments of the job.
     options : sequence of str, optional
         Options of spark-submit, such as --master.
 
@@ -39,6 +39,11 @@ def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -
     -------
     int
         Exit status of the job.
+
+    Raises
+    ------
+    BadInput
+        If PySpark or a new enough Java is not installed, or a folder of Spark has a space in its path.
     """
     return _run_program(
         [str(_spark_environment() / "bin" / "spark-submit"), *options, str(_JOB_SCRIPT), module, *arguments]
@@ -46,7 +51,11 @@ def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -
 
 
 def run_in_process(module: str, arguments: Sequence[str]) -> int:
-    """Run a job in this process and return its exit status. A session starts only if a step needs Spark workers."""
+    """Run a job in this process and return its exit status.
+
+    `module` is the name of the module that defines the job as `JOB`. A Spark session starts only if a table of the job
+    is computed in worker processes. Raises BadInput if PySpark or Java is missing.
+    """
     from truesky.running import submitted_job
 
     use_environment()
@@ -54,14 +63,22 @@ def run_in_process(module: str, arguments: Sequence[str]) -> int:
 
 
 def use_environment() -> None:
-    """Set environment variables so that a Spark session of this process uses the settings of spark-submit."""
+    """Set $SPARK_CONF_DIR and $SPARK_HOME, so that a Spark session of this process uses the settings of spark-submit.
+
+    Raises BadInput if PySpark or Java is missing.
+    """
     folder, spark = _spark_environment(), find_spec("pyspark")
     if spark is not None and spark.origin is not None:
         os.environ |= {"SPARK_CONF_DIR": str(folder / "spark-conf"), "SPARK_HOME": str(Path(spark.origin).parent)}
 
 
 def _spark_environment() -> Path:
-    """Return the folder with the Spark settings: .venv if `make` prepared it, else a folder of the cache."""
+    """Return the folder with the settings of Spark.
+
+    It is the virtual environment if `make` has written settings there. Otherwise it is a folder of the cache, in which
+    the settings are written if necessary. Raises BadInput if PySpark or a new enough Java is not installed, or if a
+    path contains a space.
+    """
     environment = Path(sys.prefix)
     if (environment / "spark-conf" / "spark-env.sh").is_file() and (environment / "java" / "bin" / "java").is_file():
         return environment
@@ -80,8 +97,8 @@ def _spark_environment() -> Path:
 
 
 def _run_program(command: Sequence[str]) -> int:
-    """Run a program and return its exit status; stop it if this process is interrupted."""
-    # A signal that arrives while the program starts is handled once there is a process to stop.
+    """Run a program and return its exit status; terminate it if an exception, such as Ctrl-C, ends the wait."""
+    # Record signals that arrive while the program starts, and handle them when there is a process to stop.
     early_signals: list[int] = []
     handlers = {number: signal.signal(number, lambda n, _: early_signals.append(n)) for number in _STOP_SIGNALS}
     with subprocess.Popen(command) as job:
@@ -98,7 +115,11 @@ def _run_program(command: Sequence[str]) -> int:
 
 @contextmanager
 def stop_on_signal(name: str) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM stop the running job and end the command `name` with status 130 or 143 and a message."""
+    """Let Ctrl-C and SIGTERM end the `with` block, stop the job that runs in it, and end this process.
+
+    A message that begins with `name`, the name of the command, is printed. The exit status is 130 after Ctrl-C and 143
+    after SIGTERM.
+    """
     previous_handlers = {number: signal.signal(number, _raise_interrupt) for number in _STOP_SIGNALS}
     try:
         yield

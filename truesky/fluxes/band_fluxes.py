@@ -1,12 +1,12 @@
 """Compute spectra of galaxies and stars as they reach the telescope, and their fluxes in passbands.
 
-Spectra are on the grid of passbands.grid(), 600 to 24000 A in steps of 1 A. The flux tables contain the same sums. They
-are interpolated in tables (tables/flux_tables.py) if the accuracy permits it. Otherwise they are integrated over the
-wavelengths of the requested bands (integration.py).
+Spectra are on the grid of passbands.grid(), 600 to 24000 A in steps of 1 A. Fluxes are interpolated in precomputed
+tables (tables/flux_tables.py) if the requested accuracy permits it. Otherwise they are integrated over wavelength in
+the requested bands (integration.py), which gives the same results as whole spectra.
 
 References
 ----------
-Serrano et al. 2024, appendix B; the steps are in the same order.
+Serrano et al. 2024, appendix B. Dust, lines, magnification and other effects are applied in the order of this appendix.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from truesky.fluxes.tables.settings import stars_tabulated
 from truesky.numerics import matrices
 from truesky.request.accuracy import REFERENCE, Accuracy
 
-# Rows converted to arrays at a time, about 80 MB. With more rows, each section of a table is used more often.
+# Number of sources in a slice. Sources are converted to arrays slice by slice, about 80 MB each, and sorted by redshift
+# within a slice. With larger slices, each part of a flux table is read less often from memory.
 _SLICE = 200_000
 
 
@@ -44,7 +45,7 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
     Parameters
     ----------
     galaxies : pa.Table
-        Rows of the table `galaxies`.
+        Rows of the table `galaxies` with `kind` 0, 1 or 4 (central, satellite, strong lens).
     library : Library
         Templates of galaxies.
     medium : str, optional
@@ -53,7 +54,14 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
     Returns
     -------
     float array, shape (n, 23401)
-        f_lambda in erg s-1 cm-2 A-1 (187 kB per row).
+        f_lambda in erg s-1 cm-2 A-1 at 600 to 24000 A (187 kB per galaxy).
+
+    Raises
+    ------
+    BadInput
+        If a value is missing, `kind` is another number, or the medium is unknown.
+    OutOfRange
+        If a value is out of range.
 
     Notes
     -----
@@ -79,7 +87,7 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
 
 
 def star_spectra(stars: pa.Table, library: Library) -> Float:
-    """Return the spectra of stars behind the dust in front of them.
+    """Return the spectra of stars, dimmed by the dust in front of each star.
 
     Parameters
     ----------
@@ -91,7 +99,14 @@ def star_spectra(stars: pa.Table, library: Library) -> Float:
     Returns
     -------
     float array, shape (n, 23401)
-        f_lambda in erg s-1 cm-2 A-1.
+        f_lambda in erg s-1 cm-2 A-1 at 600 to 24000 A.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing.
+    OutOfRange
+        If a value is out of range.
     """
     rows = stars_from_table(stars, library)
     spectra = np.zeros((len(rows), len(library.wavelength)))
@@ -107,7 +122,7 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
     Parameters
     ----------
     spectra : float array, shape (n, 23401)
-        f_lambda on the grid in erg s-1 cm-2 A-1.
+        f_lambda on passbands.grid() in erg s-1 cm-2 A-1.
     bands : sequence of Passband
         The passbands.
 
@@ -131,23 +146,24 @@ def galaxy_fluxes(
     Parameters
     ----------
     galaxies : pa.Table
-        Rows of the table `galaxies` of any kind.
+        Rows of the table `galaxies` of any `kind`, also quasars and high-redshift galaxies. Columns id, ra, dec and
+        _healpix_29 are copied to the result.
     bands : sequence of str or Passband
-        Names of passbands, or user passbands.
+        At least one passband: names of built-in ones, or Passband objects.
     library : Library
-        Templates of the kinds central, satellite and strong lens.
+        Templates of galaxies with `kind` 0, 1 or 4 (central, satellite, strong lens).
     accuracy : Accuracy, optional
-        Largest errors that are allowed.
+        Errors that are allowed. By default they are so small that all fluxes are integrated.
 
     Returns
     -------
     pa.Table
-        Rows of the table `galaxy_fluxes` in the same order, in microjansky.
+        Rows of the table `galaxy_fluxes` in the same order: f_nu in microjansky in one column per band.
 
     Raises
     ------
     BadInput
-        If a value is missing. The message names the column and the source.
+        If there is no band, a name is unknown, or a value is missing. The message names the column and the source.
     OutOfRange
         If a value is out of range.
 
@@ -164,7 +180,7 @@ def galaxy_fluxes(
 def fluxes_with_settings(
     galaxies: pa.Table, curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library
 ) -> pa.Table:
-    """Return the fluxes of galaxies from tables with the given settings; see `galaxy_fluxes`.
+    """Return the fluxes of galaxies like `galaxy_fluxes`, from flux tables of the given resolutions.
 
     Parameters
     ----------
@@ -173,14 +189,16 @@ def fluxes_with_settings(
     curves : sequence of Passband
         The passbands.
     settings : sequence of Setting or None
-        Resolution of the table of each passband. Passbands with None are integrated.
+        Resolution of the flux table of each passband. Fluxes in passbands with None are integrated.
     library : Library
         Templates of galaxies.
 
     Returns
     -------
     pa.Table
-        Rows of the table `galaxy_fluxes` in the same order, in microjansky.
+        Rows of the table `galaxy_fluxes` in the same order, with f_nu in microjansky. Their column `integrated` is true
+        for galaxies outside the ranges of the flux tables, for quasars and high-redshift galaxies, and for all galaxies
+        if no passband has a table.
     """
     tabulated = [k for k, setting in enumerate(settings) if setting is not None]
     grid = None
@@ -202,23 +220,31 @@ def fluxes_with_settings(
 def star_fluxes(
     stars: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
 ) -> pa.Table:
-    """Return the fluxes of stars in passbands, behind the dust in front of each; see `galaxy_fluxes`.
+    """Return the fluxes of stars in passbands, dimmed by the dust in front of each star.
 
     Parameters
     ----------
     stars : pa.Table
-        Rows of the table `stars`.
+        Rows of the table `stars`. Columns id, ra, dec and _healpix_29 are copied to the result.
     bands : sequence of str or Passband
-        Names of built-in passbands, or user passbands.
+        At least one passband: names of built-in ones, or Passband objects.
     library : Library
         Templates of stars.
     accuracy : Accuracy, optional
-        Largest errors that are allowed.
+        Errors that are allowed. By default they are so small that all fluxes are integrated.
 
     Returns
     -------
     pa.Table
-        Rows of the table `star_fluxes` in the same order, in microjansky.
+        Rows of the table `star_fluxes` in the same order: f_nu in microjansky in one column per band. The column
+        `integrated` is true for stars whose fluxes are not from flux tables.
+
+    Raises
+    ------
+    BadInput
+        If there is no band, a name is unknown, or a value is missing.
+    OutOfRange
+        If a value is out of range.
     """
     curves = _load_passbands(bands)
     tabulated = stars_tabulated(accuracy)
@@ -238,18 +264,20 @@ def prepare(
     star_library: Library,
     accuracy: Accuracy,
 ) -> None:
-    """Fill the cache with the tables and machine code for these bands, so that workers can load them.
+    """Compute the flux tables and machine code for some bands and write them to the cache on disc.
+
+    Worker processes then load them instead of computing them at the same time.
 
     Parameters
     ----------
     curves : sequence of Passband
         The passbands.
     settings : sequence of Setting or None
-        Resolution of the table of each passband for galaxies; None if it is integrated.
+        Resolution of the flux table of each passband for galaxies; None for passbands that are integrated.
     galaxy_library, star_library : Library
         Templates of galaxies and of stars.
     accuracy : Accuracy
-        Largest errors that are allowed.
+        Errors that the user allows. They decide whether fluxes of stars come from tables.
     """
     tabulated = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
     if tabulated:
@@ -270,7 +298,11 @@ def _galaxy_f_nu(
     grid: flux_tables.Grid | None,
     library: Library,
 ) -> tuple[Float, Bool]:
-    """Return fluxes, float64[n, n_band], from tables if possible, and True for galaxies outside the tables, bool[n]."""
+    """Return f_nu (microjansky), float64[n, n_band], and True for galaxies whose fluxes are all integrated, bool[n].
+
+    `tabulated` has the indices of the bands in the flux tables `grid`. Other bands, and galaxies outside the ranges of
+    the tables, are integrated; all are if `grid` is None.
+    """
     if grid is None:
         return integration.galaxy_fluxes(rows, curves, library), np.ones(len(rows), bool)
     inside = flux_tables.covered_galaxies(rows)
@@ -309,12 +341,12 @@ def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
     wavelength : float array, shape (n_lambda,)
         Wavelengths in A.
     a_v : float array, shape (n,)
-        Extinction A(V) = R_V E(B-V) in mag.
+        Extinction A(V) = 3.1 E(B-V) towards each source in mag.
 
     Returns
     -------
     float array, shape (n, n_lambda)
-        Transmission, with A(lambda) = R_V E(B-V) [A(lambda) / A(V)].
+        Transmission from 0 to 1 (above 1 if A(V) is negative).
     """
     return np.asarray(extinction.transmission(extinction.milky_way(wavelength), a_v[:, None]))
 

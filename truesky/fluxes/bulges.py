@@ -1,16 +1,17 @@
 """Compute the bulge's fraction of a galaxy's light in each band, since bulges are redder than their discs.
 
-In the reference band at rest, the ratio of bulge to disc is that of `bulge_fraction`. In another band it is multiplied
-by a ratio of two templates. The numerator is the light of a template that is redder by `bulge_color` in 0.1(g - r); the
-denominator is the light of the galaxy's template. Templates are ordered by colour, and the logarithm of their light is
-interpolated between neighbours. For the reddest template, both templates are the same, and bulge and disc have equal
-colours. Since the ratio is positive, both components are positive at every wavelength. Their sum is always the galaxy's
-spectrum.
+The column `bulge_fraction` is the fraction in the rest-frame reference band 0.1r (SDSS r, shifted to the blue by a
+factor 1.1). The column `bulge_color` is how much redder in 0.1(g - r) the bulge is than the galaxy. In another band the
+ratio of bulge to disc is multiplied by a ratio of two templates. The numerator is the light of a template that is
+redder by `bulge_color`; the denominator is the light of the galaxy's template. Templates are ordered by colour, and the
+logarithm of their light is interpolated between neighbours. A galaxy with the reddest template has a bulge and a disc
+of equal colours. Since the ratio is positive, bulge and disc are positive at every wavelength. Their sum is always the
+galaxy's spectrum.
 
 Notes
 -----
-Dust in front of both components changes the ratio within a band. This is neglected: the error is 5 % of the ratio at
-E(B-V) = 0.4. Emission lines are divided like the continuum.
+Dust in front of bulge and disc changes their ratio, because they have different spectra within a band. This change is
+neglected: the error is 5 % of the ratio at E(B-V) = 0.4. Emission lines are divided like the continuum.
 
 References
 ----------
@@ -36,29 +37,33 @@ from truesky.fluxes.spectra.continuum import COMPONENTS, REFERENCE_BAND
 from truesky.numerics import matrices
 
 FRACTION, COLOUR = "bulge_fraction", "bulge_color"
-# Other columns that are read.
+# Columns of the table `galaxies` that are read in addition to `bulge_fraction`.
 COLUMNS = (COLOUR, "z_obs", *(f"{name}_{k}" for k in COMPONENTS for name in ("sed", "frac")))
 _BLUE_BAND = "sdss_g01"
-# Nodes of the table of a band in ln(1 + z), and samples of the band at each. The error of a fraction is 1e-3.
-_FIRST, _LAST, _STEP, _SAMPLES = np.log(0.97), np.log(8.0), 0.01, 500
-# Smallest step in colour, so that templates with the same colour stay in increasing order.
+# First and last redshift node, as ln(1 + z), of the table of the templates' light in a band (see `_compute_table`).
+_FIRST, _LAST = np.log(0.97), np.log(8.0)
+# Step of the redshift nodes in ln(1 + z). With this step the error of a bulge fraction is 1e-3.
+_STEP = 0.01
+# Approximate number of wavelengths at which a band is sampled.
+_SAMPLES = 500
+# Increment (mag) that is added from template to template, so that the sequence increases even if colours are equal.
 _COLOUR_STEP = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourSequence:
-    """Templates in order from blue to red.
+    """The m galaxy templates of a library, in order from blue to red.
 
     Attributes
     ----------
     colour : float array, shape (m,)
-        0.1(g - r) in mag, increasing.
+        Rest-frame colour 0.1(g - r) in mag, increasing.
     template : int array, shape (m,)
-        Index of the template in the library.
+        Index of each template in the library, in order of colour.
     rank : int array, shape (m,)
-        Position of each template of the library in the sequence.
+        Position in this sequence of each template of the library, in the order of the library.
     light : float array, shape (m,)
-        f_nu in the reference band.
+        Rest-frame f_nu in the reference band 0.1r, in order of colour; arbitrary unit.
     """
 
     colour: Float
@@ -69,7 +74,7 @@ class ColourSequence:
 
 @lru_cache(maxsize=4)
 def colour_sequence(library: Library) -> ColourSequence:
-    """Return the templates of a library without dust, in order of colour."""
+    """Return the templates of a galaxy library in order of their rest-frame colour without dust."""
     blue, light = (_rest_frame_light(library, passbands.load(name)) for name in (_BLUE_BAND, REFERENCE_BAND))
     colour = -2.5 * np.log10(blue / light)
     order = np.argsort(colour, kind="stable")
@@ -78,12 +83,13 @@ def colour_sequence(library: Library) -> ColourSequence:
 
 
 def with_fractions_in_band(rows: pa.Table, band: Passband, library: Library) -> pa.Table:
-    """Replace `bulge_fraction` by the bulge's fraction of the light in a band, for rows with a bulge colour.
+    """Replace the column `bulge_fraction` by the bulge's fraction of the observed light in a band.
 
     Parameters
     ----------
     rows : pa.Table
-        Rows of `galaxies`. Without `COLUMNS`, or without a colour, a row stays unchanged.
+        Rows of `galaxies`. A row stays unchanged if its `bulge_color` is null, NaN or 0, its fraction is 0 or 1, or its
+        `kind` has no galaxy template. All rows stay unchanged if one of the columns `COLUMNS` is missing.
     band : Passband
         The passband.
     library : Library
@@ -120,9 +126,9 @@ def fractions_in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
     Parameters
     ----------
     rows : pa.Table
-        Rows of `galaxies`.
+        Rows of `galaxies`. Rows without a bulge colour have the value of `bulge_fraction` in all bins.
     light : float array, shape (n_template, n_bin)
-        Light of each template in the bins.
+        Light of each template of the library in the bins, in the unit of f_nu in the library.
     library : Library
         Templates to which the columns sed_1 and sed_2 refer.
 
@@ -145,10 +151,11 @@ def fractions_in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
 
 
 def _neighbour_ranks(sequence: ColourSequence, sed: Int, redness: Float) -> tuple[Int, Int, Float]:
-    """Find the templates for a bulge that is redder than template `sed` by `redness` (mag).
+    """Find the templates for bulges that are redder than the templates `sed` by `redness` (mag).
 
-    Returns the rank of `sed`, the rank of the neighbour on the blue side of the bulge's colour, and the fraction of the
-    way to the next template; arrays of shape (n,).
+    Returns three arrays of shape (n,): the position of `sed` in the sequence of colours, the position of the last
+    template that is not redder than the bulge, and the fraction of the way from this template to the next one. The
+    colour of a bulge is limited to the colours of the bluest and the reddest template.
     """
     rank = sequence.rank[sed]
     target_colour = np.clip(sequence.colour[rank] + redness, sequence.colour[0], sequence.colour[-1])
@@ -157,12 +164,19 @@ def _neighbour_ranks(sequence: ColourSequence, sed: Int, redness: Float) -> tupl
 
 
 def _log_light_ratio(fraction: Float, low: Float, high: Float, galaxy: Float) -> Float:
-    """Interpolate the logarithm of light between two templates, and subtract that of the galaxy's template."""
+    """Return ln(light of the bulge's template / light of the galaxy's template).
+
+    All arguments but the first are ln(light). The bulge lies at `fraction` of the way from template `low` to `high`.
+    """
     return np.asarray(low + fraction * (high - low) - galaxy)
 
 
 def _read_rows(rows: pa.Table, library: Library) -> tuple[Float, Int, Float, list[tuple[Int, Float]]]:
-    """Return fractions[n] in the reference band; for rows with a colour also indices, colours, templates and shares."""
+    """Return the bulge fractions of all rows in the reference band, and the data of the rows with a bulge colour.
+
+    These data are the indices of the rows, their bulge colours (mag), and for each of the two templates of a galaxy the
+    pair (template, share of the light). They are empty if a column is missing.
+    """
     share = np.asarray(rows[FRACTION].to_numpy(), float).copy()
     if not set(COLUMNS) <= set(rows.column_names) or len(library) < 2:
         return share, np.zeros(0, np.int64), np.zeros(0), []
@@ -189,18 +203,23 @@ def _rest_frame_light(library: Library, band: Passband) -> Float:
 
 
 def _logarithm(light: Float) -> Float:
-    """Return the logarithm of light, with a floor for old templates without light in the far ultraviolet."""
+    """Return ln(light). Light below 1e-38 counts as 1e-38, since templates of old galaxies emit no far ultraviolet."""
     return np.asarray(np.log(np.maximum(light, np.finfo(np.float32).tiny)))
 
 
 def _band_table(band: Passband, library: Library) -> Float:
-    # Cache by the contents of the passband, since it is read again for each detector.
+    # Cache by the bytes of the curve: the passband is read again for each detector, so objects are never the same.
     return _compute_table(band.response.tobytes(), band.wavelength.tobytes(), library)
 
 
 @lru_cache(maxsize=64)
 def _compute_table(response: bytes, wavelength: bytes, library: Library) -> Float:
-    """Return ln(flux in a band / rest-frame flux in the reference band) by redshift and template, float64[z, m]."""
+    """Return ln(observed flux in a band / rest-frame flux in the reference band), float64[n_z, m].
+
+    The first axis is the redshift node, the second the template in order of colour. At each redshift, all templates
+    have the same arbitrary offset, because only differences between templates are used. `response` and `wavelength` are
+    the bytes of the passband's float64 arrays.
+    """
     band = Passband("", np.frombuffer(wavelength), np.frombuffer(response), "")
     sequence, nodes = colour_sequence(library), np.exp(np.arange(_FIRST, _LAST + 2 * _STEP, _STEP))
     samples = slice(None, None, max(len(band.wavelength) // _SAMPLES, 1))

@@ -1,4 +1,4 @@
-"""Compute factors that scale template spectra to the magnitudes in the catalogue."""
+"""Compute factors that scale template spectra to the magnitudes of galaxies and stars in the catalogues."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ from truesky.fluxes.sources import Stars
 from truesky.numerics import matrices
 
 STAR_BAND = "twomass_h"
-# f_nu of a normalised template is 1e-11. Single precision has no digits left 30 decades below.
+# Smallest f_nu in a band that counts as light, erg s-1 cm-2 Hz-1. A normalised template has f_lambda near
+# 1 erg s-1 cm-2 A-1, and f_nu of about 1e-11. Thirty decades below it, single precision has no digits left.
 _MIN_F_NU = 1e-41
 
 
 def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
-    """Return the factor that scales the continuum of a galaxy to its magnitude.
+    """Return the factor that scales the continuum of each galaxy to its apparent magnitude.
 
     Parameters
     ----------
     mag_r01 : float array, shape (n,)
-        Apparent AB magnitude in the reference band.
+        Apparent AB magnitude in the reference band 0.1r (SDSS r, shifted to the blue by a factor 1.1).
     f_nu_observed : float array, shape (n,)
-        f_nu of the unscaled continuum in the reference band in erg s-1 cm-2 Hz-1.
+        f_nu of the unscaled, redshifted continuum in this band, in erg s-1 cm-2 Hz-1.
 
     Returns
     -------
     float array, shape (n,)
-        Factors.
+        Factors by which the unscaled continuum is multiplied.
 
     Raises
     ------
     BadInput
-        If dust leaves no light in the reference band.
+        If a galaxy has (almost) no light in the reference band, for example because of dust, or NaN.
 
     References
     ----------
@@ -48,12 +49,12 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
 
 
 def star_scale(stars: Stars, library: Library) -> Float:
-    """Return the factor for each star's mixture of templates, from its H magnitude before extinction.
+    """Return the factors that scale stars' mixtures of templates to their H magnitudes before extinction, float64[n].
 
     Notes
     -----
-    H in the catalogue is a Vega magnitude, 1.375 mag below AB. Serrano et al. 2024, appendix B, use the AB formula for
-    it.
+    H in the catalogue is a Vega magnitude, which is 1.375 mag below the AB magnitude. Serrano et al. 2024, appendix B,
+    insert it in the formula for AB magnitudes.
     """
     band = passbands.load(STAR_BAND)
     spectra = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)

@@ -1,10 +1,13 @@
-"""Compute band fluxes of every source in a lake, and the tables of spectra, laws, lines and passbands behind them.
+"""Compute band fluxes of every source in a lake (the folder of all tables of a simulation).
 
     spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST [--bands BAND ...]
 
-The facts in the manifests of the tables describe the computation. `accuracy` is the requested accuracy. `errors` has
-the setting and the measured relative error of each band. `covered` has the ranges in which tables were used; sources
-outside were integrated, and their column `integrated` is true. `files` has the sha256 of each file of the request.
+The job also writes the tables `templates`, `extinction_laws`, `emission_lines` and `passbands`, with which the fluxes
+are computed. The manifest of a flux table (the list of its files) contains facts about the computation. `accuracy` is
+the requested accuracy. `errors` has the resolution of each band's interpolation table, and the measured relative error.
+`covered` (for stars a part of `errors`) has the ranges of redshift and extinction of the interpolation tables; sources
+outside were integrated, and their column `integrated` is true. `files` has the sha256 of each file that the request
+names.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +39,13 @@ CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Return the steps that write the input tables, then the fluxes with one task per cell of each catalogue."""
+    """Return the steps of the job, each of which makes one table: four input tables, and fluxes of galaxies and stars.
+
+    The input tables are `templates`, `extinction_laws`, `emission_lines` and `passbands`. A step of fluxes has one task
+    per partition (file) of the catalogue, that is, per cell of the sky. The steps are planned, not run. Tables in which
+    fluxes are interpolated are computed and cached, unless the lake already has the fluxes of galaxies and of stars.
+    Raises BadInput if a catalogue was made from another universe than the request describes.
+    """
     catalogues = [(kind, read.input_version(lake, name, request.name)) for kind, name in CATALOGUES]
     universe.check_catalogues([version for _, version in catalogues], request)
     flux_inputs = inputs.read(request.curves)
@@ -45,7 +54,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     choices = errors_measured.choose(curves, request.accuracy, flux_inputs.library)
     flux_steps = [_step(catalogue, kind, request, flux_inputs, choices, sources) for kind, catalogue in catalogues]
     if not all(layout.version_folder(lake, step.plan.table.name, step.plan.key).exists() for step in flux_steps):
-        # Fill the cache once here, not in every worker at the same time.
+        # Compute the interpolation tables of fluxes here and cache them on disc. Otherwise every worker would compute
+        # them at the same time.
         band_fluxes.prepare(
             curves, [choice.setting for choice in choices], flux_inputs.library, flux_inputs.stars, request.accuracy
         )
@@ -53,21 +63,21 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def flux_step(kind: str, lake: Path, request: Request) -> Step:
-    """Return the step for the fluxes of one kind of source.
+    """Return the step of the job that makes one table, the fluxes of galaxies or of stars.
 
     Parameters
     ----------
     kind : str
         "galaxy" or "star".
     lake : Path
-        Root of the lake.
+        Root folder of the lake, which must contain the catalogue.
     request : Request
-        The request.
+        The user's request, with the passbands and the accuracy.
 
     Returns
     -------
     Step
-        The step.
+        The planned step, with one task per partition (file) of the catalogue. It is not run.
     """
     flux_inputs = inputs.read(request.curves)
     choices = errors_measured.choose(
@@ -84,7 +94,10 @@ def flux_step(kind: str, lake: Path, request: Request) -> Step:
 
 
 def source_steps(flux_inputs: FluxInputs) -> list[Step]:
-    """Return the steps that write the tables `templates`, `extinction_laws`, `emission_lines` and `passbands`."""
+    """Return four steps, which make the tables `templates`, `extinction_laws`, `emission_lines` and `passbands`.
+
+    Each step makes one table, with a single file. The steps are planned, not run.
+    """
 
     def step(table: Table, rows: Callable[[FluxInputs], pa.Table]) -> Step:
         plan = Plan(table, {"files": flux_inputs.sha256(), "code": code_version()}, (Task("all.parquet", {}),))
@@ -130,7 +143,11 @@ def _error_facts(kind: str, request: Request, choices: Sequence[Choice]) -> dict
 
 
 def compute_partition(lake: Path, facts: Json) -> Output:
-    """Return the fluxes of one cell, in the order of its rows."""
+    """Compute the fluxes of one partition (the sources in a cell of the sky), in the order of the catalogue's rows.
+
+    `facts` has the inputs as JSON values: catalogue and its version, name of the partition, passbands, user files,
+    accuracy, and resolutions of the tables in which fluxes are interpolated.
+    """
     rows = read.version(lake, facts["catalogue"], facts["input"]).rows(partitions=[facts["part"]])
     curves = [inputs.passband_from_facts(lake, facts, band) for band in facts["bands"]]
     if facts["catalogue"] == "galaxies":

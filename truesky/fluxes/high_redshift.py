@@ -1,8 +1,9 @@
 """Compute spectra and fluxes of quasars and of galaxies beyond z = 6.
 
-These sources are few, and their fluxes are integrated directly. A row of these kinds has one template, sed_1, without
-internal dust; its lines are in the template. Its mag_r01 is a monochromatic AB magnitude at 1450 A (quasars) or 1500 A
-(galaxies) in the rest frame (Serrano et al. 2024, appendix B).
+These sources are few, and their fluxes are integrated directly. In the table `galaxies`, quasars have `kind` 2 and
+high-redshift galaxies `kind` 3. Such a row has one template, sed_1, without internal dust; emission lines are in the
+template. Its mag_r01 is a monochromatic AB magnitude at 1450 A (quasars) or 1500 A (galaxies) in the rest frame
+(Serrano et al. 2024, appendix B).
 """
 
 from __future__ import annotations
@@ -28,31 +29,43 @@ from truesky.fluxes.spectra.continuum import check_range
 from truesky.numerics import matrices
 
 QUASAR, HIGH_REDSHIFT = 2, 3
-# Rest-frame wavelength of the magnitude, A.
+# Rest-frame wavelength (A) at which mag_r01 is the monochromatic magnitude.
 MAGNITUDE_WAVELENGTH = {QUASAR: 1450.0, HIGH_REDSHIFT: 1500.0}
 Z_MAX = 15.0
 
-# Rest-frame wavelengths, A: 600 A observed at z = 15, and 24000 A observed at z = 0.
-_REST_FIRST, _REST_LAST = 36, 24500
-# Galaxies beyond z = 6 have no flux below Lyman alpha. Quasars are observed through the intergalactic medium.
+# First rest-frame wavelength of the templates, A; 600 A observed at z = 15 is 37.5 A.
+_REST_FIRST = 36
+# Last rest-frame wavelength, A; 24000 A observed at z = 0, with some margin.
+_REST_LAST = 24500
+# Wavelength of Lyman alpha, A. Templates of galaxies have no flux below it. Templates of quasars do, and intergalactic
+# absorption is applied to their observed spectra.
 _LYMAN_ALPHA = 1215.67
 
-# Vanden Berk et al. 2001: slopes of f_lambda below and above 5000 A; the 3 x 3 of Barnett et al. 2019.
+# Exponents of a quasar's f_lambda (a power of lambda) below and above 5000 A: Vanden Berk et al. 2001.
 _QUASAR_SLOPE, _QUASAR_RED_SLOPE, _QUASAR_BREAK = -1.56, 0.45, 5000.0
-# Below Lyman alpha f_nu falls as nu^-1.7: Lusso et al. 2015, MNRAS 449, 4204.
+# Exponent of f_lambda below Lyman alpha, where f_nu falls as nu^-1.7: Lusso et al. 2015, MNRAS 449, 4204.
 _QUASAR_FAR_UV_SLOPE = -0.3
+# Offsets from the exponent _QUASAR_SLOPE, and factors of the line fluxes. All 3 x 3 combinations are templates, as in
+# Barnett et al. 2019.
 QUASAR_OFFSETS, QUASAR_STRENGTHS = (-0.3, 0.0, 0.3), (0.5, 1.0, 2.0)
 QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
 
-# Slopes around the mean of Bouwens et al. 2014; equivalent widths of Lyman alpha, A; its width redwards, A (adopted).
-HIGH_REDSHIFT_SLOPES, LYMAN_ALPHA_WIDTHS, _LYMAN_ALPHA_SIGMA = (-2.6, -2.3, -2.0, -1.7, -1.4), (0.0, 25.0, 50.0), 1.0
+# Exponents of f_lambda of high-redshift galaxies, around the mean of Bouwens et al. 2014.
+HIGH_REDSHIFT_SLOPES = (-2.6, -2.3, -2.0, -1.7, -1.4)
+# Rest-frame equivalent widths of Lyman alpha, A.
+LYMAN_ALPHA_WIDTHS = (0.0, 25.0, 50.0)
+# Gaussian sigma of Lyman alpha, A (adopted). Only the red half of the line is transmitted.
+_LYMAN_ALPHA_SIGMA = 1.0
 
-# Rows whose whole spectra are computed at a time.
+# Number of sources whose whole spectra are computed at a time.
 _BLOCK = 64
 
 
 def quasar_library() -> Library:
-    """Return the nine quasar templates: slope i and line strength j in template 3 i + j."""
+    """Return the nine quasar templates. Template 3 i + j has QUASAR_OFFSETS[i] and QUASAR_STRENGTHS[j].
+
+    These are the offset of the continuum's exponent from the mean, and the factor of the line fluxes.
+    """
     wavelength = _rest_wavelengths()
     flux, names = [], []
     for offset in QUASAR_OFFSETS:
@@ -63,7 +76,11 @@ def quasar_library() -> Library:
 
 
 def high_redshift_library() -> Library:
-    """Return the fifteen galaxy templates: ultraviolet slope i and Lyman alpha width j in template 3 i + j."""
+    """Return the 15 templates of high-redshift galaxies.
+
+    Template 3 i + j has the ultraviolet slope HIGH_REDSHIFT_SLOPES[i] and the Lyman alpha equivalent width
+    LYMAN_ALPHA_WIDTHS[j].
+    """
     wavelength = _rest_wavelengths()
     flux, names = [], []
     for slope in HIGH_REDSHIFT_SLOPES:
@@ -74,9 +91,10 @@ def high_redshift_library() -> Library:
 
 
 def ultraviolet_magnitude(abs_mag: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """Return the apparent AB magnitude at the redshifted wavelength, M_UV + DM - 2.5 log10(1 + z).
+    """Return the apparent monochromatic AB magnitude at the redshifted wavelength, M_UV + DM - 2.5 log10(1 + z).
 
-    M_UV (`abs_mag`) and the distance modulus DM have h = 0.67. The result is the column mag_r01 of these kinds.
+    `abs_mag` is the absolute magnitude M_UV. It and the distance modulus DM are for h = 0.67. The result is stored in
+    the column mag_r01 of quasars and high-redshift galaxies.
     """
     distance = cosmology.distance_modulus(z) - 5.0 * np.log10(cosmology.HUBBLE)
     return np.asarray(np.asarray(abs_mag, float) + distance - 2.5 * np.log10(1.0 + np.asarray(z, float)))
@@ -88,7 +106,7 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
     Parameters
     ----------
     galaxies : pa.Table
-        Rows of the table `galaxies` of kind 2 or 3.
+        Rows of the table `galaxies` with `kind` 2 (quasars) or 3 (high-redshift galaxies).
     bands : sequence of Passband
         The passbands.
 
@@ -96,6 +114,13 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
     -------
     float array, shape (n, n_band)
         f_nu in microjansky.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing, or frac_2 or ebv_1 is not 0. The message names the column and the source.
+    OutOfRange
+        If a redshift, magnitude, extinction, template number or magnification is out of range.
     """
     out = np.zeros((galaxies.num_rows, len(bands)))
     for start in range(0, galaxies.num_rows, _BLOCK):
@@ -107,24 +132,26 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
 
 
 def spectra(galaxies: pa.Table) -> Float:
-    """Return the spectra of quasars and high-redshift galaxies.
+    """Return the observed spectra of quasars and high-redshift galaxies.
+
+    Lensing magnification, intergalactic absorption (quasars) and Milky Way extinction are included.
 
     Parameters
     ----------
     galaxies : pa.Table
-        Rows of the table `galaxies` of kind 2 or 3.
+        Rows of the table `galaxies` with `kind` 2 (quasars) or 3 (high-redshift galaxies). Other kinds give 0.
 
     Returns
     -------
     float array, shape (n, 23401)
-        f_lambda in erg s-1 cm-2 A-1.
+        f_lambda in erg s-1 cm-2 A-1 at 600 to 24000 A.
 
     Raises
     ------
     BadInput
-        If a value is missing or not allowed. The message names the column and the source.
+        If a value is missing, or frac_2 or ebv_1 is not 0. The message names the column and the source.
     OutOfRange
-        If a value is out of range.
+        If a redshift, magnitude, extinction, template number or magnification is out of range.
     """
     kind, z, mag, a_v = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "a_v"))
     sed = column(galaxies, "sed_1").astype(np.int64)
@@ -153,23 +180,25 @@ def spectra(galaxies: pa.Table) -> Float:
 def template_scale(code: int, templates: Library, sed: Int, mag: Float, z: Float) -> Float:
     """Return the factor that converts a template's f_lambda at lambda / (1 + z) to the observed f_lambda at lambda.
 
+    Magnification and extinction are not included.
+
     Parameters
     ----------
     code : int
         Kind of source, `QUASAR` or `HIGH_REDSHIFT`.
     templates : Library
-        Templates of this kind.
+        Templates of this kind of source.
     sed : int array, shape (n,)
         Index of each source's template.
     mag : float array, shape (n,)
-        mag_r01 of each source.
+        Apparent AB magnitude (column mag_r01) at the redshifted 1450 A (quasars) or 1500 A (galaxies).
     z : float array, shape (n,)
         Redshifts.
 
     Returns
     -------
     float array, shape (n,)
-        Factors.
+        Factors, in erg s-1 cm-2 A-1 per unit of the template.
     """
     wavelength = MAGNITUDE_WAVELENGTH[code]
     template_flux = np.array(
@@ -207,7 +236,11 @@ def _quasar_spectrum(wavelength: Float, slope: float, strength: float) -> Float:
 
 
 def _star_forming_spectrum(wavelength: Float, slope: float, width: float) -> Float:
-    """Return a power law, 1 at 1500 A, with the red half of Lyman alpha, in bins of 1 A."""
+    """Return f_lambda of a high-redshift galaxy: a power law that is 1 at 1500 A, with the red half of Lyman alpha.
+
+    `wavelength` is in A in steps of 1 A, `slope` the exponent, and `width` the equivalent width of Lyman alpha in A.
+    f_lambda is 0 below Lyman alpha. The line is averaged over bins of 1 A.
+    """
     from scipy.special import erf
 
     flux = np.where(wavelength < _LYMAN_ALPHA, 0.0, (wavelength / MAGNITUDE_WAVELENGTH[HIGH_REDSHIFT]) ** slope)

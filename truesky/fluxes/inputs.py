@@ -1,6 +1,7 @@
-"""Collect the spectra, laws and passbands with which fluxes are computed, and store them as lake tables.
+"""Collect the template spectra, extinction laws and passbands with which fluxes are computed, and store them as tables.
 
-Inputs are the built-in library and the files that a request names. Workers read them back from the lake tables.
+They come from the built-in libraries and from a user's files, which the request (the user's TOML file) names. Processes
+that compute fluxes read them back from these tables of the lake.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.request.files import Curves, UserCurves
 
-# Prefixes of the keys of user files.
+# Prefixes of the request's keys for user files: passbands, galaxy templates, extinction laws and stars. For example,
+# "fluxes.passbands.NAME" is the file of the passband NAME.
 FILTER_PREFIX, _TEMPLATES_PREFIX, _LAWS_PREFIX, _STARS_PREFIX = (
     f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars")
 )
@@ -54,20 +56,21 @@ FILTER_PREFIX, _TEMPLATES_PREFIX, _LAWS_PREFIX, _STARS_PREFIX = (
 
 @dataclass(frozen=True, slots=True)
 class FluxInputs:
-    """Passbands and libraries with which fluxes are computed.
+    """User passbands, and libraries of templates, with which fluxes are computed.
 
     Attributes
     ----------
     passbands : mapping of str to Passband
         User passbands by name.
     library : Library
-        Galaxy templates with their extinction laws.
+        Galaxy templates with the extinction laws of dust in galaxies.
     stars : Library
         Stellar templates.
     origins : mapping of str to Origin
-        Origin of each user file, by the key in the request.
+        File name, format and checksum of each user file, by its key in the request, such as "fluxes.passbands.NAME".
     dwarf_origins : sequence of Origin
-        Origins of the dwarf stars, the first templates of `stars`; () for the built-in ones.
+        Files, reference and checksum of the spectrum of each dwarf star; () for built-in dwarfs. The dwarfs are the
+        first templates of `stars`.
     """
 
     passbands: Mapping[str, Passband]
@@ -77,17 +80,18 @@ class FluxInputs:
     dwarf_origins: Sequence[Origin] = ()
 
     def sha256(self) -> dict[str, str]:
-        """Return the checksums of the user files, which identify them in a plan."""
+        """Return the SHA-256 checksum of each user file, by its key in the request."""
         return {key: origin.sha256 for key, origin in self.origins.items()}
 
 
 def read(user_curves: UserCurves) -> FluxInputs:
-    """Read the built-in libraries with the replacements that a request names, and its passbands.
+    """Read the built-in libraries of templates, with the replacements in a user's files, and the user's passbands.
 
     Raises
     ------
     BadInput
-        If a file is not valid. The message names the key of the request, the file and, if there is one, the row.
+        If a file is absent or not valid. The message names the key of the request, the file and, if there is one, the
+        row.
     """
     user_passbands, origins = read_passbands(user_curves)
     library = templates.galaxy_library()
@@ -111,12 +115,19 @@ def read(user_curves: UserCurves) -> FluxInputs:
 
 
 def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
-    """Return the user passbands by name, and their origins by key.
+    """Read the user's passbands.
+
+    Returns
+    -------
+    passbands : dict of str to Passband
+        Passbands by name.
+    origins : dict of str to Origin
+        File name, format and checksum of each passband, by key "fluxes.passbands.NAME".
 
     Raises
     ------
     BadInput
-        If a passband has a built-in name, or its file is not valid.
+        If a passband has the name of a built-in one, or its file is not valid.
     """
     user_passbands, origins = {}, {}
     for name, curves in user_curves.passbands:
@@ -131,7 +142,11 @@ def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[s
 
 
 def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
-    """Return the stellar library, the origins of the user files by key, and the origins of the user's dwarfs."""
+    """Return the stellar library, the origin of each user file by request key, and the origin of each dwarf star.
+
+    An origin is the file name, reference and checksum. Without user files the library is the built-in one, and both
+    origins are empty.
+    """
     if user_curves.basel is None and not user_curves.irtf:
         return templates.stellar_library(), {}, []
     low_resolution, reference, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
@@ -152,7 +167,7 @@ def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], li
 
 
 def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband]) -> list[Passband]:
-    """Return passbands by name; raises BadInput if a name is unknown."""
+    """Return the passbands with the given names, built-in or from the user; raises BadInput if a name is unknown."""
     available = (*passbands.names(), *user_passbands)
     for name in names:
         if name not in available:
@@ -161,7 +176,10 @@ def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband
 
 
 def template_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Return the table `templates`: galaxies (user or built-in), quasars, high-redshift galaxies and stars."""
+    """Return the rows of the table `templates`: spectra of galaxies, quasars, high-redshift galaxies and stars.
+
+    Galaxies and stars are taken from `flux_inputs`; quasars and high-redshift galaxies are built in.
+    """
     libraries = {
         "galaxy": flux_inputs.library,
         "qso": high_redshift.quasar_library(),
@@ -180,7 +198,7 @@ def template_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def law_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Return the table `extinction_laws` on the wavelengths of the galaxy templates."""
+    """Return the rows of the table `extinction_laws`: k(lambda) of five laws, at the galaxy templates' wavelengths."""
     code = Path(extinction.__file__)
     embedded = (
         _origin("no dust", code),
@@ -193,7 +211,11 @@ def law_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def line_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Return the table `emission_lines`. User files contain no lines, so `flux_inputs` is not used."""
+    """Return the rows of the table `emission_lines`, which are always the built-in lines.
+
+    `flux_inputs` is not used, because a user cannot give lines. It is a parameter so that all four functions that make
+    a table have the same signature.
+    """
     emission_lines = lines.line_list()
     return line_table.line_rows(
         emission_lines, lines.width_law(), [_origin(line.source, lines.TABLE) for line in emission_lines]
@@ -201,7 +223,7 @@ def line_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def passband_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Return the table `passbands` with built-in and user passbands."""
+    """Return the rows of the table `passbands`: all built-in passbands, then the user's."""
     bands = [*(passbands.load(name) for name in passbands.names()), *flux_inputs.passbands.values()]
     origins = [_passband_origin(name) for name in passbands.names()]
     origins += [flux_inputs.origins[f"{FILTER_PREFIX}{name}"] for name in flux_inputs.passbands]
@@ -210,7 +232,12 @@ def passband_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def galaxy_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
-    """Return the galaxy library with which a flux table is computed, from the facts of its plan."""
+    """Return the galaxy library with which a table of fluxes is computed.
+
+    `facts` has the recorded inputs of this table: `files` has the checksums of user files. `sources` has the keys
+    (hashes) of the versions of input tables, such as `templates`. The library is read from the lake if it
+    contains a user's templates or extinction laws.
+    """
     library = templates.galaxy_library()
     if any(key.startswith((_TEMPLATES_PREFIX, _LAWS_PREFIX)) for key in facts.get("files", ())):
         library = published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
@@ -218,28 +245,34 @@ def galaxy_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library
 
 
 def stellar_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
-    """Return the stellar library with which a flux table is computed, from the facts of its plan."""
+    """Return the stellar library with which a table of fluxes is computed.
+
+    `facts` has the recorded inputs of this table: `files` has the checksums of user files. `sources` has the keys
+    (hashes) of the versions of input tables, such as `templates`. The library is read from the lake if it
+    contains a user's stars.
+    """
     if not any(key.startswith(_STARS_PREFIX) for key in facts.get("files", ())):
         return templates.stellar_library()
     return published_stars(lake, facts["sources"]["templates"])
 
 
 def passband_from_facts(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
-    """Return a passband with which a flux table is computed.
+    """Return a passband with which a table of fluxes is computed.
 
     Parameters
     ----------
     lake : Folder
-        The lake.
-    facts : mapping of str
-        Facts of the plan of the flux table.
+        Root folder of the lake.
+    facts : mapping of str to object
+        Recorded inputs of the flux table: `files` are the checksums of user files, `sources` the keys (hashes) of the
+        versions of the table `passbands` and others.
     name : str
         Name of the passband.
 
     Returns
     -------
     Passband
-        The built-in or published passband.
+        The user's passband, read from the lake, if `files` contains one of this name, otherwise the built-in passband.
     """
     if f"{FILTER_PREFIX}{name}" not in facts.get("files", ()):
         return passbands.load(name)
@@ -248,19 +281,19 @@ def passband_from_facts(lake: Folder, facts: Mapping[str, Any], name: str) -> Pa
 
 @lru_cache(maxsize=2)
 def published_library(lake: Folder, templates_key: str, laws_key: str) -> Library:
-    """Return the galaxies of published versions of `templates` and `extinction_laws`, memory-mapped from the cache.
+    """Read the galaxy library from the tables `templates` and `extinction_laws` of a lake.
 
     Parameters
     ----------
     lake : Folder
-        The lake.
+        Root folder of the lake.
     templates_key, laws_key : str
-        Keys of the versions.
+        Keys (hashes) of the versions of these tables.
 
     Returns
     -------
     Library
-        Templates and laws.
+        Galaxy templates and extinction laws, memory-mapped from the cache on disc.
     """
 
     def read_rows() -> dict[str, Array]:
@@ -279,7 +312,10 @@ def published_library(lake: Folder, templates_key: str, laws_key: str) -> Librar
 
 @lru_cache(maxsize=2)
 def published_stars(lake: Folder, templates_key: str) -> Library:
-    """Return the stars of a published version of `templates`, memory-mapped from the cache."""
+    """Read the stellar library from the table `templates` of a lake.
+
+    `templates_key` is the key (hash) of the version of the table. The spectra are memory-mapped from the cache on disc.
+    """
 
     def read_rows() -> dict[str, Array]:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
@@ -292,16 +328,16 @@ def published_stars(lake: Folder, templates_key: str) -> Library:
 
 
 def published_passband(lake: Folder, key: str, name: str) -> Passband:
-    """Return a passband of a published version of the table `passbands`.
+    """Read a passband from the table `passbands` of a lake.
 
     Parameters
     ----------
     lake : Folder
-        The lake.
+        Root folder of the lake.
     key : str
-        Key of the version.
+        Key (hash) of the version of the table.
     name : str
-        Name of the passband.
+        Name of a passband in this table.
 
     Returns
     -------
@@ -316,7 +352,10 @@ def published_passband(lake: Folder, key: str, name: str) -> Passband:
 
 @contextmanager
 def _prefix_errors(key: str) -> Iterator[None]:
-    """Add the key of the request to the message of any error."""
+    """Convert errors (BadInput, OSError, ValueError) inside the `with` block to BadInput with a prefix.
+
+    The prefix is the key of the request that names the user's file.
+    """
     try:
         yield
     except (BadInput, OSError, ValueError) as error:
@@ -342,11 +381,15 @@ def _galaxy_origin(template: int) -> Origin:
 
 
 def _star_origins(user_origins: Sequence[Origin]) -> list[Origin]:
-    """Return the origins of the stellar library; `user_origins` has one per user dwarf, () if dwarfs are built in."""
+    """Return the origin (files, reference and checksum) of each template of the stellar library.
+
+    `user_origins` has the origin of each dwarf from a user's file; it is empty if the dwarfs are built in.
+    """
     dwarfs = _origin("Pecaut & Mamajek 2013", stellar.TABLE)
     first = [*user_origins] or [dwarfs] * len(stellar.types().names)
     colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
-    # Models change smoothly into dwarfs. User dwarfs replace the models, or provide their infrared spectra.
+    # Give each model star the origin of the user's dwarf of next higher temperature. Spectra of model stars are
+    # computed from the user's dwarfs, or have infrared parts from the user's files.
     models = (
         [user_origins[k] for k in model_stars.nearest_dwarfs(stellar.types())]
         if user_origins

@@ -1,6 +1,7 @@
 """Compute band fluxes of many sources by direct integration over the wavelengths of the bands.
 
-The sums are the same as band_fluxes.band_fluxes of whole spectra, but in blocks that stay in the processor's cache.
+The sums equal those of `band_fluxes.band_fluxes`, which needs whole spectra (600 to 24000 A). Here only wavelengths
+inside the bands are computed, for blocks of sources that stay in the processor's cache.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from truesky.fluxes.spectra import extinction, lines
 from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_curves, observed_shape
 from truesky.numerics import matrices
 
-# Samples (rows times wavelengths) per block. Temporary arrays of half a MB are kept by the allocator for reuse.
+# Largest number of samples (sources times wavelengths) per block. The memory allocator keeps temporary arrays of this
+# size (half a MB) for reuse.
 _BLOCK = 60_000
-# Bands closer than this are integrated in one window, A.
+# Largest gap (A) between two bands that are integrated in one wavelength window.
 _GAP = 300
-# Galaxies whose lines are computed together.
+# Number of galaxies whose emission lines are computed in one block.
 _LINE_ROWS = 128
 
 
@@ -37,13 +39,14 @@ class WavelengthWindow:
     Attributes
     ----------
     first : int
-        Wavelength of the first sample in A.
+        Wavelength of the first sample in A. The w samples are 1 A apart.
     weights : float array, shape (w, n_band)
-        Weights of every band, 0 outside the band.
+        Weights of every band such that f_nu = f_lambda @ weights; 0 outside the band.
     milky_way : float32 array, shape (w,)
         A(lambda) / A(V) of the Milky Way.
     reference : (int, int), optional
-        First sample of the reference band and the sample after its last; None if it is in another window.
+        First sample of the reference band, in which the catalogue gives magnitudes, and the sample after its last. None
+        if this band is in another window or not needed.
     """
 
     first: int
@@ -63,7 +66,7 @@ def galaxy_fluxes(rows: Galaxies, bands: Sequence[Passband], library: Library) -
     rows : Galaxies
         The galaxies.
     bands : sequence of Passband
-        The passbands.
+        The passbands, at least one.
     library : Library
         Templates of galaxies.
 
@@ -72,19 +75,25 @@ def galaxy_fluxes(rows: Galaxies, bands: Sequence[Passband], library: Library) -
     float array, shape (n, n_band)
         f_nu in microjansky.
 
+    Raises
+    ------
+    BadInput
+        If there is no passband, or if dust leaves a galaxy no light in the band of its magnitude mag_r01.
+
     Notes
     -----
-    The error relative to integration over whole spectra is 1e-7 (tests/truesky/fluxes/test_integration.py).
+    The relative difference from integration over whole spectra is 1e-7 (tests/truesky/fluxes/test_integration.py).
     """
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     windows, reference_weights = _windows(bands, reference), passbands.weights(reference)
-    # Galaxies with similar redshifts have windows of the same width.
+    # Sort by redshift, because all galaxies of a block get as many template samples as the galaxy that needs the most.
     order = np.argsort(rows.mix.z_obs, kind="stable")
     continuum, observed = np.zeros((len(rows), len(bands))), np.zeros(len(rows))
     for indices in _blocks(order, len(reference.wavelength)):
         block = rows.select(indices)
         amplitude = amplitudes(block.mix, reference, library, dust)
-        # Scale to order 1 for any units, so that single precision does not underflow.
+        # Divide the amplitudes of both templates by their sum, because single precision could underflow for smaller
+        # numbers. The factor `scale` below restores the true flux.
         amplitude /= amplitude.sum(0)
         for window in windows:
             for block_rows in _blocks(np.arange(len(indices)), len(window)):
@@ -101,14 +110,14 @@ def galaxy_fluxes(rows: Galaxies, bands: Sequence[Passband], library: Library) -
 
 
 def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
-    """Return the fluxes of stars behind the dust in front of each.
+    """Return the fluxes of stars, dimmed by the Milky Way dust in front of each star.
 
     Parameters
     ----------
     rows : Stars
         The stars.
     bands : sequence of Passband
-        The passbands.
+        The passbands, at least one.
     library : Library
         Templates of stars.
 
@@ -116,6 +125,11 @@ def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Flo
     -------
     float array, shape (n, n_band)
         f_nu in microjansky.
+
+    Raises
+    ------
+    BadInput
+        If there is no passband.
     """
     scale = star_scale(rows, library)
     f_nu = np.zeros((len(rows), len(bands)))
@@ -137,7 +151,11 @@ def _blocks(rows: Int, width: int) -> Iterator[Int]:
 
 
 def _line_fluxes(rows: Galaxies, order: Int, bands: Sequence[Passband]) -> Float:
-    """Return f_nu of the lines in microjansky, behind the Milky Way but not magnified: float64[n, n_band]."""
+    """Return f_nu (microjansky) of each galaxy's emission lines in each band, float64[n, n_band].
+
+    Milky Way extinction is included, lensing magnification is not. Blocks of galaxies are processed in the given
+    order (indices sorted by redshift).
+    """
     out = np.zeros((len(rows), len(bands)))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     for medium in sorted({band.medium for band in bands}):
@@ -163,7 +181,11 @@ def _line_block_fluxes(profiles: lines.Profiles, rows: Galaxies, table: Float) -
 
 
 def _full_weights(bands: Sequence[Passband]) -> Float:
-    """Return each band's weights on the grid, 0 at its ends, and A(lambda) / A(V) last: float64[23401, n_band + 1]."""
+    """Return the weights of each band and, in the last column, A(lambda) / A(V): float64[23401, n_band + 1].
+
+    Rows are the wavelengths of passbands.grid(). Weights of the first and last row are 0, because wavelengths outside
+    the grid are clipped to these rows.
+    """
     grid = passbands.grid()
     table = np.zeros((len(grid), len(bands) + 1))
     for k, band in enumerate(bands):
@@ -174,7 +196,10 @@ def _full_weights(bands: Sequence[Passband]) -> Float:
 
 
 def _windows(bands: Sequence[Passband], reference: Passband | None) -> list[WavelengthWindow]:
-    """Return the windows that contain all bands and the reference band."""
+    """Return wavelength windows that together contain all bands and, if given, the reference band.
+
+    Bands at most `_GAP` apart share a window. Raises BadInput if `bands` is empty.
+    """
     all_bands = [*bands, *([reference] if reference is not None else [])]
     if not bands:
         raise BadInput("passbands: at least one is required")
@@ -200,6 +225,9 @@ def _window(first: int, last: int, bands: Sequence[Passband], reference: Passban
 
 
 def _band_samples(band: Passband, first: int, last: int) -> tuple[int, int] | None:
-    """Return the samples of a band in a window. A band is inside a single window."""
+    """Return the first sample of a band in the window `first` to `last` (A), and the sample after its last.
+
+    Return None if the band is in another window. A band never extends over two windows.
+    """
     low = int(band.wavelength[0]) - first
     return (low, low + len(band.wavelength)) if 0 <= low <= last - first else None

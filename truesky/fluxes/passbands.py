@@ -20,12 +20,13 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.numerics import cache, matrices
 from truesky.numerics.code_fingerprints import code_key
 
-# Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
+# First and last wavelength of the common grid, A. Serrano et al. 2024, appendix B, resample every spectrum and response
+# to this range in steps of 1 A.
 GRID_FIRST, GRID_LAST = 600, 24000
-# Each end of a curve is cut so that this fraction of the photons of a source with constant f_lambda is outside.
-# Nothing is cut inside: for sources behind dust, a red leak has most of the flux in ultraviolet bands.
+# Each end of a passband is cut so that this fraction of the photons of a source with constant f_lambda is lost. Small
+# responses between the ends are kept: with much dust, the red leak of an ultraviolet band has most of the flux.
 END_PHOTON_FRACTION = 1e-7
-# Extent of a logistic edge in widths; exp(-20) is negligible.
+# Extent of a logistic edge of a band in units of its width; exp(-20) is negligible.
 _LOGISTIC_REACH = 20.0
 
 TABLE = Path(__file__).with_suffix(".csv")
@@ -33,14 +34,14 @@ TABLE = Path(__file__).with_suffix(".csv")
 
 @dataclass(frozen=True, slots=True)
 class Passband:
-    """Photon response of a telescope, filter and detector.
+    """Photon response of a telescope, filter and detector, as a function of wavelength.
 
     Attributes
     ----------
     name : str
         Name of the passband.
     wavelength : float array, shape (n,)
-        Wavelengths inside the grid in A, whole numbers in steps of 1, in the band's medium.
+        Wavelengths in A, whole numbers in steps of 1 between 600 and 24000, in the band's medium.
     response : float array, shape (n,)
         Detected photons per arriving photon. Some published curves have an arbitrary scale.
     medium : str
@@ -54,12 +55,12 @@ class Passband:
 
     @property
     def first(self) -> int:
-        """Return the index of the first wavelength on the grid."""
+        """Return the index of the band's first wavelength on the grid of `grid()`."""
         return int(self.wavelength[0]) - GRID_FIRST
 
 
 def grid() -> Float:
-    """Return the observed-frame wavelength grid in A, float64[23401]."""
+    """Return the observed-frame wavelength grid, 600 to 24000 A in steps of 1 A: float64[23401]."""
     return np.arange(GRID_FIRST, GRID_LAST + 1, dtype=float)
 
 
@@ -69,7 +70,7 @@ def names() -> tuple[str, ...]:
 
 
 def load(name: str) -> Passband:
-    """Return a passband by name, resampled linearly to 1 A; raises BadInput if the name is unknown."""
+    """Return a built-in passband by name, resampled to steps of 1 A; raises BadInput if the name is unknown."""
     rows = _rows()
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
@@ -80,13 +81,17 @@ def load(name: str) -> Passband:
 
 
 def provenance(name: str) -> tuple[str, str]:
-    """Return the source of a passband as in passbands.csv, and a note."""
+    """Return two columns of passbands.csv for a built-in passband: the source of its curve, and a note.
+
+    The source is "speclite:NAME" for a curve of the package speclite, or "logistic:..." with the parameters of a
+    top hat with logistic edges. Raises KeyError if the name is unknown.
+    """
     row = _rows()[name]
     return row["source"], row["note"]
 
 
 def weights(band: Passband) -> Float:
-    """Return weights float64[n] such that f_nu = weights @ f_lambda(band.wavelength).
+    """Return weights, float64[n], such that the band-averaged f_nu is weights @ f_lambda(band.wavelength).
 
     f_nu is in erg s-1 cm-2 Hz-1 for f_lambda in erg s-1 cm-2 A-1.
 
@@ -105,14 +110,17 @@ def weights(band: Passband) -> Float:
 
 
 def log_width(band: Passband) -> float:
-    """Return int R dln(lambda), which converts f_nu to detected photons (lake_schema.units.electron_rate)."""
+    """Return the integral of the response R over ln(lambda), without unit.
+
+    `lake_schema.units.electron_rate` uses it to convert f_nu to detected photons.
+    """
     return float(np.sum(band.response / band.wavelength))
 
 
 def pivot_wavelength(band: Passband) -> float:
     """Return the pivot wavelength in A, sqrt(int R lambda dlambda / int R dlambda / lambda).
 
-    On average, f_nu = f_lambda lambda^2 / c at this wavelength.
+    At this wavelength, band averages obey f_nu = f_lambda lambda^2 / c.
     """
     return float(np.sqrt(np.sum(band.response * band.wavelength) / np.sum(band.response / band.wavelength)))
 
@@ -165,7 +173,11 @@ def _rows() -> dict[str, dict[str, str]]:
 
 
 def _curve(source: str, shift: float) -> dict[str, Float]:
-    """Return the response on whole angstroms. A shift above 1 moves it to the blue: R_new(lambda) = R(shift lambda)."""
+    """Compute the response of a built-in passband on whole angstroms, from its columns in passbands.csv.
+
+    `source` is "speclite:NAME" or "logistic:BLUE:RED:WIDTH:PEAK". A `shift` above 1 moves the band to the blue:
+    R_new(lambda) = R(shift lambda).
+    """
     kind, _, detail = source.partition(":")
     wavelength, response = _speclite_curve(detail) if kind == "speclite" else _logistic(detail)
     angstroms, resampled_response = resample_to_grid(wavelength / shift, response)
@@ -173,7 +185,7 @@ def _curve(source: str, shift: float) -> dict[str, Float]:
 
 
 def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
-    """Resample a curve linearly to the whole angstroms of the grid, without its ends; empty if it is outside the grid.
+    """Resample a passband linearly to whole angstroms from 600 to 24000 A, and cut its negligible ends.
 
     Parameters
     ----------
@@ -185,7 +197,8 @@ def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
     Returns
     -------
     wavelength, response : float array, shape (n,)
-        The resampled curve, without `END_PHOTON_FRACTION` of the photons at each end.
+        The resampled curve, without `END_PHOTON_FRACTION` of the photons at each end. Both are empty if the curve
+        contains no whole angstrom of the grid.
     """
     angstroms = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
     angstroms = angstroms[(angstroms >= GRID_FIRST) & (angstroms <= GRID_LAST)]
@@ -198,16 +211,19 @@ def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
 
 
 def _speclite_curve(name: str) -> tuple[Float, Float]:
-    # The import is slow, and needed only if a band is not in the cache.
+    # Import here, because the import is slow, and needed only if a band is not in the disc cache.
     from speclite.filters import load_filter
 
-    # load_filter converts to A; the files themselves are in A, nm or um.
+    # `load_filter` returns wavelengths in A, although the files of speclite are in A, nm or um.
     response = load_filter(name)
     return np.asarray(response.wavelength, float), np.clip(np.asarray(response.response, float), 0.0, None)
 
 
 def _logistic(detail: str) -> tuple[Float, Float]:
-    """Return a top hat with logistic edges from "blue edge:red edge:width of the edges:peak", wavelengths in A."""
+    """Return wavelengths (A) and response of a top hat with logistic edges.
+
+    `detail` is "BLUE:RED:WIDTH:PEAK": the positions of both edges and their width in A, and the peak response.
+    """
     blue, red, width, peak = (float(part) for part in detail.split(":"))
     wavelength = np.arange(np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0)
     edges = 1.0 / ((1.0 + np.exp(-(wavelength - blue) / width)) * (1.0 + np.exp((wavelength - red) / width)))

@@ -1,4 +1,4 @@
-"""Convert rows of the catalogue tables to checked arrays, from which spectra are computed."""
+"""Convert rows of the catalogue tables `galaxies` and `stars` to checked arrays, from which spectra are computed."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.spectra import lines
 from truesky.fluxes.spectra.continuum import COMPONENTS, TemplateMix, check_range, mix_from_columns, take_last_axis
 
+# Largest lensing magnification that is accepted.
 MAGNIFICATION_MAX = 100.0
-# Suffixes of the columns with further templates of a star, in addition to `sed`.
+# Numbers k of the columns sed_k and frac_k, which add up to three templates to a star's template `sed`.
 STAR_COMPONENTS = (2, 3, 4)
-# Kinds whose templates are in the galaxy library: central, satellite, strong lens.
+# Values of the column `kind` whose templates are in the galaxy library: 0 central, 1 satellite, 4 strong lens.
 GALAXY_KINDS = (0, 1, 4)
 
 
@@ -32,13 +33,14 @@ class Galaxies:
     Attributes
     ----------
     mix : TemplateMix
-        Two templates of each galaxy, with dust.
+        Redshift, and two templates with their dust, of each galaxy.
     abs_mag_r01, mag_r01 : float array, shape (n,)
-        Absolute (M - 5 log10 h) and apparent AB magnitude in the reference band.
+        Absolute (M - 5 log10 h) and apparent AB magnitude in the reference band 0.1r, before lensing and Milky Way
+        extinction.
     lines : float array, shape (n, n_line)
         Flux of each line of lines.line_list() in erg s-1 cm-2, 0 without a line.
     magnification : float array, shape (n,)
-        Magnification by gravitational lensing.
+        Flux magnification by gravitational lensing, 1 without lensing.
     a_v : float array, shape (n,)
         Extinction A(V) of the Milky Way in mag.
     """
@@ -51,7 +53,7 @@ class Galaxies:
     a_v: Float
 
     def __post_init__(self) -> None:
-        # Compiled code reads all lines without a check of array bounds.
+        # Check the shape here, because compiled code reads all lines without checking array bounds.
         expected_shape = len(self.mix), len(lines.line_list())
         if self.lines.shape != expected_shape:
             raise ValueError(f"lines are of shape {self.lines.shape}, not {expected_shape}")
@@ -60,7 +62,7 @@ class Galaxies:
         return len(self.mix)
 
     def select(self, indices: Int | slice) -> Galaxies:
-        """Return the galaxies with these indices."""
+        """Return the galaxies with the given indices, or in the given slice."""
         return Galaxies(
             self.mix.select(indices),
             take_last_axis(self.abs_mag_r01, indices),
@@ -73,18 +75,18 @@ class Galaxies:
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """Properties of n stars that set their spectra.
+    """Properties of n stars that set their spectra. The spectrum of a star is a mixture of up to k templates.
 
     Attributes
     ----------
     sed : int array, shape (k, n)
-        Indices of the templates that are mixed.
+        Indices of the templates in the stellar library.
     frac : float array, shape (k, n)
-        Fractions of f_lambda at 5500 A for these templates.
+        Fraction of each template in f_lambda at 5500 A; 0 for a template that is not used.
     mag_h : float array, shape (n,)
         H magnitude (Vega) before extinction.
     a_v : float array, shape (n,)
-        Extinction A(V) in mag.
+        Extinction A(V) of the Milky Way in mag.
     """
 
     sed: Int
@@ -96,17 +98,17 @@ class Stars:
         return len(self.mag_h)
 
     def select(self, indices: Int | slice) -> Stars:
-        """Return the stars with these indices."""
+        """Return the stars with the given indices, or in the given slice."""
         return Stars(self.sed[:, indices], self.frac[:, indices], self.mag_h[indices], self.a_v[indices])
 
     @classmethod
     def from_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
-        """Return stars with one template each.
+        """Return stars with a single template each.
 
         Parameters
         ----------
         sed : int array, shape (n,)
-            Indices of the templates.
+            Index of each star's template in the stellar library.
         mag_h : float array, shape (n,)
             H magnitudes (Vega) before extinction.
         a_v : float array, shape (n,)
@@ -121,12 +123,12 @@ class Stars:
 
 
 def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
-    """Return checked rows of the table `galaxies`.
+    """Check rows of the table `galaxies`, and convert them to arrays.
 
     Parameters
     ----------
     table : pa.Table
-        Rows of galaxies whose `kind` has templates in the library (not quasars, not high-redshift galaxies).
+        Rows with `kind` 0, 1 or 4 (central, satellite, strong lens), or without a column `kind`.
     library : Library
         Templates to which sed_1 and sed_2 refer.
 
@@ -138,9 +140,10 @@ def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
     Raises
     ------
     BadInput
-        If a value is missing or NaN. The message names the column and the source.
+        If a column is missing, a value is null or NaN, or `kind` is another number. The message names the column and
+        the source.
     OutOfRange
-        If a value is out of range. The message names the column.
+        If a value is outside its declared bounds, or a magnification is not in (0, 100]. The message names the column.
     """
     _refuse_other_kinds(table)
     names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
@@ -158,7 +161,13 @@ def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
 
 
 def stars_from_table(table: pa.Table, library: Library) -> Stars:
-    """Return checked rows of the table `stars`; raises the same errors as `galaxies_from_table`."""
+    """Check rows of the table `stars`, and convert them to arrays.
+
+    `library` has the templates to which the columns `sed`, sed_2, sed_3 and sed_4 refer. If a column sed_k is missing
+    or contains only nulls, frac_k is not read and counts as 0. Otherwise a null or NaN in frac_k counts as 0. Raises
+    BadInput if another required column or value is missing. Raises OutOfRange if a value is out of bounds, or if sed_k
+    is null although frac_k is above 0.
+    """
     mag_h, a_v = (column(table, name) for name in ("mag_h", "a_v"))
     for name, values in (("mag_h", mag_h), ("a_v", a_v)):
         declared = STARS.column(name)
@@ -186,19 +195,19 @@ def magnification(
     Parameters
     ----------
     kappa, gamma1, gamma2 : float array, shape (n,)
-        Convergence and shear.
+        Convergence, and both components of the shear.
     ids : sequence of int, length n
-        Identifiers of the sources for messages.
+        Identifiers of the sources, for error messages.
 
     Returns
     -------
     float array, shape (n,)
-        Magnification, 0 to 100.
+        Flux magnification, above 0 and at most 100.
 
     Raises
     ------
     OutOfRange
-        If mu is not in (0, 100], which occurs at and inside the critical curve. The message names the source.
+        If mu is not in (0, 100], which occurs near and inside the critical curve. The message names the source.
 
     References
     ----------
@@ -219,27 +228,34 @@ def determinant(kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLi
     Parameters
     ----------
     kappa, gamma1, gamma2 : float array, shape (n,)
-        Convergence and shear.
+        Convergence, and both components of the shear.
 
     Returns
     -------
     float array, shape (n,)
-        Determinant of the lensing matrix.
+        Determinant of the lensing Jacobian matrix; 0 on the critical curve.
     """
     stretch = 1.0 - np.asarray(kappa, float)
     shear = np.hypot(np.asarray(gamma1, float), np.asarray(gamma2, float))
-    # The product of sum and difference is more precise than the difference of squares.
+    # a^2 - b^2 as (a - b)(a + b), which has a smaller rounding error.
     return np.asarray((stretch - shear) * (stretch + shear))
 
 
 def table_magnification(table: pa.Table) -> Float:
-    """Return the magnification of rows of the table `galaxies`."""
+    """Return the lensing magnification of rows of the table `galaxies`, from the columns kappa, gamma1 and gamma2.
+
+    Raises BadInput if a value is missing, and OutOfRange if a magnification is not in (0, 100].
+    """
     kappa, gamma1, gamma2 = (column(table, name) for name in ("kappa", "gamma1", "gamma2"))
     return magnification(kappa, gamma1, gamma2, source_ids(table))
 
 
 def _line_fluxes(table: pa.Table) -> Float:
-    """Return the fluxes of all lines; 0 for a missing column, null or NaN, which mark lines that were not modelled."""
+    """Return the fluxes of all emission lines in erg s-1 cm-2, float64[n, n_line].
+
+    A missing column, null or NaN gives 0, because it marks a line that was not modelled. Raises OutOfRange if a flux is
+    outside its declared bounds.
+    """
     out = np.zeros((table.num_rows, len(lines.line_list())))
     for k, line in enumerate(lines.line_list()):
         if line.column not in table.column_names:
@@ -275,14 +291,14 @@ def _refuse_other_kinds(table: pa.Table) -> None:
 
 
 def source_ids(table: pa.Table) -> Int:
-    """Return the identifiers of the rows, or row numbers if the table has no column `id`."""
+    """Return the column `id` as int64, or the row numbers from 0 if the table has no column `id`."""
     if "id" not in table.column_names:
         return np.arange(table.num_rows, dtype=np.int64)
     return np.asarray(table["id"].to_numpy(), np.int64)
 
 
 def column(table: pa.Table, name: str) -> Float:
-    """Return a column as floats; raises BadInput if a value is missing."""
+    """Return a column as float64; raises BadInput if the column is missing or contains null or NaN."""
     values = _floats(table, name)
     gap = np.isnan(values)
     if gap.any():
@@ -292,7 +308,7 @@ def column(table: pa.Table, name: str) -> Float:
 
 
 def _floats(table: pa.Table, name: str) -> Float:
-    """Return a column as float64, with NaN for null."""
+    """Return a column as float64, with NaN for null; raises BadInput if the column is missing."""
     if name not in table.column_names:
         raise BadInput(f"column {name} is missing")
     return np.asarray(pc.cast(table[name], pa.float64()).to_numpy(), float)

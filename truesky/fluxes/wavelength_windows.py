@@ -1,7 +1,7 @@
 """Compute spectra of many sources in one range of wavelengths, for grism spectroscopy.
 
-Results are the same as in band_fluxes, but only in the requested range, and in blocks that stay in the processor's
-cache.
+The spectra equal the results of `band_fluxes` in the requested range. They are computed in blocks of sources that stay
+in the processor's cache.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from truesky.fluxes.spectra import extinction, lines
 from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_curves, observed_shape
 from truesky.numerics import matrices
 
-# Rows per block, about 1 MB of wavelengths.
+# Number of sources per block. Their spectra are about 1 MB.
 _ROWS = 32
 
 
@@ -29,7 +29,7 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
     rows : Galaxies
         The galaxies.
     first : int
-        First wavelength in A (vacuum).
+        First observed wavelength in A (vacuum).
     count : int
         Number of wavelengths in steps of 1 A.
     library : Library
@@ -42,20 +42,22 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
 
     Notes
     -----
-    The error relative to whole spectra is 1e-6 (tests/truesky/fluxes/test_wavelength_windows.py).
+    The relative difference from `band_fluxes.galaxy_spectra` is 1e-6
+    (tests/truesky/fluxes/test_wavelength_windows.py).
     """
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     weights, grid = passbands.weights(reference), first + np.arange(float(count))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     milky_way = extinction.milky_way(grid).astype(np.float32)
     out = np.empty((len(rows), count), np.float32)
-    # Galaxies with similar redshifts have windows of the same width.
+    # Sort by redshift, because all galaxies of a block get as many template samples as the galaxy that needs the most.
     order = np.argsort(rows.mix.z_obs, kind="stable")
     for start in range(0, len(rows), _ROWS):
         indices = order[start : start + _ROWS]
         block = rows.select(indices)
         amplitude = amplitudes(block.mix, reference, library, dust)
-        # Scale to order 1 for any units, so that single precision does not underflow.
+        # Divide the amplitudes of both templates by their sum, because single precision could underflow for smaller
+        # numbers. The factor `scale` below restores the true flux.
         amplitude /= amplitude.sum(0)
         reference_shape = observed_shape(
             block.mix, amplitude, library, dust, int(reference.wavelength[0]), len(weights)
@@ -72,16 +74,16 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
 
 
 def star_spectra(rows: Stars, first: int, count: int, library: Library) -> Float32:
-    """Return spectra of stars behind the dust in front of each.
+    """Return spectra of stars, dimmed by the dust in front of each star.
 
     Parameters
     ----------
     rows : Stars
         The stars.
     first : int
-        First wavelength in A (vacuum).
+        First wavelength in A (vacuum), 600 or more.
     count : int
-        Number of wavelengths in steps of 1 A.
+        Number of wavelengths in steps of 1 A; the last must not be above 24000 A.
     library : Library
         Templates of stars.
 

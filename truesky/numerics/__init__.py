@@ -1,1 +1,1 @@
-"""Arithmetic with the same bits on every machine, compiled functions, and a disc cache of computed arrays."""
+"""Matrix arithmetic with the same bits on every machine, compilation of functions, and a disc cache of arrays."""

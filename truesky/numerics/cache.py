@@ -1,6 +1,7 @@
-"""Store arrays that are expensive to compute on disc, keyed by the inputs of the computation.
+"""Store arrays that are expensive to compute in a cache on disc, under a hash of the inputs of the computation.
 
-A process checks the checksum of a file before it first maps it. A damaged file is computed again, with a warning.
+Arrays are memory-mapped. Before a process maps a file for the first time, it checks the checksum. If a file is damaged,
+its arrays are computed again, with a warning.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from lake_schema.errors import BadInput
 from lake_schema.store import blocks, layout, manifest
 from lake_schema.store.provenance import digest, machine
 
+# Name of the file with the checksums of a folder's files, and suffix of a file with an array.
 _CHECKSUM_FILE, _ARRAY = "sums.json", ".npy"
-# Another process may remove a damaged folder just after this one has replaced it.
+# Largest number of attempts to write and read an entry (a folder of arrays): another process may remove it as damaged
+# just after this process has replaced it.
 _TRIES = 3
+# Number of hexadecimal digits of the hash in the name of an entry's folder.
 _KEY_LENGTH = 32
 
 
@@ -44,7 +48,10 @@ def cache_dir() -> Path:
 
 @contextlib.contextmanager
 def use_temporary_dir() -> Iterator[None]:
-    """Use an empty cache in this context, and remove it afterwards."""
+    """Use an empty temporary folder as the cache inside the `with` block, and remove it at the end.
+
+    $TRUESKY_CACHE is set to the folder, so that child processes use it, too, and restored at the end.
+    """
     previous = os.environ.get("TRUESKY_CACHE")
     with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
         os.environ["TRUESKY_CACHE"] = folder
@@ -57,26 +64,31 @@ def use_temporary_dir() -> Iterator[None]:
 
 
 def machine_code_dir() -> Path:
-    """Return the folder for machine code of numba, in $NUMBA_CACHE_DIR or the cache, named by a key of the sources."""
+    """Return the folder for machine code of numba, named by a hash of the sources (16 digits of `sources_key`).
+
+    It is in $NUMBA_CACHE_DIR, by default in the folder `numba` of the cache. It may not exist yet.
+    """
     folder, key = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_dir() / "numba"), sources_key()[:16]
-    # In a child process $NUMBA_CACHE_DIR may contain the key already.
+    # Do not append the key twice: in a child process $NUMBA_CACHE_DIR may be the folder of the parent process.
     return folder if folder.name == key else folder / key
 
 
 def sources_key(root: Path = Path(__file__).parents[1]) -> str:
-    """Return the sha256 (hex) of every file below a folder that names truesky.numerics.compiling.
+    """Return one sha256 (hexadecimal) of the paths and contents of all Python files that affect compiled machine code.
 
-    numba compiles a function again if its own file changes, but not if another file changes whose functions or
-    constants it contains. A file with such constants therefore names the module in a comment.
+    They are the files below the folder `root` that contain the text "truesky.numerics.compiling". Numba compiles a
+    function again if its own file changes, but not if its constants or the functions that it calls change in another
+    file. The other file must therefore contain this text, for example in a comment.
     """
     compiled = [path for path in sorted(root.rglob("*.py")) if b"truesky.numerics.compiling" in path.read_bytes()]
     return content_key(*(part for path in compiled for part in (path.relative_to(root).as_posix(), path.read_bytes())))
 
 
 def content_key(*parts: bytes | str | int | float | Array) -> str:
-    """Return the sha256 (hex) of the parts, each with its type, shape and length: ("ab", "c") and ("a", "bc") differ.
+    """Return one sha256 (hexadecimal) of all arguments, which identifies the inputs of a computation.
 
-    Raises BadInput for parts of other types than bytes, str, int, float and arrays without objects.
+    Types, shapes and lengths are included: ("ab", "c") and ("a", "bc") differ. Raises BadInput for an argument that is
+    not bytes, str, int, float or a NumPy array without Python objects; bool is refused, too.
     """
     digest = hashlib.sha256()
     for part in parts:
@@ -106,24 +118,26 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     Parameters
     ----------
     name : str
-        Legible beginning of the folder's name.
+        First part of the name of the folder with the arrays, to be read by humans.
     key : str
-        Result of `content_key`.
+        Hash of everything on which the arrays depend, from `content_key`.
     make : callable
-        Function that computes the arrays by name. It is called only if the cache has no intact files for the key. If
-        several processes compute them at the same time, all use the arrays that were published first.
+        Function without arguments that returns the arrays by name. It is called only if the cache has no intact files
+        for the key. If several processes compute the arrays at the same time, all use those that were stored first.
 
     Returns
     -------
     dict of str to array
-        Arrays that are mapped from disc, read-only.
+        Read-only arrays, memory-mapped from disc.
 
     Raises
     ------
     BadInput
-        If the stored arrays cannot be read after several attempts.
+        If `make` returns no arrays, a name is not allowed as a file name, or the stored arrays cannot be read after
+        three attempts.
     """
-    # If different kinds of machine share the cache, each kind has separate files: their last bits may differ.
+    # Include the kind of this machine (instruction set and C library) in the key. Machines of different kinds may share
+    # the cache, and the last bits of their results may differ.
     machine_key = content_key(key, machine())[:_KEY_LENGTH]
     folder = cache_dir() / f"{layout.check_name(name)}-{machine_key}"
     arrays: Mapping[str, Array] | None = None
@@ -146,13 +160,13 @@ def _load(folder: Path) -> dict[str, Array] | None:
     try:
         return {name.removesuffix(_ARRAY): _map(folder / name) for name in checksums}
     except (ValueError, EOFError, FileNotFoundError) as error:
-        # Another process may have removed the folder in the meantime.
+        # Treat a file that vanished like a damaged one: another process may have removed the folder in the meantime.
         discard(folder, str(error))
         return None
 
 
 def store_checksums(folder: Path, names: Iterable[str]) -> None:
-    """Write the checksums of a folder's files into the folder, and sync the files and folders."""
+    """Write the CRC-32 of the named files of a folder to a file in it, and flush all of them to disc (fsync)."""
     checksums = {}
     for name in names:
         manifest.sync(folder / name)
@@ -163,12 +177,14 @@ def store_checksums(folder: Path, names: Iterable[str]) -> None:
 
 
 def stored_checksums(folder: Path) -> dict[str, int] | None:
-    """Return the CRC-32 of each file of a folder by name, or None without an intact list.
+    """Return the CRC-32 of each file of a folder by name, from the list that `store_checksums` has written.
 
-    A folder with a missing or damaged list is removed.
+    Return None if the folder does not exist. Also return None if its list is missing or damaged; the folder is then
+    removed.
     """
     if not folder.exists():
-        # Check the folder before its list of checksums is read, because another process may publish it at any time.
+        # Test for the folder before reading the list. Another process may publish the folder in between, and the code
+        # below would remove a folder whose list was missing.
         return None
     try:
         stored = json.loads((folder / _CHECKSUM_FILE).read_bytes())
@@ -183,7 +199,10 @@ def stored_checksums(folder: Path) -> dict[str, int] | None:
 
 
 def is_intact(path: Path, crc: int) -> bool:
-    """Return True if a file has the given CRC-32. It is compared once per process, and again if the file changes."""
+    """Return True if a file exists and has the given CRC-32.
+
+    A process computes the checksum only once per file, and again if the size or modification time of the file changes.
+    """
     try:
         status = path.stat()
         return _crc32(path, status.st_ino, status.st_size, status.st_mtime_ns) == crc
@@ -197,7 +216,7 @@ def _crc32(path: Path, *file_state: int) -> int:
 
 
 def discard(folder: Path, reason: str) -> None:
-    """Remove a folder and log a warning with the reason."""
+    """Remove a damaged folder of the cache, and log a warning with the reason."""
     logging.getLogger(__name__).warning("cache %s: %s: computed again", folder, " ".join(reason.split()))
     _remove(folder)
 
@@ -205,7 +224,7 @@ def discard(folder: Path, reason: str) -> None:
 def _remove(folder: Path) -> None:
     if not folder.exists():
         return
-    # Rename first, so that no other process finds half a folder.
+    # Rename the folder before its files are removed, so that no other process finds a folder with some files missing.
     trash = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
     with contextlib.suppress(OSError):
         folder.rename(trash / folder.name)
@@ -214,12 +233,15 @@ def _remove(folder: Path) -> None:
 
 def _map(file: Path) -> Array:
     mapped: Array = np.load(file, mmap_mode="r", allow_pickle=False)
-    # Return a plain view because numpy.memmap is slower to index.
+    # Return a plain array that shares the memory, because numpy.memmap is slower to index.
     return np.asarray(mapped)
 
 
 def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
-    """Write the arrays next to `folder` and rename once. If another process was faster, discard this copy."""
+    """Write the arrays to a temporary folder, and rename it to `folder` when it is complete.
+
+    If another process has created `folder` in the meantime, discard the temporary one.
+    """
     if not arrays:
         raise BadInput(f"cache {folder.name}: the computation returned no arrays")
     folder.parent.mkdir(parents=True, exist_ok=True)

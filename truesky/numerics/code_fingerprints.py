@@ -1,6 +1,7 @@
-"""Compute fingerprints of code, so that keys of caches change if code or tables change that may affect the contents.
+"""Compute hashes of code, which are part of the keys under which computed arrays are cached.
 
-Docstrings, comments and blank lines do not change a fingerprint.
+The hash of a module changes if its code, the code of modules that it imports, or their tables of numbers change. It
+does not change with docstrings, comments and blank lines.
 """
 
 from __future__ import annotations
@@ -15,23 +16,29 @@ from truesky.numerics.code_text import code_text
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ENDINGS = (".csv", ".toml")
-# Modules that check, store, transport or name arrays but do not compute them.
+# Packages and modules that check, store, transport or name arrays but do not compute them. Their code is not part of a
+# hash.
 _IRRELEVANT = (
     "truesky.numerics.cache", "truesky.numerics.code_fingerprints", "truesky.request", "lake_schema.arrays",
     "lake_schema.columns", "lake_schema.errors", "lake_schema.mission", "lake_schema.store", "lake_schema.tables",
 )  # fmt: skip
 
-# Modules in these packages whose numbers do affect arrays.
+# Modules in the packages of `_IRRELEVANT` that do affect the numbers in arrays.
 _RELEVANT = ("truesky.request.accuracy",)
 
 
 @lru_cache
 def code_key(module: str) -> str:
-    """Return the sha256 (hex) of the code of a module and of all our modules that it imports, directly or not.
+    """Return the sha256 (hexadecimal) of the code of a module and of the project modules that affect its arrays.
 
-    A function that moves from one module to another changes the key, and so does a new module. The key also covers the
-    tables of numbers (.csv, .toml) that the modules read. It does not cover the arguments of functions, such as the
-    parameters of the mission and the files of the user: the caller adds them to the key of its result.
+    These are the modules that it imports directly or indirectly, except modules that only check, store or name arrays,
+    such as `lake_schema.tables` and `lake_schema.mission`: a change in them does not change the hash, nor does a
+    change in a module that only they import. Comments, docstrings and blank lines do not count. Tables of numbers
+    (.csv, .toml) of the package `truesky` are included if the code contains their file name. A function that moves from
+    one module to another changes the hash.
+
+    Arguments of functions, such as parameters of the mission and files of the user, are not included: callers must add
+    them to the key of a result. Raises ImportError if there is no such module.
     """
     code = (part for name in required_modules(module) for part in (name, _code(_source(name))))
     data = (part for file in data_files(module) for part in (file.name, _content(file)))
@@ -39,15 +46,18 @@ def code_key(module: str) -> str:
 
 
 def data_files(module: str) -> tuple[Path, ...]:
-    """Return the tables of numbers that a module and the modules that it imports name, sorted by path.
+    """Return the tables of numbers (.csv, .toml) that a module and the project modules it imports read, sorted by path.
 
-    Code names a file by its whole name as a constant, or by the suffix alone if the file has the name of the module.
+    A table counts as read if a string in the code is its file name, such as "lines.csv". The suffix ".csv" alone stands
+    for the file with the name of the module.
     """
     return tuple(sorted({file for name in required_modules(module) for file in _scan(name)[1]}))
 
 
 def required_modules(module: str) -> tuple[str, ...]:
-    """Return the names of a module and of all our modules that it imports, directly or not, sorted.
+    """Return the sorted names of a module and of all project modules that it imports, directly or indirectly.
+
+    Modules that cannot affect computed arrays are left out, unless one is the given module.
 
     Raises
     ------
@@ -81,7 +91,7 @@ def _content(file: Path) -> bytes:
 
 @lru_cache
 def _data() -> dict[str, Path]:
-    """Return the path of every table in `truesky` by file name."""
+    """Return the path of every table (.csv, .toml) in the package `truesky` by its file name."""
     return {file.name: file for file in (_ROOT / "truesky").rglob("*") if file.suffix in _ENDINGS}
 
 
@@ -92,7 +102,10 @@ def _code(source: bytes) -> str:
 
 @lru_cache
 def _scan(module: str) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-    """Return the modules that a module imports itself, anywhere in its file, and the tables that it names."""
+    """Return the project modules that a module imports directly, also inside functions, and the tables that it names.
+
+    A table is a .csv or .toml file whose name is a string in the code.
+    """
     tree = ast.parse(_source(module))
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     names = {module.rpartition(".")[2] + text if text in _ENDINGS else text for text in texts}
@@ -103,7 +116,7 @@ def _scan(module: str) -> tuple[tuple[str, ...], tuple[Path, ...]]:
 def _imports(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
-            # A name that is imported from a package is a module, or is defined in the package's __init__.py.
+            # `from package import name` imports the module `name`, or an object of the package's __init__.py.
             names = [f"{node.module}.{alias.name}" for alias in node.names]
             yield from (
                 _relevant_module(name) or _relevant_module(node.module)
@@ -115,7 +128,7 @@ def _imports(tree: ast.AST) -> Iterator[str]:
 
 
 def _relevant_module(module: str) -> str:
-    """Return the module if it is one of ours that may shape an array, else ""."""
+    """Return the name of a module if it belongs to this project and may affect computed arrays, else ""."""
     if module.split(".")[0] not in ("lake_schema", "truesky") or _file(module) is None:
         return ""
     if module in _RELEVANT:

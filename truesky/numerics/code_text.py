@@ -1,4 +1,4 @@
-"""Text of Python source code without docstrings, comments and blank lines, for keys of caches."""
+"""Reduce Python source code to its code, without docstrings, comments and blank lines, so that hashes ignore these."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ def code_text(source: str, tree: ast.Module | None = None) -> str:
     source : str
         Text of a Python file.
     tree : ast.Module, optional
-        Its syntax tree, if the caller has parsed it already.
+        Syntax tree of the source, if the caller has parsed it already.
 
     Returns
     -------
     str
-        The lines that contain code.
+        The lines that contain code, with line ends between them. Strings stay unchanged.
 
     Raises
     ------
     SyntaxError
-        If the source is not valid Python.
+        If the source is not valid Python and no tree is given.
     """
     tree = ast.parse(source) if tree is None else tree
     lines = [line.encode() for line in source.split("\n")]
-    # Spans of strings: first line, first byte, last line, last byte. Lines count from 0.
+    # Find the spans of all strings: index of the first line, first byte in it, index of the last line, byte after its
+    # end. Indices begin with 0.
     nodes = list(ast.walk(tree))
     docstrings = {_span(node.body[0]) for node in nodes if _has_docstring(node)}
     strings = sorted({_span(node) for node in nodes if _is_text(node)} - docstrings)
     for first, start, last, end in sorted(docstrings, reverse=True):
         lines[first : last + 1] = [lines[first][:start] + lines[last][end:]] + [b""] * (last - first)
-    # Lines whose end, and lines whose beginning, is part of a string.
+    # Indices of the lines that end inside a string. The blanks at the end of these lines belong to the string.
     open_end = {number for first, _, last, _ in strings for number in range(first, last)}
     code_lines = []
     for number, whole in enumerate(lines):
@@ -67,7 +68,11 @@ def _has_docstring(node: ast.AST) -> TypeGuard[ast.Module | ast.ClassDef | ast.F
 
 
 def _without_comment(number: int, line: bytes, strings: list[tuple[int, int, int, int]]) -> bytes:
-    """Cut a line at the first # outside all strings; `strings` are sorted spans, which may contain others."""
+    """Return line `number` of the source without its comment, that is, cut at the first # outside all strings.
+
+    `strings` has the spans of all strings (first line, first byte, last line, last byte), sorted. A span may contain
+    others, as in f-strings.
+    """
     start = line.find(b"#")
     while start >= 0:
         candidates = strings[: bisect.bisect_right(strings, (number, start + 1))]

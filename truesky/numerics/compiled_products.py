@@ -1,4 +1,8 @@
-"""Loops of `matrices.matmul`: two orders of access to the matrices, with the same order of summation."""
+"""Compiled loops of the matrix product `matrices.matmul`.
+
+The two functions read the matrices in different orders, each faster for some shapes. They add terms in the same order,
+so that their results agree in every bit.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,13 @@ import numpy as np
 
 from truesky.numerics.compiling import exact_jit
 
-# Number of columns that stay in the cache of the processor during the summation.
+# Number of columns of the result that are computed together, so that they stay in the cache of the processor.
 _BLOCK = 512
 
 
 @exact_jit
 def multiply_rows(matrix_a: Any, matrix_b: Any, out: Any) -> None:
-    """Fill `out` with matrix_a @ matrix_b, with four rows of `matrix_b` at a time.
+    """Fill `out` with matrix_a @ matrix_b by adding multiples of the rows of `matrix_b`; fast if m is large.
 
     Parameters
     ----------
@@ -23,7 +27,7 @@ def multiply_rows(matrix_a: Any, matrix_b: Any, out: Any) -> None:
     matrix_b : float array, shape (k, m)
         Second factor.
     out : float64 array, shape (n, m)
-        Result.
+        Output: the product. Shapes are not checked.
     """
     n, count = matrix_a.shape
     m = matrix_b.shape[1]
@@ -51,16 +55,16 @@ def multiply_rows(matrix_a: Any, matrix_b: Any, out: Any) -> None:
 
 @exact_jit
 def multiply_transposed(matrix_a: Any, matrix_b: Any, out: Any) -> None:
-    """Fill `out` with matrix_a @ matrix_b.T, with eight rows of `matrix_a` at a time.
+    """Fill `out` with matrix_a @ matrix_b.T by products of rows; fast if m is small.
 
     Parameters
     ----------
     matrix_a : float array, shape (n, k)
-        First factor.
+        First factor. Eight of its rows are processed at a time.
     matrix_b : float array, shape (m, k)
         Second factor, transposed.
     out : float64 array, shape (n, m)
-        Result.
+        Output: the product. Shapes are not checked.
     """
     n, m = len(matrix_a), len(matrix_b)
     for i in range(0, n - 7, 8):

@@ -1,6 +1,7 @@
-"""Compile functions with numba, and keep their machine code in the project's cache.
+"""Compile functions with numba, and keep their machine code in the project's cache on disc.
 
-A function is compiled once per machine and version of the sources, not once per process or per copy of the package.
+A function is compiled once per machine and version of the source files. Numba by itself would compile it again for each
+copy of the package.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Any, TypeVar
 from lake_schema import instruction_set
 from truesky.numerics import cache
 
-# numba reads these variables when it is imported. Child processes inherit them.
+# Set the environment variables of numba before it is imported, because it reads them only once. Child processes inherit
+# the variables.
 instruction_set.limit_numba()
 _MACHINE_CODE = cache.machine_code_dir()
 os.environ["NUMBA_CACHE_DIR"] = str(_MACHINE_CODE)
@@ -24,17 +26,20 @@ from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parents[1]
 _CONFIG: Any = numba.config
-# The other locators are for functions of users, and for machines on which the cache cannot be written. The options
-# below affect the machine code, so that this file must be part of its key, too: it names truesky.numerics.compiling.
+# Classes that choose the folder of a function's machine code; numba uses the first that is applicable. Those after
+# PackageCacheLocator are for functions of users, and for machines on which the cache cannot be written.
+#
+# The options of numba below affect the machine code. This file must therefore be part of the hash that names the folder
+# of the machine code. The hash covers all files with the text truesky.numerics.compiling.
 _LOCATORS = f"{__name__}.PackageCacheLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
 
 
 class PackageCacheLocator(UserProvidedCacheLocator):
-    """Name the machine code of a module by the module's place in the package.
+    """Choose the folder in which numba keeps the machine code of a module of this package.
 
-    By default numba names it by the absolute path of the file, so that each clone and each environment would compile
-    again. The cache folder is named by the contents of all compiled modules, so that the files of one folder belong to
-    the same sources.
+    By default numba names the folder by the absolute path of the module's file, so that each copy of the package would
+    be compiled again. Here it is named by the module's place in the package. The folder above is named by a hash of all
+    compiled modules, so that machine code of different versions is never mixed.
     """
 
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
@@ -44,7 +49,11 @@ class PackageCacheLocator(UserProvidedCacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
-        """Return a locator; None for a function outside the package, or if the cache cannot be written."""
+        """Return the object that tells numba in which folder the machine code of a function is cached (a locator).
+
+        Return None for a function outside this package, or if the folder cannot be written. Numba then tries its next
+        class of locators.
+        """
         if not Path(py_file).is_relative_to(_PACKAGE):
             return None
         locator: Any = cls(py_func, py_file)
@@ -55,7 +64,10 @@ class PackageCacheLocator(UserProvidedCacheLocator):
         return locator
 
     def get_source_stamp(self) -> str:
-        """Return a constant: the name of the cache folder already depends on the sources."""
+        """Return a constant, by which numba considers the machine code up to date.
+
+        The name of the folder already depends on the contents of the source files.
+        """
         return ""
 
 
@@ -71,17 +83,20 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def jit(function: Function) -> Function:
-    """Compile a function for speed when it is first called: sums may be computed in any order."""
-    # Sums in any order are twice as fast; NaN and infinity remain valid. The order depends on the function into which
-    # a function is inlined. Always inline it: otherwise a process that compiles would round differently from a process
-    # that finds the caller in the cache.
+    """Compile a function with numba for speed: sums may be computed in any order, which changes their last bits.
+
+    It is compiled when it is first called. Use `exact_jit` if every bit must be reproducible.
+    """
+    # Allow sums in any order, which is twice as fast; NaN and infinity remain valid. The order depends on the caller
+    # into which a function is inlined. Always inline it. Otherwise a process that compiles the caller would round
+    # differently from a process that loads the caller from the cache.
     fast = {"reassoc", "contract", "nsz"}
     return _compile(function, fastmath=fast, forceinline=True)
 
 
 def exact_jit(function: Function) -> Function:
-    """Compile a function so that every operation is rounded as written: the same bits on any processor.
+    """Compile a function with numba so that every operation is rounded as written, with the same bits on any processor.
 
-    The function releases the GIL, so that other threads run at the same time.
+    It is compiled when it is first called. It releases the GIL, so that other threads run at the same time.
     """
     return _compile(function, nogil=True)

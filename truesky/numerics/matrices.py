@@ -1,4 +1,4 @@
-"""Products and solutions of matrices with the same bits on every machine.
+"""Compute matrix products, inverses, least squares and quadrature nodes with the same bits on every machine.
 
 BLAS is not used because its order of summation depends on threads and processor. Element-wise operations of numpy, sums
 along an axis, and einsum without `optimize` are reproducible and need no replacement.
@@ -15,18 +15,22 @@ import numpy.typing as npt
 
 from lake_schema.arrays import Array, Float
 
-# Sums of at most _FEW_TERMS terms use array operations of numpy, unless the result has _LARGE_SIZE elements or more.
-_FEW_TERMS, _LARGE_SIZE = 8, 1 << 18
-# From this number of columns it is faster to add rows of the second factor than to follow rows of the first.
+# Products with at most this number of terms per sum use array operations of numpy instead of compiled code, unless the
+# result is large.
+_FEW_TERMS = 8
+# Smallest number of elements of a large result.
+_LARGE_SIZE = 1 << 18
+# Smallest number of columns of a product for which it is faster to add multiples of rows of the second factor than to
+# compute products of rows and columns.
 _WIDE_COLUMNS = 16
 
 
 def matmul(a: npt.ArrayLike, b: npt.ArrayLike) -> Any:
-    """Return the product a @ b of matrices or vectors as float64.
+    """Return the product a @ b of matrices or vectors as float64; for two vectors a float.
 
-    `a` has the shape (..., n, k) or (k,), `b` the shape (k, m) or (k,). With 8 terms k or fewer, `b` may also have the
-    shape (..., k, m). Sums run in ascending order of k, with each product and each sum rounded to float64. The error is
-    k 2^-53 times the sum of the terms' absolute values. Raises ValueError if the shapes do not match.
+    `a` has the shape (..., n, k) or (k,), `b` the shape (k, m) or (k,). If k is 8 or less, `b` may also have the shape
+    (..., k, m). The k terms of a sum are added in order, with each product and each sum rounded to float64. The error
+    is at most k 2^-53 times the sum of the terms' absolute values. Raises ValueError if the shapes do not match.
     """
     matrix_a, matrix_b = np.asarray(a), np.asarray(b)
     a_is_vector, b_is_vector = matrix_a.ndim == 1, matrix_b.ndim == 1
@@ -54,7 +58,7 @@ def _multiply_arrays(matrix_a: Array, matrix_b: Array) -> Float:
 
 
 def _multiply_compiled(matrix_a: Array, matrix_b: Array) -> Float:
-    # Import compiled code only if it is needed, because importing numba takes time.
+    # Import compiled code here, because importing numba takes time and small products do not need it.
     from truesky.numerics import compiled_products
 
     out = np.empty((len(matrix_a), matrix_b.shape[1]))
@@ -68,7 +72,7 @@ def _multiply_compiled(matrix_a: Array, matrix_b: Array) -> Float:
 
 
 def inverse(matrix: npt.ArrayLike) -> Float:
-    """Return the inverses of 2 x 2 matrices, shape (..., 2, 2)."""
+    """Return the inverses of 2 x 2 matrices, shape (..., 2, 2); infinite or NaN for a matrix with determinant 0."""
     m = np.asarray(matrix, float)
     a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
     adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
@@ -82,9 +86,10 @@ def determinant(matrix: npt.ArrayLike) -> Float:
 
 
 def least_squares(basis: Float, values: Float) -> Float:
-    """Return the solution x, shape (n,) or (n, m), that minimises |basis @ x - values|, by Householder reflections.
+    """Return the vector x that minimises |basis @ x - values|, computed with Householder reflections.
 
-    `basis` has the shape (k, n) with n linearly independent columns and k >= n; `values` has the shape (k,) or (k, m).
+    `basis` has the shape (k, n) with n linearly independent columns and k >= n, which is not checked. `values` has the
+    shape (k,) or (k, m) for m independent problems, and x has the shape (n,) or (n, m).
 
     References
     ----------
@@ -107,9 +112,9 @@ def least_squares(basis: Float, values: Float) -> Float:
 
 @lru_cache(maxsize=8)
 def gauss_legendre(count: int) -> tuple[Float, Float]:
-    """Return nodes and weights of Gauss-Legendre quadrature on [-1, 1], with an error of 1e-15.
+    """Return nodes and weights of Gauss-Legendre quadrature on [-1, 1], each with an error of 1e-15.
 
-    The arrays have the shape (count,), are read-only, and the nodes ascend.
+    Both arrays have the shape (count,) and are read-only. The nodes increase. `count` must be at least 1.
     """
     nodes, weights = np.empty((2, count))
     for i in range((count + 1) // 2):
@@ -126,7 +131,7 @@ def gauss_legendre(count: int) -> tuple[Float, Float]:
 
 
 def _legendre(count: int, x: float) -> tuple[float, float]:
-    """Return the Legendre polynomial P_count and its derivative at x."""
+    """Return the Legendre polynomial P_count and its derivative at x, for count of 1 or more and -1 < x < 1."""
     previous, current = 1.0, x
     for k in range(2, count + 1):
         previous, current = current, ((2 * k - 1) * x * current - (k - 1) * previous) / k

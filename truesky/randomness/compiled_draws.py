@@ -1,6 +1,7 @@
-"""Draw random numbers from 64-bit keys in compiled code: the same key gives the same number everywhere.
+"""Draw random numbers in compiled code, each from a 64-bit key: the same key always gives the same number.
 
-A key is a uint64. `child_key`, a step of SplitMix64, derives further keys from it.
+A key is a uint64, for example of a source. `child_key` derives further keys from it, for its properties or draws, by a
+step of the generator SplitMix64.
 
 References
 ----------
@@ -17,8 +18,8 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.rng import GOLDEN, mix_bits
 
-# Coefficients of AS 241, PPND16, lowest power first: numerator and denominator in the middle, the tails and the far
-# tails.
+# Coefficients of the inverse normal distribution function (AS 241, PPND16) in its middle, its tails and its far tails.
+# Each is a ratio of two polynomials: (numerator, denominator), lowest power first.
 _MIDDLE = (
     (
         3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
@@ -49,7 +50,8 @@ _FAR_TAIL = (
         7.86869131145613259100e-4, 1.84631831751005468180e-5, 1.42151175831644588870e-7, 2.04426310338993978564e-15,
     ),
 )  # fmt: skip
-# Largest mean for which exp(-mean) is a normal floating-point number. Counts of larger means are sums of several.
+# Largest mean for which a Poisson number is drawn at once, since exp(-mean) must not underflow. A number with a larger
+# mean is the sum of several numbers with smaller means.
 _LARGEST_MEAN = 600.0
 _S12 = np.uint64(12)
 
@@ -58,19 +60,28 @@ _mix_bits = exact_jit(mix_bits)
 
 @exact_jit
 def child_key(key: Any, number: Any) -> Any:
-    """Derive the key of child `number` (an int from 0) of `key`."""
+    """Derive the key number `number` (an integer, 0 or more) from the uint64 `key`, for example for one more draw.
+
+    Different numbers give different, statistically independent keys.
+    """
     return _mix_bits(key + (np.uint64(number) + np.uint64(1)) * GOLDEN)
 
 
 @exact_jit
 def uniform(key: Any) -> Any:
-    """Return a uniform number (k + 1/2) 2^-52 with an integer k, which is never rounded to 0 or 1."""
+    """Return a uniform number in (0, 1) from a uint64 key.
+
+    It has the form (k + 1/2) 2^-52 with an integer k, which is never rounded to 0 or 1.
+    """
     return (np.float64(key >> _S12) + 0.5) * 2.0**-52
 
 
 @exact_jit
 def normal(key: Any) -> Any:
-    """Return a standard normal deviate by inverting the cumulative distribution, with a relative error of 1e-15."""
+    """Return a standard normal deviate from a uint64 key, by inversion of the cumulative distribution.
+
+    The relative error of the inversion is 1e-15.
+    """
     u = uniform(key)
     q = u - 0.5
     if abs(q) <= 0.425:
@@ -91,7 +102,10 @@ def _ratio(coefficients: Any, x: Any) -> Any:
 
 @exact_jit
 def poisson(key: Any, mean: Any) -> Any:
-    """Return a Poisson number with the given mean, by inversion."""
+    """Return a Poisson number from a uint64 key, by inversion; `mean` is 0 or more, which is not checked.
+
+    The time grows in proportion to the mean.
+    """
     pieces = int(mean / _LARGEST_MEAN) + 1
     part_mean = mean / pieces
     total = 0
@@ -99,7 +113,7 @@ def poisson(key: Any, mean: Any) -> Any:
         u = uniform(child_key(key, piece))
         probability = np.exp(-part_mean)
         cumulative, count = probability, 0
-        # If u is very close to 1, the sum stops growing before it reaches u: stop when the probability underflows.
+        # Also stop if `probability` underflows to 0: for u very close to 1, rounding keeps the sum below u.
         while u > cumulative and probability > 0.0:
             count += 1
             probability *= part_mean / count
@@ -110,7 +124,10 @@ def poisson(key: Any, mean: Any) -> Any:
 
 @exact_jit
 def gamma(key: Any, shape: Any) -> Any:
-    """Return a standard gamma deviate with shape > 0, by the rejection method of Marsaglia & Tsang 2000."""
+    """Return a standard gamma deviate from a uint64 key, by the rejection method of Marsaglia & Tsang 2000.
+
+    `shape` is the shape parameter, above 0, which is not checked.
+    """
     d = (shape if shape >= 1.0 else shape + 1.0) - 1.0 / 3.0
     c = 1.0 / np.sqrt(9.0 * d)
     trial = 1
@@ -125,16 +142,16 @@ def gamma(key: Any, shape: Any) -> Any:
 
 @exact_jit
 def uniforms(keys: Any, number: Any, out: Any) -> None:
-    """Fill `out` with a uniform number of child `number` of each key.
+    """Fill `out` with one uniform number in (0, 1) per source.
 
     Parameters
     ----------
     keys : uint64 array, shape (n,)
         Key of each source.
     number : int
-        Index of the child key, from 0.
+        Number of the draw, 0 or more: the number is drawn from `child_key(key, number)`.
     out : float64 array, shape (n,)
-        Result.
+        Output: the numbers.
     """
     for i in range(keys.size):
         out[i] = uniform(child_key(keys[i], number))
@@ -142,16 +159,16 @@ def uniforms(keys: Any, number: Any, out: Any) -> None:
 
 @exact_jit
 def normals(keys: Any, number: Any, out: Any) -> None:
-    """Fill `out` with a standard normal deviate of child `number` of each key.
+    """Fill `out` with one standard normal deviate per source.
 
     Parameters
     ----------
     keys : uint64 array, shape (n,)
         Key of each source.
     number : int
-        Index of the child key, from 0.
+        Number of the draw, 0 or more: the deviate is drawn from `child_key(key, number)`.
     out : float64 array, shape (n,)
-        Result.
+        Output: the deviates.
     """
     for i in range(keys.size):
         out[i] = normal(child_key(keys[i], number))
@@ -159,18 +176,18 @@ def normals(keys: Any, number: Any, out: Any) -> None:
 
 @exact_jit
 def gammas(keys: Any, number: Any, shapes: Any, out: Any) -> None:
-    """Fill `out` with a standard gamma deviate of child `number` of each key.
+    """Fill `out` with one standard gamma deviate per source.
 
     Parameters
     ----------
     keys : uint64 array, shape (n,)
         Key of each source.
     number : int
-        Index of the child key, from 0.
+        Number of the draw, 0 or more: the deviate is drawn from `child_key(key, number)`.
     shapes : float64 array, shape (n,)
-        Shape parameter of each source, more than 0.
+        Shape parameter of each source's distribution, above 0, which is not checked.
     out : float64 array, shape (n,)
-        Result.
+        Output: the deviates.
     """
     for i in range(keys.size):
         out[i] = gamma(child_key(keys[i], number), shapes[i])

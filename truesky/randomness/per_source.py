@@ -1,7 +1,7 @@
-"""Draw random numbers of many sources so that those of one source do not depend on the other sources.
+"""Draw random numbers for many sources, such that the numbers of a source do not depend on the other sources.
 
-A source has the same numbers in a deeper or wider catalogue: they depend on the seed, the property, the source and the
-number of previous draws, not on the other sources.
+The numbers depend on the seed, the name of the property that is drawn, the source's identifier and the number of
+previous draws. A source therefore has the same numbers in a deeper or wider catalogue.
 """
 
 from __future__ import annotations
@@ -17,43 +17,61 @@ from truesky.randomness.rng import key_hex, mix_bits
 
 
 class PerSourceGenerator:
-    """Generator with one number per source and call, and the methods of numpy's generator.
+    """Random generator for n sources: each call of a method returns one number per source.
 
-    Sources may be left out later (`select`) without a change in the numbers of the others.
+    Its methods have the same names as in numpy.random.Generator. Sources may be left out with `select`, which does not
+    change the numbers of the other sources.
     """
 
     def __init__(self, ids: Int, *identity: int | str) -> None:
-        """Start the streams of sources with distinct identifiers, int64[n]; `identity` is as in `rng.stream`."""
+        """Create the generator of n sources with the given identifiers, int64[n].
+
+        `identity` are integers and texts that identify the purpose, such as a seed and "galaxies.shape". Sources with
+        equal identifiers get equal numbers.
+        """
         self._keys, self._calls = keys(ids, *identity), 0
 
     def select(self, keep: npt.NDArray[np.generic]) -> PerSourceGenerator:
-        """Return a generator for selected sources (a mask or row numbers), which continues with their next numbers."""
+        """Return a generator for some of the sources, given by a boolean mask or by indices.
+
+        Its first numbers are the numbers that this generator would return next for these sources.
+        """
         new = object.__new__(PerSourceGenerator)
         new._keys, new._calls = self._keys[keep], self._calls
         return new
 
     def random(self, size: int | None = None) -> Float:
-        """Return uniform numbers in (0, 1), shape (n,). `size` must be n if it is given."""
+        """Return one uniform number in (0, 1) per source, shape (n,).
+
+        Raises ValueError if `size` is given and is not the number of sources n.
+        """
         return self._draw(size, compiled_draws.uniforms)
 
     def standard_normal(self, size: int | None = None) -> Float:
-        """Return standard normal deviates, shape (n,). `size` must be n if it is given."""
+        """Return one standard normal deviate per source, shape (n,).
+
+        Raises ValueError if `size` is given and is not the number of sources n.
+        """
         return self._draw(size, compiled_draws.normals)
 
     def standard_gamma(self, shape: npt.ArrayLike, size: int | None = None) -> Float:
-        """Return standard gamma deviates for a shape parameter > 0, float or float[n]; `size` is n if it is given."""
+        """Return one standard gamma deviate per source, shape (n,).
+
+        `shape` is the shape parameter, above 0 (not checked), as a number or as one number per source. Raises
+        ValueError if `size` is given and is not the number of sources n.
+        """
         shapes = np.ascontiguousarray(np.broadcast_to(np.asarray(shape, float), self._keys.shape))
         return self._draw(size, compiled_draws.gammas, shapes)
 
     def beta(self, a: npt.ArrayLike, b: npt.ArrayLike, size: int | None = None) -> Float:
-        """Draw beta deviates in (0, 1).
+        """Return one beta deviate in (0, 1) per source.
 
         Parameters
         ----------
         a, b : float or float array, shape (n,)
-            Parameters of the distribution, more than 0.
+            Parameters of the distribution, above 0, which is not checked.
         size : int, optional
-            Number of sources n, if it is given.
+            Number of sources n; ValueError is raised for another number.
 
         Returns
         -------
@@ -64,14 +82,14 @@ class PerSourceGenerator:
         return gamma_a / (gamma_a + gamma_b)
 
     def integers(self, low: int, high: int, size: int | None = None) -> Int:
-        """Draw uniform integers.
+        """Return one uniform integer per source.
 
         Parameters
         ----------
         low, high : int
-            Range: `low` is included, `high` is not. The range has at most 2^52 numbers.
+            Range: `low` is included, `high` is not. The range must have 1 to 2^52 numbers, which is not checked.
         size : int, optional
-            Number of sources n, if it is given.
+            Number of sources n; ValueError is raised for another number.
 
         Returns
         -------
@@ -89,15 +107,16 @@ class PerSourceGenerator:
         return out
 
 
-# Type of the generator in functions that draw one number per source.
+# Type of the random generator that is accepted by functions that draw one number per source and call.
 AnyGenerator = np.random.Generator | PerSourceGenerator
 
 
 def keys(ids: Int, *identity: int | str) -> npt.NDArray[np.uint64]:
-    """Return the key of each source, uint64[n], for compiled draws.
+    """Return the random key of each source, uint64[n], for the functions of `compiled_draws`.
 
-    `ids` are int64[n], and `identity` is as in `rng.stream`. The keys of sources are as independent as the mixing
-    function makes them.
+    `ids` are the identifiers of the sources, int64[n]. `identity` are integers and texts that identify the purpose,
+    such as a seed and "galaxies.shape". Each key is a hash of the identifier and `identity`. Raises BadInput if
+    `identity` contains another type.
     """
     name = key_hex(*identity)
     first, second = np.uint64(int(name[:16], 16)), np.uint64(int(name[16:], 16))

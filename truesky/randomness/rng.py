@@ -1,8 +1,9 @@
-"""Create random generators that are keyed by the identity of a draw, not by where or when the code runs.
+"""Create random generators whose numbers depend only on an identity, not on where or when the code runs.
 
-A stream's identity (seed, stage, cell, source, detector, effect, ...) is hashed into the key of a counter-based Philox
-generator. Equal identities give equal numbers on any core, in any order, and in repeated attempts. A new stage has a
-new name and does not change the numbers of the others.
+An identity consists of integers and texts, such as a seed, the name of a computation and the number of a sky cell. It
+is hashed into the key of a counter-based Philox generator. Equal identities give equal numbers on any processor, in
+any order of execution, and in repeated attempts. A new computation gets a new name, and does not change the numbers of
+the others.
 """
 
 from __future__ import annotations
@@ -16,42 +17,54 @@ import numpy.typing as npt
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 
-# Increment of the counter of SplitMix64.
+# Increment of the counter of the generator SplitMix64.
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+# Factors and shifts of the function by which SplitMix64 mixes bits.
 _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
 def key_hex(*identity: int | str) -> str:
-    """Return the key of an identity's generator as 32 hexadecimal digits, with the first word of Philox's key first."""
+    """Return the 128-bit Philox key of an identity as 32 hexadecimal digits, first 64-bit word first.
+
+    Raises BadInput if the identity does not consist of integers and texts.
+    """
     first, second = _key(identity)
     return f"{int(first):016x}{int(second):016x}"
 
 
 def stream(*identity: int | str) -> np.random.Generator:
-    """Return the generator of an identity, for example stream(seed, "galaxies.shape", cell).
+    """Return a new numpy generator for an identity, for example stream(seed, "galaxies.shape", cell).
 
-    The identity consists of integers and strings: 1 and "1" differ, and so do ("a", "b") and ("ab",).
+    Generators of equal identities return equal numbers. The identity consists of integers and texts: 1 and "1" differ,
+    and so do ("a", "b") and ("ab",). Raises BadInput for other types, such as bool.
     """
     return np.random.Generator(np.random.Philox(key=_key(identity)))
 
 
 def uniforms(ids: Int, count: int, *identity: int | str) -> Float:
-    """Draw uniform numbers per source, each a function of only the identity, the source and its index.
+    """Return `count` uniform numbers for each source.
+
+    A number depends only on the identity, the source's identifier and the index of the number.
 
     Parameters
     ----------
     ids : int64 array, shape (n,)
         Identifiers of the sources.
     count : int
-        Numbers per source.
+        Number of random numbers per source.
     *identity : int or str
-        Same as in `stream`.
+        Integers and texts that identify the purpose, such as a seed and a name; see `stream`.
 
     Returns
     -------
     float array, shape (count, n)
         Numbers in (0, 1).
+
+    Raises
+    ------
+    BadInput
+        If the identity does not consist of integers and texts.
 
     References
     ----------
@@ -59,18 +72,18 @@ def uniforms(ids: Int, count: int, *identity: int | str) -> Float:
     """
     first, second = _key(identity)
     hashed_ids = mix_bits(ids.astype(np.uint64) ^ first)
-    # The arithmetic is modulo 2^64.
+    # Counters of SplitMix64 for the indices 1 to count; the products of uint64 are taken modulo 2^64.
     counters = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * GOLDEN
     bits = mix_bits((hashed_ids[None, :] ^ second) + counters[:, None])
-    # A multiple of 2^-52 plus a half is never rounded to 0 or 1.
+    # (k + 1/2) 2^-52 with an integer k from 0 to 2^52 - 1 is never rounded to 0 or 1.
     return np.asarray(((bits >> np.uint64(12)) + 0.5) * 2.0**-52)
 
 
 def mix_bits(words: Any) -> Any:
-    """Mix uint64 words with the function of SplitMix64, which changes half of the bits.
+    """Return hashes of uint64 words, by the function of SplitMix64: a change of one bit changes half of the bits.
 
-    The words are arrays, or scalars in code that truesky.numerics.compiling compiles. Because this file names that
-    module, it is part of the key of the machine code.
+    `words` is an array, or a number in code that truesky.numerics.compiling compiles. This module name must stay in
+    this docstring: a changed file causes a new compilation only if it contains the name.
     """
     words = (words ^ (words >> _S30)) * _FIRST
     words = (words ^ (words >> _S27)) * _SECOND

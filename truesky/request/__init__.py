@@ -1,4 +1,4 @@
-"""Read and check simulation requests."""
+"""Read and check simulation requests, the TOML files in which users describe a simulation."""
 
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request

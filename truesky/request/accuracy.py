@@ -1,6 +1,7 @@
-"""Find the fastest drawing settings whose errors are within the accuracy that a request allows.
+"""Find the fastest settings for drawing sources whose errors are within the accuracy that a request allows.
 
-A request sets the accuracy by the name of a preset or by numbers. Settings with measured errors are in accuracy.csv.
+A request (a user's TOML file) sets the accuracy by the name of a preset or by numbers. Settings with measured errors
+are in accuracy.csv.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from lake_schema.errors import BadInput, OutOfRange
 
-# Written by benchmarks/trade.py.
+# Table of drawing settings with their measured errors and CPU times, written by benchmarks/trade.py.
 _TABLE = Path(__file__).with_name("accuracy.csv")
 
 
@@ -23,18 +24,19 @@ class Accuracy:
     Attributes
     ----------
     flux : float
-        Relative error of a source's flux.
+        Relative error of the flux of any source.
     shape : float
-        Error of each component of reduced shear: multiplicative error of the response to shear, and additive error.
+        Error of each component of the reduced shear of a source. It limits both the multiplicative error and the
+        additive error.
     position : float
         Error of a source's position in pixels.
     background : float
-        Error of the light drawn in a pixel, as a fraction of the noise of a sky pixel, for any source.
+        Error of the light of any source in any pixel, as a fraction of the noise of a pixel with sky only.
 
     Raises
     ------
     OutOfRange
-        If a value is outside 1e-12 to 1.
+        If a value is NaN or outside 1e-12 to 1.
     """
 
     flux: float
@@ -52,14 +54,14 @@ class Accuracy:
 QUICKLOOK = Accuracy(flux=1e-2, shape=2e-2, position=3e-2, background=0.5)
 DRAFT = Accuracy(flux=5e-3, shape=1e-3, position=1e-3, background=0.1)
 SURVEY = Accuracy(flux=1e-3, shape=1e-4, position=1e-4, background=0.02)
-# The finest accuracy that can be verified. The centres of bright bulges are known to 6e-3 of the sky noise for any
-# size of the stamp; the table of Sersic profiles limits them to 3e-6 of the light.
+# The finest accuracy that can be verified. Even with large image stamps, the centres of bright bulges are known only to
+# 6e-3 of the sky noise, since tabulated Sersic profiles have errors of 3e-6 of the light.
 REFERENCE = Accuracy(flux=1e-4, shape=1e-5, position=1e-5, background=0.006)
 PRESETS = {"quicklook": QUICKLOOK, "draft": DRAFT, "survey": SURVEY, "reference": REFERENCE}
 
 
 def preset(name: str) -> Accuracy:
-    """Return the accuracy with the name `name`; raises BadInput if no preset has this name."""
+    """Return the accuracy with the given name in `PRESETS`, such as "survey"; raises BadInput for an unknown name."""
     if name not in PRESETS:
         raise BadInput(f"accuracy = {name!r} is not one of {', '.join(PRESETS)}")
     return PRESETS[name]
@@ -67,7 +69,7 @@ def preset(name: str) -> Accuracy:
 
 @cache
 def fastest_row(allowed: Accuracy) -> dict[str, float]:
-    """Return the row of accuracy.csv with the least CPU time among the rows with the allowed accuracy.
+    """Return the drawing settings with the least CPU time among all settings whose errors are allowed.
 
     Parameters
     ----------
@@ -77,17 +79,17 @@ def fastest_row(allowed: Accuracy) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Settings, errors and CPU seconds.
+        A row of accuracy.csv: settings, errors, and CPU time in seconds, by column name.
 
     Raises
     ------
     BadInput
-        If no row is accurate enough. The message names each number that cannot be reached, and the best value:
-        the value of the last row, which has the smallest errors of all four kinds.
+        If no settings are accurate enough. The message names each error that cannot be reached, and its smallest value.
+        This is the value in the last row of accuracy.csv, in which all four errors are smallest.
 
     Notes
     -----
-    A row qualifies if its errors are small enough for two sets of sources: the sources for which the settings were
+    Settings qualify if their errors are small enough for two sets of sources: the sources for which the settings were
     chosen, and other sources (columns that end with ``_held``).
     """
     table = rows()
@@ -104,7 +106,11 @@ def fastest_row(allowed: Accuracy) -> dict[str, float]:
 
 
 def expected_errors(allowed: Accuracy) -> Accuracy:
-    """Return the largest errors of the settings for an accuracy, measured on sources for which they were not chosen."""
+    """Return the measured errors of the drawing settings that are used for an allowed accuracy.
+
+    They were measured on other sources than the sources for which the settings were chosen. Raises BadInput if no
+    settings are accurate enough.
+    """
     row = fastest_row(allowed)
     return Accuracy(**{item.name: row[f"{item.name}_held"] for item in fields(Accuracy)})
 
@@ -126,7 +132,11 @@ def _error(row: dict[str, float], name: str) -> float:
 
 
 def _round_up(value: float) -> str:
-    """Return a number with two significant digits, rounded up, so that a request with this number is accepted."""
+    """Return a positive number as text, rounded up to two significant digits.
+
+    An error message prints the number as the smallest accuracy that can be reached. Rounding up ensures that a request
+    with the printed number is accepted.
+    """
     low = f"{value:.1e}"
     if float(low) >= value:
         return f"{float(low):g}"

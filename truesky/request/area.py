@@ -1,4 +1,7 @@
-"""Area of the sky that a request covers: the HEALPix cells it touches, and tests of positions."""
+"""Define the area of the sky that a request (a user's TOML file) covers, and read it from the request.
+
+An area can list the HEALPix cells that it touches and test whether positions are inside.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,13 @@ from truesky.numerics import matrices
 from truesky.request.toml_values import Toml, as_table, boolean, checked_number, integer, number, number_pair
 
 _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
-# The wide survey omits positions within these angles (deg) of the Galactic and ecliptic planes. The values are adopted:
-# they leave about the 15 000 deg2 of Serrano et al. 2024, whose region follows maps of stars, dust and zodiacal light.
+# The wide survey omits positions within these angles (deg) of the Galactic and ecliptic planes. The values are adopted.
+# They leave about 15 000 deg2, as in Serrano et al. 2024, where the region follows maps of stars, dust and zodiacal
+# light.
 _GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
+# Largest number of vertices of a polygon, and of circles of an area.
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000
+# Name, smallest and largest value (deg) of a coordinate.
 _RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
 
 
@@ -28,14 +34,17 @@ _RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
 class Area:
     """A convex spherical polygon, a box, a circle, several circles, or the sky of the wide survey.
 
+    Only the attributes of one shape are set; the others have their defaults.
+
     Attributes
     ----------
     vertices : tuple of (float, float)
         Right ascension and declination of the vertices of a polygon in degrees.
     box : (float, float, float, float), optional
-        West, east, south and north limits in degrees. East may be smaller than west if the box crosses 0.
+        Right ascension of the west and east limits, and declination of the south and north limits, in degrees. East is
+        smaller than west if the box crosses right ascension 0.
     ra, dec, radius : float
-        Centre and radius of a circle in degrees.
+        Centre and radius of a circle in degrees, used if no other shape is given.
     patches : tuple of (float, float, float)
         Right ascension, declination and radius of several circles in degrees.
     wide : bool
@@ -51,7 +60,10 @@ class Area:
     wide: bool = False
 
     def cells(self, order: int = GENERATION_ORDER) -> list[int]:
-        """Return the nested HEALPix cells of `order` that the area touches, in ascending order."""
+        """Return the indices (nested scheme) of the HEALPix cells of `order` that the area touches, ascending.
+
+        Some cells just outside the edge of the area may be included.
+        """
         if self.wide:
             all_cells = np.arange(12 << (2 * order))
             touched = self.contains(*sky.cell_centres(order, all_cells), 2 * sky.cell_radius(order))
@@ -73,12 +85,13 @@ class Area:
         ra, dec : float array, shape (n,)
             Positions in degrees.
         margin : float, optional
-            Largest distance from the area in degrees.
+            Largest distance from the area in degrees. A negative margin excludes positions near the edge.
 
         Returns
         -------
         bool array, shape (n,)
-            True for positions in the area or its margin.
+            True for positions in the area or at most `margin` outside. Opposite a corner of a polygon or box, some
+            positions that are farther away are accepted; see `depth`.
         """
         return np.asarray(self.depth(ra, dec) >= -margin)
 
@@ -97,7 +110,10 @@ class Area:
 
         Notes
         -----
-        Outside a corner of a polygon or box, the true distance is larger than the result.
+        For positions outside a polygon, a box or the sky of the wide survey, opposite a corner, the distance is larger
+        than the absolute value of the result. Where several circles overlap, the result is the distance to the edge of
+        one of them, which may be inside another. Distances to the west and east sides of a box are measured along the
+        parallel, which is longer than a great circle.
         """
         lon, lat = np.asarray(ra, float), np.asarray(dec, float)
         if self.wide:
@@ -117,7 +133,10 @@ class Area:
         return self.radius - sky.separation(lon, lat, self.ra, self.dec)
 
     def bounding_circle(self) -> tuple[float, float, float]:
-        """Return right ascension, declination and radius (degrees) of a circle that contains the area."""
+        """Return right ascension, declination and radius (degrees) of a circle that contains the area.
+
+        The circle is not the smallest one. It is the whole sky for the wide survey.
+        """
         if self.wide:
             return 0.0, 0.0, 180.0
         corners = np.array([patch[:2] for patch in self.patches] or self.vertices or _corners_of(self.box))
@@ -141,15 +160,12 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
     corners = sky.unit_vectors(*np.array(vertices).T)
     sides = np.cross(corners, np.roll(corners, -1, 0))
     sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
-    # Vertices may be in clockwise or counterclockwise order.
+    # Let all normals point into the polygon, whose vertices may be in clockwise or counterclockwise order.
     sides *= np.sign(matrices.matmul(sides[0], corners[2]))
     x, y = np.radians(ra), np.radians(dec)
     place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
     depth = np.degrees(np.arcsin(np.clip(matrices.matmul(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
     return np.asarray(depth.reshape(np.shape(ra)))
-
-
-# ------------------------------------------------------------------------------------------------ reading
 
 
 def parse(table: Toml, path: str = "area") -> Area:
@@ -158,9 +174,9 @@ def parse(table: Toml, path: str = "area") -> Area:
     Parameters
     ----------
     table : Toml
-        The section, with exactly one key.
+        The section, with exactly one of the keys "polygon", "cone", "box", "tile", "patches" and "wide".
     path : str, optional
-        Name of the section for messages.
+        Name of the section, for error messages.
 
     Returns
     -------
@@ -170,7 +186,9 @@ def parse(table: Toml, path: str = "area") -> Area:
     Raises
     ------
     BadInput
-        If the section is not valid. The message names the key.
+        If the section has another number of keys, an unknown key or a wrong value. The message names the key.
+    OutOfRange
+        If a number is out of range.
     """
     table = as_table(table, path, set(_FORMS))
     if len(table) != 1:
@@ -196,7 +214,7 @@ def _box(value: object, path: str) -> Area:
     box = as_table(value, path, {"ra", "dec"})
     west, east = number_pair(box, f"{path}.ra", -360.0, 720.0)
     south, north = number_pair(box, f"{path}.dec", -90.0, 90.0)
-    # The range [350, 10] crosses 0.
+    # A box may cross right ascension 0: the range [350, 10] has a width of 20 deg.
     width = east - west + (360.0 if east < west else 0.0)
     if not 0.0 < width < 180.0:
         raise BadInput(f"{path}.ra = [{west}, {east}]: the second must be east of the first by less than 180 deg")
@@ -226,7 +244,11 @@ def _patches(value: object, path: str) -> Area:
 def _coordinate_lists(
     value: object, path: str, min_count: int, max_count: int, *bounds: tuple[str, float, float]
 ) -> list[list[float]]:
-    """Read a list of lists of numbers, right ascension first. `bounds` has the name and both limits of each number."""
+    """Read `min_count` to `max_count` lists of numbers in degrees, of which the first is a right ascension.
+
+    `bounds` has the name, smallest and largest value of each number in a list. Right ascensions are converted to 0 to
+    360. Raises BadInput, which names `path`, if the value is not such a list.
+    """
     form = f"[{', '.join(name for name, _, _ in bounds)}]"
     if not isinstance(value, list) or not min_count <= len(value) <= max_count:
         raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form}")

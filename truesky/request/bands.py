@@ -1,6 +1,6 @@
-"""Find the passbands in which the exposures of a request are taken.
+"""Find the passbands in which the exposures of a request (a user's TOML file) are taken.
 
-Fluxes are computed in these passbands if the request does not name others.
+Fluxes of sources are computed in these passbands if the request does not name others.
 """
 
 from __future__ import annotations
@@ -18,24 +18,27 @@ if TYPE_CHECKING:
 
 
 def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Return the passbands of all pointings and observations, then the passbands in which sources are selected.
+    """Return the passbands of all exposures of a request, and the passbands by which sources of spectra are selected.
+
+    In slitless spectroscopy, only sources that are bright enough in the latter passbands are drawn.
 
     Parameters
     ----------
     request : Request
         The request.
     mission : MissionConfiguration
-        Mission parameters, with the bands of the ground surveys.
+        Mission parameters, which contain the bands of the ground surveys.
 
     Returns
     -------
     tuple of str
-        Each passband once, in the order of the request.
+        Names of passbands, each once: passbands of the exposures in the order of the request, then the others.
 
     Raises
     ------
     BadInput
-        If no channel of an observation has a band that the observation names. The message names the observation.
+        If an observation names a band that its channels or its ground survey do not have. The message names the
+        observation.
     """
     bands = [pointing.band for pointing in request.pointings]
     for i, block in enumerate(request.observations):
@@ -47,7 +50,10 @@ def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[st
 
 
 def _selection_bands(request: Request) -> list[str]:
-    """Return the passbands in which sources are selected; the request may have no exposure in them."""
+    """Return the passbands whose fluxes decide which sources are drawn in slitless spectra, such as euclid_h.
+
+    The request need not have an exposure in them. The list is empty without slitless channels.
+    """
     channels = [pointing.channel for pointing in request.pointings]
     for block in request.observations:
         channels += block.channels if block.table is None else [channel for channel, _ in block.table.kinds]
@@ -60,14 +66,15 @@ def observation_bands(block: Observation, mission: MissionConfiguration) -> tupl
     Parameters
     ----------
     block : Observation
-        The observation.
+        The observation, a block of exposures.
     mission : MissionConfiguration
-        Mission parameters, with the bands of the ground surveys.
+        Mission parameters, which contain the bands of the ground surveys.
 
     Returns
     -------
     tuple of str
-        The passbands.
+        Names of the passbands in the order of the channels. If the observation names no band of a channel, all bands of
+        this channel; the blue grism only if the observation uses it.
 
     Raises
     ------
@@ -81,7 +88,7 @@ def observation_bands(block: Observation, mission: MissionConfiguration) -> tupl
         return _select(block.bands, [b for rule in rules for b in rule["bands"].split()], f"survey {block.survey}")
     available = [b for channel in block.channels for b in EUCLID_BANDS[channel] if b != "nisp_blue" or block.blue]
     selected = _select(block.bands, available, ", ".join(block.channels))
-    # A channel without any named filter uses all its filters.
+    # If the observation names no filter of a channel, all filters of this channel are used.
     return tuple(
         band
         for channel in block.channels

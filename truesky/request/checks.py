@@ -1,4 +1,7 @@
-"""Check a whole request: its sources, bands, mission parameters, and whether all of it can be rendered."""
+"""Check a whole request (a user's TOML file): sources, bands, mission parameters, and whether it can be rendered.
+
+Checks of single keys are in the modules that read them.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,10 @@ if TYPE_CHECKING:
 
 
 def check_sources(request: Request) -> None:
-    """Raise BadInput if a request names all its sources and also has a section that adds other sources."""
+    """Raise BadInput if a request has the section `sources` and also `ingest`, `stars` or `solar_system`.
+
+    The tables in `sources` contain all sources of the simulation, and the other sections would add more.
+    """
     other_sections = {
         "ingest": request.ingest != Ingest(),
         "stars": request.stars != Stars(),
@@ -29,9 +35,10 @@ def check_sources(request: Request) -> None:
 
 
 def check_bands(request: Request) -> None:
-    """Raise BadInput if a camera would observe in a user's passband for which it has no zero point, sky and seeing.
+    """Raise BadInput if a camera would observe in a user's passband for which it has no zero point and sky.
 
-    VIS can observe in any passband of the user, and a user's camera in its passbands.
+    VIS can observe in any user passband, and a user's camera in the passbands that its folder defines. No observation
+    that the planner schedules may use a user passband.
     """
     user_passbands = {name for name, _ in request.curves.passbands}
     of_cameras = {(camera.name, curve.band) for camera in request.mission.cameras for curve in camera.curves}
@@ -49,7 +56,7 @@ def check_bands(request: Request) -> None:
 
 
 def check_mission(request: Request) -> MissionConfiguration:
-    """Return the mission parameters that a request selects.
+    """Check and return the mission parameters (instruments and survey) that a request selects.
 
     Parameters
     ----------
@@ -59,13 +66,14 @@ def check_mission(request: Request) -> MissionConfiguration:
     Returns
     -------
     MissionConfiguration
-        Parameters with the overrides and cameras of the request.
+        Parameters with the values (overrides) and cameras of the user.
 
     Raises
     ------
     BadInput
-        If an override or an explored value has an unknown name, a wrong unit or is out of range, or if a camera or a
-        ramp is not valid. The message names the key.
+        If a user's value has an unknown name or a wrong unit, or is out of range. This includes the values that the
+        section `explore` tries in turn. Also if a user's camera, or the ramp of an infrared detector (numbers of
+        groups, reads and drops), is not valid. The message names the key.
     """
     from lake_schema.mission.checks import camera_faults, ramp_faults
     from lake_schema.mission.configuration import resolve
@@ -94,14 +102,17 @@ def check_mission(request: Request) -> MissionConfiguration:
 
 
 def check_rendered(request: Request) -> None:
-    """Raise BadInput if no simulator exists for a channel and image type of the request."""
+    """Raise BadInput if the request contains a channel and image type that cannot be rendered, only planned."""
     for key, (channel, image_type) in _requested_types(request):
         if not _is_rendered((channel, image_type)):
             raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can only be planned")
 
 
 def describe_skipped(request: Request) -> str:
-    """Return a line that lists what is planned and forecast but not rendered, or "" if all can be rendered."""
+    """Return a line that lists the channels and image types of a request that cannot be rendered, "" if all can.
+
+    Their exposures are planned and their costs are forecast, but rendering skips them.
+    """
     names = dict.fromkeys(
         f"{channel} {image_type}" if channel in RENDERED_TYPES else channel
         for _, (channel, image_type) in _requested_types(request)
@@ -113,7 +124,11 @@ def describe_skipped(request: Request) -> str:
 
 
 def _requested_types(request: Request) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield the key of each pointing and observation, with its channel and image type."""
+    """Yield (key, (channel, image type)) for all pointings and observations of a request.
+
+    The key is that of the request's file, such as "pointing[0].channel". An observation yields one pair per channel, or
+    per combination in its table of pointings.
+    """
     for i, pointing in enumerate(request.pointings):
         yield f"pointing[{i}].channel", (pointing.channel, "science")
     for i, block in enumerate(request.observations):

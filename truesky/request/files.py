@@ -1,4 +1,8 @@
-"""Read the sections of a request that name external files: spectra, filters, catalogues, PSFs, sources and cameras."""
+"""Read the sections of a request (a user's TOML file) that name other files of the user.
+
+These are files of spectra, passbands, catalogues, PSFs, sources and cameras. File names are relative to the folder of
+the request. The files of spectra, catalogues and PSFs are not opened here.
+"""
 
 from __future__ import annotations
 
@@ -17,24 +21,25 @@ from truesky.request.toml_values import Toml, as_table, boolean, number, quote_v
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
 
-# Kind of file in messages of lake_schema.user_files.
+# Words by which error messages of lake_schema.user_files name a file of sources.
 SOURCES_KIND = "table of sources"
 
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Files of spectra, of a filter or of an extinction law.
+    """User files with galaxy spectra, a passband or an extinction law.
 
     Attributes
     ----------
     files : tuple of Path
-        The files.
+        The files: one per galaxy spectrum, or a single one.
     format : str
         Format of the files, a key of truesky/fluxes/libraries/spectrum_formats.toml.
     medium : str
-        Medium in which a filter's wavelengths are measured, "air" or "vacuum".
+        Medium in which a passband's wavelengths are measured, "air" or "vacuum"; "" for spectra and laws.
     location : str
-        Table and line that name the file, for messages; "" if a key of the request names it.
+        File and line of a camera's table that names the passband, for error messages; "" if a key of the request
+        names the file.
     """
 
     files: tuple[Path, ...]
@@ -50,17 +55,19 @@ class UserCurves:
     Attributes
     ----------
     passbands : tuple of (str, Curves)
-        Name and file of each passband.
+        Name and file of each additional passband.
     templates : Curves, optional
-        Spectra of galaxies.
+        Spectra that replace the galaxy templates; None for the built-in templates.
     extinction : tuple of (int, Curves)
-        Number of the law that is replaced (1 to 4), and its file.
+        Number of each extinction law that is replaced (1 to 4), and its file.
     basel : Path, optional
-        File of model spectra of dwarf stars (BaSeL).
+        File of model spectra of dwarf stars (BaSeL), which are then used for all gravities and metallicities; None for
+        the built-in spectra.
     irtf : tuple of Path
-        Spectra of stars (IRTF) that replace the infrared part of the dwarf spectra.
+        Spectra of stars (IRTF) that replace the infrared part of the spectra of dwarfs (O9 to M9) and of stars by
+        gravity and metallicity; () for none.
     intergalactic : bool
-        True if the intergalactic hydrogen absorbs the light of galaxies.
+        True if intergalactic hydrogen absorbs the light of galaxies.
     """
 
     passbands: tuple[tuple[str, Curves], ...] = ()
@@ -73,16 +80,17 @@ class UserCurves:
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """Files of an external catalogue.
+    """Files of a user's catalogue.
 
     Attributes
     ----------
     files : tuple of Path
-        The files.
+        Files, or folders with files.
     format : str
         Format of a catalogue of galaxies, a key of ingest_formats.toml; "" for none.
     columns : tuple of (str, str)
-        Name of our column and its replacement as JSON, in addition to the columns of the format.
+        Pairs of a column name in the lake, and the column of the file or its definition as JSON. They are added to the
+        columns of the format, or replace them.
     """
 
     files: tuple[Path, ...]
@@ -92,20 +100,22 @@ class Catalogue:
 
 @dataclass(frozen=True, slots=True)
 class DustMap:
-    """A HEALPix map of E(B-V) or A(V).
+    """A user's HEALPix map of the Milky Way's dust.
 
     Attributes
     ----------
     file : Path
-        The file.
+        FITS file of the map.
     column : str
-        Name of the column.
+        Name of the column with the map.
     quantity : str
-        "ebv" or "a_v".
+        Quantity in the map, "ebv" for E(B-V) or "a_v" for A(V), in mag.
     ordering : str
-        "RING" or "NESTED": the header must have this value, or none. "" to use the value in the header.
+        Order of the pixels, "RING" or "NESTED"; "" to use the value in the file's header. A header with another value
+        is refused.
     coordinates : str
-        "G" (Galactic) or "C" (equatorial): the header must have this value, or none. "" to use the value in the header.
+        "G" (Galactic) or "C" (equatorial); "" to use the value in the file's header. A header with another value is
+        refused.
     """
 
     file: Path
@@ -117,16 +127,16 @@ class DustMap:
 
 @dataclass(frozen=True, slots=True)
 class Ingest:
-    """External catalogues and maps that replace simulated ones.
+    """User catalogues and maps that replace simulated ones. An attribute is None if nothing is replaced.
 
     Attributes
     ----------
     galaxies : Catalogue, optional
-        A finished catalogue of galaxies.
+        A complete catalogue of galaxies, which replaces the simulated galaxies.
     halos : Catalogue, optional
-        A light-cone of halos.
+        A light-cone of dark-matter halos, which replaces the simulated halos.
     training : Catalogue, optional
-        Observed galaxies; each simulated galaxy gets the spectrum of one of these.
+        Observed galaxies. Each simulated galaxy gets the spectrum of a similar one among them.
     dust : DustMap, optional
         Map of the dust of the Milky Way.
     """
@@ -139,16 +149,17 @@ class Ingest:
 
 @dataclass(frozen=True, slots=True)
 class UserSources:
-    """Tables that contain all sources of a simulation.
+    """A user's tables that contain all sources of a simulation.
 
     Attributes
     ----------
     galaxies, stars : Path, optional
-        CSV files (truesky/catalogue/given_sources.py).
+        CSV files (truesky/catalogue/given_sources.py lists their columns); None if there are no such sources.
     band : str
-        Passband of their magnitudes.
+        Passband of the magnitudes in the tables.
     spacing : float
-        Spacing in arcsec of the grid on which the rows are placed in turn; 0 if the tables have positions.
+        Spacing in arcsec of a grid that fills the area. The rows of both tables are placed on it in turn, and repeated
+        until the grid is full. 0 if the tables have positions.
     """
 
     galaxies: Path | None
@@ -157,7 +168,11 @@ class UserSources:
     spacing: float
 
     def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
-        """Return the facts about these sources for the key of a plan; `bounds` is the bounding circle of the area."""
+        """Return checksums and options of the tables as JSON values, from which hashes of catalogues are computed.
+
+        `bounds` is the bounding circle of the area in degrees: right ascension, declination and radius. It is included
+        only if the sources are on a grid. Raises BadInput if a file does not exist or is not a .csv file.
+        """
         files = {"galaxies": self.galaxies, "stars": self.stars}
         checksums = {
             name: file_sha256(_check_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None
@@ -173,19 +188,22 @@ def _check_csv(file: Path, key: str) -> Path:
 
 
 def resolve_path(folder: Path, name: str) -> Path:
-    """Return the path of a file that is named relative to the folder of the request."""
+    """Return the path of a file that a request names; a relative name starts at `folder`, the folder of the request.
+
+    ~ is expanded. It is not checked that the file exists.
+    """
     return user_files.expand_path(name, folder)
 
 
 def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
-    """Read the folders of user cameras.
+    """Read the folders in which a user defines ground cameras.
 
     Parameters
     ----------
     names : sequence of str
-        Folders, as the request names them.
+        Folders, one per camera, as the request names them.
     folder : Path
-        Folder of the request; other paths are relative to it.
+        Folder of the request, at which relative names start.
 
     Returns
     -------
@@ -195,11 +213,12 @@ def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     Raises
     ------
     BadInput
-        If a folder is not a valid camera, or two have one name. The message names the file and the line.
+        If a folder does not define a valid camera, or two cameras have the same name. The message names the key of the
+        request and, for a wrong line of a file in the folder, the file and the line.
     """
     if not names:
         return ()
-    # Importing the unit parser takes a second, so requests without cameras skip it.
+    # Import here, because the import takes a second (it includes a parser of units) and most requests have no cameras.
     from lake_schema.mission import camera_folder
 
     user_cameras: list[Camera] = []
@@ -213,33 +232,34 @@ def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     return tuple(user_cameras)
 
 
-# Format by file name extension, a key of truesky/fluxes/libraries/spectrum_formats.toml.
+# Format of a camera's passband by the suffix of its file; the names are keys of
+# truesky/fluxes/libraries/spectrum_formats.toml.
 _CURVE_FORMATS = {".ecsv": "passband_ecsv", ".xml": "passband_svo", ".vot": "passband_svo"}
 
 
 def with_camera_passbands(
     user_curves: UserCurves, user_cameras: Sequence[Camera], bands: Collection[str]
 ) -> UserCurves:
-    """Add the passbands of user cameras in which a request observes.
+    """Add those passbands of user cameras that a request uses to the user's other passbands.
 
     Parameters
     ----------
     user_curves : UserCurves
-        The section `fluxes` of the request.
+        Files in the section `fluxes` of the request.
     user_cameras : sequence of Camera
-        The user's cameras.
+        The user's cameras, which define passbands.
     bands : collection of str
-        Bands that the request names.
+        Names of the bands of the request.
 
     Returns
     -------
     UserCurves
-        The section with these passbands added.
+        The files with the passbands of the cameras added.
 
     Raises
     ------
     BadInput
-        If two passbands have one name.
+        If two passbands have the same name.
     """
     passbands = dict(user_curves.passbands)
     camera_curves = [
@@ -257,12 +277,12 @@ def with_camera_passbands(
 
 
 def parse_curves(table: Toml, folder: Path) -> UserCurves:
-    """Read the section `fluxes`; `folder` is the folder of the request.
+    """Read the user files in the section `fluxes` of a request; relative names start at `folder`, the request's folder.
 
     Raises
     ------
     BadInput
-        If the section is not valid. The message names the key.
+        If a key is missing or unknown, or has a wrong value. The message names the key.
     """
     filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
     laws = as_table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
@@ -300,12 +320,13 @@ def _curves(value: object, path: str, folder: Path, has_medium: bool = False) ->
 
 
 def parse_ingest(table: Toml, folder: Path) -> Ingest:
-    """Read the section `ingest`; `folder` is the folder of the request.
+    """Read the section `ingest` of a request; relative file names start at `folder`, the folder of the request.
 
     Raises
     ------
     BadInput
-        If the section is not valid. The message names the key.
+        If a key is missing or unknown, or has a wrong value. Also if a complete catalogue of galaxies is combined with
+        halos or training galaxies. The message names the key.
     """
     galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
     halos, training = (
@@ -329,14 +350,15 @@ def parse_ingest(table: Toml, folder: Path) -> Ingest:
 
 
 def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
-    """Read the section `psf` and return pairs (band, file); `folder` is the folder of the request.
+    """Read the section `psf` of a request, and return pairs (band, path of a PSF file), sorted by band.
 
-    A band with a list of files has one pair for each file.
+    A band with a list of files has one pair for each file. Relative file names start at `folder`, the folder of the
+    request. The files are not opened.
 
     Raises
     ------
     BadInput
-        If the section is not valid. The message names the key.
+        If a value is not a file name or a list of them. The message names the key.
     """
     band_files = []
     for band in sorted(table):
@@ -350,12 +372,16 @@ def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
 
 
 def parse_sources(table: Toml, folder: Path) -> UserSources | None:
-    """Read the section `sources`; `folder` is the folder of the request. Return None if the section is empty.
+    """Read the section `sources` of a request, or return None if it is empty.
+
+    Relative file names start at `folder`, the folder of the request. The files are not opened.
 
     Raises
     ------
     BadInput
-        If the section is not valid. The message names the key.
+        If a key is missing or has a wrong value. The message names the key.
+    OutOfRange
+        If the spacing of the grid is out of range.
     """
     if not table:
         return None

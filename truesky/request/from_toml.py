@@ -1,9 +1,10 @@
-"""Read a simulation request: a short TOML file with limits for every number.
+"""Read a simulation request: a TOML file in which a user describes a simulation. Every number has limits.
 
 All keys::
 
     name = "demo"      seed = 2024      noise_seed = 1 (default: seed)
-    accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
+    accuracy = "survey" | "quicklook" | "draft" | "reference"
+               | {flux = .., shape = .., position = .., background = ..}
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
@@ -39,7 +40,8 @@ All keys::
                    {detector} in the name is replaced by the detector's name
     [solar_system] bodies = "file"      user's moving bodies that replace ours (truesky/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
-                   off = ["all"]          all except those in `on` and the analogue-to-digital conversion
+                   off = ["all"]          all except those in `on` and effects that every image needs, such as
+                                          analogue-to-digital conversion (ALWAYS_ON in truesky/request/schema.py)
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
                    grism_angle    direction of NISP-S spectra in the focal plane: -4, 0, 180, 184 deg
@@ -49,17 +51,19 @@ All keys::
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
                      | "standard_star" | "planetary_nebula" | "trap_pumping" | "defocus" | "bleeding"
                      | "stray_light" | "white_dwarf" | "persistence"
-        survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
+        survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}
+                     default: the area of the request, or of the deep field if survey = "edf_north" ..
         ra, dec, position_angle    user's field instead of the fields of the survey (docs/own_field.md)
         pointings = "file.csv"     table of pointings instead of both (truesky/request/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
-        lamps = [..], intensities = [..] of flats      macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
+        lamps = [..], intensities = [..] of flat and persistence
+        macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
         delays_s = [..], bright = "flat" | "sky" of persistence
         phase_times_s = [..] of trap_pumping     defocus_nm = [..] of defocus
         magnitude of bleeding, white_dwarf, stray_light     distance_deg of stray_light
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",
-                            "persistence", "ramp", "order_1", "order_0", "order_2", "order_m1"]
+                            "persistence", "ramp", "traps", "dipoles", "order_1", "order_0", "order_2", "order_m1"]
                    compression = "none" | "rice"   lossless, for integer images
                    wcs = "sip" | "tpv"   convention for distortion in headers, default: the instrument pipeline's;
                                          source-extractor, SCAMP and SWarp read TPV, or the .head file of the image
@@ -134,12 +138,13 @@ _SECTIONS = (
     "area", "universe", "stars", "ingest", "sources", "strong_lenses", "structure", "mission", "fluxes",
     "psf", "solar_system", "effects", "explore", "products",
 )  # fmt: skip
-# SQL (truesky/explore) uses the request's name as the schema of its tables, and reserves these names.
+# Names that a request must not have: SQL queries (truesky/explore) use the request's name as the schema of its tables,
+# and these schemas exist already.
 _RESERVED_NAMES = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
 
 def parse(path: Path) -> Request:
-    """Read and check a request file; raises BadInput with one line that names the file and the key."""
+    """Read and check a request file; raises BadInput if it is not valid, with one line that names file and key."""
     try:
         table = user_files.read_toml(path, "request")
     except BadInput as error:
@@ -158,14 +163,14 @@ def _name(table: Toml) -> str:
 
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
-    """Return the request in a parsed TOML table.
+    """Check a parsed TOML table and convert it to a request.
 
     Parameters
     ----------
     table : Toml
-        The table.
+        The whole request.
     folder : Path, optional
-        Folder to which file names are relative.
+        Folder to which file names in the request are relative; by default the current folder.
 
     Returns
     -------
@@ -175,7 +180,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     Raises
     ------
     BadInput
-        If the request is not valid. The message names the key.
+        If a key is missing or unknown, or has a value that is not allowed. The message names the key.
     """
     _check_keys(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
     pointings, blocks = observations.parse_pointings(table), observations.parse_observations(table, folder)
@@ -226,7 +231,8 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     return replace(request, bands=tuple(dict.fromkeys((*(bands or default_bands), *user_bands))))
 
 
-# ------------------------------------------------------------------------------------------------ sections
+# The functions below read one section or key of a request each. They raise BadInput, which names the key, if a value is
+# not allowed.
 
 
 def _accuracy(value: object, path: str) -> Accuracy:
@@ -236,7 +242,7 @@ def _accuracy(value: object, path: str) -> Accuracy:
         return preset(value)
     table = _as_table(value, path, {"flux", "shape", "position", "background"})
     accuracy = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
-    # Refuse an accuracy that cannot be reached before any computation starts.
+    # Call `fastest_row` only for its check: it raises BadInput if no drawing settings reach this accuracy.
     fastest_row(accuracy)
     return accuracy
 
@@ -259,7 +265,10 @@ def _universe(table: Toml) -> Universe:
 
 
 def _lensing(value: object) -> tuple[float, float] | None:
-    """Return None for the lensing by the box, or a constant shear: (0, 0) for "none"."""
+    """Read the key `universe.lensing`: "box", "none" or a constant reduced shear {g1, g2}.
+
+    Return None for "box" (lensing by the simulated matter), (0, 0) for "none", and else (g1, g2).
+    """
     path = "universe.lensing"
     if isinstance(value, str):
         return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
@@ -337,7 +346,11 @@ def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
 
 
 def _choices(key: str, value: object) -> tuple[str, ...]:
-    """Return the values of one explored parameter as JSON."""
+    """Read a key of the section `explore`: the name of a parameter, and the values that it takes.
+
+    Return the values as JSON texts: an accuracy as an object, a switch of an effect as true or false, and a mission
+    parameter as [number, unit].
+    """
     path = f"explore.{key}"
     if key != "accuracy" and not key.startswith("effects."):
         table = _as_table(value, path, {"values", "unit"})

@@ -1,4 +1,7 @@
-"""Read the observations of a request: single pointings, and blocks of exposures that the planner schedules."""
+"""Read the observations of a request (a user's TOML file): single pointings, and blocks of exposures.
+
+The user gives position and time of a pointing. The planner schedules the exposures of a block.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +31,17 @@ from truesky.request.toml_values import (
     table_list,
 )
 
+# Largest number of pointings and of observation blocks in a request, and of copies of an exposure with different noise.
 _MAX_POINTINGS, _MAX_OBSERVATIONS, _MAX_REALISATIONS = 100_000, 1000, 10_000
-# Largest length of a list with one value per frame.
+# Largest number of values in a list that gives one value per calibration frame, such as delays_s.
 _MAX_VALUES = 1000
-# Largest number of user dithers, and their largest offset along each axis (arcsec).
+# Largest number of dither offsets that a user may give, and largest offset along each axis (arcsec).
 _MAX_DITHERS, _MAX_OFFSET = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
-# Calibrations of each channel. The list is not derived from the rendered types because more can be planned.
-# test_checks.py checks that it contains all rendered types.
+# Types of calibration images that can be planned for each channel. Some of them cannot be rendered. test_checks.py
+# checks that all types that can be rendered are listed.
 _CALIBRATIONS = {
     "VIS": (
         "bias", "dark", "flat", "charge_injection", "trap_pumping", "self_calibration", "defocus", "bleeding",
@@ -48,13 +52,14 @@ _CALIBRATIONS = {
     "EXT": ("bias", "dark", "flat"),
 }  # fmt: skip
 _SKY_TYPES = ("science", "deep")
-# Kinds of observation, as messages name them.
+# Kinds of observation, with the words by which error messages name them. They decide which keys are allowed.
 _SURVEY, _USER_FIELD = "fields of a Euclid survey", "a Euclid field at ra, dec"
 _GROUND, _GROUND_USER_FIELD = "a ground survey's pattern", "a ground camera's field at ra, dec"
 _TIMED, _UNTIMED = "dark and flat frames", "bias, charge_injection and trap_pumping frames"
 _DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
 _CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
-# Kinds that use a key; a key that is not listed is used by all. EXT always has a survey, which selects its camera.
+# Kinds of observation for which a key is allowed. A key that is not listed is allowed for all kinds. `survey` is also
+# allowed for all ground observations (EXT), since it selects the camera.
 _BLOCKS_OF_KEY = {
     "survey": (_SURVEY, _TABLE),
     "area": (_SURVEY, _GROUND, *_CALIBRATION),
@@ -77,9 +82,9 @@ _BLOCKS_OF_KEY = {
     "macc": (_SURVEY, _USER_FIELD, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_USER_FIELD, _TIMED, _DITHERED, _TABLE),
 }
-# Keys that only some channels use.
+# Channels that use a key. A key that is not listed is used by all channels.
 _CHANNELS_OF_KEY = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
-# Image types that use a key of calibrations.
+# Image types that use a key. A key that is not listed is used by all image types.
 _TYPES_OF_KEY = {
     "lamps": ("flat", "persistence"),
     "intensities": ("flat", "persistence"),
@@ -90,31 +95,37 @@ _TYPES_OF_KEY = {
     "magnitude": ("bleeding", "white_dwarf", "stray_light"),
     "distance_deg": ("stray_light",),
 }
-# Sources of the bright exposure before the darks that measure persistence.
+# Light of the bright exposure that precedes the dark frames in which persistence is measured.
 BRIGHT_TYPES = ("flat", "sky")
-# Number of LEDs of each calibration unit. This is a copy because requests must not import the renderer;
-# test_survey.py compares it with the lamps.
+# Number of LEDs of the calibration unit of each channel. This copies the renderer's lamps, because requests must not
+# import the renderer; test_infrared.py compares the two.
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """One exposure of the list `pointing`.
+    """One science exposure of a request, with its position and time.
 
     Attributes
     ----------
+    channel : str
+        VIS, NISP-P, NISP-S or EXT (ground cameras).
+    camera : str
+        Name of the camera in the mission database.
+    band : str
+        Name of the passband.
     ra, dec : float
-        Position in degrees of the boresight, or of the centre of detector `centre_on`.
+        ICRS position in degrees of the boresight, or of the centre of detector `centre_on`.
     position_angle : float
         Position angle of the focal plane's y axis in degrees, from north through east.
     mjd : float
         Start of the exposure (MJD).
     detectors : tuple of str
-        Names of detectors; () for all of the camera.
+        Names of detectors to render; () for all detectors of the camera.
     centre_on : str, optional
         Detector whose centre has the position ra, dec.
     exposure_time_s : float, optional
-        Exposure time in seconds; None for the mission's value.
+        Exposure time in seconds; None for the value in the mission database.
     realisations : int
         Number of exposures that differ only in their noise.
     grism_angle : float, optional
@@ -139,68 +150,77 @@ class Pointing:
 class Observation:
     """A block of exposures that the planner schedules.
 
+    "The mission's value" of a field is the value in the mission database.
+
     Attributes
     ----------
     channels : tuple of str
-        Channels that observe, or EXT alone.
+        Channels that observe: VIS, NISP-P and NISP-S in any combination, or EXT (ground cameras) alone.
     image_type : str
-        Image type of the exposures.
+        Image type of the exposures, such as "science" or "flat".
     survey : str
-        Survey whose pattern is used; it selects the camera of EXT.
+        Survey whose pattern of fields and exposures is used. For EXT it also selects the camera.
     pointings : str
-        Path of a table of pointings, or "".
+        Path of a table of pointings (a CSV file with one exposure per line), or "" for none.
     table : Contents, optional
-        Summary of this table.
+        Summary of the table of pointings; None without such a table.
     ra, dec : float, optional
         Centre of a user's field in degrees; None for the fields of the survey.
     position_angle : float, optional
         Position angle in degrees of the focal plane's y axis at ra, dec. None for
         the angle set by the direction of the Sun (Euclid) or 0 (ground cameras).
     area : Area, optional
-        Area to observe; None for the area of the request.
+        Area to observe; None for the area of the request, or for that of the Euclid Deep Field if `survey` is one.
     fields : int
-        Largest number of fields; those deepest in the area are used. 0 for all.
+        Largest number of fields; fields farthest from the edge of the area are used first. 0 for all fields.
     visits : int
-        Visits of each field; 0 for the number of the survey.
+        Visits of each field; 0 for the number in the survey.
     exposures : int
         Number of exposures. A ground survey that shares positions among bands counts those of all bands together.
-        For calibrations, the number of frames. 0 for the default.
+        For calibrations, the number of frames or of dithers, at each level, phase time or defocus. 0 for the default;
+        bias, dark, flat and charge_injection frames have none, so that 0 is refused.
     dither : str or tuple of (float, float)
-        Pattern within a field, or offsets (x, y) in arcsec along the axes of the focal plane.
+        Name of the dither pattern within a field, one of `DITHERS`, or offsets (x, y) in arcsec along the axes of the
+        focal plane.
     short, flat : bool
-        True to include the short VIS exposure, and the closing flat.
+        True to include the short VIS exposure in the first dither, and the VIS flat after the last dither.
     blue : bool
-        True to use the blue grism in addition to the red grisms.
+        True to use the blue grism in place of the red grisms in every second visit of a field.
     bands : tuple of str
-        Passbands; () for all of the channel.
+        Passbands; () for all passbands of the channels.
     detectors : tuple of str
-        Names of detectors; () for all of the camera.
+        Names of detectors to render; () for all detectors of the camera.
     mjd : float, optional
-        Earliest date (MJD); None for the launch of the mission.
+        Earliest date (MJD); None for the launch of the mission. Without a date, an observation with NISP begins when
+        earlier NISP observations without a date, or of calibrations, have ended and their persistence has faded.
     exposure_time_s : float, optional
         Exposure time in seconds; None for the mission's value.
     realisations : int
         Number of copies of each exposure that differ only in their noise.
     lamps : tuple of int
-        Numbers of the LEDs for flats in their order; () for all. Each is used in the bands that respond to it.
+        Numbers of the LEDs for flats, also for those that precede the darks of persistence, from 1, in the order of
+        use; () for all. Each is used in the bands that respond to its light.
     macc : tuple of int
-        Groups, reads and drops of NISP-P ramps, or of NISP-S ramps without NISP-P; () for the mission's values.
+        Numbers of groups, of reads per group and of dropped frames between groups in the ramps of NISP-P, or of NISP-S
+        if the block has no NISP-P; () for the mission's values.
     intensities : tuple of float
-        Levels of flats relative to the mission's level of the lamp, each for `exposures` frames; () for 1.
+        Levels of flats relative to the mission's level of the lamp. Each is used for `exposures` frames; () for 1.
     delays_s : tuple of float
         For persistence, seconds from the end of the bright exposure to the start of each dark; () for the mission's
         values.
     bright : str
-        For persistence, the source of the bright exposure, one of `BRIGHT_TYPES`.
+        For persistence, the light of the bright exposure, one of `BRIGHT_TYPES`.
     phase_times_s : tuple of float
-        For trap pumping, seconds that charge stays under an electrode, one frame for each; () for the mission's values.
+        For trap pumping, seconds that charge stays under an electrode; () for the mission's values. Each is used for
+        `exposures` frames, by default one.
     defocus_nm : tuple of float
-        For exposures out of focus, rms of the wavefront in nm, one exposure for each; () for the mission's value on
-        both sides of the focus.
+        For exposures out of focus, rms wavefront error of the defocus in nm, negative on one side of the focus. There
+        is one exposure for each, at each dither; () for the mission's value on both sides.
     magnitude : float, optional
         AB magnitude of calibration stars in the exposure's band; None for the mission's value.
     distance_deg : float, optional
-        Distance in degrees of a star outside the field from the boresight; None for the mission's value.
+        Distance in degrees from the boresight of a bright star outside the field, whose stray light is observed; None
+        for the mission's value.
     """
 
     channels: tuple[str, ...]
@@ -236,12 +256,15 @@ class Observation:
 
     @property
     def field_centre(self) -> tuple[float, float] | None:
-        """Return ra, dec (degrees) of the user's field, or None for fields of the survey."""
+        """Return (ra, dec) in degrees of the user's field, or None if the survey's fields are observed."""
         return None if self.ra is None or self.dec is None else (self.ra, self.dec)
 
 
 def parse_pointings(table: Toml) -> tuple[Pointing, ...]:
-    """Read the pointings of a request; raises BadInput that names the key if one is not valid."""
+    """Read the list `pointing` of a request, () if it is missing.
+
+    `table` is the parsed request. Raises BadInput, which names the key, if an entry is not valid.
+    """
     entries = table_list(table, "pointing", _MAX_POINTINGS)
     return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(entries))
 
@@ -266,12 +289,15 @@ def _pointing(value: object, path: str) -> Pointing:
 
 
 def parse_observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
-    """Read the observations of a request; tables of pointings must be in `folder` or below.
+    """Read the list `observation` of a request, () if it is missing.
+
+    `table` is the parsed request and `folder` its folder. Tables of pointings (CSV files that an observation may name)
+    are read, too. They must be in this folder or below.
 
     Raises
     ------
     BadInput
-        If an observation is not valid. The message names the key.
+        If an observation or its table of pointings is not valid. The message names the key.
     """
     entries = table_list(table, "observation", _MAX_OBSERVATIONS)
     return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(entries))
@@ -330,7 +356,10 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
 
 
 def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the numbers of LEDs, which all channels must have."""
+    """Read the numbers of LEDs for flats, () if the key is missing.
+
+    Raises BadInput if one of the channels does not have such an LED, or if a number occurs twice.
+    """
     lamp_count = min(LAMPS.get(channel, 1) for channel in channels)
     lamps = _integers(table, path, (), ((1, lamp_count),) * lamp_count)
     if len(set(lamps)) < len(lamps):
@@ -346,9 +375,11 @@ def _macc(table: Toml, path: str) -> tuple[int, ...]:
 
 
 def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
-    """Read a list of whole numbers, () if the key is missing.
+    """Read a list of whole numbers, () if the key at the end of `path` is missing.
 
-    The list must be as long as `names`. If `names` is empty, it may be shorter than `bounds`.
+    `bounds` has the smallest and largest value of each number, and `names` their names for error messages. The list
+    must be as long as `names`; if `names` is empty, it may be shorter than `bounds`. Raises BadInput if the value is
+    not such a list.
     """
     values = table.get(path.rpartition(".")[2])
     if values is None:
@@ -365,7 +396,10 @@ def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tupl
 
 
 def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
-    """Read a list of different numbers, () if the key is missing."""
+    """Read a list of 1 to 1000 different numbers from `lo` to `hi`, () if the key at the end of `path` is missing.
+
+    Raises BadInput if the value is not such a list, and OutOfRange if a number is out of range.
+    """
     values = table.get(path.rpartition(".")[2])
     if values is None:
         return ()
@@ -382,7 +416,10 @@ def _wrap_ra(ra: float | None) -> float | None:
 
 
 def _refuse_two_places(table: Toml, path: str) -> None:
-    """Check that a user's field, a table of pointings, and an area with survey fields are not combined."""
+    """Raise BadInput if an observation has more than one way to give positions, or an incomplete one.
+
+    The ways are the position of a user's field (`ra` and `dec`), a table of pointings, and survey fields in an `area`.
+    """
     if ("ra" in table) != ("dec" in table):
         raise BadInput(f"{path}.{'dec' if 'ra' in table else 'ra'} is missing: ra and dec must be given together")
     if "position_angle" in table and "ra" not in table:
@@ -394,7 +431,7 @@ def _refuse_two_places(table: Toml, path: str) -> None:
 
 
 def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
-    """Check that every key has an effect on this kind of observation."""
+    """Raise BadInput if a key has no effect on this kind of observation, its channels or its image type."""
     ground = "EXT" in channels
     kind = _block_kind(table, ground, image_type)
     for key in table:
@@ -420,7 +457,10 @@ def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
 
 
 def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
-    """Return the path of the table of pointings, which must be inside the request's folder, or None."""
+    """Return the path of an observation's table of pointings, or None if it has none.
+
+    Raises BadInput if the file is not in `folder` (the folder of the request) or below, or does not exist.
+    """
     if not string(table, f"{path}.pointings", default=""):
         return None
     file = folder / string(table, f"{path}.pointings")
@@ -438,7 +478,10 @@ def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str)
 
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
-    """Return the name of a pattern, or offsets in arcsec."""
+    """Read the key `dither`: the name of a pattern, or a list of offsets (x, y) in arcsec.
+
+    The default is "S", or "none" for ground cameras, which have no named patterns. Raises BadInput for other values.
+    """
     dither = table.get("dither", "none" if ground else "S")
     if not isinstance(dither, list):
         pattern = string({"dither": dither}, path, DITHERS)

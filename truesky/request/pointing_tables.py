@@ -1,6 +1,6 @@
-"""Read a user's table of pointings: a CSV file with one exposure per line.
+"""Read a user's table of pointings: a CSV file with position and other properties of one exposure per line.
 
-Lines that begin with # are comments. `COLUMNS` lists the columns with units and defaults for empty fields.
+Lines that begin with # are comments. `COLUMNS` lists the columns with units and with defaults for empty fields.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from lake_schema.tables.exposures import EUCLID_BANDS
 CHANNELS = tuple(code for code, _ in declared.CHANNELS)
 IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 
-# Name, unit, meaning and default of each column; "" if the column is required.
+# Columns of the file: name, unit, meaning, and a description of the default for an empty field. A column is required if
+# its default is "".
 COLUMNS = (
     ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360", ""),
     ("dec", "deg", "declination of the boresight, ICRS", ""),
@@ -56,16 +57,25 @@ _MAX_LINES, _MAX_LINE_LENGTH = 2 * _MAX_ROWS, 20 * _MAX_LENGTH
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of a table of pointings.
+    """One exposure of a table of pointings.
 
-    An empty field is None or "" if the default comes from the mission parameters.
+    An attribute is None, "" or () if its field is empty and its default is not in the file. The default may be in the
+    observation, the request or the mission database.
 
     Attributes
     ----------
     location : str
-        File and line, for messages.
+        File and line of the exposure, for error messages.
+    channel : str
+        VIS, NISP-P, NISP-S or EXT (ground cameras).
+    camera : str
+        Name of the camera in the mission database; "" for the camera of the observation's ground survey.
+    band : str
+        Name of the passband.
+    image_type : str
+        Image type, such as "science".
     ra, dec : float
-        Position of the boresight in degrees.
+        ICRS position of the boresight in degrees.
     position_angle : float, optional
         Position angle of the focal plane's y axis in degrees, from north through east.
     mjd : float, optional
@@ -73,17 +83,17 @@ class Row:
     exposure_time_s : float, optional
         Effective exposure time in seconds.
     sky : float, optional
-        Diffuse sky in electrons per pixel and second.
+        Diffuse sky brightness in electrons per pixel and second.
     seeing : float, optional
-        FWHM of the atmosphere in arcsec, only for ground cameras.
+        FWHM of the atmosphere's PSF in arcsec; always None for Euclid.
     zero_point : float, optional
-        AB magnitude of 1 electron per second.
+        AB magnitude of a source that gives 1 electron per second.
     psf : str, optional
         Path of a PSF file.
     grism_angle : float, optional
         Direction of NISP-S spectra in the focal plane in degrees.
     detectors : tuple of str
-        Names of detectors; () for the default.
+        Names of detectors to render; () for the detectors of the observation.
     """
 
     location: str
@@ -111,11 +121,11 @@ class Contents:
     Attributes
     ----------
     sha256 : str
-        Checksum of the file.
+        SHA-256 checksum of the file.
     bands : tuple of str
-        Passbands of the rows, each once.
+        Passbands of the exposures, each once.
     kinds : tuple of (str, str)
-        Pairs (channel, image type) of the rows, each once.
+        Pairs (channel, image type) of the exposures, each once.
     """
 
     sha256: str
@@ -124,7 +134,7 @@ class Contents:
 
 
 def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
-    """Read a table of pointings and return its summary.
+    """Read and check a table of pointings, and return its summary.
 
     Parameters
     ----------
@@ -133,17 +143,17 @@ def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
     channels : sequence of str
         Channels of the observation to which the table belongs.
     image_type : str
-        Image type of the observation.
+        Image type of the observation, the default for rows without one.
 
     Returns
     -------
     Contents
-        Checksum, bands and kinds of exposures.
+        Checksum of the file, and passbands, channels and image types of its exposures.
 
     Raises
     ------
     BadInput
-        If the table is not valid, see `read`.
+        If the file does not exist or the table is not valid, see `read`.
     """
     rows = read(path, channels, image_type)
     bands = tuple(dict.fromkeys(row.band for row in rows))
@@ -165,12 +175,13 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     Returns
     -------
     list of Row
-        The rows in the order of the file.
+        The exposures in the order of the file; empty if the file has only a line with column names.
 
     Raises
     ------
     BadInput
-        If the table is not valid. The message names the file, the line and the column.
+        If the file does not exist or is too long, a column is missing, unknown or repeated, or a value is missing,
+        wrong or out of range. The message names the file, and the line and the column if there are any.
     """
     stream = io.StringIO(user_files.read_text(path, "table of pointings"), newline="")
     numbered_lines, line_number = _data_lines(path, stream), 0
@@ -209,7 +220,10 @@ def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -
 
 
 def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line that is not a comment; refuse files that are too long."""
+    """Yield number (from 1) and text of each line that does not begin with #.
+
+    Raises BadInput if the file has too many lines or a line is too long.
+    """
     for number, line in enumerate(stream, start=1):
         if number > _MAX_LINES or len(line) > _MAX_LINE_LENGTH:
             raise BadInput(f"{path}: more than {_MAX_LINES} lines, or one of more than {_MAX_LINE_LENGTH} characters")

@@ -1,4 +1,4 @@
-"""Define the records that contain a checked request."""
+"""Define the records that contain a checked request, the TOML file in which a user describes a simulation."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
 TRUTH_CONTENTS = tuple(code for code, _ in products.CONTENTS if code != "science")
 COMPRESSIONS = ("none", "rice")
-# Same as in truesky/render/camera/tpv.py (a test compares them).
+# Conventions for distortion in FITS headers. This copies truesky/render/camera/tpv.py; a test compares the two.
 WCS_CONVENTIONS = ("sip", "tpv")
 FILE_LAYOUTS = ("detector", "exposure")
-# Readouts of ground cameras, the same as in truesky/render/channels/ground.py (test_readout.py compares them).
+# Forms of the images of ground cameras. This copies truesky/render/channels/ground.py; test_readout.py compares them.
 READOUTS = ("raw", "amplifiers", "electrons")
-# Fields of a request that set the format of images.
+# Names of the fields of `Request` that set the format of image files.
 IMAGE_OPTIONS = ("compression", "wcs", "readout")
 DENSITY_MODELS = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
-# Largest reduced shear. Above it, near a critical line, the image of a source is not an ellipse.
+# Largest constant reduced shear of a request. Above it, near a critical line, the image of a source is not an ellipse.
 MAX_SHEAR = 0.9
-# Effects of all rendered channels. This is a copy because requests must not import the renderer; test_effect.py
-# compares it with the registry of channels.
+# Names of all instrument effects that a request may switch. This copies the registry of channels, because requests must
+# not import the renderer; test_effect.py compares the two.
 EFFECTS = (
     "adc", "amplifiers", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp",
     "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map",
@@ -48,7 +48,7 @@ EFFECTS = (
     "readout_trail", "reset_level", "satellite_trails", "serial_cti", "serial_loss", "shutter", "signal_adc",
     "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
-# Effects without which no image is valid.
+# Effects that "all" in `effects.off` does not switch off, because no image is valid without them.
 ALWAYS_ON = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")
 _NO_FILES = UserCurves()
 _NO_INGEST = Ingest()
@@ -62,27 +62,27 @@ class Universe:
     Attributes
     ----------
     galaxy_limit : float
-        Faintest AB magnitude of galaxies, before the Milky Way's dust and intergalactic hydrogen. A shallower or nearer
-        request contains the same galaxies as a deeper one up to its limit.
+        Faintest AB magnitude of galaxies, before absorption by the Milky Way's dust and intergalactic hydrogen. If two
+        requests differ only in their limit, the deeper one contains all galaxies of the other.
     galaxy_band : str
-        Built-in passband of `galaxy_limit`.
+        Name of the built-in passband in which `galaxy_limit` is a magnitude.
     star_limit : float
         Faintest H magnitude of stars (Vega, as observed).
     z_max : float
-        Highest redshift.
+        Highest redshift of galaxies and quasars below z = 6. Those beyond z = 6 do not depend on it.
     box_cells : int
-        Cells of 4 Mpc/h along each side of the matter box.
+        Number of cells of 4 Mpc/h along each side of the periodic box with the simulated matter density.
     lensing_nside : int
-        HEALPix resolution of the box's lensing maps, which need 5 GB of cache for 1024.
+        HEALPix N_side of the lensing maps computed from the matter box. Maps with 1024 need 5 GB in the cache on disc.
     lensing : (float, float), optional
-        Constant reduced shear (g1, g2) of all galaxies instead of the lensing by box and halos. In the frame
-        (east, north), g1 > 0 stretches east-west and g2 > 0 from the south-west to the north-east.
+        Constant reduced shear (g1, g2) of all galaxies. In the frame (east, north), g1 > 0 stretches east-west and
+        g2 > 0 from the south-west to the north-east. None for lensing by the matter box and halos.
     alignment : float
-        Strength of the alignment of galaxies with the matter around them, relative to nature; 0 for none.
+        Strength of the intrinsic alignment of galaxies with the matter around them, relative to nature; 0 for none.
     rotation : float
         Angle in degrees added to the position angle of every galaxy before lensing.
     high_redshift_boost, quasar_boost : float
-        Density of high-redshift galaxies and of quasars relative to nature; 0 for none.
+        Number density of high-redshift galaxies, and of quasars, relative to nature; 0 for none.
     """
 
     galaxy_limit: float = 26.0
@@ -107,20 +107,21 @@ class Stars:
     density : str
         Model of the stellar density, one of `DENSITY_MODELS`.
     brown_dwarf_boost : float
-        Density of L and T dwarfs relative to nature; 0 for none.
+        Number density of L and T dwarfs relative to nature; 0 for none.
     tycho2 : tuple of Path
-        Files of Tycho-2, which replace the model above the brightness V = 11.
+        Files of the Tycho-2 catalogue, whose stars replace those of the model brighter than V = 11. () for none.
     catalogue : Path, optional
-        File of stars that replace the model.
+        File with stars that replace all stars of the model; None to use the model.
     columns : tuple of (str, str)
-        Pairs (column of ours, column of the file) for `catalogue`.
+        Pairs (column of the table `stars`, column of the file) for `catalogue`.
     plane_limit : float, optional
-        Faintest H (Vega, as observed) within 5 deg of the Galactic plane and in the bulge. If None, requests there are
-        refused.
+        Faintest H (Vega, as observed) of stars within 5 deg of the Galactic plane and in the bulge. If None, areas
+        there are refused.
     bright_limit : float, optional
-        Brightest H (Vega, as observed); None for no limit.
+        Brightest H (Vega, as observed) of stars; None for no limit.
     rows_a_file : int
-        Expected number of rows above which the file of a cell is split into files of the next HEALPix order.
+        Largest expected number of stars in a file of the table `stars`. The file of a HEALPix cell with more stars is
+        split into files of smaller cells, down to order 8.
     """
 
     density: str = "juric"
@@ -135,7 +136,7 @@ class Stars:
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """Value and unit that replace the value of a mission parameter."""
+    """A user's value and unit, which replace the value of a parameter in the mission database."""
 
     value: float
     unit: str
@@ -143,16 +144,18 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class MissionChoice:
-    """Selection of mission parameters.
+    """Selection of values of the mission parameters, which describe the instruments and the survey.
+
+    The mission database may have several values of a parameter, each with a status.
 
     Attributes
     ----------
     ladder : tuple of str
-        Statuses of parameter values, the preferred first.
+        Statuses of parameter values in order of preference, such as "CBE" (current best estimate), "REQ" (required).
     overrides : tuple of (str, Override)
-        Parameters with values from the user.
+        Names of parameters with their values from the user.
     cameras : tuple of Camera
-        The user's cameras.
+        Ground cameras that the user has defined.
     """
 
     ladder: tuple[str, ...] = LADDER
@@ -162,7 +165,11 @@ class MissionChoice:
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """Effects that are switched on or off for all scenes."""
+    """Names of instrument effects that are switched on or off for all images.
+
+    `on` has the effects that are applied to all images, `off` those that are applied to none. An effect in neither of
+    them is applied to an image if it changes a pixel noticeably.
+    """
 
     on: tuple[str, ...] = ()
     off: tuple[str, ...] = ()
@@ -170,42 +177,65 @@ class Effects:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A checked simulation request.
+    """A checked simulation request, with all keys of the user's file.
 
     Attributes
     ----------
+    name : str
+        Name of the request.
     seed : int
         Seed of all random numbers.
+    accuracy : Accuracy
+        Largest errors of fluxes, shapes, positions and pixels.
+    area : Area
+        Area of the sky.
+    universe : Universe
+        Depth and resolution of the simulated universe.
+    stars : Stars
+        Model of the stars.
+    mission : MissionChoice
+        Selection of the parameters of instruments and survey.
     bands : tuple of str
         Passbands in which fluxes are computed.
+    pointings : tuple of Pointing
+        Single exposures.
     truth : tuple of str
-        Truth images, from `TRUTH_CONTENTS`.
+        Additional images with one component of the truth each, such as the image without noise; from `TRUTH_CONTENTS`.
+    curves : UserCurves
+        User files of spectra, extinction laws and passbands.
+    observations : tuple of Observation
+        Blocks of exposures that the planner schedules.
+    effects : Effects
+        Instrument effects that are switched on or off.
     explore : tuple of (str, tuple of str)
-        Explored parameters, each with its values as JSON.
+        Parameters that take several values, each with its values as JSON texts. All combinations are rendered.
+    ingest : Ingest
+        User catalogues and maps that replace simulated ones.
     strong_lens_boost : float
-        Density of strong lenses relative to nature.
+        Number density of strong lenses relative to nature.
     compression : str
         Compression of integer images, one of `COMPRESSIONS`.
     wcs : str, optional
-        Convention for the distortion in headers, one of `WCS_CONVENTIONS`; None for that of the instrument's pipeline.
+        Convention for distortion in FITS headers, one of `WCS_CONVENTIONS`; None for that of the instrument's pipeline.
     files : str
-        Whether science images are also stored in one file per exposure, one of `FILE_LAYOUTS`.
+        "exposure" if science images are also stored in one file per exposure, "detector" if not.
     readout : str
         Form of the images of ground cameras, one of `READOUTS`.
     psfs : tuple of (str, str)
         Pairs (band, file) of PSFs that replace the models.
     bodies : Path, optional
-        File of moving bodies that replace the simulated ones.
+        File of moving bodies of the solar system that replace the simulated ones.
     noise_seed : int, optional
         Seed of everything that differs between exposures of the same sky with the same detectors; None to use `seed`.
     sources : UserSources, optional
         Tables that contain all sources; None for the simulated universe.
     structure : Structure
-        Structure of galaxies beyond smooth profiles.
+        Spiral arms, knots and images of galaxies, in place of smooth profiles.
     detectors : tuple of str
-        Detectors to render now, () for all. Set on the command line; the plan does not depend on it.
+        Detectors to render now, () for all. Set on the command line; the list of planned images does not depend on it.
     limit : int, optional
-        Largest number of detectors to render now. Set on the command line; the plan does not depend on it.
+        Largest number of detectors to render now, None for all. Set on the command line; the list of planned images
+        does not depend on it.
     """
 
     name: str
@@ -237,14 +267,17 @@ class Request:
     limit: int | None = None
 
     def facts(self, *names: str) -> dict[str, Any]:
-        """Return the named fields of the request as JSON values, for the key of the products that depend on them."""
+        """Return the named fields of the request as JSON values, from which hashes of tables and images are computed.
+
+        Raises KeyError if there is no such field.
+        """
         all_values = asdict(self)
         # A camera is identified by the contents of its folder, not by its path.
         all_values["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
         return {name: all_values[name] for name in names}
 
     def variants(self) -> Iterator[dict[str, Any]]:
-        """Yield all combinations of explored parameters as {parameter: value}; a single {} if nothing is explored."""
+        """Yield all combinations of values in `explore` as {parameter: value}; a single {} if `explore` is empty."""
         names = [name for name, _ in self.explore]
         for values in product(*(choices for _, choices in self.explore)):
             yield {name: json.loads(value) for name, value in zip(names, values, strict=True)}

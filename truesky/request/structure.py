@@ -1,4 +1,4 @@
-"""Read the section `structure` of a request: spiral arms, knots and postage stamps of galaxies."""
+"""Read the section `structure` of a request (a user's TOML file): spiral arms, knots and images of galaxies."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput
 from truesky.request.toml_values import Toml, as_table, boolean, integer, number, string
 
-# Fewer knots do not fill a disc. The upper limit bounds the time, since each knot is drawn.
+# Smallest and largest number of knots per disc. Fewer knots do not fill a disc. More take too long, since each knot is
+# drawn.
 _KNOT_LIMITS = (20, 5000)
 
 
 @dataclass(frozen=True, slots=True)
 class Arms:
-    """Spiral arms and knots of large discs.
+    """Spiral arms and knots (bright compact regions) of large discs.
 
     Attributes
     ----------
     contrast : float
-        Brightness at the ridge of an arm over the mean at that radius, less 1, for the average disc; 0 for no arms.
+        Brightness at the ridge of an arm divided by the mean at this radius, minus 1, for the average disc; 0 for no
+        arms.
     knots : float
-        Fraction of the disc's light in knots.
+        Fraction of the disc's light in knots, 0 to 0.5.
     number : int
         Number of knots per disc.
     least_radius : float
@@ -38,16 +40,17 @@ class Arms:
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """A library of galaxy images that replace profiles (truesky/render/sources/galaxy_stamps.py).
+    """A user's library of galaxy images (stamps), which are drawn instead of smooth profiles.
 
     Attributes
     ----------
     file : Path
-        File of the library.
+        File of the library (truesky/render/sources/galaxy_stamps.py describes it).
     nearest : bool
-        True if galaxies without a stamp number get one, drawn among the stamps nearest in shape.
+        True if galaxies for which the catalogue has no stamp number get a random one among the stamps with the most
+        similar shape.
     least_radius : float
-        Half-light radius in arcsec of the smallest galaxy that gets such a stamp.
+        Half-light radius in arcsec of the smallest galaxy that gets a random stamp.
     """
 
     file: Path
@@ -57,14 +60,17 @@ class Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Structure of galaxies beyond smooth profiles; `arms` is None for smooth discs, `stamps` is None for no stamps."""
+    """Structure of galaxies in addition to smooth profiles: spiral arms and knots, and images from a library.
+
+    `arms` is None for smooth discs, and `stamps` is None if no library of images is used.
+    """
 
     arms: Arms | None = None
     stamps: Stamps | None = None
 
 
 def parse(table: Toml, folder: Path) -> Structure:
-    """Read the section `structure`; `folder` is the folder of the request.
+    """Read the section `structure` of a request; file names are relative to `folder`, the folder of the request.
 
     Raises
     ------
@@ -104,7 +110,10 @@ def _arms(value: object) -> Arms | None:
 
 
 def facts(structure: Structure) -> dict[str, Any]:
-    """Return the facts that change the images of galaxies, without file names; {} if all galaxies are smooth."""
+    """Return the settings that change the images of galaxies, as JSON values for the hash of an image.
+
+    File names are left out. The result is {} if all galaxies are smooth.
+    """
     structure_facts: dict[str, Any] = {}
     if structure.arms is not None:
         structure_facts["arms"] = asdict(structure.arms)

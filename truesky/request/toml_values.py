@@ -1,6 +1,7 @@
-"""Read and check values of a parsed TOML table. Errors name the full path of the key.
+"""Read and check values of a parsed TOML table, a request (the file in which a user describes a simulation).
 
-The parameter `path` of these functions is the name of a key with its sections, for example "universe.z_max".
+Error messages name the full path of the key. The parameter `path` of these functions is the name of a key with its
+sections, for example "universe.z_max". The function looks for the last part, here "z_max", in the table of the section.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ def check_keys(table: Toml, path: str, keys: set[str]) -> None:
     Parameters
     ----------
     table : Toml
-        The table.
+        The table of a section.
     path : str
-        Path of the table; "" for the whole request.
+        Name of the section with the sections around it, for the error message; "" for the whole request.
     keys : set of str
-        Keys that are allowed.
+        Keys that are allowed. They need not be present.
 
     Raises
     ------
     BadInput
-        If the table has another key.
+        If the table has another key. The message names the first one.
     """
     unknown = sorted(set(table) - keys)
     if unknown:
@@ -38,41 +39,41 @@ def check_keys(table: Toml, path: str, keys: set[str]) -> None:
 
 
 def section(table: Toml, key: str, keys: set[str] | None) -> Toml:
-    """Return the table of a key, empty if the key is missing.
+    """Return a section of a request as a table, empty if the section is missing.
 
     Parameters
     ----------
     table : Toml
-        The table with the key.
+        Table that contains the section, such as the whole request.
     key : str
-        Name of the key.
+        Name of the section.
     keys : set of str or None
-        Keys that are allowed in the table; None for all.
+        Keys that are allowed in the section; None for any.
 
     Returns
     -------
     Toml
-        The table of the key.
+        The table of the section.
 
     Raises
     ------
     BadInput
-        If the value is not a table, or has another key.
+        If the value is not a table, or the section has another key.
     """
     return as_table(table.get(key, {}), key, keys)
 
 
 def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
-    """Return a value that must be a table.
+    """Check that a value is a table, and return it.
 
     Parameters
     ----------
     value : object
-        The value.
+        Value of a key in the request.
     path : str
-        Path of the key.
+        Path of the key, for error messages.
     keys : set of str or None
-        Keys that are allowed in the table; None for all.
+        Keys that are allowed in the table; None for any.
 
     Returns
     -------
@@ -82,7 +83,7 @@ def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
     Raises
     ------
     BadInput
-        If the value is not a table, or has another key.
+        If the value is not a table, or the table has another key.
     """
     if not isinstance(value, dict):
         raise BadInput(f"{path} must be a table, got {quote_value(value)}")
@@ -92,12 +93,12 @@ def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
 
 
 def table_list(table: Toml, key: str, max_tables: int) -> list[object]:
-    """Return the list of a key, empty if the key is missing.
+    """Return a list of tables, such as [[pointing]] in TOML, empty if the key is missing.
 
     Parameters
     ----------
     table : Toml
-        The table with the key.
+        Table with the key.
     key : str
         Name of the key.
     max_tables : int
@@ -106,7 +107,7 @@ def table_list(table: Toml, key: str, max_tables: int) -> list[object]:
     Returns
     -------
     list of object
-        The list. Its items are not checked.
+        The list. It is not checked that its items are tables.
 
     Raises
     ------
@@ -120,12 +121,12 @@ def table_list(table: Toml, key: str, max_tables: int) -> list[object]:
 
 
 def has_key(table: Toml, path: str) -> bool:
-    """Return True if the table has the key at the end of `path`."""
+    """Return True if the table has the key at the end of `path`: "z_max" for "universe.z_max"."""
     return path.rpartition(".")[2] in table
 
 
 def required_value(table: Toml, path: str) -> object:
-    """Return the value of a key; raises BadInput if the key is missing."""
+    """Return the value of the key at the end of `path`, of any type; raises BadInput if the table has no such key."""
     key = path.rpartition(".")[2]
     if key not in table:
         raise BadInput(f"{path} is missing")
@@ -133,18 +134,18 @@ def required_value(table: Toml, path: str) -> object:
 
 
 def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | None = None) -> str:
-    """Return a text.
+    """Read the value of a key that must be text.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     legal : sequence of str, optional
-        Texts that are allowed; all if empty.
+        Texts that are allowed; empty for any text.
     default : str, optional
-        Value if the key is missing; None if the key is required.
+        Value if the key is missing, which is not checked; None if the key is required.
 
     Returns
     -------
@@ -167,18 +168,18 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
 
 
 def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = True) -> tuple[str, ...]:
-    """Return a list of texts, empty if the key is missing.
+    """Read the value of a key that must be a list of texts; return () if the key is missing.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     legal : sequence of str, optional
-        Texts that are allowed; all if empty.
+        Texts that are allowed; empty for any texts.
     distinct : bool, optional
-        If True, no text may occur twice.
+        If True, no text may occur twice in the list.
 
     Returns
     -------
@@ -188,7 +189,7 @@ def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = 
     Raises
     ------
     BadInput
-        If the value is not a list of allowed texts, or contains a text twice.
+        If the value is not a list of allowed texts, or if `distinct` is True and a text occurs twice.
     """
     texts = table.get(path.rpartition(".")[2], [])
     if not isinstance(texts, list) or not all(isinstance(item, str) for item in texts):
@@ -202,18 +203,18 @@ def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = 
 
 
 def number(table: Toml, path: str, lo: float, hi: float, default: float | None = None) -> float:
-    """Return a finite number.
+    """Read the value of a key that must be a finite number.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     lo, hi : float
-        Limits, both allowed.
+        Smallest and largest number that is allowed.
     default : float, optional
-        Value if the key is missing; None if the key is required.
+        Value if the key is missing, which is not checked; None if the key is required.
 
     Returns
     -------
@@ -225,7 +226,7 @@ def number(table: Toml, path: str, lo: float, hi: float, default: float | None =
     BadInput
         If the key is missing without a default, or the value is not a number.
     OutOfRange
-        If the number is outside its limits.
+        If the number is outside its limits, NaN or infinite.
     """
     if default is not None and not has_key(table, path):
         return default
@@ -233,43 +234,43 @@ def number(table: Toml, path: str, lo: float, hi: float, default: float | None =
 
 
 def optional_number(table: Toml, path: str, lo: float, hi: float) -> float | None:
-    """Return a finite number, or None if the key is missing.
+    """Read the value of a key that must be a finite number; return None if the key is missing.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     lo, hi : float
-        Limits, both allowed.
+        Smallest and largest number that is allowed.
 
     Returns
     -------
     float or None
-        The number.
+        The number, or None.
 
     Raises
     ------
     BadInput
         If the value is not a number.
     OutOfRange
-        If the number is outside its limits.
+        If the number is outside its limits, NaN or infinite.
     """
     return number(table, path, lo, hi) if has_key(table, path) else None
 
 
 def checked_number(value: object, path: str, lo: float, hi: float) -> float:
-    """Return a value that must be a finite number.
+    """Check that a value is a finite number, and return it as float.
 
     Parameters
     ----------
     value : object
         Value in the request.
     path : str
-        Path of the key.
+        Path of the key, for error messages.
     lo, hi : float
-        Limits, both allowed.
+        Smallest and largest number that is allowed.
 
     Returns
     -------
@@ -279,31 +280,31 @@ def checked_number(value: object, path: str, lo: float, hi: float) -> float:
     Raises
     ------
     BadInput
-        If the value is not a number.
+        If the value is not a number; true and false are not numbers.
     OutOfRange
-        If the number is outside its limits.
+        If the number is outside its limits, NaN or infinite.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise BadInput(f"{path} must be a number, got {quote_value(value)}")
-    # Compare before the conversion to float: whole numbers in TOML have no upper limit.
+    # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
     if not lo <= value <= hi or not math.isfinite(value):
         raise OutOfRange(path, quote_value(value), lo, hi)
     return float(value)
 
 
 def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None) -> int:
-    """Return a whole number.
+    """Read the value of a key that must be a whole number.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     lo, hi : int
-        Limits, both allowed.
+        Smallest and largest number that is allowed.
     default : int, optional
-        Value if the key is missing; None if the key is required.
+        Value if the key is missing, which is not checked; None if the key is required.
 
     Returns
     -------
@@ -328,12 +329,12 @@ def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None
 
 
 def boolean(table: Toml, path: str, default: bool) -> bool:
-    """Return true or false.
+    """Read the value of a key that must be true or false.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     default : bool
@@ -356,18 +357,18 @@ def boolean(table: Toml, path: str, default: bool) -> bool:
 
 
 def integer_choice(table: Toml, path: str, legal: Sequence[int], default: int) -> int:
-    """Return one of a few whole numbers.
+    """Read the value of a key that must be one of a few whole numbers.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     legal : sequence of int
         Numbers that are allowed.
     default : int
-        Value if the key is missing.
+        Value if the key is missing; it must be one of `legal`.
 
     Returns
     -------
@@ -386,28 +387,28 @@ def integer_choice(table: Toml, path: str, legal: Sequence[int], default: int) -
 
 
 def number_pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, float]:
-    """Return two numbers.
+    """Read the value of a key that must be a list of two finite numbers.
 
     Parameters
     ----------
     table : Toml
-        Section with the key.
+        Table of the section with the key.
     path : str
         Path of the key.
     lo, hi : float
-        Limits of both numbers, both allowed.
+        Smallest and largest number that is allowed, for both numbers.
 
     Returns
     -------
     (float, float)
-        The numbers.
+        The numbers, in the order of the list.
 
     Raises
     ------
     BadInput
         If the key is missing, or the value is not a list of two numbers.
     OutOfRange
-        If a number is outside its limits.
+        If a number is outside its limits, NaN or infinite.
     """
     numbers = required_value(table, path)
     if not isinstance(numbers, list) or len(numbers) != 2:
@@ -417,6 +418,6 @@ def number_pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, fl
 
 
 def quote_value(value: object) -> str:
-    """Return a value as text for a message, with at most 60 characters."""
+    """Return repr(value) for an error message, cut to at most 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

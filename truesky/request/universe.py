@@ -1,4 +1,8 @@
-"""Compare the universe of a request (seed, depth and all else that shapes it) with catalogues and other requests."""
+"""Compare the universe of a request with the catalogues in a lake (the folder of all tables of a simulation).
+
+A request is a user's TOML file. Its universe is given by the seed, the depth and the other values of its sections
+`universe` and `stars`, and the files that replace parts of it.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +22,24 @@ from truesky.request.files import Catalogue
 from truesky.request.schema import Request
 
 CATALOGUES = ("galaxies", "stars")
-# Formats of external catalogues. Some formats have pairs of files.
+# File with the formats of user catalogues. In some formats, the columns are split between two files.
 _FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
-# Keys that name files or set how rows are written.
+# Keys of the section `stars` that name files or set how rows are written. They are not compared as values.
 _FILE_KEYS = {"tycho2", "catalogue", "columns", "rows_a_file"}
 
 
 def requested_values(request: Request) -> dict[str, Any]:
-    """Return the seed and the values of the sections `universe` and `stars` by name, without files."""
+    """Return the seed and the values of the sections `universe` and `stars` by name, without names of files."""
     values = request.facts("universe", "stars")
     star_values = {key: value for key, value in values["stars"].items() if key not in _FILE_KEYS}
     return {"seed": request.seed, **values["universe"], **star_values}
 
 
 def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> None:
-    """Check that every catalogue belongs to the universe of the request; raises BadInput at the first that does not."""
+    """Raise BadInput if a catalogue in a lake was made from another universe than that of the request.
+
+    The message names the first catalogue and the first value that differ.
+    """
     for version in catalogues:
         if different := _difference(version, request):
             first = f"run build_{version.table} first, then compute_fluxes"
@@ -40,14 +47,15 @@ def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> No
 
 
 def check_lake(root: Path, request: Request) -> None:
-    """Check that the other requests in a lake have the universe of this request.
+    """Check that the catalogues of other requests in a lake were made from the universe of this request.
 
-    A lake contains one universe. A request may change the universe if it is the only one in the lake.
+    All requests of a lake must have the same universe. A request may change the universe if it is the only one in the
+    lake, since its previous catalogues are not compared. A lake that does not exist is accepted.
 
     Raises
     ------
     BadInput
-        If the catalogues of another request differ.
+        If the catalogues of another request were made from a different universe. The message names the difference.
     """
     for name in request_links.request_names(root):
         for table in CATALOGUES if name != request.name else ():
@@ -59,13 +67,14 @@ def check_lake(root: Path, request: Request) -> None:
 
 
 def _difference(version: read.Version, request: Request) -> str:
-    """Describe how the universe of a catalogue differs from that of the request; "" if they agree."""
+    """Describe the first difference between the universe of a catalogue and that of the request; "" if they agree."""
     facts = version.manifest["facts"]
     values, sources = requested_values(request), request.sources
     source_facts = None if sources is None else sources.facts(request.area.bounding_circle())
     if canonical(facts.get("sources")) != canonical(source_facts):
         return "other sources than the request"
-    # Facts of external catalogues do not contain the depth.
+    # Compare only values that the manifest (JSON description) of the catalogue contains. For a user's catalogue, for
+    # example, the manifest has no limiting magnitude.
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if canonical(facts.get(key)) != canonical(values[key]):
             return f"{key} {facts.get(key)}, the request {values[key]}"
@@ -83,16 +92,16 @@ def _difference(version: read.Version, request: Request) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _NamedFiles:
-    """Files that a request names.
+    """Files of a user that replace a part of the universe, such as a catalogue.
 
     Attributes
     ----------
     files : sequence of Path
         Files and folders.
-    options : mapping of str
-        Options with which the files are read.
+    options : mapping of str to object
+        Options with which the files are read, such as their format and columns.
     pair_prefixes : sequence of str
-        Beginnings of the file names of a pair, if rows are split between two files.
+        Beginnings of the names of both files of a pair, if the columns are split between two files; otherwise empty.
     """
 
     files: Sequence[Path]
@@ -101,7 +110,11 @@ class _NamedFiles:
 
 
 def _named_files(table: str, request: Request) -> Iterator[tuple[str, _NamedFiles | None]]:
-    """Yield each name under which a catalogue's facts record files, with the files of the request."""
+    """Yield pairs (kind of user files that may replace parts of a catalogue, files of this kind in the request).
+
+    The kind, such as "dust", is a key in the manifest (JSON description) of the catalogue. `table` is "galaxies" or
+    "stars". The files are None if the request names none.
+    """
     ingest, stars = request.ingest, request.stars
     dust = {} if ingest.dust is None else {name: value for name, value in asdict(ingest.dust).items() if name != "file"}
     yield "dust", _NamedFiles((ingest.dust.file,), dust) if ingest.dust else None
@@ -127,12 +140,15 @@ def _catalogue_files(catalogue: Catalogue, with_format: bool = False) -> _NamedF
 
 
 def _is_same(facts: Json, named: _NamedFiles) -> bool:
-    """Return True if the files have the recorded checksums, or if a file is missing and cannot be compared."""
+    """Return True if the user's files have the checksums `facts["sha256"]`, which were recorded with a catalogue.
+
+    Return True as well if a file no longer exists, because it cannot be compared.
+    """
     if not all(path.exists() for path in named.files):
         return True
     all_files = [file for path in named.files for file in (external_rows.find_files(path) if path.is_dir() else [path])]
     if named.pair_prefixes:
-        # A folder with pairs of files may contain other tables.
+        # Use only the pairs of files, because their folder may contain other tables.
         first, second = named.pair_prefixes
         all_files = [file for file in all_files if file.name.startswith(first) and not file.name.startswith(second)]
         all_files += [file.with_name(second + file.name.removeprefix(first)) for file in all_files]

@@ -1,1 +1,1 @@
-"""Run jobs: the command line of a job, the Spark session and its workers, time and memory of tasks."""
+"""Run jobs, which make tables, with Spark: command line, session and worker processes, time and memory of tasks."""

@@ -1,6 +1,7 @@
 """Run one job under spark-submit: spark_entry.py MODULE --lake LAKE --request REQUEST.
 
-The command `truesky` submits this file, since a wheel contains no `jobs/` folder.
+MODULE is the name of the Python module that defines the job. The command `truesky` submits this file, because an
+installed package does not contain the folder `jobs/` with one script per job.
 """
 
 import sys
@@ -8,7 +9,8 @@ from importlib import import_module
 from pathlib import Path
 
 if __name__ == "__main__":
-    # Python puts the folder of this file first, where its modules could hide others of the same name.
+    # Remove the folder of this file from the import path. Python puts the folder of a script first, so that modules in
+    # the folder could hide others of the same name.
     if sys.path[:1] == [str(Path(__file__).resolve().parent)]:
         del sys.path[0]
     from lake_schema import command

@@ -3,8 +3,8 @@
 Spark runs python -m truesky.running.spark_workers pyspark.worker.
 
 The process is PySpark's daemon with another handler of SIGPIPE. Java drops a worker that has been idle for a minute.
-The worker then writes to a closed socket. In the Unix domain this is an error at once, which would print a traceback.
-With the default handler the worker ends silently, as with any other closed pipe or socket.
+The worker then writes to a closed socket. With a Unix domain socket this fails at once, and Python would print a
+traceback. With the default handler of SIGPIPE, the worker ends silently.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
 """Run a job from its command line to published tables.
 
-A job is a function (lake, request) -> steps. A step is a plan (tasks and their inputs) and the function that runs one
-task. Spark transports only names and facts of tasks, and their receipts; rows are written directly to files. Only this
-module and session.py use Spark.
+A job makes tables of a lake (the folder of all tables of a simulation) for a request (a user's TOML file). It has one
+step per table. A step is a plan (a list of tasks with their inputs) and a function that runs one task, which writes one
+file of the table. Spark transports only the names and inputs of tasks, and their receipts: records of the files
+written, their time and memory. Rows are written directly to files. Only this module, session.py and spark_workers.py
+use Spark.
 """
 
 from __future__ import annotations
@@ -48,20 +50,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One table of a job.
+    """One table that a job makes.
 
     Attributes
     ----------
     plan : Plan
-        Table, facts and tasks.
+        The table, the facts (JSON values) that determine its contents, and one task per file.
     run_task : callable
-        Function that runs one task and returns its receipt.
+        Function (lake, facts of plan and task) -> Output that computes the rows and files of one task.
     on_driver : bool
-        True to run the tasks in the driver, if they are too small for workers.
+        True to run the tasks in this process and not in Spark workers, since they are small.
     unit : str
-        Name of a task in the progress bar.
+        Word for a task in the progress bar.
     on_published : callable, optional
-        Function that is called with the published version.
+        Function that is called with the version of the table after it has been published.
     """
 
     plan: Plan
@@ -80,16 +82,16 @@ class Job:
     name : str
         Name of the command.
     doc : str
-        Text of its --help.
+        Description in the text of its option --help.
     steps : callable
-        Function (lake, request) -> steps.
+        Function (lake, request) -> steps, one per table.
     list_options : tuple of (str, str)
-        Names and help texts of options that replace lists of the request, such as bands.
+        Names and help texts of options that replace fields of the request with a list of texts, such as `bands`.
     integer_options : tuple of (str, str)
-        Names and help texts of options that replace integers of the request.
+        Names and help texts of options that replace fields of the request with an integer, such as `limit`.
     dry_run : callable, optional
-        Function (lake, request) -> steps to run with --dry-run, which prints a forecast. By default the job has no such
-        option.
+        Function (lake, request) -> steps that replaces `steps` if the option --dry-run is given. It prints a forecast.
+        With None the job has no such option.
     """
 
     name: str
@@ -100,23 +102,24 @@ class Job:
     dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
 
 
-# Fields of a receipt that a worker sends to the driver.
+# Fields of a task's receipt (record of its files, time and memory) that a Spark worker sends to the main process.
 _RESULT_FIELDS = (
     "part", "rows", "bytes", "seconds", "cpu_s", "peak_gb", "machine", "attempt", "error", "traceback"
 )  # fmt: skip
 
 
-# Names of ASCII encodings in C libraries.
+# Names of the ASCII encoding in different C libraries.
 _ASCII = ("ANSI_X3.4-1968", "US-ASCII", "646")
-# This variable is set if Java started Python.
+# Environment variable that is set if Java (spark-submit) has started this Python.
 _GATEWAY = "PYSPARK_GATEWAY_PORT"
 _RESUME_HINT = "a second run continues where this one ended"
 
 
 def main(job: Job, argv: Sequence[str] | None = None) -> int:
-    """Run a job from its command line and return the exit status.
+    """Run a job with the arguments of its command line (by default sys.argv) and return the exit status.
 
-    The status is 0 for success, 1 if a task failed, 2 for bad input, and 130 or 143 after a signal.
+    The status is 0 for success, 1 if a task or the operating system failed or the lake is damaged, and 2 for bad input.
+    After Ctrl-C or SIGTERM the process ends at once with status 130 or 143.
     """
     options = _options(job, argv)
 
@@ -131,22 +134,23 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
 
 
 def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
-    """Make and publish every table of a job that does not exist yet.
+    """Make and publish the tables of a job. Files of a table that exist already are not made again.
 
     Parameters
     ----------
     job : Job
-        Job with its steps.
+        The job.
     root : Path
-        Folder of the lake.
+        Folder of the lake. It is created if it does not exist.
     request : Request
-        Checked request.
+        The checked request.
     verbose : bool, optional
         True to print tracebacks and messages of Spark.
 
     Notes
     -----
-    Errors of `publish.make_version` are raised unchanged.
+    Errors are raised unchanged. They come from planning, such as BadInput, and from `publish.make_version`, such as
+    TasksFailed if a task fails. Tables that were finished before the error remain published.
     """
     if difference := instruction_set.check():
         command.print_error(job.name, difference, 0)
@@ -158,12 +162,15 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
     metrics = {"prepare_s": time.time() - started, "prepare_cpu_s": time.process_time() - cpu}
     for step in steps:
         _run_step(job, step, root, request, verbose, metrics)
-        # Only the first step records these metrics.
+        # Record the time of planning only in the log of the first table, so that it counts once.
         metrics = {}
 
 
 def common_facts(request: Request, *sections: str) -> dict[str, Any]:
-    """Return facts that the plans of a request have in common: the named sections of the request, and the code."""
+    """Return facts that determine the contents of a table: the named fields of the request, and the code version.
+
+    Raises KeyError if the request has no such field.
+    """
     return {"request": request.facts(*sections), "code": code_version()}
 
 
@@ -187,11 +194,10 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _refuse_mangled(*paths: str) -> None:
-    """Raise BadInput for paths that lost letters on their way here, so that no lake with a wrong name is made.
+    """Raise BadInput for paths in which an ASCII locale has replaced letters, so that no lake gets a wrong name.
 
-    In an ASCII locale, Java passes a question mark for any other letter, which cannot be distinguished from a typed
-    one: spark-submit runs two processes, and the first one has already lost the letters. Python without Java keeps each
-    byte of such a letter as a surrogate.
+    In such a locale, Java replaces every letter outside ASCII by a question mark, so that paths with a question mark
+    are refused under spark-submit. Python without Java replaces each byte of such a letter by a surrogate character.
     """
     if locale.nl_langinfo(locale.CODESET) in _ASCII:
         lost_letter = re.compile("[?]" if _GATEWAY in os.environ else "[\ud800-\udfff]")
@@ -214,7 +220,10 @@ def _request(job: Job, options: argparse.Namespace) -> Request:
 
 @contextmanager
 def _exit_on_signal(job: Job) -> Iterator[None]:
-    """End the process at once after Ctrl-C or SIGTERM: the lake is always consistent, and the next run continues."""
+    """End the process at once if Ctrl-C or SIGTERM arrives inside the `with` block, with status 130 or 143.
+
+    No clean-up of the lake is necessary: finished files are kept, and the next run makes only the others.
+    """
 
     def stop(signum: int, frame: FrameType | None) -> None:
         if (running := sys.modules.get("truesky.running.session")) is not None:
@@ -229,11 +238,14 @@ def _exit_on_signal(job: Job) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------------------------------------------------ steps
+# ------------------------------------------------------------------------------------- tables of a job and their logs
 
 
 def _run_step(job: Job, step: Step, root: Path, request: Request, verbose: bool, metrics: Json) -> None:
-    """Run the tasks of a step and publish its table; `metrics` are additional facts for the first line of the log."""
+    """Run the tasks of a step, which makes one table; then publish the table in the lake, and write a log.
+
+    `metrics` has additional values for the first line of the log, such as the time of planning.
+    """
     plan, started = step.plan, time.time()
     log = _RunLog(root, job, step, request, metrics)
     results: list[Json] = []
@@ -280,9 +292,10 @@ def _print_summary(version: read.Version, tasks_run: int, seconds: float, existe
 
 
 class _RunLog:
-    """Log of a run in LAKE/runs/<id>.jsonl, with one line at the start, one per task, and one at the end.
+    """Log of the making of one table, a file in LAKE/runs with one JSON object per line.
 
-    If the log cannot be written, the run continues without it.
+    It has one line at the start, one per task, and one at the end. If the log file cannot be created, a message is
+    printed and nothing is logged.
     """
 
     def __init__(self, root: Path, job: Job, step: Step, request: Request, extra_facts: Json) -> None:
@@ -314,7 +327,12 @@ class _RunLog:
 
 @contextmanager
 def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
-    """Show a progress bar that counts receipts, so that it is correct after a resume and with any scheduler."""
+    """Show a progress bar of the tasks of a table inside the `with` block.
+
+    The bar counts the receipt files, of which each finished task leaves one. The count therefore includes tasks of an
+    interrupted run, and does not depend on Spark. The bar is hidden if stderr is not a terminal, unless the environment
+    has $TRUESKY_PROGRESS.
+    """
     folder = stage.receipts_folder(layout.stage_folder(root, plan.table.name, plan.key))
 
     def count() -> int:
@@ -332,7 +350,7 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
                 started = time.perf_counter()
                 bar.update(count() - bar.n)
                 bar.refresh()
-                # Counting 100,000 receipts takes long and loads the file system: wait longer between counts.
+                # Wait at least 20 times as long as a count takes: counting 100,000 files loads the file system.
                 wait = max(0.25, 20.0 * (time.perf_counter() - started))
 
         thread = threading.Thread(target=update_bar, daemon=True)
@@ -345,17 +363,22 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
             bar.update(count() - bar.n)
 
 
-# ------------------------------------------------------------------------------------------------ Spark
+# ------------------------------------------------------------------------------------ execution of tasks with Spark
 
 
 def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: str, verbose: bool) -> Iterable[Json]:
-    """Run each task of the plan as a Spark task; find a task that kills its worker by running the rest in halves."""
+    """Run a function for each task in Spark workers, and return the results.
+
+    If a worker process ends unexpectedly, Spark gives up all tasks. The list of tasks is then divided into halves,
+    which are run separately, until the task that kills its worker is alone. The result of this task contains an error.
+    Raises LakeError if Spark does not start or its Java process has ended.
+    """
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 
     from truesky.running.session import get_session, is_alive
 
-    # Failures are reported in one line instead of by log messages of Spark.
+    # Silence Spark's log unless `verbose` is True, because the command reports failures in one line.
     quietly = contextlib.nullcontext if verbose else _silence_logging
     try:
         with quietly():
@@ -377,7 +400,7 @@ def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: st
 
 
 def has_session() -> bool:
-    """Return True if this process already has an active Spark session."""
+    """Return True if this process has an active Spark session. PySpark is not imported for this test."""
     if "pyspark" not in sys.modules:
         return False
     from pyspark.sql import SparkSession
@@ -387,7 +410,7 @@ def has_session() -> bool:
 
 @contextmanager
 def _silence_logging() -> Iterator[None]:
-    """Disable logging: the bridge to Java logs a traceback for every interrupted call."""
+    """Disable all logging inside the `with` block, because py4j logs a traceback for every interrupted call of Java."""
     previous_level = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -416,20 +439,26 @@ def _collect(spark: SparkSession, function: Callable[[Task], Json], tasks: Seque
             }
         _freeze_garbage()
 
-    # Each Spark task gets only one task: data in the closure would be unpickled by every one of them.
+    # Give each Spark task one task as its data. A list of all tasks in the function would be unpickled by every worker.
     results: list[Json] = spark.sparkContext.parallelize(tasks, len(tasks)).mapPartitions(run).collect()
     return results
 
 
 @cache
 def _freeze_garbage() -> None:
-    """Freeze objects once per worker: otherwise the garbage collection after each Spark task takes 22 ms."""
+    """Exclude all present objects of this worker process from garbage collection; repeated calls do nothing.
+
+    Otherwise the garbage collection after each Spark task takes 22 ms.
+    """
     gc.collect()
     gc.freeze()
 
 
 def _max_attempts(spark: SparkSession) -> int:
-    """Return how often Spark runs a failing task: F for local[N,F], 1 for local[N], else spark.task.maxFailures."""
+    """Return the largest number of times that Spark runs a failing task.
+
+    It is F for the master local[N,F], 1 for local[N], and otherwise the setting spark.task.maxFailures (default 4).
+    """
     master = str(spark.sparkContext.master)
     local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
     if local:

@@ -1,4 +1,4 @@
-"""Measure the time, memory and output size of tasks."""
+"""Measure the time, memory and output size of tasks. A task makes one file (partition) of a table."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from typing import Any
 
 from lake_schema.store.plan import Json, Task
 
-# On Linux, writing 5 to this file resets the peak memory of the process to its current memory.
-_CLEAR, _RESET, _STATUS = Path("/proc/self/clear_refs"), "5", Path("/proc/self/status")
+# On Linux, writing _RESET to the file _CLEAR resets the peak memory of this process to its current memory.
+_CLEAR, _RESET = Path("/proc/self/clear_refs"), "5"
+# Linux file with the peak memory of this process, in the line VmHWM.
+_STATUS = Path("/proc/self/status")
 
 
 class WithMetrics:
-    """Wrap a task function so that its receipt also records time, peak memory and output size.
+    """Wrap a function that runs a task, and add time, peak memory and output size to the dictionary that it returns.
 
-    Instances can be pickled and sent to Spark workers.
+    The added keys are `seconds` and `cpu_s` (wall and CPU time in s), `peak_gb` (GB) and `bytes` (total size of the
+    entries of `files`, if there are any). Instances can be pickled and sent to Spark workers.
     """
 
     def __init__(self, run_task: Callable[[Task], Json]) -> None:
@@ -39,7 +42,7 @@ class WithMetrics:
 
 
 def reset_peak_memory() -> None:
-    """Reset the record of peak memory, if the operating system supports it."""
+    """Reset the peak memory that the operating system records for this process; do nothing where this is impossible."""
     try:
         _CLEAR.write_text(_RESET)
     except OSError:
@@ -47,14 +50,14 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_gb() -> float:
-    """Return the peak resident memory in GB since the last reset.
+    """Return the peak resident memory of this process in GB (1e9 bytes) since the last `reset_peak_memory`.
 
-    If resetting is not supported, the peak is since the start of the process.
+    If the operating system cannot reset the peak, the result is the peak since the start of the process.
     """
     try:
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024 / 1e9
     except (OSError, StopIteration, ValueError):
-        # The value is in kilobytes on Linux and in bytes on macOS.
+        # `ru_maxrss` is in kilobytes on Linux and in bytes on macOS.
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9

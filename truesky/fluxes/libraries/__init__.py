@@ -1,1 +1,1 @@
-"""Read and compute libraries of template spectra."""
+"""Read and compute libraries of template spectra of galaxies and stars."""

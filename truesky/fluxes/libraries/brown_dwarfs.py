@@ -1,4 +1,4 @@
-"""Compute spectra of L and T dwarfs: 365 templates, about 19 realisations of colour scatter for each of 19 subtypes.
+"""Compute spectra of L and T dwarfs: 365 templates, about 19 for each of 19 subtypes, which differ by random colours.
 
 The mean colours are from Pecaut & Mamajek 2013: i - z (AB), and J - H and H - Ks (Vega). The colour z - J is computed
 from z - Y with an adopted Y - J.
@@ -21,18 +21,19 @@ _BANDS = ("sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
 _J = _BANDS.index("twomass_j")
 # Adopted Y - J in AB magnitudes; in UKIDSS it varies from 0.7 to 0.9 along the sequence (Hewett et al. 2006).
 _COLOR_YJ = 0.8
-# Scatter of J - H and H - Ks within a subtype, mag (adopted).
+# Gaussian scatter of J - H and H - Ks within a subtype, mag (adopted).
 _SCATTER = 0.07
+# Largest error of a colour (mag), and largest number of iterations of the search for a spectrum with given colours.
 _TOLERANCE = 1e-4, 200
-# Centre (A), width (A) and depth of methane and water bands. They are adopted and give only texture, since colours are
-# corrected afterwards.
+# Centre (A), Gaussian sigma (A) and depth of methane and water bands. They are adopted and only make spectra look
+# realistic, since colours are corrected afterwards.
 _METHANE = ((11_500.0, 700.0, 0.6), (16_700.0, 900.0, 0.8), (22_500.0, 1200.0, 0.8))
 _WATER = ((9_300.0, 300.0, 0.4), (14_000.0, 700.0, 0.7), (18_700.0, 900.0, 0.8))
 
 
 @dataclass(frozen=True, slots=True)
 class Subtypes:
-    """Properties of n subtypes.
+    """Properties of n spectral subtypes of L and T dwarfs.
 
     Attributes
     ----------
@@ -43,7 +44,7 @@ class Subtypes:
     abs_mag_j : float array, shape (n,)
         Absolute J magnitude (Vega).
     colors : float array, shape (n, 5)
-        m_band - m_J (AB) of i, z, J, H, Ks.
+        Mean colours m_band - m_J (AB) of i, z, J, H and Ks in mag.
     """
 
     names: tuple[str, ...]
@@ -53,9 +54,9 @@ class Subtypes:
 
 
 def subtypes() -> Subtypes:
-    """Return the subtypes L0 to T8 of Pecaut & Mamajek 2013."""
+    """Return the properties of the 19 whole subtypes L0 to T8 in the table of Pecaut & Mamajek 2013."""
     names, column = stellar.table(_FIRST, _LAST)
-    # The table also contains T4.5, T5.5 and T7.5.
+    # Leave out the half subtypes T4.5, T5.5 and T7.5 of the table.
     is_whole_subtype = np.array(["." not in name for name in names])
     names, column = (
         tuple(np.array(names)[is_whole_subtype].tolist()),
@@ -69,7 +70,10 @@ def subtypes() -> Subtypes:
 
 
 def template_names() -> tuple[str, ...]:
-    """Return subtype and number ("L0-00") of the 365 templates in order of subtype; number 00 is the mean."""
+    """Return a label SUBTYPE-NUMBER, such as "L0-00", of each of the 365 templates, in order of subtype.
+
+    Number 00 has the mean colours of the subtype; the others have random colours.
+    """
     names = subtypes().names
     counts = [COUNT // len(names) + (k < COUNT % len(names)) for k in range(len(names))]
     return tuple(f"{name}-{m:02d}" for name, count in zip(names, counts, strict=True) for m in range(count))
@@ -77,16 +81,16 @@ def template_names() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Properties of the 365 templates.
+    """Properties of the 365 templates of L and T dwarfs.
 
     Attributes
     ----------
     subtype : int array, shape (365,)
-        Index of the subtype.
+        Index of the subtype, 0 (L0) to 18 (T8).
     teff : float array, shape (365,)
         Effective temperature in K.
     abs_mag_j, abs_mag_h : float array, shape (365,)
-        Absolute magnitudes (Vega).
+        Absolute magnitudes in J and H (Vega).
     """
 
     subtype: Int
@@ -96,7 +100,7 @@ class Templates:
 
 
 def templates() -> Templates:
-    """Return the properties of the templates; all realisations of a subtype have its M_J."""
+    """Return the properties of the 365 templates. All templates of a subtype have the same temperature and M_J."""
     types = subtypes()
     labels = [name.partition("-")[::2] for name in template_names()]
     subtype = np.array([types.names.index(name) for name, _ in labels])
@@ -108,9 +112,9 @@ def templates() -> Templates:
 
 
 def spectra() -> Float:
-    """Return f_lambda of all templates on passbands.grid(), float64[365, 23401], with mean 1 between 5450 and 5550 A.
+    """Return f_lambda of the 365 templates at 600 to 24000 A in steps of 1 A, float64[365, 23401].
 
-    Colours are correct within 1e-4 mag.
+    The mean f_lambda between 5450 and 5550 A is 1. Colours differ from the required ones by at most 1e-4 mag.
     """
     grid, types = passbands.grid(), subtypes()
     bands = [passbands.load(name) for name in _BANDS]
@@ -132,7 +136,11 @@ def spectra() -> Float:
 
 
 def _scatter(subtype: str, number: int) -> Float:
-    """Return the offsets of the colours m_band - m_J of a realisation; 0 for number 0, the mean."""
+    """Return random offsets (mag) from the mean colours m_band - m_J, for template `number` of a subtype: float64[5].
+
+    The bands are i, z, J, H and Ks; only H and Ks have offsets. Template 0 has no offsets, because it has the mean
+    colours.
+    """
     if number == 0:
         return np.zeros(len(_BANDS))
     jh, hk = _SCATTER * stream("brown dwarfs", subtype, number).standard_normal(2)
@@ -140,9 +148,10 @@ def _scatter(subtype: str, number: int) -> Float:
 
 
 def _band_transmission(wavelength: Float, position: float) -> Float:
-    """Return the transmission of water and methane; position is 0 at L0 and 1 at T8.
+    """Return the transmission of water and methane bands, in the shape of `wavelength` (A).
 
-    Water absorbs along the whole sequence, methane in its second half.
+    `position` is the place in the sequence of subtypes, from 0 at L0 to 1 at T8. Water absorbs everywhere in the
+    sequence, methane above 0.5.
     """
     transmission = np.ones_like(wavelength)
     for bands, strength in ((_WATER, 0.5 + 0.5 * position), (_METHANE, max(2.0 * position - 1.0, 0.0))):
@@ -152,7 +161,7 @@ def _band_transmission(wavelength: Float, position: float) -> Float:
 
 
 def _vega(band: str) -> float:
-    # Import here, to avoid an import cycle.
+    # Import here to avoid an import cycle.
     from truesky.fluxes.libraries.vega import vega_magnitude
 
     return vega_magnitude(passbands.load(band))

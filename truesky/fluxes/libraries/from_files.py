@@ -1,6 +1,7 @@
-"""Read spectra, extinction curves and passbands from external files, and check them.
+"""Read template spectra, extinction curves and passbands from a user's files, and check them.
 
-spectrum_formats.toml has the formats. Errors are BadInput; messages name the file and, if there is one, the row.
+spectrum_formats.toml describes the formats. All errors are BadInput. Their messages name the file and, if there is one,
+the row.
 """
 
 from __future__ import annotations
@@ -25,26 +26,27 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
-# Attribute of a VOTable with the number of rows, for which astropy would allocate memory.
+# Attribute of a VOTable with the number of rows. It is removed, because astropy would allocate memory for this number.
 _ROW_COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
+# Angstrom per unit of wavelength.
 ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
-# Exponent of f_lambda beyond the red end of a galaxy file.
+# Exponent of f_lambda (a power of lambda) beyond the red end of a galaxy spectrum from a file.
 _RED_SLOPE = -3.2
 
-# Largest allowed k; the steepest law has about 25 at 912 A.
+# Largest k = A / E(B-V) that is accepted in an extinction law; the steepest law has about 25 at 912 A.
 _MAX_EXTINCTION = 100.0
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A spectrum, extinction curve or passband.
+    """A spectrum, extinction curve or passband as in a file.
 
     Attributes
     ----------
     wavelength : float array, shape (n,)
         Wavelengths in A, increasing.
     value : float array, shape (n,)
-        Values, 0 or more.
+        f_lambda, k = A / E(B-V) or response at these wavelengths, 0 or more.
     """
 
     wavelength: Float
@@ -52,7 +54,7 @@ class Curve:
 
 
 def formats() -> Mapping[str, Mapping[str, Any]]:
-    """Return the formats by name."""
+    """Return the file formats by name, as in spectrum_formats.toml: reader, columns, unit, limits of wavelengths."""
     return user_files.parse_toml(_FORMATS.read_text(encoding="utf-8"))
 
 
@@ -64,12 +66,12 @@ def read(path: Path, format_name: str) -> Curve:
     path : Path
         The file.
     format_name : str
-        Name of its format, one of `formats`.
+        Name of its format, one of the keys of `formats()`.
 
     Returns
     -------
     Curve
-        The curve.
+        Wavelengths, converted to A, and values.
 
     Raises
     ------
@@ -86,31 +88,36 @@ def read(path: Path, format_name: str) -> Curve:
     except LakeError:
         raise
     except Exception as error:
-        # The readers of astropy and NumPy may raise many kinds of errors for a user's file.
+        # Catch all errors, because the readers of astropy and NumPy raise many types for a wrong file.
         raise BadInput(f"{path}: cannot be read as {format_name}: {' '.join(str(error).split())[:200]}") from None
     check_curve(path, wavelength, value, form)
     return Curve(wavelength, value)
 
 
 def library(files: Sequence[Path], format_name: str = "cosmos") -> Library:
-    """Read galaxy templates on the rest-frame grid of the built-in library.
+    """Read galaxy templates from files, and resample them to 80 to 24500 A in steps of 1 A.
 
     Parameters
     ----------
     files : sequence of Path
-        One file per template, earliest type first.
+        At least one file. Each has one template, in order of galaxy type, elliptical first.
     format_name : str, optional
-        Format of the files, one of `formats`.
+        Format of the files, one of the keys of `formats()`.
 
     Returns
     -------
     Library
-        The normalised templates.
+        Templates whose mean f_lambda is 1 between 5450 and 5550 A. They are named after the files.
+
+    Raises
+    ------
+    BadInput
+        If a file cannot be read or its spectrum is not valid.
 
     Notes
     -----
     Each bin of 1 A gets the mean of the file's spectrum over the bin, which conserves flux. The flux is 0 beyond the
-    blue end, and proportional to lambda^-3.2 beyond the red end.
+    blue end of a file, and proportional to lambda^-3.2 beyond its red end.
     """
     from truesky.fluxes.libraries.rest_grid import rest_grid
 
@@ -121,21 +128,26 @@ def library(files: Sequence[Path], format_name: str = "cosmos") -> Library:
 
 
 def law(path: Path, format_name: str, wavelength: Float) -> Float:
-    """Read an extinction law k(lambda) = A / E(B-V).
+    """Read an extinction law k(lambda) = A / E(B-V) from a file.
 
     Parameters
     ----------
     path : Path
         The file.
     format_name : str
-        Format of the file, one of `formats`.
+        Format of the file, one of the keys of `formats()`.
     wavelength : float array, shape (n,)
-        Wavelengths in A.
+        Wavelengths in A at which the law is needed.
 
     Returns
     -------
     float array, shape (n,)
         k at these wavelengths, interpolated linearly, and constant beyond the wavelengths of the file.
+
+    Raises
+    ------
+    BadInput
+        If the file cannot be read, its curve is not valid, or a value is above 100.
     """
     curve = read(path, format_name)
     _refuse(path, curve.value > _MAX_EXTINCTION, f"is more than k = {_MAX_EXTINCTION:g}: the values must be A / E(B-V)")
@@ -143,28 +155,28 @@ def law(path: Path, format_name: str, wavelength: Float) -> Float:
 
 
 def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -> Passband:
-    """Read a user's passband.
+    """Read a passband from a file.
 
     Parameters
     ----------
     path : Path
         The file.
     name : str
-        Name of the passband.
+        Name that the passband gets.
     medium : str
         Medium of the wavelengths, "air" or "vacuum".
     form : str, optional
-        Format of the file, one of `formats`.
+        Format of the file, one of the keys of `formats()`.
 
     Returns
     -------
     Passband
-        The passband on the common grid.
+        The passband, resampled to steps of 1 A.
 
     Raises
     ------
     BadInput
-        If the medium is unknown, or the curve is not valid or outside the grid.
+        If the medium is unknown, the file cannot be read, or the curve is not valid or outside 600 to 24000 A.
     """
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
@@ -177,7 +189,7 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
 
 
 def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
-    """Return the wavelengths (A) and values of a file."""
+    """Read the wavelengths (converted to A) and values of a curve from a file of the given format, unchecked."""
     reader, names = form["reader"], (form["wavelength"], form["value"])
     scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
@@ -186,7 +198,7 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
             raise BadInput(f"{path}: has no rows")
         rows = np.loadtxt(lines, comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
         return rows[:, 0] * scale, rows[:, 1]
-    # The import is slow, and the most common format does not need it.
+    # Import here, because the import is slow and plain text files do not need it.
     from astropy.units import Quantity, dimensionless_unscaled
 
     table = read_table(path, "curve") if reader == "fits" else _table(path, reader)
@@ -197,7 +209,10 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
 
 
 def _table(path: Path, reader: str) -> Any:
-    """Read a text file as an astropy table. Astropy gets the text, since it would unpack or download from a path."""
+    """Read a VOTable (reader "votable") or a text table (reader of astropy, such as "ecsv") as an astropy table.
+
+    Astropy gets the text and not the path, since it would unpack a compressed file or download from an address.
+    """
     from astropy.table import QTable
 
     text = user_files.read_text(path, "table of a curve")
@@ -210,7 +225,7 @@ def _table(path: Path, reader: str) -> Any:
 
 
 def _without_unit(column: Any) -> Float:
-    """Return a column without unit; masked values become NaN, which `check_curve` refuses."""
+    """Return a table column as float64 without its unit; masked values become NaN, which `check_curve` refuses."""
     bare = getattr(column, "value", column)
     return np.asarray(np.ma.filled(np.ma.asarray(bare, dtype=float), np.nan), float)
 
@@ -221,11 +236,12 @@ def check_curve(path: Path, wavelength: Float, value: Float, form: Mapping[str, 
     Parameters
     ----------
     path : Path
-        File for messages.
+        File of the curve, for error messages. It is not read.
     wavelength, value : float array, shape (n,)
-        The curve.
-    form : mapping of str
-        Limits `bounds`, `largest_gap` and optionally `covers`, as in the formats.
+        Wavelengths in A, and values.
+    form : mapping of str to object
+        Limits: `bounds`, the first and last allowed wavelength (A); `largest_gap`, the largest step in ln(wavelength);
+        and optionally `covers`, the range (A) that the curve must contain.
 
     Raises
     ------
@@ -263,13 +279,17 @@ def _refuse(path: Path, bad: Bool, problem: str) -> None:
 
 
 def resample(grid: Float, curve: Curve) -> Float:
-    """Return the mean of a piecewise linear spectrum over each bin of 1 A, computed from its integral."""
+    """Return the mean of a piecewise linear spectrum over bins of 1 A centred on `grid` (A), in the shape of `grid`.
+
+    The mean is computed from the spectrum's integral. The spectrum is 0 beyond its blue end, and proportional to
+    lambda^-3.2 beyond its red end.
+    """
     at, value = curve.wavelength, curve.value
     if at[-1] < grid[-1] + 0.5:
         tail = np.arange(at[-1] + 1.0, grid[-1] + 2.0)
         at, value = np.append(at, tail), np.append(value, value[-1] * (tail / at[-1]) ** _RED_SLOPE)
     edges = np.append(grid, grid[-1] + 1.0) - 0.5
-    # Add the edges of the bins to the samples. The integral is exact at the samples.
+    # Add the edges of the bins to the samples, since the integral of a piecewise linear curve is exact at its samples.
     nodes = np.union1d(at, edges)
     sampled = np.interp(nodes, at, value, left=0.0)
     integral = np.append(0.0, np.cumsum(0.5 * (sampled[1:] + sampled[:-1]) * np.diff(nodes)))

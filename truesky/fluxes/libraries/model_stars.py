@@ -1,9 +1,10 @@
 """Compute spectra of stars by temperature, gravity and metallicity, and describe stars as mixtures of these spectra.
 
-The models have the colours of Castelli & Kurucz 2003 (model_stars.csv, which lists the sources). At the hottest nodes,
-and at the coolest nodes of dwarfs, they change smoothly into the dwarfs of `stellar`, which continue beyond the models.
-A star between nodes is a mixture of the four corners of its simplex. The mixture is linear and continuous in ln Teff,
-log g and [M/H].
+A model is the spectrum at a node (Teff, log g, [M/H]). Models have the colours of Castelli & Kurucz 2003
+(model_stars.csv, which lists the sources). At the hottest nodes, and at the coolest nodes of dwarfs, they change
+smoothly into the dwarf spectra of the module `stellar`, which continue to hotter and cooler stars. Cells between nodes
+are divided into simplices (tetrahedra). A star is a mixture of the four corners of its simplex. The mixture is linear
+and continuous in ln Teff, log g and [M/H].
 """
 
 from __future__ import annotations
@@ -26,29 +27,32 @@ TABLE = Path(__file__).with_name("model_stars.csv")
 TEFF = np.geomspace(3600.0, 8500.0, 18)
 LOG_G = np.array([1.6, 3.2, 4.6])
 METALLICITY = np.array([-2.5, -1.5, -1.0, -0.5, 0.0, 0.5])
-# Number of spectra in the mixture of a star.
+# Number of spectra that are mixed for a star.
 MIXTURE_SIZE = 4
 BANDS = ("sdss_u", "sdss_g", "sdss_r", "sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
 _DWARF_GRAVITY = len(LOG_G) - 1
-# Fraction of the model at the hottest nodes (from the last), and at the coolest nodes of dwarfs (from the first).
-_HOT_SHARES, _COOL_SHARES = (0.0, 0.5), (0.0, 1 / 3, 2 / 3)
-# Stars cooler than the models are giants if log g is at most this. They use the coolest models.
+# Fraction of the model in the spectrum at the two hottest temperatures, hottest first. The rest is a dwarf spectrum.
+_HOT_SHARES = (0.0, 0.5)
+# Fraction of the model in the spectrum at the three coolest temperatures, coolest first, for nodes with the gravity of
+# dwarfs. The rest is a dwarf spectrum.
+_COOL_SHARES = (0.0, 1 / 3, 2 / 3)
+# Largest log g of giants. Stars cooler than all models use the coolest models if they are giants, else dwarf spectra.
 _GIANT = 3.9
 _V = "bessell_v"
-# Largest error of a colour (mag), and largest number of iterations.
+# Largest error of a colour (mag), and largest number of iterations of the search for a spectrum with given colours.
 _TOLERANCE = 1e-4, 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Models:
-    """Colours of the models at the nodes.
+    """Colours of the models at all nodes of temperature, gravity and metallicity.
 
     Attributes
     ----------
     bolometric_h : float array, shape (n_teff, n_log_g, n_metallicity)
-        M_bol - M_H (AB) in mag.
+        Bolometric correction of the H band, M_bol - M_H (AB), in mag.
     colors : float array, shape (n_teff, n_log_g, n_metallicity, 8)
-        m_band - m_V (AB) of `BANDS` in mag.
+        Colours m_band - m_V (AB) of the passbands `BANDS` in mag.
     """
 
     bolometric_h: Float
@@ -57,14 +61,14 @@ class Models:
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """Spectra of which stars are mixtures.
+    """The mixture of template spectra that represents each of n stars.
 
     Attributes
     ----------
     sed : int array, shape (MIXTURE_SIZE, n)
-        Indices in the stellar library.
+        Indices of the templates in the stellar library.
     frac : float array, shape (MIXTURE_SIZE, n)
-        Fractions of f_lambda at 5500 A.
+        Fraction of each template in f_lambda at 5500 A; 0 for a template that is not used.
     """
 
     sed: Int
@@ -73,7 +77,7 @@ class Mixture:
 
 @lru_cache(maxsize=1)
 def models() -> Models:
-    """Read the table of models."""
+    """Read the colours of the models from model_stars.csv."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     shape = (TEFF.size, LOG_G.size, METALLICITY.size)
@@ -83,13 +87,16 @@ def models() -> Models:
 
 
 def names() -> tuple[str, ...]:
-    """Return Teff, log g and [M/H] of each model as text; [M/H] varies fastest."""
+    """Return a label with Teff, log g and [M/H] of each model, such as "3600 K 1.6 -2.5"; [M/H] varies fastest."""
     return tuple(f"{t:.0f} K {g:.1f} {z:+.1f}" for t in TEFF for g in LOG_G for z in METALLICITY)
 
 
 @lru_cache(maxsize=1)
 def model_share() -> Float:
-    """Return the fraction of the model at each node [teff, log_g, metallicity]; the rest is a dwarf."""
+    """Return the fraction of the model in the spectrum at each node; the rest is the spectrum of a dwarf.
+
+    The axes are temperature, gravity and metallicity.
+    """
     share = np.ones((TEFF.size, LOG_G.size, METALLICITY.size))
     for k, value in enumerate(_HOT_SHARES):
         share[-1 - k] *= value
@@ -99,23 +106,23 @@ def model_share() -> Float:
 
 
 def spectra(dwarfs: Float, types: StellarTypes) -> Float:
-    """Return the normalised spectra of the models on passbands.grid().
+    """Return the normalised spectra of the models at 600 to 24000 A (passbands.grid()).
 
     Parameters
     ----------
     dwarfs : float array, shape (m, 23401)
-        Normalised spectra of the dwarf types.
+        f_lambda of the dwarf types, with mean 1 between 5450 and 5550 A.
     types : StellarTypes
-        The dwarf types.
+        The m dwarf types.
 
     Returns
     -------
     float array, shape (n, 23401)
-        f_lambda of each model.
+        f_lambda of each model in the order of `names`, with mean 1 between 5450 and 5550 A.
 
     Notes
     -----
-    Colours are within 1e-4 mag of the table at nodes without a contribution of dwarfs.
+    At nodes without a contribution of dwarfs, colours differ from the values in model_stars.csv by at most 1e-4 mag.
     """
     grid, table, share = passbands.grid(), models(), model_share()
     bands = [passbands.load(name) for name in (*BANDS, _V)]
@@ -156,14 +163,15 @@ def dwarf_spectra(dwarfs: Float, types: StellarTypes) -> Float:
     Parameters
     ----------
     dwarfs : float array, shape (k, m)
-        Spectra of the types.
+        Spectra of the k dwarf types.
     types : StellarTypes
         The dwarf types.
 
     Returns
     -------
     float array, shape (n, m)
-        Spectrum for each model.
+        Spectrum of a dwarf with the temperature of each model. Models that differ only in gravity or metallicity have
+        the same one.
     """
     neighbours, weight = _neighbour_dwarfs(types, TEFF)
     interpolated = (1.0 - weight)[:, None] * dwarfs[neighbours[0]] + weight[:, None] * dwarfs[neighbours[1]]
@@ -171,30 +179,31 @@ def dwarf_spectra(dwarfs: Float, types: StellarTypes) -> Float:
 
 
 def nearest_dwarfs(types: StellarTypes) -> Int:
-    """Return for each model the index of the next hotter dwarf."""
+    """Return for each model the index of the next hotter dwarf type, int64[n]."""
     return np.repeat(_neighbour_dwarfs(types, TEFF)[0][0], LOG_G.size * METALLICITY.size)
 
 
 def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallicity: Float) -> Mixture:
-    """Return the spectra of which stars are mixtures, the largest fraction first.
+    """Return the mixture of up to four template spectra that represents each star.
 
     Parameters
     ----------
     types : StellarTypes
-        The dwarf types, with which the stellar library begins.
+        The dwarf types, whose templates are the first of the stellar library.
     first : int
-        Index of the first model in the library.
+        Index of the first model in the stellar library.
     teff : float array, shape (n,)
         Effective temperature in K.
     log_g : float array, shape (n,)
         Surface gravity, log10 of cm s-2.
     metallicity : float array, shape (n,)
-        [M/H].
+        [M/H] in dex.
 
     Returns
     -------
     Mixture
-        Indices and fractions.
+        Indices and fractions, for each star with the largest fraction first. Temperatures beyond the dwarfs, and
+        gravities and metallicities beyond the models, are clipped.
     """
     n = teff.size
     sed, frac = np.zeros((MIXTURE_SIZE, n), np.int64), np.zeros((MIXTURE_SIZE, n))
@@ -204,25 +213,25 @@ def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallic
 
 
 def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, metallicity: Float) -> Float:
-    """Return M_bol - M_H (Vega) of stars.
+    """Return the bolometric correction M_bol - M_H (Vega) of stars.
 
     Parameters
     ----------
     types : StellarTypes
         The dwarf types.
     vega : float
-        AB magnitude of Vega in H.
+        AB magnitude of Vega in the H band.
     teff : float array, shape (n,)
         Effective temperature in K.
     log_g : float array, shape (n,)
         Surface gravity, log10 of cm s-2.
     metallicity : float array, shape (n,)
-        [M/H].
+        [M/H] in dex.
 
     Returns
     -------
     float array, shape (n,)
-        Differences in mag.
+        M_bol - M_H in mag, averaged over the templates of each star's mixture.
     """
     mixed = mixture(types, types.teff.size, teff, log_g, metallicity)
     of_models = model_share() * (models().bolometric_h + vega)
@@ -232,7 +241,7 @@ def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, me
 
 
 def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
-    """Return V - H (Vega) of the dwarfs and of the models.
+    """Return the colour V - H (Vega) of all dwarf types, followed by that of all models.
 
     Parameters
     ----------
@@ -254,7 +263,11 @@ def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
 
 
 def _neighbour_dwarfs(types: StellarTypes, teff: Float) -> tuple[Int, Float]:
-    """Return the two dwarfs next to each temperature [2, n], and the fraction[n] of the second, linear in ln Teff."""
+    """Return the dwarf types next to each temperature (K), and the weight of the cooler one, linear in ln Teff.
+
+    The types are the indices of the hotter and the cooler neighbour, int64[2, n]. The weight, float64[n], is limited to
+    0 to 1 for temperatures beyond the dwarfs.
+    """
     ln_teff = np.log(types.teff)
     cooler = np.clip(np.searchsorted(-ln_teff, -np.log(teff)), 1, ln_teff.size - 1)
     weight = (ln_teff[cooler - 1] - np.log(teff)) / (ln_teff[cooler - 1] - ln_teff[cooler])
@@ -266,14 +279,19 @@ def _mix(
     teff: Float, log_g: Float, metallicity: Float, ln_teff: Float, gravities: Float, metals: Float, dwarfs: Float,
     first: int, giant: float, sed: Int, frac: Float,
 ) -> None:  # fmt: skip
-    """Fill `sed` and `frac`, shape (MIXTURE_SIZE, n), with the mixture of each star.
+    """Write the template indices and fractions of each star's mixture to `sed` and `frac`, shape (MIXTURE_SIZE, n).
 
-    `ln_teff`, `gravities` and `metals` are the nodes; `dwarfs` has ln Teff of the dwarfs, decreasing.
+    `ln_teff`, `gravities` and `metals` are the nodes of the models, and `dwarfs` is ln Teff of the dwarf types,
+    decreasing. `first` is the index of the first model in the library, and `giant` the largest log g of giants.
 
     Notes
     -----
-    The six simplices of a cell share its diagonal. The path from corner to corner follows first the axis along which
-    the star is farthest.
+    A star hotter than all models, or cooler than all models and not a giant, is a mixture of two dwarf types. Any other
+    star is a mixture of four models.
+
+    A cell between eight nodes is divided into six simplices (tetrahedra) that share the diagonal of the cell. The
+    corners of the star's simplex are on a path along the edges of the cell from the lowest to the highest node. The
+    path first takes the axis along which the star is farthest from the lowest node.
 
     References
     ----------
@@ -290,7 +308,8 @@ def _mix(
             b, up = _find_node(gravities, log_g[i])
             c, rich = _find_node(metals, metallicity[i])
             size_a, size_b = gravities.size * metals.size, metals.size
-            # Sort the three axes by decreasing fraction.
+            # Sort the three axes by decreasing distance of the star from the lowest node of its cell. x, y, z are the
+            # distances as fractions of the cell, and p, q, r the steps of the template index along the axes.
             x, y, z = along, up, rich
             p, q, r = size_a, size_b, 1
             if y > x:
@@ -312,6 +331,9 @@ def _mix(
 
 @exact_jit
 def _find_node(nodes: Float, value: float) -> tuple[int, float]:
-    """Return the node before a value, and the fraction of the way to the next node; values outside are clipped."""
+    """Return the index of the node before a value, and the fraction (0 to 1) of the way to the next node.
+
+    `nodes` increase. Values outside the nodes count as the first or last node.
+    """
     low = min(max(int(np.searchsorted(nodes, value, side="right")) - 1, 0), nodes.size - 2)
     return low, min(max((value - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0), 1.0)

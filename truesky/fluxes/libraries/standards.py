@@ -13,27 +13,33 @@ from truesky.fluxes.libraries import stellar
 
 NAMES = ("Vega", "white dwarf DA", "planetary nebula")
 
-# A hot DA such as GD 71 (Teff of Bohlin, Hubeny & Rauch 2020). Depth and width (A) of its Balmer lines are adopted.
-_WHITE_DWARF_TEFF, _BALMER_DEPTH, _BALMER_WIDTH, _LOWER_LEVEL = 33_590.0, 0.45, 25.0, 2.0
+# Effective temperature (K) of a hot white dwarf of type DA such as GD 71: Bohlin, Hubeny & Rauch 2020.
+_WHITE_DWARF_TEFF = 33_590.0
+# Depth and Gaussian sigma (A) of the Balmer lines of this white dwarf; both are adopted.
+_BALMER_DEPTH, _BALMER_WIDTH = 0.45, 25.0
+# Lower level of the Balmer series of hydrogen.
+_LOWER_LEVEL = 2.0
 NEBULA = Path(__file__).with_name("planetary_nebula.csv")
-# Equivalent width of H beta in the nebula's flat continuum (A), and sigma of the lines (A); both are adopted.
-_HBETA_WIDTH, _NEBULA_SIGMA = 500.0, 1.0
+# Equivalent width (A) of H beta over the flat continuum of the nebula, adopted.
+_HBETA_WIDTH = 500.0
+# Gaussian sigma (A) of the lines of the nebula, adopted.
+_NEBULA_SIGMA = 1.0
 
 
 def spectra(vega_wavelength: Float, vega_flux: Float) -> Float:
-    """Return the spectra of the sources in `NAMES`.
+    """Return the normalised spectra of the sources in `NAMES`: Vega, a white dwarf and a planetary nebula.
 
     Parameters
     ----------
     vega_wavelength : float array, shape (m,)
         Wavelengths of Vega's spectrum in A.
     vega_flux : float array, shape (m,)
-        Vega's f_lambda.
+        Vega's f_lambda in any unit.
 
     Returns
     -------
     float array, shape (3, 23401)
-        f_lambda on passbands.grid() with mean 1 between 5450 and 5550 A.
+        f_lambda at 600 to 24000 A in steps of 1 A, with mean 1 between 5450 and 5550 A.
     """
     grid = passbands.grid()
     vega = np.interp(grid, vega_wavelength, vega_flux, left=0.0)
@@ -43,7 +49,7 @@ def spectra(vega_wavelength: Float, vega_flux: Float) -> Float:
 
 
 def _nebula(grid: Float) -> Float:
-    """Return lines in bins of 1 A on a flat continuum of 1."""
+    """Return f_lambda of the planetary nebula: emission lines, averaged over bins of 1 A, on a flat continuum of 1."""
     from scipy.special import erf
 
     edges = np.append(grid, grid[-1] + 1.0) - 0.5

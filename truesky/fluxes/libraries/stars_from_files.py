@@ -1,7 +1,8 @@
-"""Read stellar spectra from external files, which replace the built-in dwarfs.
+"""Read stellar spectra from a user's files, which replace the built-in stars from O9 to M9.
 
-Dwarfs come from BaSeL models (Lejeune, Cuisinier & Buser 1997, .cor files), and their infrared spectra from IRTF
-spectra with a similar Y - H colour. Errors are BadInput; messages name the file.
+Dwarfs come from BaSeL models (Lejeune, Cuisinier & Buser 1997, .cor files), and also replace stars of other gravities
+and metallicities. Infrared spectra come from stars observed with the IRTF, which have a similar Y - H colour. Either
+kind of file may be missing. Errors are BadInput; messages name the file.
 """
 
 from __future__ import annotations
@@ -25,17 +26,26 @@ from truesky.fluxes.libraries.stellar import StellarTypes, normalise
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 
-# Lejeune, Cuisinier & Buser 1997, ReadMe: 1221 wavelengths in nm, 8 of 10 characters a line; models in blocks of a
-# header "2I6,4F6.2" and 1221 values of H_nu, 7 of 11 characters a line; f_lambda = 4 pi H_nu c / lambda^2 / pi.
-_BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
+# Format of a BaSeL file: Lejeune, Cuisinier & Buser 1997, ReadMe. It begins with 1221 wavelengths in nm, 8 per line.
+# Each model has a header line "2I6,4F6.2" and 1221 values of the Eddington flux H_nu, 7 per line. It is converted to
+# f_lambda = 4 pi H_nu c / lambda^2 / pi.
+
+# Number of wavelengths in a BaSeL file.
+_BASEL_COUNT = 1221
+# Number of characters of a wavelength, and of a value of H_nu, in a BaSeL file.
+_BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 10, 11
+# Index of the first character of each of the first five columns in a header line of a BaSeL file.
 _BASEL_HEADER = (0, 6, 12, 18, 24)
 
-# Wavelength at which spectra are normalised, A.
+# Wavelength in the middle of the range in which spectra are normalised, 5500 A.
 _VISUAL = float(np.mean(stellar.NORMALISATION_RANGE))
 
-# Bands of the colour by which stars are compared; range of IRTF spectra that is used, and half-width of the joins, A.
+# Bands of the colour by which dwarfs and IRTF stars are compared.
 SPLICE_BANDS = ("euclid_y", "euclid_h")
-_SPLICE_FROM, _SPLICE_TO, _SPLICE_JOIN = 8_200.0, 24_000.0, 200.0
+# First and last wavelength of an IRTF spectrum that is used, A.
+_SPLICE_FROM, _SPLICE_TO = 8_200.0, 24_000.0
+# Width (A) of the ranges at both ends of an IRTF spectrum in which its mean is scaled to that of the replaced spectrum.
+_SPLICE_JOIN = 200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +59,9 @@ class BaselModels:
     teff : float array, shape (n,)
         Effective temperature in K.
     log_g, metallicity : float array, shape (n,)
-        log10 of the surface gravity in cm s-2, and [M/H].
+        log10 of the surface gravity in cm s-2, and [M/H] in dex.
     flux : float array, shape (n, 1221)
-        f_lambda.
+        f_lambda in an arbitrary unit, since spectra are normalised later.
     """
 
     wavelength: Float
@@ -74,9 +84,14 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
     Returns
     -------
     library : Library
-        The stellar library.
+        The stellar library, in which L and T dwarfs and calibration sources are the built-in ones.
     infrared_index : int array, shape (n,)
-        Index of the infrared file of each dwarf, -1 for none.
+        For each dwarf the index of the IRTF file with its infrared spectrum, -1 if there are no IRTF files.
+
+    Raises
+    ------
+    BadInput
+        If a file cannot be read or is not valid.
     """
     embedded, types = templates.stellar_library(), stellar.types()
     grid, n = embedded.wavelength, len(types.names)
@@ -90,7 +105,8 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
         model_flux, _ = splice(grid, model_flux, curves)
     flux = normalise(grid, flux)
     if models is not None:
-        # A file has a single metallicity, so its dwarfs are used for stars of any metallicity.
+        # A BaSeL file has a single metallicity. Its dwarfs therefore replace the models of all gravities and
+        # metallicities.
         model_flux = model_stars.dwarf_spectra(flux, types)
     all_flux = np.concatenate([flux, embedded.flux[n:first], normalise(grid, model_flux)]).astype(np.float32)
     return replace(embedded, flux=all_flux, external=True), infrared_index
@@ -104,24 +120,25 @@ def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
     path : Path
         BaSeL file.
     types : StellarTypes
-        The dwarf types.
+        The n dwarf types.
     grid : float array, shape (n_lambda,)
-        Wavelengths in A.
+        Wavelengths in A, in steps of 1.
 
     Returns
     -------
     float array, shape (n, n_lambda)
-        f_lambda.
+        f_lambda with mean 1 between 5450 and 5550 A.
 
     Raises
     ------
     BadInput
-        If the models do not cover the temperatures of the types, or one has no flux at 5500 A.
+        If the file is not valid, its models do not cover the temperatures of the types, or one has no flux at 5500 A.
 
     Notes
     -----
-    Only models with the metallicity nearest to the Sun are used. At each model temperature, the model with the gravity
-    nearest to the type is selected. Between temperatures, ln f is linear in 1 / T, as for black bodies.
+    Only models with the metallicity nearest to the Sun are used. At each temperature of the models, the model with the
+    gravity nearest to that of the type is selected. Between two temperatures, ln(f_lambda) is linear in 1 / T, as for
+    black bodies.
     """
     models = read_basel(path)
     solar = np.abs(models.metallicity)
@@ -156,7 +173,7 @@ def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
 
 
 def read_basel(path: Path) -> BaselModels:
-    """Read all models of a BaSeL file, lcb[mp]NN.cor; raises BadInput if the file is not valid."""
+    """Read all models of a BaSeL file (named lcb[mp]NN.cor); raises BadInput if the file is absent or not valid."""
     try:
         lines = user_files.read_text(path, "library of spectra").splitlines()
         wavelength, at = _read_numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
@@ -186,21 +203,21 @@ def splice(wavelength: Float, flux: Float, stars: Sequence[Curve]) -> tuple[Floa
     wavelength : float array, shape (n_lambda,)
         Wavelengths in A.
     flux : float array, shape (n, n_lambda)
-        Low-resolution spectra.
+        f_lambda of low-resolution spectra. It is not modified.
     stars : sequence of Curve
-        IRTF spectra.
+        IRTF spectra, at least one.
 
     Returns
     -------
     flux : float array, shape (n, n_lambda)
-        The spectra with infrared parts.
+        The spectra with their infrared parts replaced.
     nearest : int array, shape (n,)
-        Index of the IRTF star of each spectrum.
+        Index of the IRTF star that is used for each spectrum.
 
     Notes
     -----
-    The IRTF spectrum is scaled to match the other at both ends. The broad shape remains that of the low-resolution
-    spectrum.
+    The IRTF spectrum is multiplied by a linear function of wavelength that matches the low-resolution spectrum at both
+    ends. The broad shape remains that of the low-resolution spectrum.
     """
     infrared = [np.interp(wavelength, star.wavelength, star.value) for star in stars]
     ends = [(max(star.wavelength[0], _SPLICE_FROM), min(star.wavelength[-1], _SPLICE_TO)) for star in stars]
@@ -224,7 +241,11 @@ def _color(bands: Sequence[Passband], wavelength: Float, flux: Float) -> float:
 
 
 def _read_numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
-    """Return `count` numbers of fixed width from line `at` on, and the index of the next line."""
+    """Read `count` numbers, each of `width` characters, from successive lines that begin with index `at`.
+
+    Return the numbers and the index of the next line. Raises ValueError if a line contains more numbers than are left
+    or other text, and IndexError if lines are missing.
+    """
     numbers: list[float] = []
     while len(numbers) < count:
         line = lines[at].rstrip()

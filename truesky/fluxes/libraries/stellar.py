@@ -1,8 +1,8 @@
 """Compute spectra of dwarf stars from published temperatures and colours.
 
-The sequence O9V to M9V is from Pecaut & Mamajek 2013. The spectrum of a type is a Planck spectrum with absorption
-features, times a smooth curve that gives the published colours. Metal-poor stars and giants use the spectrum of the
-dwarf with their temperature.
+The sequence O9V to M9V is from Pecaut & Mamajek 2013. The spectrum of a spectral type is a Planck spectrum with
+absorption features, times a smooth curve that gives the published colours. The module `model_stars` computes spectra by
+gravity and metallicity.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from truesky.fluxes import passbands
 from truesky.numerics import cache, matrices
 from truesky.numerics.code_fingerprints import code_key
 
-# Every spectrum of a library has a mean f_lambda of 1 between these wavelengths (A), so mixtures are linear in flux.
+# Spectra of galaxies and stars in a library have a mean f_lambda of 1 between these wavelengths (A). Fractions of
+# templates in the mixture of a star are therefore fractions of the flux at 5500 A.
 NORMALISATION_RANGE = (5450.0, 5550.0)
 
 _FIRST, _LAST = "O9V", "M9V"
-# Passbands of the table's colours, which are all relative to V.
+# Passbands of the colours in the published table. All colours are converted to m_band - m_V.
 _BANDS = (
     "bessell_u",
     "bessell_b",
@@ -36,14 +37,16 @@ _BANDS = (
     "twomass_ks",
 )
 _V = _BANDS.index("bessell_v")
-# Largest error of colours (mag), and largest number of iterations; late M dwarfs need the most (about 100).
+# Largest error of a colour (mag), and largest number of iterations of the search for a spectrum with given colours.
+# Late M dwarfs need the most iterations, about 100.
 _TOLERANCE = 2e-7, 400
 # log10 of the Sun's surface gravity, cm s-2 (IAU 2015 nominal values).
 _LOG_G_SUN = 4.438
-# Rydberg wavelength of hydrogen in vacuum (A), and number of lines of a series that are included.
+# Rydberg wavelength of hydrogen in vacuum, A.
 _RYDBERG = 911.763
+# Number of lines of a hydrogen series that are included.
 _SERIES_LINES = 12
-# The strength of hydrogen features is a Gaussian in ln(Teff), with its peak at type A0.
+# The strength of hydrogen features is a Gaussian in ln(Teff): peak in K (type A0), and sigma.
 _HYDROGEN_PEAK, _HYDROGEN_WIDTH = 9500.0, 0.3
 
 _FEATURES = Path(__file__).with_name("stellar_features.csv")
@@ -57,7 +60,7 @@ class StellarTypes:
     Attributes
     ----------
     names : tuple of str
-        Spectral types.
+        Spectral types, such as "G2V".
     teff : float array, shape (n,)
         Effective temperature in K.
     log_g : float array, shape (n,)
@@ -67,11 +70,11 @@ class StellarTypes:
     abs_mag_v : float array, shape (n,)
         Absolute magnitude in V (Johnson).
     abs_mag_j, abs_mag_h, abs_mag_ks : float array, shape (n,)
-        Absolute magnitudes (2MASS).
+        Absolute magnitudes in J, H and Ks (2MASS).
     bolometric_h : float array, shape (n,)
-        M_bol - M_H.
+        Bolometric correction of the H band, M_bol - M_H, in mag.
     colors : float array, shape (n, 8)
-        m_band - m_V of the bands U B V R I J H Ks, NaN if unknown.
+        Colours m_band - m_V (Vega) of the bands U B V R I J H Ks in mag, NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -87,17 +90,17 @@ class StellarTypes:
 
     @property
     def color_bv(self) -> Float:
-        """Return B - V in mag."""
+        """Return the colour B - V of each type in mag (Vega), float64[n]."""
         return self.colors[:, 1]
 
     @property
     def v_minus_h(self) -> Float:
-        """Return V - H in mag."""
+        """Return the colour V - H of each type in mag (Vega), float64[n]."""
         return -self.colors[:, 6]
 
 
 def types() -> StellarTypes:
-    """Return the types O9V to M9V of the table of Pecaut & Mamajek 2013 (version 2022.04.16)."""
+    """Return the properties of the dwarf types O9V to M9V: Pecaut & Mamajek 2013, table of version 2022.04.16."""
     names, column = table(_FIRST, _LAST)
     bv, vk, hk = column["B-V"], column["V-Ks"], column["H-Ks"]
     h = hk - vk
@@ -117,7 +120,11 @@ def types() -> StellarTypes:
 
 
 def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
-    """Return the spectral types from `first` to `last`, and the columns of the dwarf table by title, NaN if unknown."""
+    """Return the spectral types from `first` to `last`, and the columns of the table of dwarfs for these types.
+
+    Columns are float arrays by their title in dwarf_sequence.csv, NaN where the table has no value. Raises ValueError
+    if a type is unknown.
+    """
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     names = [row["SpT"] for row in rows]
@@ -129,18 +136,18 @@ def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
 
 
 def fingerprint() -> str:
-    """Return a key of everything on which the spectra depend."""
+    """Return a hash of the code, table and passbands on which the spectra depend, which identifies them in a cache."""
     responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
     return cache.content_key(code_key(__name__), TABLE.read_bytes(), *responses)
 
 
 def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Float:
-    """Return the normalised spectrum of each type on passbands.grid().
+    """Return the normalised spectrum of each dwarf type at 600 to 24000 A (passbands.grid()).
 
     Parameters
     ----------
     stars : StellarTypes
-        The types.
+        The n dwarf types.
     vega_wavelength : float array, shape (m,)
         Wavelengths of Vega's spectrum in A.
     vega_flux : float array, shape (m,)
@@ -153,7 +160,8 @@ def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Fl
 
     Notes
     -----
-    Vega colours are within 1e-6 mag of the table, if the table has them.
+    The Vega colours of the spectra differ from the published colours by at most 1e-6 mag. Bands for which the table has
+    no colour are ignored.
     """
     grid = passbands.grid()
     bands = [passbands.load(name) for name in _BANDS]
@@ -170,7 +178,7 @@ def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Fl
 
 
 def planck(wavelength: Float, temperature: float) -> Float:
-    """Return Planck's f_lambda, normalised to 1 at 5500 A, for wavelengths in A and a temperature in K."""
+    """Return Planck's f_lambda, divided by its value at 5500 A, for wavelengths in A and a temperature in K."""
     middle = float(np.mean(NORMALISATION_RANGE))
     scale = PLANCK_ERG_S * LIGHT_ANGSTROM_S / (BOLTZMANN_ERG_K * temperature)
     at, reference = scale / wavelength, scale / middle
@@ -179,13 +187,17 @@ def planck(wavelength: Float, temperature: float) -> Float:
 
 
 def normalise(wavelength: Float, flux: Float) -> Float:
-    """Return spectra, shape (..., n_lambda), divided by their mean between 5450 and 5550 A."""
+    """Return spectra, shape (..., n_lambda), divided by their mean between 5450 and 5550 A; `wavelength` is in A."""
     inside = (wavelength >= NORMALISATION_RANGE[0]) & (wavelength <= NORMALISATION_RANGE[1])
     return np.asarray(flux / flux[..., inside].mean(-1, keepdims=True))
 
 
 def _match_colors(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
-    """Return `start` times 10^(-0.4 c) with the given colours; c is cubic between the pivots and constant outside."""
+    """Return the spectrum `start` (f_lambda), multiplied by a smooth curve that gives it the colours m_band - m_V.
+
+    `colors` are in mag; bands with NaN are ignored. `pivots` are ln of the bands' pivot wavelengths, and
+    f_lambda @ response is the flux relative to Vega in each band.
+    """
     has_color = np.isfinite(colors)
     at, v = pivots[has_color], int(np.sum(has_color[:_V]))
     correction = color_correction(log_wavelength, start, response[:, has_color], at, colors[has_color], v, _TOLERANCE)
@@ -202,7 +214,7 @@ def color_correction(
     tolerance: tuple[float, int],
     first: Float | None = None,
 ) -> Float:
-    """Return the correction at the pivots that gives a spectrum the colours m_band - m_reference.
+    """Find the correction, in mag at the pivot wavelengths, that gives a spectrum the colours m_band - m_reference.
 
     Parameters
     ----------
@@ -211,22 +223,23 @@ def color_correction(
     start : float array, shape (n_lambda,)
         f_lambda before the correction.
     response : float array, shape (n_lambda, n_band)
-        Weights of the bands: f_nu = f_lambda @ response.
+        Weights of the bands: a colour is -2.5 log10 of the ratio of two elements of f_lambda @ response.
     pivots : float array, shape (n_band,)
-        ln of the pivot wavelengths at which the correction is defined.
+        ln of the bands' pivot wavelengths (A), increasing, at which the correction is defined.
     colors : float array, shape (n_band,)
         Required colours in mag.
     reference : int
         Index of the reference band.
     tolerance : (float, int)
-        Largest error of a colour in mag, and largest number of iterations; the first that is reached ends the search.
+        Largest error of a colour in mag, and largest number of iterations. The search ends when either is reached,
+        without an error.
     first : float array, shape (n_band,), optional
-        Correction at which to begin; 0 by default.
+        Correction at which the search begins; 0 by default.
 
     Returns
     -------
     float array, shape (n_band,)
-        Correction in mag, see `apply_correction`.
+        Correction in mag for `apply_correction`.
     """
     correction = np.zeros(len(pivots)) if first is None else first
     for _ in range(tolerance[1]):
@@ -240,7 +253,7 @@ def color_correction(
 
 
 def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
-    """Return a spectrum times 10^(-0.4 c), with the correction c cubic between the pivots and constant outside.
+    """Return a spectrum times 10^(-0.4 c). The correction c is cubic between the pivots, and constant outside.
 
     Parameters
     ----------
@@ -249,9 +262,9 @@ def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correct
     start : float array, shape (n_lambda,)
         f_lambda before the correction.
     pivots : float array, shape (n_band,)
-        ln of the pivot wavelengths.
+        ln of the bands' pivot wavelengths (A), increasing.
     correction : float array, shape (n_band,)
-        Correction at the pivots in mag.
+        Correction c at the pivots in mag.
 
     Returns
     -------
@@ -265,9 +278,10 @@ def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correct
 
 
 def feature_transmission(wavelength: Float, teff: float) -> Float:
-    """Return the transmission of the absorption features (stellar_features.csv) at a temperature in K.
+    """Return the transmission of a star's absorption features (stellar_features.csv), in the shape of `wavelength`.
 
-    The features give texture only; colours are corrected afterwards.
+    `wavelength` is in A and `teff` in K. The features only make spectra look realistic; callers correct the colours
+    afterwards.
     """
     transmission = np.ones_like(wavelength)
     hydrogen = np.exp(-0.5 * (np.log(teff / _HYDROGEN_PEAK) / _HYDROGEN_WIDTH) ** 2)
@@ -289,18 +303,19 @@ def feature_profile(kind: str, wavelength: Float, centre: float, width: float) -
     Parameters
     ----------
     kind : str
-        "line", "band" (shaded to the red), "edge" or "series" (of hydrogen).
+        "line" (Gaussian), "band" (sharp blue end, exponential to the red), "edge" (absorption blueward of a wavelength)
+        or "series" (hydrogen lines with a common lower level).
     wavelength : float array, shape (n_lambda,)
         Wavelengths in A.
     centre : float
-        Wavelength of the feature in A; for a series, the lower level.
+        Wavelength of the feature in A; for a series, the number of the lower level (2 for Balmer).
     width : float
-        Width in A.
+        Width in A: sigma of a line, length of the exponential of a band, or scale of an edge.
 
     Returns
     -------
     float array, shape (n_lambda,)
-        Profile.
+        Profile from 0 to 1.
 
     Raises
     ------

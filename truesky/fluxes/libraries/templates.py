@@ -2,7 +2,8 @@
 
 Galaxies are mixtures of the four spectra of Coleman, Wu & Weedman 1980 and of a young burst. Stars are dwarfs from O9
 to T8 with the colours of Pecaut & Mamajek 2013, calibration sources, and models by temperature, gravity and
-metallicity. Both libraries take seconds to compute, and are then memory-mapped from the cache.
+metallicity. Both libraries take seconds to compute. They are kept in a cache on disc, from which they are
+memory-mapped.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
 _ANCHORS = ("E", "Sbc", "Scd", "Im")
-# Exponent of f_lambda beyond 22050 A, where the published spectra end.
+# Exponent of f_lambda (a power of lambda) beyond 22050 A, where the published spectra end.
 _INFRARED_SLOPE = -3.2
-# A straight line replaces weak lines in the observed spectra within this distance on both sides, A.
+# Half-width (A) of the range around each emission line in the published spectra that is replaced by a straight line.
 _LINE_MASK = 40.0
 
-# The sequence: first and last template k, earlier and later anchor, offset, denominator and factor of
-# x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted, to span the colours
-# of the 31 templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
+# Name of the spectrum of a young burst of star formation, which is computed in this module.
 YOUNG = "young"
+# The sequence of galaxy templates k: first and last k, earlier and later spectrum, offset, denominator and factor. The
+# template is (1 - x) earlier + x later, with x = factor (k - offset) / denominator. These numbers are adopted, to span
+# the colours of the 31 templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
 _SEQUENCE = (
     (0, 7, "E", "Sbc", 0, 7, 0.72),
     (8, 13, "Sbc", "Scd", 8, 5, 1.0),
@@ -38,31 +40,33 @@ _SEQUENCE = (
     (20, 30, "Im", YOUNG, 19, 11, 0.95),
 )
 GALAXY_LIBRARY_SIZE = 31
-# The young end, adopted: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge).
+# The young burst is a sum of Planck spectra: temperature (K), share of f_lambda at 5500 A, and factor below the Balmer
+# edge. These numbers are adopted.
 _YOUNG = ((28000.0, 0.70, 1.0), (9500.0, 0.22, 0.45), (4200.0, 0.08, 1.0))
+# Wavelengths of the Balmer and Lyman edges (A), and factor of the burst's spectrum below the Lyman edge.
 _BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Library:
-    """Template spectra on a common wavelength grid. Libraries are immutable and compared by identity.
+    """Template spectra at common wavelengths. Libraries are immutable, and are equal only if they are the same object.
 
     Attributes
     ----------
     wavelength : float array, shape (n_lambda,)
-        Wavelengths in A, whole numbers in steps of 1.
+        Wavelengths in A, whole numbers in steps of 1; in the rest frame for galaxies.
     flux : float32 array, shape (n, n_lambda)
-        f_lambda with mean 1 between 5450 and 5550 A.
+        f_lambda; galaxies and stars have mean 1 between 5450 and 5550 A.
     names : tuple of str
         Label of each template.
     types : stellar.StellarTypes, optional
         Properties of the dwarf sequence, the first stars of the library; None for galaxies.
     dust : float32 array, shape (5, n_lambda), optional
-        k(lambda) of the extinction laws in galaxies; None for those of extinction.laws.
+        k(lambda) of five extinction laws of dust in galaxies; None for the built-in ones (extinction.laws).
     external : bool
-        True if the library is from external files. Errors measured for the built-in library do not apply to it.
+        True if spectra or laws are from a user's files. Errors measured for the built-in library do not apply to it.
     intergalactic : bool
-        True if intergalactic hydrogen absorbs (truesky.fluxes.spectra.intergalactic).
+        True if intergalactic hydrogen absorbs light of galaxies (truesky.fluxes.spectra.intergalactic).
     """
 
     wavelength: Float
@@ -79,7 +83,10 @@ class Library:
 
 @lru_cache(maxsize=1)
 def galaxy_library() -> Library:
-    """Return the 31 galaxy templates, from 0 (elliptical) to 30 (starburst), at 80 to 24500 A in the rest frame."""
+    """Return the built-in library of 31 galaxies, from 0 (elliptical) to 30 (starburst).
+
+    Rest-frame wavelengths are 80 to 24500 A in steps of 1 A.
+    """
     key = cache.content_key(
         code_key(__name__),
         emission_wavelengths(),
@@ -94,19 +101,23 @@ def galaxy_library() -> Library:
 
 
 def template_anchors(template: int) -> tuple[str, str]:
-    """Return the names of the two spectra of which a galaxy template is a mixture."""
+    """Return the names of the two spectra of which a built-in galaxy template (0 to 30) is a mixture.
+
+    They are "E", "Sbc", "Scd", "Im" (Coleman, Wu & Weedman 1980) or `YOUNG`.
+    """
     row = next(row for row in _SEQUENCE if row[0] <= template <= row[1])
     return row[2], row[3]
 
 
 @lru_cache(maxsize=1)
 def stellar_library() -> Library:
-    """Return the stellar library on the observed-frame grid.
+    """Return the built-in library of stars at 600 to 24000 A in steps of 1 A.
 
     Notes
     -----
-    Templates 0 to 75 are the dwarfs O9V to M9V, hottest first, with their table of types. Templates 76 to 440 are the L
-    and T dwarfs, 441 to 443 Vega, a white dwarf and a planetary nebula. The models of model_stars begin at 444.
+    Templates 0 to 75 are the dwarfs O9V to M9V, hottest first, whose properties are in `types`. Templates 76 to 440 are
+    the L and T dwarfs, 441 to 443 Vega, a white dwarf and a planetary nebula. Models by temperature, gravity and
+    metallicity begin at 444.
     """
     types = stellar.types()
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
@@ -117,7 +128,7 @@ def stellar_library() -> Library:
 
 
 def first_model() -> int:
-    """Return the index of the first model of model_stars in the stellar library."""
+    """Return the index in the stellar library of the first model by temperature, gravity and metallicity."""
     return len(stellar.types().names) + brown_dwarfs.COUNT + len(standards.NAMES)
 
 
@@ -128,25 +139,29 @@ def _star_spectra(types: stellar.StellarTypes) -> Float32:
 
 
 def emission_wavelengths() -> Float:
-    """Return vacuum wavelengths in A of the lines to remove from the observed spectra, float64[10] (lines.csv)."""
+    """Return the vacuum wavelengths (A) of the emission lines to remove from the published galaxy spectra, float64[10].
+
+    They are the lines of lines.csv with `bridged` = 1.
+    """
     with (files("truesky.fluxes.spectra") / "lines.csv").open(encoding="utf-8") as file:
         return np.array([float(row["vacuum"]) for row in csv.DictReader(file) if int(row["bridged"])])
 
 
 def galaxy_spectra(wavelength: Float, bridge_width: float = _LINE_MASK) -> Float:
-    """Return the spectra of the galaxy templates.
+    """Compute the spectra of the 31 galaxy templates.
 
     Parameters
     ----------
     wavelength : float array, shape (n_lambda,)
-        Wavelengths in A.
+        Rest-frame wavelengths in A, increasing. They must contain 5450 to 5550 A.
     bridge_width : float, optional
-        Distance in A from each emission line within which a straight line replaces the spectrum; below 0 for none.
+        Distance in A from each emission line within which a straight line replaces the spectrum. With a negative number
+        lines stay.
 
     Returns
     -------
     float array, shape (31, n_lambda)
-        f_lambda.
+        f_lambda with mean 1 between 5450 and 5550 A.
     """
     anchors = {name: _anchor_spectrum(name, wavelength, bridge_width) for name in _ANCHORS}
     anchors[YOUNG] = _young_spectrum(wavelength)
@@ -161,7 +176,7 @@ def galaxy_spectra(wavelength: Float, bridge_width: float = _LINE_MASK) -> Float
 def _anchor_spectrum(name: str, wavelength: Float, bridge_width: float) -> Float:
     table = np.loadtxt(vega.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
     at, flux = table[:, 0], table[:, 1]
-    # Interpolate the logarithm, since an elliptical fades by half between the samples in the ultraviolet, 100 A apart.
+    # Interpolate the logarithm: in the ultraviolet, an elliptical fades by half between two samples, 100 A apart.
     sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
     sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
     line_free = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridge_width).all(1)

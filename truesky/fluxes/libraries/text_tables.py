@@ -1,7 +1,7 @@
-"""Check the size of an external text table before astropy allocates memory for it.
+"""Check the size of a user's text table before astropy reads it, because a small file may need much time or memory.
 
-Astropy allocates memory for each word of a column as for the longest word. It reads a header as YAML, which is slow and
-can define types of any size. Words in quotes may span several lines.
+For each word of a column, astropy allocates as much memory as for the longest word, which may span several lines if it
+is in quotes. Astropy reads the header of an ECSV file as YAML, which is slow and can define data types of any size.
 """
 
 from __future__ import annotations
@@ -12,18 +12,24 @@ from itertools import takewhile
 
 import yaml
 
-# Largest number of characters in a line, in a header, and in all words if each is as long as the longest line.
-_MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_CHARACTERS = 4096, 64 << 10, 64 << 20
-# Only the types of ECSV are allowed, since NumPy also accepts types such as 9999999D with 80 MB per row.
+# Largest number of characters in a line.
+_MAX_LINE_LENGTH = 4096
+# Largest number of characters in a header.
+_MAX_HEADER_LENGTH = 64 << 10
+# Largest number of characters in all words of a table, if each word were as long as the longest line.
+_MAX_CHARACTERS = 64 << 20
+# Data types that a header may declare. Other types are refused, since NumPy also accepts types such as 9999999D, with
+# 80 MB per row.
 _DATATYPES = {"bool", "string"} | {
     f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
 }
-# Tags that astropy writes for columns with units. Other tags can define arrays of any shape.
+# Prefixes of the YAML tags that astropy writes for columns with units. Other tags are refused, because they can define
+# arrays of any shape.
 _TAGS = ("tag:yaml.org,2002:", "!astropy.units.", "!astropy.table.SerializedColumn")
 
 
 def refuse_large(lines: Sequence[str], has_header: bool) -> None:
-    """Check that lines contain no more than a curve needs.
+    """Check that a text table contains no more than a spectrum, extinction curve or passband needs.
 
     Parameters
     ----------
@@ -35,7 +41,8 @@ def refuse_large(lines: Sequence[str], has_header: bool) -> None:
     Raises
     ------
     ValueError
-        If a line, the header or the table is too large, or the header contains other types than a curve needs.
+        If a line, the header or the table is too large, a text in quotes spans several lines, or the header contains
+        references, subtypes, or data types other than booleans, real numbers and strings.
     yaml.YAMLError
         If the header is not valid YAML.
     """

@@ -1,4 +1,4 @@
-"""Load the spectrum of Vega, and compute magnitudes relative to it."""
+"""Load the spectrum of Vega, and compute its AB magnitudes, which convert Vega magnitudes to AB magnitudes."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from truesky.fluxes.passbands import Passband
 
 
 def vega_magnitude(band: Passband) -> float:
-    """Return the AB magnitude of Vega in a band, so that m_AB = m_Vega + result (2MASS J 0.9001, H 1.3753, Ks 1.8474).
+    """Return the AB magnitude of Vega in a band, which converts Vega magnitudes: m_AB = m_Vega + result.
 
-    Photons are counted, as for all fluxes. With energy instead, H would be 1.3718.
+    It is 0.9001, 1.3753 and 1.8474 in 2MASS J, H and Ks. Passbands are photon responses; with energy responses, H would
+    be 1.3718. Raises BadInput if Vega's spectrum (900 to 24500 A) does not cover the band.
     """
     return _magnitude(band, *vega())
 
@@ -39,26 +40,29 @@ def _magnitude(band: Passband, wavelength: Float, flux: Float) -> float:
     return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, wavelength, flux))))
 
 
-# Exponent of Vega's f_lambda (Rayleigh-Jeans tail) beyond the end of the CALSPEC extract at 22008 A.
+# Exponent of Vega's f_lambda (Rayleigh-Jeans tail) beyond 22008 A, where the file of the CALSPEC spectrum ends.
 _VEGA_SLOPE = -3.95
 
 
 def vega() -> tuple[Float, Float]:
-    """Return wavelengths (A) and f_lambda (erg s-1 cm-2 A-1) of Vega from 900 to 24500 A.
+    """Return wavelengths (A) and f_lambda (erg s-1 cm-2 A-1) of Vega from 900 to 24500 A, two arrays of shape (n,).
 
     References
     ----------
     CALSPEC alpha_lyr_mod_001, as distributed with GalSim.
     """
     table = np.loadtxt(spectrum_file("vega.txt").read_text().splitlines())
-    # The file is in nm and per nm.
+    # Convert nm to A, and flux per nm to flux per A.
     wavelength, flux = table[:, 0] * 10.0, table[:, 1] / 10.0
     tail = np.arange(np.ceil(wavelength[-1]), REST_LAST + 1.0)[1:]
     return np.append(wavelength, tail), np.append(flux, flux[-1] * (tail / wavelength[-1]) ** _VEGA_SLOPE)
 
 
 def spectrum_file(name: str) -> Path:
-    """Return the path of a spectrum of GalSim, without its slow import; raises BadInput if it is not installed."""
+    """Return the path of a file with a spectrum in the package GalSim, which is not imported because that is slow.
+
+    Raises BadInput if GalSim is not installed. It is not checked that the file exists.
+    """
     spec = importlib.util.find_spec("galsim")
     if spec is None or not spec.submodule_search_locations:
         raise BadInput("package GalSim is not installed: its spectra of galaxies and Vega are required")

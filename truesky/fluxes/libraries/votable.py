@@ -1,8 +1,8 @@
-"""Check the size of an external VOTable before astropy allocates memory for it.
+"""Check the size of a user's VOTable before astropy reads it, because a small file may need much time or memory.
 
-A streaming XML parser reads the text first. It refuses tables for which astropy needs quadratic time (many tables, or
-columns with the same name), large allocations (arrays of fixed size in every row), and data that astropy would unpack
-or load from elsewhere.
+A streaming XML parser reads the text first. Tables are refused if astropy would need quadratic time (many tables, or
+columns with the same name) or much memory (arrays of fixed size in every row). They are also refused if their data are
+compressed, binary or stored elsewhere.
 """
 
 from __future__ import annotations
@@ -12,16 +12,26 @@ import re
 from collections.abc import Mapping
 from xml.parsers import expat
 
-# Largest number of elements outside rows, of nested elements, of characters in an attribute, of numbers in a cell and
-# of numbers in all rows. A passband has about 50 elements, two columns and up to about ten thousand rows.
-_MAX_ELEMENTS, _MAX_DEPTH, _MAX_ATTRIBUTE_LENGTH, _MAX_CELL_SIZE, _MAX_NUMBERS = 1000, 32, 1000, 999, 4_000_000
+# The limits below are far above the needs of a passband, which has about 50 XML elements, two columns and up to about
+# ten thousand rows.
+
+# Largest number of XML elements outside rows.
+_MAX_ELEMENTS = 1000
+# Largest number of elements nested in each other.
+_MAX_DEPTH = 32
+# Largest number of characters in an attribute of an element.
+_MAX_ATTRIBUTE_LENGTH = 1000
+# Largest number of values in a cell of the table.
+_MAX_CELL_SIZE = 999
+# Largest number of values in all rows.
+_MAX_NUMBERS = 4_000_000
 _ENCODINGS = {None, "utf-8", "us-ascii"}
 _OTHER_SERIALISATIONS = {"BINARY", "BINARY2", "FITS", "STREAM", "PARQUET"}
 _ROWS = {"TR", "TD"}
 
 
 class _SizeCounter:
-    """Handlers of the XML parser that count elements, rows and numbers."""
+    """Handlers of the XML parser, which count elements, rows and numbers; they raise ValueError above a limit."""
 
     def __init__(self) -> None:
         self.depth = self.elements = self.rows = self.row_size = 0
@@ -52,7 +62,10 @@ class _SizeCounter:
 
 
 def _cell_size(text: str) -> int:
-    """Return the number of values in a cell of an array size, for example 6 for "2x3"; variable lengths count as 1."""
+    """Return the number of values in a cell from an attribute `arraysize`, for example 6 for "2x3".
+
+    An empty text or a variable length ("*") counts as 1.
+    """
     return math.prod(map(int, re.findall(r"\d+", text)))
 
 
@@ -66,12 +79,13 @@ def _refuse_doctype(*_: object) -> None:
 
 
 def refuse_large(text: str) -> None:
-    """Check that a VOTable contains no more than a curve needs.
+    """Check that the XML text of a VOTable contains no more than a spectrum, extinction curve or passband needs.
 
     Raises
     ------
     ValueError
-        If the table is too large or has a feature that a curve does not need.
+        If the table exceeds a limit of this module, has a DOCTYPE, is not in UTF-8, or has rows that are not plain
+        TABLEDATA.
     expat.ExpatError
         If the text is not XML.
     """

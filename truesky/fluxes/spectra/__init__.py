@@ -1,1 +1,1 @@
-"""Model the effects on a spectrum between its source and the telescope."""
+"""Compute the components of spectra: mixtures of templates, dust, emission lines and intergalactic absorption."""

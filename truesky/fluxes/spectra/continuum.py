@@ -1,9 +1,11 @@
-"""Compute the continuum of galaxies: two templates, each behind dust, mixed and redshifted.
+"""Compute the continuum of galaxies: two template spectra, each with its own dust, mixed and redshifted.
+
+A component is a template with an extinction law and E(B-V). Its fraction is that of the light after dust in the
+reference band 0.1r (SDSS r, shifted to the blue by a factor 1.1).
 
 References
 ----------
-Serrano et al. 2024, appendix B. There, both templates have the same extinction law and E(B-V). Here, each component has
-a law and E(B-V), and is normalised in the 0.1r band behind its dust.
+Serrano et al. 2024, appendix B, where both templates have the same extinction law and E(B-V).
 """
 
 from __future__ import annotations
@@ -30,20 +32,20 @@ EBV_MAX = 3.0
 
 @dataclass(frozen=True, slots=True)
 class TemplateMix:
-    """Two components of each of n galaxies.
+    """Redshifts of n galaxies, and the two components (template spectra with dust) of each.
 
     Attributes
     ----------
     z_obs : float array, shape (n,)
         Observed redshift.
     sed : int array, shape (2, n)
-        Index of the template.
+        Index of each component's template in the galaxy library.
     law : int array, shape (2, n)
-        Code of the extinction law.
+        Code of each component's extinction law, 0 (no dust) to 4; see `extinction`.
     frac : float array, shape (2, n)
-        Fraction of the rest-frame 0.1r flux after dust.
+        Fraction of each component in the galaxy's rest-frame 0.1r flux after dust.
     ebv : float array, shape (2, n)
-        E(B-V) in mag.
+        E(B-V) of each component in mag.
     """
 
     z_obs: Float
@@ -56,7 +58,7 @@ class TemplateMix:
         return len(self.z_obs)
 
     def select(self, indices: Int | slice) -> TemplateMix:
-        """Return the galaxies with these indices."""
+        """Return the galaxies with the given indices, or in the given slice."""
         return TemplateMix(
             take_last_axis(self.z_obs, indices),
             take_last_axis(self.sed, indices),
@@ -75,29 +77,32 @@ def take_last_axis(values: _Array, indices: Int | slice) -> _Array:
 
 
 def dust_curves(library: Library) -> Float32:
-    """Return k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
+    """Return k(lambda) = A(lambda) / E(B-V) of a library's five extinction laws, float32[5, n_lambda].
+
+    They are at the wavelengths of the library. The built-in laws are used if `library.dust` is None.
+    """
     return extinction.laws(library.wavelength).astype(np.float32) if library.dust is None else library.dust
 
 
 def mix_from_columns(columns: Mapping[str, npt.ArrayLike], library: Library) -> TemplateMix:
-    """Check columns of the table `galaxies` and return the components.
+    """Check columns of the table `galaxies`, and convert them to a TemplateMix.
 
     Parameters
     ----------
-    columns : mapping of str to array
+    columns : mapping of str to array, shape (n,)
         Columns z_obs, sed_k, frac_k, ext_law_k, ebv_k (k = 1, 2).
     library : Library
-        Templates to which sed_1 and sed_2 refer.
+        Templates to which sed_1 and sed_2 refer. Its wavelengths limit the redshifts.
 
     Returns
     -------
     TemplateMix
-        The components.
+        Redshifts and components of the galaxies.
 
     Raises
     ------
     BadInput
-        If a column is missing, or frac_1 and frac_2 are both 0.
+        If a column is missing, or frac_1 and frac_2 of a galaxy are both 0.
     OutOfRange
         If a value is out of range or NaN. The message names the column.
     """
@@ -129,16 +134,16 @@ def check_range(name: str, values: Float, lo: float, hi: float) -> None:
     Parameters
     ----------
     name : str
-        Name of the column for the message.
+        Name of the column, for the error message.
     values : float array
-        Values.
+        Values of any shape; an empty array is accepted.
     lo, hi : float
-        Limits, both allowed.
+        Limits; values equal to a limit are accepted.
 
     Raises
     ------
     OutOfRange
-        If a value is outside [lo, hi] or NaN. The message has the first one.
+        If a value is outside [lo, hi] or NaN. The message contains the first such value.
     """
     bad = ~((values >= lo) & (values <= hi))
     if bad.any():
@@ -153,31 +158,34 @@ def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, 
     sed : int array, shape (n,)
         Indices of the templates.
     law : int array, shape (n,)
-        Codes of the extinction laws.
+        Code of the extinction law of each template.
     ebv : float array, shape (n,)
-        E(B-V) in mag.
+        E(B-V) of each template in mag.
     band : Passband
-        The passband.
+        The passband. The library must cover it.
     library : Library
         Templates.
     dust : float32 array, shape (n_law, n_lambda)
-        k(lambda) of each law.
+        k(lambda) of each extinction law at the library's wavelengths.
 
     Returns
     -------
     float array, shape (n,)
-        f_nu in units of the library.
+        f_nu in erg s-1 cm-2 Hz-1 for templates with f_lambda near 1 erg s-1 cm-2 A-1, as they are stored.
     """
     first = int(band.wavelength[0] - library.wavelength[0])
     stretch = slice(first, first + len(band.wavelength))
     ebv32 = ebv.astype(np.float32)[:, None]
     spectra = library.flux[:, stretch][sed] * extinction.transmission(dust[:, stretch][law], ebv32)
-    # Sum in double precision, so that rounding errors average out and no sum depends on neighbouring rows.
+    # `matmul` sums in double precision, so that rounding errors average out. The sum of a row does not depend on the
+    # other rows.
     return np.asarray(matrices.matmul(spectra, passbands.weights(band)))
 
 
 def amplitudes(mix: TemplateMix, band: Passband, library: Library, dust: Float32) -> Float:
-    """Return the factor of each component, its fraction over its rest-frame f_nu in the reference band.
+    """Return the factors of the two templates of each galaxy, with which their fractions in the reference band are met.
+
+    A factor is the template's fraction divided by its rest-frame f_nu in this band after dust.
 
     Parameters
     ----------
@@ -188,7 +196,7 @@ def amplitudes(mix: TemplateMix, band: Passband, library: Library, dust: Float32
     library : Library
         Templates.
     dust : float32 array, shape (n_law, n_lambda)
-        k(lambda) of each law.
+        k(lambda) of each extinction law at the library's wavelengths.
 
     Returns
     -------
@@ -211,13 +219,13 @@ def observed_shape(
     Parameters
     ----------
     mix : TemplateMix
-        Components of n galaxies.
+        Components of n galaxies, at least one.
     amplitude : float array, shape (2, n)
-        Factor of each component.
+        Factor of each template, from `amplitudes`.
     library : Library
         Templates.
     dust : float32 array, shape (n_law, n_lambda)
-        k(lambda) of each law.
+        k(lambda) of each extinction law at the library's wavelengths.
     first : int
         First observed wavelength in A.
     count : int
@@ -226,21 +234,21 @@ def observed_shape(
     Returns
     -------
     float32 array, shape (n, count)
-        f_lambda in the observed frame, before scaling.
+        f_lambda in the observed frame, before it is scaled to the galaxies' magnitudes. Milky Way dust is not included.
 
     Notes
     -----
-    Components are combined and extinguished on the library's grid. Wavelengths are then multiplied by (1 + z), the flux
-    is divided by (1 + z), and the result is interpolated linearly to the observed grid. If the library has
-    intergalactic absorption, it is applied.
+    Both templates are multiplied by their dust and added at the library's wavelengths. Wavelengths are then multiplied
+    by (1 + z), the flux is divided by (1 + z), and the result is interpolated linearly to the observed grid.
+    Intergalactic absorption is applied if `library.intergalactic` is True.
     """
     shrink = 1.0 / (1.0 + mix.z_obs)
     start = first * shrink - library.wavelength[0]
     first_index = np.floor(start).astype(np.int64)
-    # Interpolation needs one sample beyond the last.
+    # Number of rest-frame samples of each galaxy, with the sample after the last position, for interpolation.
     width = int(np.max(np.floor(start + (count - 1) * shrink).astype(np.int64) - first_index)) + 2
     rest = _rest_shape(mix, (amplitude * shrink).astype(np.float32), library, dust, first_index, width)
-    # Positions need double precision: 24000 A times the single-precision step would be wrong by 1e-3 A.
+    # Positions (index of a sample, with fraction) need double precision: single precision would be wrong by 1e-3 A.
     position = shrink[:, None] * np.arange(float(count))
     position += (start - first_index + width * np.arange(len(mix)))[:, None]
     floor = np.floor(position)
@@ -248,7 +256,7 @@ def observed_shape(
     position -= floor
     steps = np.empty_like(rest)
     np.subtract(rest[:, 1:], rest[:, :-1], out=steps[:, :-1])
-    # mode="clip" is twice as fast as the checked mode. All indices are valid by construction.
+    # mode="clip" is twice as fast as the default, which checks indices. Here all indices are valid.
     shape = steps.ravel().take(index, mode="clip")
     shape *= position.astype(np.float32)
     shape += rest.ravel().take(index, mode="clip")
@@ -260,7 +268,11 @@ def observed_shape(
 def _rest_shape(
     mix: TemplateMix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int
 ) -> Float32:
-    """Return combined, extinguished spectra on `width` points of the library's grid from `start`: float32[n, width]."""
+    """Return the sum of both templates after dust, float32[n, width], at rest-frame wavelengths.
+
+    The wavelengths are `width` samples of the library from index `start` of each galaxy. Transmission is computed only
+    once if both templates of all galaxies have the same dust.
+    """
     shared = bool((mix.law[0] == mix.law[1]).all() and (mix.ebv[0] == mix.ebv[1]).all())
     total = _windows(library.flux, mix.sed[0], start, width)
     total *= amplitude[0][:, None]
@@ -283,7 +295,10 @@ def _transmission(mix: TemplateMix, component: int, dust: Float32, start: Int, w
 
 
 def _windows(table: Float32, row: Int, start: Int, width: int) -> Float32:
-    """Return table[row[i], start[i] : start[i] + width] for every i; copies of slices are faster than indexing."""
+    """Return table[row[i], start[i] : start[i] + width] for every i, float32[n, width].
+
+    Values beyond the end of the table are 0. Slices are copied one by one, which is faster than an index array.
+    """
     out = np.zeros((len(row), width), np.float32)
     for i, (r, s) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
         window = table[r, s : s + width]

@@ -1,7 +1,7 @@
 """Compute emission lines: their observed wavelengths, widths, and profiles on the grid.
 
-lines.csv has the ten lines of Serrano et al. 2024, table "Emission lines", and ten more. A secondary line has a fixed
-fraction of the flux of its primary line. The catalogue contains only the flux of the primary line.
+lines.csv has the ten lines of Serrano et al. 2024, table "Emission lines", and ten more. The catalogue contains only
+the fluxes of primary lines. The flux of a secondary line is a fixed multiple of that of its primary line.
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ from lake_schema.units import LIGHT_KM_S
 
 TABLE = Path(__file__).with_suffix(".csv")
 
-# Serrano et al. 2024, appendix B: log10 sigma = (A + B z) (M_r - C) + D z. The upper bound is adopted, because the
-# relation gives unrealistically large values for galaxies brighter than M_r = -23.
+# Coefficients A, B, C and D of the velocity dispersion in km/s, log10 sigma = (A + B z) (M_r - C) + D z: Serrano et al.
+# 2024, appendix B.
 _SLOPE, _SLOPE_EVOLUTION, _MAGNITUDE_ZERO, _EVOLUTION = -0.10, 0.01, 3.0, -0.05
+# Smallest and largest velocity dispersion, km/s. The largest is adopted, because the relation gives unrealistically
+# large values for galaxies brighter than M_r = -23.
 SIGMA_MIN, SIGMA_MAX = 50.0, 400.0
 
-# Ciddor 1996, eq. 1: n - 1 of standard air (15 C, 101325 Pa, 450 ppm CO2) in 1e-8, wave numbers in 1/um.
+# (strength, resonance) of the two terms of the refractivity n - 1 of standard air (15 C, 101325 Pa, 450 ppm CO2), in
+# units of 1e-8 and for wave numbers in 1/um: Ciddor 1996, eq. 1.
 _CIDDOR = ((5_792_105.0, 238.0185), (167_917.0, 57.362))
 
-# Profiles are cut at this distance in sigma. The fraction 2e-8 of the flux outside is distributed over the rest.
+# Line profiles are cut at this distance from the centre, in sigma. The flux outside, a fraction of 2e-8, is distributed
+# over the inside.
 _REACH = 5.6
 
 
@@ -41,13 +45,13 @@ class Line:
     name : str
         Name of the line.
     column : str
-        Column of the table `galaxies` with the flux of its primary line.
+        Column of the table `galaxies` with the flux of this line, or of the primary line to which it is proportional.
     ratio : float
-        Flux relative to that column.
+        Flux of this line relative to the column, 1 for a primary line.
     vacuum, air : float
-        Rest-frame wavelengths in A.
+        Rest-frame wavelengths in vacuum and in air in A.
     source : str
-        Source of these numbers.
+        Reference of the wavelengths and the ratio.
     """
 
     name: str
@@ -60,16 +64,16 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """Flux of m lines in bins of 1 A.
+    """Profiles of m emission lines in bins of 1 A. A source may have several lines.
 
     Attributes
     ----------
     row : int array, shape (m,)
-        Row of the source with this line.
+        Index of the source to which the line belongs.
     first : int array, shape (m,)
-        Wavelength of the centre of the first bin in A.
+        Wavelength of the centre of the line's first bin in A.
     f_lambda : float array, shape (m, w)
-        Mean f_lambda in each bin.
+        Mean f_lambda in each bin in erg s-1 cm-2 A-1.
     """
 
     row: Int
@@ -79,7 +83,7 @@ class Profiles:
 
 @cache
 def line_list() -> tuple[Line, ...]:
-    """Return all lines, primary lines before their secondary lines."""
+    """Return all emission lines in the order of lines.csv, each primary line before its secondary lines."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return tuple(
@@ -89,31 +93,34 @@ def line_list() -> tuple[Line, ...]:
 
 
 def columns() -> tuple[str, ...]:
-    """Return the columns of the table `galaxies` with line fluxes."""
+    """Return the names of the columns of the table `galaxies` that contain fluxes of (primary) lines."""
     return tuple(dict.fromkeys(line.column for line in line_list()))
 
 
 def width_law() -> dict[str, float]:
-    """Return the parameters of `velocity_dispersion` by their names in the table `emission_lines`."""
+    """Return the coefficients and bounds (km/s) of the law in `velocity_dispersion`.
+
+    They have the names of columns of the table `emission_lines`.
+    """
     names = ("width_slope", "width_slope_z", "width_magnitude", "width_z", "width_least", "width_most")
     numbers = (_SLOPE, _SLOPE_EVOLUTION, _MAGNITUDE_ZERO, _EVOLUTION, SIGMA_MIN, SIGMA_MAX)
     return dict(zip(names, numbers, strict=True))
 
 
 def velocity_dispersion(abs_mag_r01: npt.ArrayLike, z_obs: npt.ArrayLike) -> Float:
-    """Return the Gaussian sigma of the lines in km/s, 50 to 400.
+    """Return the velocity dispersion (Gaussian sigma) of a galaxy's emission lines.
 
     Parameters
     ----------
     abs_mag_r01 : array_like
-        Absolute magnitude M(0.1r) - 5 log10 h.
+        Absolute AB magnitude M(0.1r) - 5 log10 h.
     z_obs : array_like
         Redshift.
 
     Returns
     -------
     float array
-        Velocity dispersion in km/s.
+        Velocity dispersion in km/s, limited to 50 to 400.
 
     References
     ----------
@@ -125,7 +132,9 @@ def velocity_dispersion(abs_mag_r01: npt.ArrayLike, z_obs: npt.ArrayLike) -> Flo
 
 
 def air_wavelength(vacuum: npt.ArrayLike) -> Float:
-    """Return the wavelength in standard air for a vacuum wavelength, both in A and above 2000 A.
+    """Return the wavelength in standard air for a vacuum wavelength, both in A.
+
+    The formula is valid above 2000 A, which is not checked.
 
     References
     ----------
@@ -138,7 +147,7 @@ def air_wavelength(vacuum: npt.ArrayLike) -> Float:
 
 
 def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str) -> Float:
-    """Return the observed wavelength of a line.
+    """Return the observed wavelength of a redshifted line.
 
     Parameters
     ----------
@@ -152,7 +161,7 @@ def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str
     Returns
     -------
     float array
-        Observed wavelength in A. Air refracts at the observed wavelength, not at the emitted wavelength.
+        Observed wavelength in A. The refraction of air is that at the observed wavelength, not at the emitted one.
 
     Raises
     ------
@@ -168,7 +177,10 @@ def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str
 
 
 def refractivity_terms() -> Float:
-    """Return (strength, resonance) of the two terms of `air_wavelength`, float64[2, 2]."""
+    """Return the coefficients of the refractivity of air in `air_wavelength`, float64[2, 2].
+
+    Each row is (strength, resonance) of a term strength / (resonance - wave number^2), in 1e-8 and 1/um^2.
+    """
     return np.array(_CIDDOR)
 
 
@@ -180,16 +192,16 @@ def profiles(
     first_wanted: float = 0.0,
     last_wanted: float = np.inf,
 ) -> Profiles:
-    """Return the profiles of lines that reach into a range of wavelengths, integrated over bins of 1 A.
+    """Return the profiles of all emission lines that reach into a range of wavelengths, averaged over bins of 1 A.
 
     Parameters
     ----------
     fluxes : float array, shape (n, n_line)
-        Observed flux of each line of `line_list` in erg s-1 cm-2; NaN or 0 without a line.
+        Flux of each line of `line_list` for each source, in erg s-1 cm-2. Lines with NaN, 0 or less are left out.
     z_obs : float array, shape (n,)
-        Redshifts.
+        Redshift of each source.
     sigma : float array, shape (n,)
-        Velocity dispersions in km/s.
+        Velocity dispersion of each source in km/s.
     medium : str
         Medium of the wavelengths, "air" or "vacuum".
     first_wanted, last_wanted : float, optional
@@ -198,7 +210,12 @@ def profiles(
     Returns
     -------
     Profiles
-        The profiles.
+        One profile per source and line.
+
+    Raises
+    ------
+    BadInput
+        If the medium is unknown.
 
     Notes
     -----
@@ -206,7 +223,7 @@ def profiles(
     integral is the flux. Serrano et al. 2024 (appendix B, eq. f_el) give the centre without redshift, and an additional
     factor 1 / (1 + z) in the exponent.
 
-    The error of the shape is 2e-8 of the flux. The bins sum to the flux within 1e-14.
+    The error of the shape is 2e-8 of the flux. The sum over the bins equals the flux within a fraction of 1e-14.
     """
     from scipy.special import erf
 
@@ -231,20 +248,20 @@ def add(spectra: Float, first: int, lines: Profiles) -> Float:
     Parameters
     ----------
     spectra : float array, shape (n, w)
-        f_lambda in steps of 1 A. It is modified.
+        f_lambda of n sources in steps of 1 A. It is modified.
     first : int
         Wavelength of the first column of `spectra` in A.
     lines : Profiles
-        Profiles of lines.
+        Profiles of the lines of these sources. Bins outside the spectra are ignored.
 
     Returns
     -------
     float array, shape (n, w)
-        `spectra`.
+        The array `spectra` itself.
     """
     index = lines.first[:, None] - first + np.arange(lines.f_lambda.shape[1])
     inside = (index >= 0) & (index < spectra.shape[1])
     row = np.broadcast_to(lines.row[:, None], index.shape)
-    # Two lines of a galaxy may be in the same bin, which += would add only once.
+    # Use np.add.at, because two lines of a galaxy may be in the same bin and `+=` would add only one of them.
     np.add.at(spectra, (row[inside], index[inside]), lines.f_lambda[inside])
     return spectra

@@ -1,1 +1,1 @@
-"""Compute band fluxes from precomputed tables."""
+"""Compute band fluxes of galaxies and stars by interpolation in precomputed tables."""

@@ -1,4 +1,7 @@
-"""Measure the errors of the tables for external spectra and passbands, which were not measured in advance."""
+"""Measure the interpolation errors of flux tables for spectra and passbands from a user's files.
+
+Errors for built-in spectra and passbands were measured in advance and are in flux_errors.csv.
+"""
 
 from __future__ import annotations
 
@@ -20,32 +23,35 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.request.accuracy import Accuracy
 
-# The largest error of a small sample is smaller than that of all galaxies; MARGIN accounts for the difference.
-_SAMPLE, _SEED = 4000, 5
+# Number of random galaxies with which errors are measured. The largest error of a small sample is smaller than that of
+# all galaxies; the factor MARGIN accounts for the difference.
+_SAMPLE = 4000
+# Seed of the random galaxies.
+_SEED = 5
 
 
 def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
-    """Return for each band the smallest setting that is accurate enough.
+    """Return for each band the smallest flux table that is accurate enough.
 
     Parameters
     ----------
     bands : sequence of Passband
         The passbands.
     accuracy : Accuracy
-        Largest errors that are allowed.
+        Errors that the user allows. `accuracy.flux` is the largest allowed relative error of a flux.
     library : Library
         Templates of galaxies.
 
     Returns
     -------
     tuple of Choice
-        Setting and errors of each band.
+        Resolution of each band's table and its errors; `settings.INTEGRATED` if no table is accurate enough.
 
     Notes
     -----
-    For built-in passbands and templates, errors are in flux_errors.csv; see settings.choose. For an external passband
-    or library, and for a band with intergalactic absorption, the errors of 4000 random galaxies decide. The search
-    starts at the setting from settings.choose.
+    For built-in passbands and templates, errors are in flux_errors.csv; see settings.choose. For a passband or library
+    from a user's file, and for a band with intergalactic absorption, the errors of 4000 random galaxies decide. The
+    search starts at the resolution from settings.choose.
     """
     embedded_choices = settings.choose([band.name for band in bands], accuracy)
     return tuple(
@@ -61,7 +67,7 @@ def _is_absorbed(band: Passband, library: Library) -> bool:
 
 
 def measure(band: Passband, setting: Setting, library: Library) -> Choice:
-    """Return the errors of a setting, rms and largest, relative to integration.
+    """Measure the errors of fluxes from a table, relative to direct integration, with 4000 random galaxies.
 
     Parameters
     ----------
@@ -75,7 +81,7 @@ def measure(band: Passband, setting: Setting, library: Library) -> Choice:
     Returns
     -------
     Choice
-        The setting and its errors as fractions of the flux.
+        The resolution, and the rms and largest error as fractions of the flux. Results are cached on disc.
     """
     library_key = build_tables.library_key(library)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
@@ -93,21 +99,21 @@ def measure(band: Passband, setting: Setting, library: Library) -> Choice:
 
 
 def draw_galaxies(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
-    """Draw random galaxies with two components and all lines, uniformly over the range of the tables.
+    """Draw random galaxies whose redshift, E(B-V) and A(V) are uniform over the range of the flux tables.
 
     Parameters
     ----------
     n : int
         Number of galaxies.
     n_template : int
-        Number of templates.
+        Number of templates in the library, from which two are drawn for each galaxy.
     rng : np.random.Generator
-        Random numbers.
+        Source of random numbers.
 
     Returns
     -------
     Galaxies
-        The galaxies.
+        Galaxies with two templates, all emission lines and no magnification.
     """
     frac = rng.uniform(0.0, 1.0, n)
     mix = TemplateMix(

@@ -2,11 +2,12 @@
 
 Notes
 -----
-A band's flux is linear in a galaxy's two components and additive in its lines. For one template behind one law, the
-logarithm of the flux is smooth in E(B-V) and in the Milky Way's A(V), because it is a cumulant generating function of
-the extinction in the band. It is a polynomial of low order. In redshift it is interpolated by cubics on nodes uniform
-in ln(1 + z). The table of the reference band scales the sum to the apparent reference magnitude. Lines, lensing and the
-extinction of lines by the Milky Way need no table in redshift.
+The flux of a galaxy in a band is a linear sum of its two templates and its emission lines. For one template and one
+extinction law, the logarithm of the flux is a cumulant generating function of the extinction in the band. It is
+therefore smooth in E(B-V) and in the Milky Way's A(V), and a polynomial of low order describes it. In redshift it is
+interpolated by cubics on nodes uniform in ln(1 + z). The table of the reference band (0.1r) scales the templates to
+the apparent magnitude in this band, which does not include lines. Lines, their extinction by the Milky Way, and lensing
+need no table in redshift.
 """
 
 from __future__ import annotations
@@ -37,35 +38,37 @@ from truesky.fluxes.tables.build_tables import (
     Setting,
 )
 
-# Setting of the reference band. Its error enters the fluxes in all bands.
+# Resolution of the reference band's table. Its error enters the fluxes in all bands.
 REFERENCE_SETTING = Setting(0.005, 6, 1)
-# Rows that are interpolated together, so that their data stay in the processor's cache. A power of two would use only
-# a fraction of the cache.
+# Number of galaxies that are interpolated together, so that their data stay in the processor's cache. A power of two
+# would use only a fraction of the cache.
 _CHUNK = 2000
-# Step in ln(lambda) of the grid on which the bands of a line are looked up, and its margin; air shifts lines by 3e-4.
-_CELL, _AIR = 0.01, 1e-3
+# Width in ln(lambda) of the wavelength cells, in which the bands that contain a line are looked up.
+_CELL = 0.01
+# Margin in ln(lambda) of a cell on both sides. It covers the shift of 3e-4 between wavelengths in vacuum and air.
+_AIR = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class LineGrid:
-    """Line tables of all bands and the wavelengths of the lines, as kernels.sum_components needs them.
+    """Tables of emission-line fluxes in all bands, and wavelengths of the lines, for `kernels.sum_components`.
 
     Attributes
     ----------
     tables : float32 array, shape (sum of n_lambda, n_width)
-        Tables of all bands, one after the other.
+        f_nu of a line of unit flux, by wavelength and line width. The tables of all bands follow one another.
     start : uint32 array, shape (n_band,)
         First row of each band in `tables`.
     last : int32 array, shape (n_band,)
-        Number of the last row of each band, from its first row.
+        Index of the last row of each band, counted from the first row of the band.
     medium : uint32 array, shape (n_band,)
         1 for air, 0 for vacuum.
     first : float array, shape (n_band,)
         ln(lambda / A) of the first row of each band.
     cells : int array, shape (n_cell + 1,)
-        Positions in `members` at which the bands of each wavelength cell begin.
+        Positions in `members` at which the bands of each wavelength cell begin. Cells are uniform in ln(lambda).
     members : uint32 array
-        Bands that respond in each wavelength cell.
+        Indices of the bands that respond in each wavelength cell, one cell after the other.
     cell_first : float
         ln(lambda / A) at the start of the first cell.
     vacuum : float array, shape (n_line,)
@@ -85,18 +88,18 @@ class LineGrid:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Memory-mapped tables of galaxies in some bands.
+    """Memory-mapped flux tables of galaxies in some bands.
 
     Attributes
     ----------
     settings : tuple of Setting
         Resolution of each band's table.
     tables : tuple of float32 array
-        Table of each band.
+        Chebyshev coefficients of each band, from `build_tables.galaxy_table`.
     reference : float32 array
-        Table of the reference band.
+        Chebyshev coefficients of the reference band.
     lines : LineGrid
-        Tables of lines.
+        Tables of emission lines.
     milky_way : float array, shape (23401,)
         A(lambda) / A(V) on passbands.grid().
     """
@@ -109,14 +112,16 @@ class Grid:
 
 
 def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: Library) -> Grid:
-    """Return the tables of bands for a library of galaxies; it takes half a second per band to compute them.
+    """Return the flux tables of bands for a library of galaxies.
+
+    A table that is not in the disc cache is computed, which takes half a second per band.
 
     Parameters
     ----------
     bands : sequence of Passband
-        The passbands.
+        The passbands, at least one.
     settings : sequence of Setting
-        Resolution of each band's table.
+        Resolution of each band's table, one per band.
     library : Library
         Templates of galaxies.
 
@@ -136,14 +141,14 @@ def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: L
 
 
 def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
-    """Return the fluxes of galaxies in the range of the tables; approximates integration.galaxy_fluxes.
+    """Return the fluxes of galaxies by interpolation in tables, which approximates integration.galaxy_fluxes.
 
     Parameters
     ----------
     rows : Galaxies
-        Galaxies for which `covered_galaxies` is True.
+        Galaxies for which `covered_galaxies` is True, which is not checked. Others get wrong fluxes.
     grid : Grid
-        Tables.
+        Tables from `open_grid`.
 
     Returns
     -------
@@ -152,10 +157,10 @@ def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
 
     Notes
     -----
-    The error of each setting in each band is in flux_errors.csv.
+    flux_errors.csv has the error of each table resolution in each band.
     """
-    # Sort by redshift, so that successive galaxies read the same rows of a table. Integers of 16 bits are precise
-    # enough, and are sorted ten times faster.
+    # Sort by redshift, so that successive galaxies read the same rows of a table. Redshifts are rounded to 16-bit
+    # integers: these are precise enough for the order, and are sorted ten times faster.
     span = 65_535.0 / np.log1p(Z_LAST - Z_FIRST)
     order = np.argsort((np.log1p(np.maximum(rows.mix.z_obs - Z_FIRST, 0.0)) * span).astype(np.uint16), kind="stable")
     out = np.empty((len(rows), len(grid.tables)))
@@ -166,7 +171,7 @@ def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
 
 
 def _fill_chunk(rows: Galaxies, grid: Grid, indices: Int, out: Float) -> None:
-    """Write the fluxes of `rows` to out[indices]."""
+    """Compute the fluxes (microjansky) of some galaxies, and write them to the rows `indices` of the array `out`."""
     log_z = np.log1p(rows.mix.z_obs)
     observed = _component_ratios(rows.mix, log_z, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,))[0]
     ratios = _component_ratios(rows.mix, log_z, rows.a_v, grid.settings, grid.tables)
@@ -205,7 +210,7 @@ def _fill_chunk(rows: Galaxies, grid: Grid, indices: Int, out: Float) -> None:
 
 
 def compile_kernels(grid: Grid) -> None:
-    """Compile the kernels with one galaxy."""
+    """Call the compiled loops for one invented galaxy, so that numba compiles them and caches the machine code."""
     ones, zeros = np.ones(1), np.zeros((2, 1))
     mix = TemplateMix(ones, zeros.astype(np.int64), zeros.astype(np.int64), zeros + 0.5, zeros)
     galaxy_fluxes(
@@ -214,12 +219,14 @@ def compile_kernels(grid: Grid) -> None:
 
 
 def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
-    """Return the fluxes of stars in the range of the tables; differs from integration.star_fluxes by at most 1e-6.
+    """Return the fluxes of stars by interpolation in tables.
+
+    They differ from integration.star_fluxes by at most a fraction of 1e-6.
 
     Parameters
     ----------
     rows : Stars
-        Stars for which `covered_stars` is True.
+        Stars for which `covered_stars` is True, which is not checked. Others get wrong fluxes.
     bands : sequence of Passband
         The passbands.
     library : Library
@@ -241,9 +248,9 @@ def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Flo
 
 
 def covered_galaxies(rows: Galaxies) -> Bool:
-    """Return True for galaxies in the range of the tables, bool[n].
+    """Return True for galaxies within the flux tables' ranges of redshift, E(B-V) and Milky Way A(V), bool[n].
 
-    A component without flux, or without an extinction law, may have any E(B-V).
+    The E(B-V) of a template without flux, or without an extinction law, does not matter.
     """
     mix = rows.mix
     dusty = (mix.ebv > EBV_LAST) & (mix.law > 0) & (mix.frac > 0.0)
@@ -252,15 +259,18 @@ def covered_galaxies(rows: Galaxies) -> Bool:
 
 
 def covered_stars(rows: Stars) -> Bool:
-    """Return True for stars in the range of the tables, bool[n]."""
+    """Return True for stars whose A(V) is at most 5 mag, the largest of the flux tables; bool[n]."""
     return np.asarray(rows.a_v <= STAR_A_V_LAST)
 
 
 def _component_ratios(
     mix: TemplateMix, log_z: Float, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32]
 ) -> Float32:
-    """Return f_nu of each component in each band relative to the reference band at rest: float32[n_band, 2, n]."""
-    # Most bands share nodes or polynomials with other bands.
+    """Return f_nu in each band / rest-frame f_nu in the reference band, for each galaxy's two templates behind dust.
+
+    The shape of the result is (n_band, 2, n).
+    """
+    # Most bands share redshift nodes or Chebyshev polynomials, so that each different one is computed only once.
     distinct = set(settings)
     steps = {s.step: s for s in distinct}
     nodes = {step: _find_nodes(setting, mix, log_z) for step, setting in steps.items()}

@@ -1,7 +1,7 @@
 """Choose the smallest flux tables whose measured error is within the accuracy that the user allows.
 
-flux_errors.csv has the errors of 20,000 random galaxies, including lines, relative to direct integration. Update it
-with `python -m benchmarks.fluxes --measure`.
+flux_errors.csv has the errors of fluxes from tables relative to direct integration, measured with 20,000 random
+galaxies with emission lines. Update it with `python -m benchmarks.fluxes --measure`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ CANDIDATES = tuple(
     )
 )  # fmt: skip
 
-# Factor from the largest measured error to the assumed largest error of all galaxies.
+# Assumed largest error of all galaxies, divided by the largest error of the measured sample.
 MARGIN = 1.5
-# If the allowed error is at most this, all fluxes are integrated. Errors of tables are known only relative to
-# integration.
+# If the allowed relative error is at most this, all fluxes are integrated instead of interpolated: errors of tables are
+# known only relative to integration.
 _MIN_TABLE_ERROR = 1e-4
-# Error of integration relative to whole spectra in double precision, due to templates in single precision.
+# Relative error of integrated fluxes, because templates are stored in single precision.
 _INTEGRATION_ERROR = 1e-6
 
 COVERED_RANGES = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.0, A_V_LAST]}
@@ -43,14 +43,14 @@ COVERED_RANGES = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Method for a band and its measured errors.
+    """How fluxes in a band are computed, from a table or by integration, and the measured errors.
 
     Attributes
     ----------
     setting : Setting, optional
-        Resolution of the table; None for integration.
+        Resolution of the flux table; None for direct integration.
     rms, largest : float
-        Errors as fractions of the flux.
+        Root mean square and largest error of the measured galaxies, as fractions of the flux.
     """
 
     setting: Setting | None
@@ -58,7 +58,7 @@ class Choice:
     largest: float
 
     def facts(self) -> dict[str, Any]:
-        """Return the choice as JSON values."""
+        """Return the method and errors as JSON values; `setting` is [step, n_ebv, n_av], or None for integration."""
         setting = [self.setting.step, self.setting.n_ebv, self.setting.n_av] if self.setting else None
         return {"setting": setting, "rms": self.rms, "largest": self.largest}
 
@@ -67,40 +67,47 @@ INTEGRATED = Choice(None, _INTEGRATION_ERROR, _INTEGRATION_ERROR)
 
 
 def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
-    """Return for each band the smallest setting whose largest error times `MARGIN` is at most accuracy.flux.
+    """Return for each band the smallest flux table whose largest error times `MARGIN` is at most accuracy.flux.
 
     Parameters
     ----------
     bands : sequence of str
         Names of passbands.
     accuracy : Accuracy
-        Largest errors that are allowed.
+        Errors that the user allows; `accuracy.flux` is relative to the flux.
 
     Returns
     -------
     tuple of Choice
-        Setting and errors of each band; `INTEGRATED` if no setting is accurate enough.
+        Resolution of each band's table and its errors; `INTEGRATED` if no table is accurate enough.
 
     Notes
     -----
-    A user passband, which was not measured, gets a setting that is accurate enough for all measured bands.
+    A user's passband is not in flux_errors.csv. It gets a resolution that is accurate enough for all bands of the file.
     """
     measured = _read_errors()
     return tuple(_smallest(measured, band, accuracy.flux) for band in bands)
 
 
 def measured_bands() -> frozenset[str]:
-    """Return the names of the measured bands."""
+    """Return the names of the bands whose table errors were measured in advance (flux_errors.csv)."""
     return frozenset(name for of_bands in _read_errors().values() for name in of_bands)
 
 
 def stars_tabulated(accuracy: Accuracy) -> bool:
-    """Return True if fluxes of stars come from tables, whose error is 1e-6 in all bands."""
+    """Return True if fluxes of stars are interpolated in tables, False if they are integrated.
+
+    Tables are used if the allowed relative error is above 1e-4. Their error for stars is 1e-6 in all bands.
+    """
     return accuracy.flux > _MIN_TABLE_ERROR
 
 
 def star_error_facts(accuracy: Accuracy) -> dict[str, Any]:
-    """Return the facts about errors of stellar fluxes as JSON values."""
+    """Return errors of stellar fluxes as JSON values, for the manifest (JSON description) of a table of fluxes.
+
+    `covered` is the range of A(V) (mag) of the tables, None if all stars are integrated. `largest` is the largest
+    relative error.
+    """
     covered = {"a_v": [0.0, STAR_A_V_LAST]} if stars_tabulated(accuracy) else None
     return {"covered": covered, "largest": _INTEGRATION_ERROR}
 
