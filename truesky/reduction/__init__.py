@@ -1,1 +1,1 @@
-"""Reduce raw frames to calibrated images and stacks, as the pipeline of an observatory does."""
+"""Reduce simulated raw frames to calibrated images, catalogues and stacks, as the pipeline of an observatory does."""

@@ -1,6 +1,7 @@
-"""Map values of amplifiers to pixels, and undo the effects of amplifiers, for quadrants and for ground cameras.
+"""Give each pixel the value (such as the gain) of its amplifier, and correct crosstalk and nonlinearity of amplifiers.
 
-Large detectors of ground cameras are processed a few rows at a time to limit memory.
+Detectors are read either in four quadrants (VIS of Euclid) or in the layout of amplifiers of a ground camera. Large
+detectors of ground cameras are processed a few rows at a time to limit memory.
 """
 
 from __future__ import annotations
@@ -14,26 +15,26 @@ from truesky.render.channels.readout import assemble_frame, split_frame
 from truesky.render.effects.readout import crosstalk, nonlinearity
 from truesky.render.effects.scene import Scene
 
-# Rows of each amplifier that are processed at a time.
+# Number of rows of each amplifier that are processed at a time, to limit memory.
 _ROWS = 64
 
 
 def to_pixels(numbers: float | Float, scene: Scene, rows: slice = slice(None)) -> float | Float:
-    """Return a map of the pixels with the value of each pixel's amplifier.
+    """Return an image in which each pixel has the value of the amplifier that reads it.
 
     Parameters
     ----------
     numbers : float or float array, shape (q,)
-        Values of the amplifiers. A scalar is returned unchanged.
+        Value of each of the q amplifiers, such as its gain. A scalar is returned unchanged.
     scene : Scene
-        Scene with the layout of the amplifiers.
+        Exposure of the detector, which contains the layout of the amplifiers.
     rows : slice, optional
-        Rows of the detector; all by default.
+        Rows of the detector to return; all by default.
 
     Returns
     -------
-    float or float array, shape (ny, nx)
-        Map, 0 between amplifiers.
+    float or float array, shape (number of rows, nx)
+        Values of the pixels; 0 for pixels that no amplifier reads.
     """
     if np.ndim(numbers) == 0:
         return numbers
@@ -50,21 +51,22 @@ def to_pixels(numbers: float | Float, scene: Scene, rows: slice = slice(None)) -
 
 
 def pixels_at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
-    """Return True for pixels at or above the value of their amplifier, or at or above 0 between amplifiers.
+    """Compare each pixel of a frame with a limit that depends on the amplifier, such as the saturation level.
 
     Parameters
     ----------
     frame : array, shape (ny, nx)
-        The frame.
+        Pixels of the frame.
     numbers : float or float array, shape (q,)
-        Values of the amplifiers.
+        Limit of each of the q amplifiers in the unit of `frame`, or one limit for all pixels.
     scene : Scene
-        Scene with the layout of the amplifiers.
+        Exposure of the detector, which contains the layout of the amplifiers.
 
     Returns
     -------
     bool array, shape (ny, nx)
-        Mask.
+        True for pixels at or above their limit. If limits depend on the amplifier, pixels that no amplifier reads have
+        the limit 0.
     """
     out = np.empty(frame.shape, bool)
     for first in range(0, len(frame), _ROWS):
@@ -74,9 +76,10 @@ def pixels_at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
 
 
 def unread_pixels(scene: Scene) -> Bool:
-    """Return the mask of pixels that no amplifier reads, bool[ny, nx].
+    """Return a mask that is True for pixels that no amplifier reads, bool[ny, nx].
 
-    These are the rows between the two halves of a detector and the gaps between its cells.
+    In VIS these are the rows between the two halves of the CCD, which are read in opposite directions. In detectors
+    made of separate cells (GPC1) these are the gaps between cells.
     """
     if scene.layout is not None:
         return scene.layout.unread_pixels
@@ -86,16 +89,17 @@ def unread_pixels(scene: Scene) -> Bool:
 
 
 def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
-    """Undo crosstalk and the nonlinear response of the amplifiers.
+    """Correct a frame for crosstalk between amplifiers and for their nonlinear response.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Measured electrons above the bias.
     scene : Scene
-        Scene with the mission parameters of these effects.
+        Exposure of the detector with its mission parameters, which define both effects exactly.
     effects : container of str
-        Names of the effects to undo.
+        Effects to correct: "crosstalk", "nonlinearity" or both; other names are ignored. Without these two, the
+        electrons of pixels that an amplifier reads are returned unchanged.
 
     Returns
     -------
@@ -113,7 +117,11 @@ def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
 
 
 def _apply_by_rows(frame: Float, scene: Scene, change: Callable[[Float], Float]) -> Float:
-    """Apply `change` to arrays [q, rows, columns] of simultaneously read pixels; pixels without amplifier become 0."""
+    """Apply `change` to the pixels of a frame, arranged by the q amplifiers, and return the changed frame [ny, nx].
+
+    `change` gets and returns arrays [q, rows, columns] in which the same position is read at the same time by all
+    amplifiers. Pixels that no amplifier reads become 0.
+    """
     layout = scene.layout
     if layout is None:
         return np.asarray(assemble_frame(change(split_frame(frame, scene)), scene))

@@ -1,13 +1,14 @@
-"""Calibrate a frame: subtract the contributions of the detector, and divide by its response::
+"""Calibrate a frame of a CCD: subtract the contributions of the detector, and divide by its response::
 
-    counted = undone(electrons - bias) - dark time
-    light = counted / (flat illumination) - fringes of the sky
+    counted = corrected(electrons - bias) - dark current x exposure time
+    light = counted / (flat x illumination) - fringes of the sky
 
-A frame is calibrated some rows at a time to limit memory.
+Here `corrected` removes crosstalk and nonlinearity of the amplifiers. A frame is calibrated in strips of rows to limit
+memory.
 
 Charge transfer inefficiency, the brighter-fatter effect and ghosts are not corrected. The varying area of pixels on the
-sky is not corrected either. It does not change the counts of a source, so a division that makes the sky flat would give
-wrong fluxes of stars. A resampling program gets the area from the WCS.
+sky is not corrected either, because it does not change the total counts of a star. A flat that includes the pixel area
+would make the sky uniform, but the fluxes of stars wrong. A resampling program gets the area from the WCS.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from truesky.render.effects.charge import pixel_borders
 from truesky.render.effects.light import illumination
 from truesky.render.effects.scene import Scene
 
-# Bits of the flags, and their meaning.
+# Bits of a pixel in the flag map (extension FLG of a calibrated image); the constant FLAGS has their meanings.
 NO_DATA, RESPONSE, HOT, SATURATED, UNSURE, COSMIC_RAY, EDGE, PERSISTENCE = 1, 2, 4, 8, 16, 32, 64, 128
+# Each bit of the flag map with its meaning, as written to FITS headers.
 FLAGS = (
     (NO_DATA, "no data"),
     (RESPONSE, "response far from 1"),
@@ -38,39 +40,48 @@ FLAGS = (
     (EDGE, "near the edge of the detector, good"),
     (PERSISTENCE, "subtracted persistence above noise, good"),
 )
-# Flags of pixels that are used.
+# Flag bits that are only information: pixels with these bits and no others keep their weight.
 GOOD = EDGE | PERSISTENCE
-# Limits of the response of a pixel that is used, and its largest difference from its neighbours in units of their rms.
-_MIN_RESPONSE, _MAX_RESPONSE, _MAX_DEVIATION = 0.7, 1.3, 8.0
-# Standard deviations of a hot pixel above the others in a dark.
+# Pixels with a lower value in the master flat get the flag RESPONSE and no weight.
+_MIN_RESPONSE = 0.7
+# Pixels with a higher value in the master flat get the flag RESPONSE and no weight.
+_MAX_RESPONSE = 1.3
+# A flat's pixel is flagged UNSURE if it exceeds the median of its neighbourhood by more than this multiple of the rms
+# excess of all pixels.
+_MAX_DEVIATION = 8.0
+# A pixel is hot if its dark current exceeds the median of the detector by more than this multiple of its uncertainty.
 _HOT_SIGMA = 8.0
-# Distance from an edge, in pixels, within which charge is displaced.
+# Pixels within this distance (pixels) of the detector's edge get the flag EDGE: electric fields displace their charge.
 _BORDER = 10
-# Side of a square of the mesh on which the sky is measured, and of the neighbourhood of a flat's pixel, in pixels.
-_MESH, _NEIGHBOURHOOD = 64, 9
-# Standard deviations above the sky at which light, smoothed over a pixel, counts as a source; reach of the smoothing in
-# pixels.
-_SOURCE_SIGMA, _SMOOTHING_REACH = 4.0, 4
-# Rows that are calibrated at a time.
+# Side, in pixels, of the squares in which the level of the sky is measured.
+_MESH = 64
+# Side, in pixels, of the square around a flat's pixel whose median the pixel is compared with.
+_NEIGHBOURHOOD = 9
+# Light above the sky counts as a source if, smoothed by a Gaussian of one pixel, it exceeds its noise by this factor.
+_SOURCE_SIGMA = 4.0
+# Radius in pixels at which the smoothing Gaussian is truncated.
+_SMOOTHING_REACH = 4
+# Number of detector rows that are calibrated at a time, to limit memory.
 _ROWS = 512
 
 
 @dataclass(frozen=True, slots=True)
 class Masters:
-    """Masters of one detector; a missing master is replaced by zeros or ones.
+    """Masters (combined calibration frames) of one detector; an omitted master is an image with a constant value.
 
     Attributes
     ----------
     bias : CombinedFrame
-        Bias in electrons.
+        Bias in electrons. For NISP, the coefficient of the nonlinearity in 1/electron is stored here.
     dark : CombinedFrame
         Dark current in electrons per second.
     flat : CombinedFrame
-        Response, 1 if all light is counted.
+        Response of each pixel relative to the light that falls on it; 1 if all light is counted.
     flags : uint8 array, shape (ny, nx)
-        Flags of the pixels.
+        Flag bits (see `FLAGS`) of pixels that are bad in the dark or the flat.
     dark_time : float
-        Exposure time of the dark frames in seconds. The dark current contains the noise of the bias, too.
+        Mean exposure time of the dark frames in seconds, infinite if unknown. It is needed because the noise of the
+        bias, which was subtracted from the darks, is also in the dark current.
     """
 
     bias: CombinedFrame
@@ -87,11 +98,12 @@ class ReducedImage:
     Attributes
     ----------
     image : float32 array, shape (ny, nx)
-        Electrons of the exposure (or another unit), including the sky; 0 without a value.
+        Light including the sky, in electrons, electrons per second or counts. Pixels without data have no meaningful
+        value: 0, or minus the fringes if fringes were subtracted.
     weight : float32 array, shape (ny, nx)
-        Inverse variance; 0 for pixels that must not be used according to their flags.
+        Inverse variance in the inverse square of the image's unit; 0 for bad pixels.
     flags : uint8 array, shape (ny, nx)
-        Flags, see `FLAGS`.
+        Flag bits, see `FLAGS`.
     """
 
     image: Float
@@ -100,28 +112,28 @@ class ReducedImage:
 
 
 def neutral_master(shape: tuple[int, ...], value: float) -> CombinedFrame:
-    """Return a constant master, which replaces a missing one."""
-    # Broadcast a single number, which takes no memory.
+    """Return a master frame of the constant `value` without uncertainty, used if a calibration frame is omitted."""
+    # Broadcast a single number to a read-only view of the full shape, which takes no memory.
     mean, uncertainty = (np.broadcast_to(np.float32(number), shape) for number in (value, 0.0))
     return CombinedFrame(mean, uncertainty, np.broadcast_to(np.int16(1), shape))
 
 
 def illumination_map(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
-    """Return the relative illumination of each pixel by the optics and the shutter, from the mission parameters.
+    """Return the relative illumination of pixels due to vignetting and the shutter, from the mission parameters.
 
     Parameters
     ----------
     scene : Scene
-        Scene of the frame.
+        Exposure of the detector with its mission parameters.
     applied : container of str
-        Names of the effects in the frame.
+        Names of the effects that were simulated in the frame. Vignetting or shutter count only if they are among them.
     rows : slice, optional
         Rows of the detector; all by default.
 
     Returns
     -------
-    float array, shape (ny, nx)
-        Illumination, 1 at the centre of the focal plane.
+    float array, shape (number of rows, nx)
+        Illumination: 1 at the centre of the focal plane, and 1 everywhere if neither effect was simulated.
     """
     out = np.ones((len(range(scene.ny)[rows]), scene.nx))
     for effect in (illumination.EFFECT, illumination.SHUTTER):
@@ -132,68 +144,76 @@ def illumination_map(scene: Scene, applied: Container[str], rows: slice = slice(
 
 
 def reading_variance(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
-    """Return the variance of a pixel without light, from readout noise and rounding to whole ADU.
+    """Return the variance of pixels without light, from readout noise and rounding to whole ADU.
 
     Parameters
     ----------
     scene : Scene
-        Scene of the frame.
+        Exposure of the detector with its mission parameters.
     applied : container of str
-        Names of the effects in the frame.
+        Names of the effects that were simulated in the frame. Readout noise counts only if it is among them.
     rows : slice, optional
         Rows of the detector; all by default.
 
     Returns
     -------
-    float array, shape (ny, nx)
-        Variance in electrons^2.
+    float array, shape (number of rows, nx)
+        Variance in electrons^2. It is constant within an amplifier.
     """
     shape = len(range(scene.ny)[rows]), scene.nx
     return np.broadcast_to(amplifiers.to_pixels(_amplifier_read_variance(scene, applied), scene, rows), shape)
 
 
 def _amplifier_read_variance(scene: Scene, applied: Container[str]) -> float | Float:
-    """Return the variance of a pixel without light for each amplifier, in electrons^2."""
+    """Return the variance of a pixel without light in electrons^2: one value per amplifier, or one for all."""
     noise = scene.amplifier_values("read_noise", "electron") if "read_noise" in applied else 0.0
     return noise**2 + scene.amplifier_values("gain", "electron / adu") ** 2 / 12.0
 
 
 def response_flags(flat: CombinedFrame) -> Array:
-    """Flag pixels with a response far from 1, and pixels with light of a star that clipping did not remove."""
+    """Return the flag bits of each pixel that follow from the master flat, uint8[ny, nx].
+
+    RESPONSE marks values outside 0.7 to 1.3. UNSURE marks pixels without an accepted frame, and pixels much brighter
+    than their neighbours, which may contain the same star in all flats.
+    """
     flags = np.where((flat.mean > _MIN_RESPONSE) & (flat.mean < _MAX_RESPONSE), 0, RESPONSE).astype(np.uint8)
-    # A median of medians is as robust as a median in two dimensions, and takes a tenth of the time.
+    # Take the median along rows, then along columns: as robust as a median over the square, in a tenth of the time.
     smooth = ndimage.median_filter(flat.mean, size=(1, _NEIGHBOURHOOD), mode="nearest")
     off = flat.mean - ndimage.median_filter(smooth, size=(_NEIGHBOURHOOD, 1), mode="nearest")
     rms = 1.4826 * float(np.median(np.abs(off)))
-    # Only excesses are flagged, since dust dims some pixels more than their neighbours.
+    # Flag only pixels brighter than their neighbours: darker pixels may be real, because dust absorbs light.
     flags[off > _MAX_DEVIATION * rms] |= UNSURE
     flags[flat.count == 0] |= UNSURE
     return flags
 
 
 def dark_flags(dark: CombinedFrame) -> Array:
-    """Flag pixels with a much higher dark current than others."""
+    """Return the flag bits of each pixel that follow from the master dark, uint8[ny, nx].
+
+    HOT marks a dark current more than 8 standard deviations above the median of the detector, and UNSURE pixels in
+    which no dark frame was accepted.
+    """
     above = dark.mean - float(np.median(dark.mean))
     hot = above > _HOT_SIGMA * np.where(np.isfinite(dark.uncertainty), dark.uncertainty, np.inf)
     return (np.where(hot, HOT, 0) | np.where(dark.count == 0, UNSURE, 0)).astype(np.uint8)
 
 
 def master_flags(shape: tuple[int, int], masters: Mapping[str, CombinedFrame], without: Container[str]) -> Array:
-    """Return flags of a detector's pixels from its flat and its dark.
+    """Return the flag bits of a detector's pixels that follow from its master flat and master dark.
 
     Parameters
     ----------
     shape : (int, int)
-        Shape of the detector.
+        Shape (ny, nx) of the detector in pixels.
     masters : mapping of str to CombinedFrame
-        Masters by kind.
+        Master frames by kind: "flat" and "dark" are required unless they are in `without`.
     without : container of str
-        Kinds of masters that are not used.
+        Kinds of masters that are ignored.
 
     Returns
     -------
     uint8 array, shape (ny, nx)
-        Flags.
+        Flag bits, see `FLAGS`; 0 everywhere if both kinds are ignored.
     """
     flags = np.zeros(shape, np.uint8)
     if "flat" not in without:
@@ -216,34 +236,36 @@ def calibrate(
     unit: float = 1.0,
     fringes: Float32 | None = None,
 ) -> ReducedImage:
-    """Calibrate a frame.
+    """Calibrate a frame of a CCD.
 
     Parameters
     ----------
     electrons : float array, shape (ny, nx)
-        Electrons above the level of the overscan.
+        Electrons of each pixel above the level of the overscan.
     saturated : bool array, shape (ny, nx)
-        True for saturated pixels.
+        True for saturated pixels, which get the flag SATURATED and the weight 0.
     masters : Masters
-        Masters of the detector.
+        Bias, dark and flat of the detector.
     scene : Scene
-        Scene of the frame.
+        Exposure of the detector with its mission parameters.
     applied : container of str
-        Names of the effects in the frame that are undone.
+        Names of effects that were simulated in the frame. Crosstalk, nonlinearity, vignetting and shutter are corrected
+        only if they are among them. Readout noise is included in the weights only if it is among them.
     unit : float, optional
-        Electrons of the exposure per unit of the image: 1 for electrons, the exposure time for e-/s, the gain for ADU.
+        Number by which electrons are divided: 1 for electrons, the exposure time for e-/s, the gain for ADU.
     fringes : float32 array, shape (ny, nx), optional
-        Fringes relative to the sky in each pixel, which are subtracted.
+        Fringe pattern as a fraction of the sky. The pattern times the sky level is subtracted; None to skip this.
 
     Returns
     -------
     ReducedImage
-        The image in the required unit.
+        The calibrated image. Pixels without data, with response 0 or below, or with NaN have the weight 0. Their value
+        is 0, or minus the fringes if fringes are subtracted.
 
     Notes
     -----
     Weights contain the shot noise of the expected light (of the sky, and of sources far above it), not of the counted
-    light.
+    light, so that weighted means are unbiased.
     """
     time = scene.exposure_time_s
     image = amplifiers.undo_effects(electrons - masters.bias.mean, scene, applied)
@@ -279,20 +301,26 @@ def calibrate(
 
 
 def _response(masters: Masters, scene: Scene, applied: Container[str], rows: slice) -> Float:
-    """Return the fraction of light that is counted in each pixel of some rows."""
+    """Return flat times illumination for the pixels in `rows`; a flat that contains vignetting is used unchanged."""
     flat = masters.flat.mean[rows]
     return np.asarray(flat * (1.0 if masters.flat.vignetted else illumination_map(scene, applied, rows)), float)
 
 
 def _subtract_fringes(image: Float, fringes: Float32, used: Bool) -> None:
-    """Subtract the fringes of the sky in place; their amplitude is proportional to the level of the sky."""
+    """Subtract `fringes` (a fraction of the sky) times the sky level from `image` in place.
+
+    The sky is measured in the pixels that are True in `used`, after division by 1 + `fringes`.
+    """
     sky = SkyMesh.from_image(image / (1.0 + fringes), used)
     for rows in _strips(len(image)):
         image[rows] -= sky.rows(rows) * fringes[rows]
 
 
 def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
-    """Return the flag EDGE for pixels near the edge, which the field at the edge displaces; uint8[ny, nx]."""
+    """Return the flag EDGE for pixels within 10 pixels of the detector's edge, and 0 for others; uint8[ny, nx].
+
+    Electric fields displace charge there. No pixel is flagged if this effect was not simulated.
+    """
     flags = np.zeros((scene.ny, scene.nx), np.uint8)
     if pixel_borders.EDGES.name in applied:
         flags[:_BORDER] = flags[-_BORDER:] = flags[:, :_BORDER] = flags[:, -_BORDER:] = EDGE
@@ -300,14 +328,16 @@ def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
 
 
 def expected_light(image: Float, used: Bool, floor: float) -> Float:
-    """Return the expected light: the sky on a mesh, plus smoothed light of sources far above it.
+    """Return a smooth model of the light in an image, from which a caller computes the shot noise.
+
+    The model is the sky, measured on a mesh, plus the smoothed light of sources more than 4 sigma above the sky.
 
     Parameters
     ----------
     image : float array, shape (ny, nx)
-        Image in electrons.
+        Calibrated image in electrons, including the sky.
     used : bool array, shape (ny, nx)
-        True for good pixels.
+        True for good pixels. Others contribute neither to the sky nor to sources.
     floor : float
         Variance of a pixel without light in electrons^2.
 
@@ -318,13 +348,14 @@ def expected_light(image: Float, used: Bool, floor: float) -> Float:
 
     Notes
     -----
-    A pixel's weight must not depend on the pixel's noise, since weighted means would then be too low.
+    The light is smoothed, because a weight must not depend on the noise of the same pixel: weighted means would then be
+    too low.
     """
     return _expected_light(image, used, SkyMesh.from_image(image, used), floor, slice(0, len(image)))
 
 
 def _expected_light(image: Float, used: Bool, mesh: SkyMesh, floor: float, rows: slice) -> Float:
-    """Return the expected light of some rows, with the sky from `mesh`."""
+    """Return `expected_light` for the pixels in `rows` only, with the sky level from `mesh`."""
     padded = slice(max(rows.start - _SMOOTHING_REACH, 0), min(rows.stop + _SMOOTHING_REACH, len(image)))
     sky = mesh.rows(padded)
     above = ndimage.gaussian_filter(
@@ -332,30 +363,30 @@ def _expected_light(image: Float, used: Bool, mesh: SkyMesh, floor: float, rows:
     )
     inner = slice(rows.start - padded.start, rows.stop - padded.start)
     sky, above = sky[inner], above[inner]
-    # Smoothing with a Gaussian of one pixel averages the noise of 4 pi pixels.
+    # Smoothing with a Gaussian of sigma = 1 pixel reduces the variance of independent pixels by a factor of 4 pi.
     noise = np.sqrt((np.maximum(sky, 0.0) + floor) / (4.0 * np.pi))
     return np.asarray(np.maximum(sky, 0.0) + np.where(above > _SOURCE_SIGMA * noise, above, 0.0))
 
 
 def sky_level(image: Float, used: Bool) -> Float:
-    """Return the sky of an image from a mesh, float64[ny, nx]."""
+    """Return the level of the sky in each pixel, float64[ny, nx], measured in the pixels that are True in `used`."""
     return SkyMesh.from_image(image, used).rows(slice(0, len(image)))
 
 
 @dataclass(frozen=True, slots=True)
 class SkyMesh:
-    """Sky of an image: clipped medians of squares, interpolated linearly between their centres.
+    """Level of the sky in an image: medians of squares of about 64 pixels, interpolated linearly between their centres.
 
-    Medians are clipped twice from above.
+    Before the median is taken, pixels more than 3 sigma above it are removed, twice.
 
     Attributes
     ----------
     values : float array, shape (n, m)
-        Level of each square.
+        Level of the sky in each square, in the unit of the image.
     middles : (float array, float array)
-        Centres of the squares in rows and in columns.
+        Row numbers (n) and column numbers (m) of the centres of the squares, counted from 0.
     shape : (int, int)
-        Shape of the image.
+        Shape (ny, nx) of the image.
     """
 
     values: Float
@@ -364,7 +395,10 @@ class SkyMesh:
 
     @classmethod
     def from_image(cls, image: Float, used: Bool) -> SkyMesh:
-        """Return the sky of an image [ny, nx], measured in the pixels that are True in `used`."""
+        """Measure the sky of an image [ny, nx] in the pixels that are True in `used`.
+
+        A square without such pixels gets the level of the nearest square; if all are empty, the sky is 0.
+        """
         edges = [np.linspace(0, n, max(n // _MESH, 1) + 1).round().astype(int) for n in image.shape]
         mesh = np.zeros((len(edges[0]) - 1, len(edges[1]) - 1))
         for i, (first_row, past_row) in enumerate(zip(edges[0][:-1], edges[0][1:], strict=True)):
@@ -381,15 +415,16 @@ class SkyMesh:
         if empty.all():
             mesh[:] = 0.0
         elif empty.any():
-            # A square without a pixel has the level of the nearest one.
+            # Give a square without usable pixels the level of the nearest square that has some.
             mesh = mesh[tuple(ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True))]
         along, across = (0.5 * (edge[:-1] + edge[1:] - 1) for edge in edges)
         return cls(mesh, (along, across), (image.shape[0], image.shape[1]))
 
     def rows(self, rows: slice) -> Float:
-        """Return the sky in some rows."""
+        """Return the level of the sky in the rows of a slice with start and stop, float64[number of rows, nx]."""
         across = np.array([np.interp(np.arange(self.shape[1]), self.middles[1], row) for row in self.values])
-        # Position in units of squares. Beyond the outermost centres the sky is constant.
+        # Convert row numbers to fractional indices of squares; rows beyond the outermost centres get the index of the
+        # outermost square.
         at = np.interp(np.arange(rows.start, rows.stop), self.middles[0], np.arange(len(self.values)))
         low = np.minimum(at.astype(int), max(len(self.values) - 2, 0))
         fraction, high = (at - low)[:, None], np.minimum(low + 1, len(self.values) - 1)

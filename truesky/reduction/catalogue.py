@@ -1,8 +1,9 @@
 """Detect and measure sources in a calibrated image, with the column names of SourceExtractor.
 
-FLAGS follow SourceExtractor: 1 for bad pixels in the aperture of MAG_AUTO, 2 for deblended sources, 4 for a saturated
-pixel, 8 for sources cut off by the edge, 16 for an aperture beyond the edge. IMAFLAGS_ISO has all bits of the flag map
-in the source's pixels.
+Bits of the column FLAGS have the meaning of SourceExtractor: 1 for bad pixels in the aperture of MAG_AUTO, 2 for
+deblended sources, 4 for a saturated pixel, 8 for sources that are cut off by the edge or contain pixels without data,
+16 for an aperture beyond the edge. The column IMAFLAGS_ISO is the bitwise OR of the image's flags in all pixels of the
+source.
 
 References
 ----------
@@ -25,35 +26,49 @@ from lake_schema.fits.ldac import ColumnData
 from truesky.reduction.calibration import NO_DATA, SATURATED, ReducedImage
 from truesky.render.camera import astrometry
 
-# Side of a square of the sky mesh in pixels, and side of its median filter in squares.
-_MESH, _MESH_FILTER = 64, 3
-# Extent of the Kron radius in isophotal axes; factor of the Kron radius, and smallest radius (pixels), for MAG_AUTO.
-_ISOPHOTES, _KRON, _MIN_RADIUS = 6.0, 2.5, 1.75
+# Side, in pixels, of the squares in which the level of the sky is measured.
+_MESH = 64
+# Side, in squares, of the median filter that smooths the levels of the sky.
+_MESH_FILTER = 3
+# The Kron radius is measured in an ellipse this many times larger than the isophotal ellipse (A_IMAGE, B_IMAGE).
+_ISOPHOTES = 6.0
+# Size of the elliptical aperture of MAG_AUTO in Kron radii.
+_KRON = 2.5
+# Smallest radius, in pixels, of the aperture of MAG_AUTO; below it, a circle of this radius is used.
+_MIN_RADIUS = 1.75
 # Value of `subpix` with which sep computes exact overlaps of pixels and apertures.
 _EXACT = 0
-# Standard deviation of the window around a source's centre, relative to the half-light radius.
+# Standard deviation of the Gaussian window for XWIN_IMAGE and YWIN_IMAGE, as a multiple of the half-light radius.
 _WINDOW = 2.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
-# Size of sep's pixel stack as a fraction of a tile, and largest number of objects during deblending of a source.
-_PIXEL_STACK, _MAX_SUBOBJECTS = 0.5, 8192
-# Side of a tile, and margin around it, in pixels. Sources are detected by tile, because sep compares all pairs of
-# sources and keeps all their pixels in memory.
-_TILE, _TILE_MARGIN = 2048, 256
-# Margin around a source that is not used for the sky (pixels), and smallest rms of the sky.
-_MARGIN, _FLOOR = 3, np.float32(1e-20)
-# SourceExtractor's value for an undefined magnitude, and magnitudes per relative change of the flux.
-_NO_MAGNITUDE, _MAGNITUDE_PER_LN = 99.0, 2.5 / np.log(10.0)
+# Number of detected pixels for which sep reserves memory, as a fraction of the pixels of a tile.
+_PIXEL_STACK = 0.5
+# Largest number of objects into which sep may divide a source while deblending.
+_MAX_SUBOBJECTS = 8192
+# Side, in pixels, of the square tiles in which sources are detected. sep compares all pairs of sources and keeps all
+# their pixels in memory, which takes too long for a whole detector.
+_TILE = 2048
+# Width, in pixels, of the border around a tile that is searched as well, so that sources at its edge are complete.
+_TILE_MARGIN = 256
+# Pixels within this distance (pixels) of a detected source do not contribute to the sky.
+_MARGIN = 3
+# Smallest rms of the sky in units of the image, to avoid a division by 0.
+_FLOOR = np.float32(1e-20)
+# Magnitude, and error of the magnitude, of a source whose flux is not positive, as in SourceExtractor.
+_NO_MAGNITUDE = 99.0
+# Change of the magnitude per change of ln(flux).
+_MAGNITUDE_PER_LN = 2.5 / np.log(10.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Detection limits of sources.
+    """Conditions that a group of adjacent pixels must meet to be detected as a source.
 
     Attributes
     ----------
     threshold : float
-        Level of a source's pixels in standard deviations of the sky, 0.5 to 10,000.
+        Smallest value of each pixel above the sky, in standard deviations of the sky, 0.5 to 10,000.
     pixels : int
-        Smallest number of pixels of a source, 1 to 10,000.
+        Smallest number of adjacent pixels, 1 to 10,000.
 
     Raises
     ------
@@ -72,27 +87,31 @@ class Limits:
 
 
 def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limits) -> dict[str, Array]:
-    """Detect and measure the sources in an image, tile by tile from below.
+    """Detect and measure the sources in an image with sep (the algorithms of SourceExtractor).
 
     Parameters
     ----------
     image : ReducedImage
-        The image.
+        The calibrated image, including the sky. Pixels with weight 0 and any flag other than SATURATED are masked.
     gain : float
-        Electrons of the exposure per unit of the image.
+        Electrons per unit of the image, for the shot noise of fluxes.
     radius : float
-        Radius of the aperture of MAG_APER in pixels.
+        Radius of the circular aperture of MAG_APER in pixels.
     limits : Limits
-        Detection limits.
+        Detection threshold and smallest number of pixels.
 
     Returns
     -------
     dict of str to array
-        Measurements of the sources, with x and y in pixels from 0.
+        One value per source in each array, except `errors`, shape (3, n): the covariances xx, yy and xy of the position
+        errors in pixels^2. Positions are in pixels from 0, fluxes in units of the image, and `theta` is in radians.
+        The function `columns` converts these measurements to catalogue columns. Sources are in the order of the tiles,
+        beginning at the first row. The arrays are empty without sources.
 
     Notes
     -----
-    A source that extends more than 256 pixels from its brightest pixel may be cut, and counted twice.
+    The image is searched in tiles of 2048 x 2048 pixels. At the edge of a tile, a source that extends more than 256
+    pixels from its brightest pixel may be truncated or counted twice.
     """
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
     above, noise, sky = _subtract_sky(image, masked, limits)
@@ -125,11 +144,11 @@ def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limi
 
 
 def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
-    """Return the image without the sky, the rms of the sky (both float32[ny, nx]), and the sky.
+    """Return the image minus the sky, the rms of the sky (both float32[ny, nx]), and the model of the sky.
 
-    Pixels of sources do not contribute to the sky.
+    The sky is measured twice. The second time, pixels on and near the sources of a first detection are left out.
     """
-    # Arrays are freed early, since each takes a third of a gigabyte for a large detector.
+    # Delete arrays as soon as possible: each takes a third of a gigabyte for a large detector.
     pixels = np.ascontiguousarray(image.image, np.float32)
     mesh = {"bw": _MESH, "bh": _MESH, "fw": _MESH_FILTER, "fh": _MESH_FILTER}
     empty = image.weight > 0.0
@@ -143,9 +162,10 @@ def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Ar
 
 
 def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options: float) -> tuple[Array, Array]:
-    """Return sources as sep describes them, and the number of each pixel's source from 1 (0 for none), int32[ny, nx].
+    """Detect sources tile by tile; return the table of sep.extract, and the segmentation map, int32[ny, nx].
 
-    `above` is the image without the sky; `options` are options of sep.extract.
+    The map has the number of the source to which a pixel belongs, from 1, or 0. `above` is the image minus the sky,
+    `noise` the rms of the sky, `masked` is True for pixels to ignore, and `options` are passed to sep.extract.
     """
     sep.set_sub_object_limit(_MAX_SUBOBJECTS)
     segmentation, all_sources, count = np.zeros(above.shape, np.int32), [], 0
@@ -161,7 +181,7 @@ def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options
         for axis, axis_slice in zip("yx", padded, strict=True):
             for name in (axis, f"{axis}min", f"{axis}max", f"{axis}peak", f"{axis}cpeak"):
                 sources[name] += axis_slice.start
-        # Keep a source only in the tile with its brightest pixel.
+        # Keep a source only if its brightest pixel is in this tile: neighbouring tiles may have detected it as well.
         in_tile = (sources["ypeak"] // _TILE == first_row // _TILE) & (
             sources["xpeak"] // _TILE == first_column // _TILE
         )
@@ -184,9 +204,10 @@ def _noise(sky: sep.Background) -> Array:
 
 
 def _errors(sources: Array, signal: Float) -> Float:
-    """Return the second moments of the error of the positions, float64[3, n]; `signal` is the S/N of the flux.
+    """Return the covariance of the position errors of n sources in pixels^2: xx, yy and xy, float64[3, n].
 
-    For a source with a masked pixel, the moments of its light over the squared S/N are used, because sep gives none.
+    If sep gives no finite error (a source with a masked pixel), the second moments of the source's light divided by
+    the squared S/N are used. `signal` is the S/N of each flux.
     """
     errors = np.stack([sources[name] for name in ("errx2", "erry2", "errxy")])
     light_errors = np.stack([sources[name] for name in ("x2", "y2", "xy")]) / np.maximum(signal, 1.0) ** 2
@@ -194,7 +215,11 @@ def _errors(sources: Array, signal: Float) -> Float:
 
 
 def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
-    """Return the diameter of a circle with the area of the pixels above half of the peak, in pixels."""
+    """Return an estimate of the FWHM of each source in pixels.
+
+    It is the diameter of a circle with the area of the source's pixels that are above half of its peak value. `above`
+    is the image minus the sky.
+    """
     inside = segmentation > 0
     source_index = segmentation[inside] - 1
     high = above[inside] >= 0.5 * peak[source_index]
@@ -202,7 +227,7 @@ def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
 
 
 def _flag_bits(segmentation: Array, flags: Array, count: int) -> Array:
-    """Return the bits of the flag map in the pixels of each source, int16[count]."""
+    """Return the bitwise OR of `flags` in the pixels of each of `count` sources, int16[count]."""
     bits = np.zeros(count + 1, np.int16)
     flagged = (segmentation > 0) & (flags > 0)
     np.bitwise_or.at(bits, segmentation[flagged], flags[flagged].astype(np.int16))
@@ -210,7 +235,11 @@ def _flag_bits(segmentation: Array, flags: Array, count: int) -> Array:
 
 
 def _flags(detection_flags: Array, aperture_flags: Array, auto_flags: Array, bits: Array) -> Array:
-    """Convert the flags of sep to the flags of SourceExtractor."""
+    """Return the FLAGS of SourceExtractor from the flags of sep.
+
+    The arguments are sep's flags of the detection, of all apertures, and of the aperture of MAG_AUTO, and the bits of
+    the image's flags in the pixels of each source.
+    """
     flags = np.where(detection_flags & sep.OBJ_MERGED, 2, 0) | np.where(detection_flags & sep.OBJ_TRUNC, 8, 0)
     flags |= np.where(auto_flags & (sep.APER_HASMASKED | sep.APER_ALLMASKED), 1, 0)
     flags |= np.where(aperture_flags & sep.APER_TRUNC, 16, 0) | np.where(bits & NO_DATA, 8, 0)
@@ -218,21 +247,22 @@ def _flags(detection_flags: Array, aperture_flags: Array, auto_flags: Array, bit
 
 
 def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[ColumnData]:
-    """Return the columns of a FITS_LDAC catalogue.
+    """Convert measurements to columns of a FITS_LDAC catalogue with the names and units of SourceExtractor.
 
     Parameters
     ----------
     sources : dict of str to array
-        Result of `detect_sources`.
+        Measurements from `detect_sources`.
     system : WCS
         WCS of the image.
     zero_point : float
-        AB magnitude of 1 unit of the image.
+        AB magnitude of a source with the flux 1 in units of the image.
 
     Returns
     -------
     list of ColumnData
-        Name, format, unit and values of each column.
+        Name, FITS format code, unit and values of each column. Pixel coordinates count from 1. Magnitudes and their
+        errors are 99 if the flux is not positive.
     """
     ra, dec = astrometry.sky_of_pixel(system, sources["x"], sources["y"])
     ra_window, dec_window = astrometry.sky_of_pixel(system, sources["xwin"], sources["ywin"])
@@ -264,7 +294,10 @@ def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[C
 
 
 def _axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
-    """Return the long axis, the short axis, and the angle of the long axis in degrees, from second moments."""
+    """Return semi-major axis, semi-minor axis and position angle of the error ellipse with these second moments.
+
+    Moments are in pixels^2, axes in pixels. The angle is in degrees from x to y.
+    """
     middle, off = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))
     return np.sqrt(middle + off), np.sqrt(np.maximum(middle - off, 0.0)), angle

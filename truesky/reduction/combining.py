@@ -1,4 +1,4 @@
-"""Combine frames of the same kind by a clipped mean."""
+"""Combine several frames of the same type (such as bias frames) by a mean that rejects outliers."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ import numpy as np
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 
-# Rows that are combined at a time, to limit memory.
+# Number of rows of the frames that are combined at a time, to limit memory.
 _ROWS = 64
 
 
 @dataclass(frozen=True, slots=True)
 class CombinedFrame:
-    """A combined frame.
+    """Mean of several frames of a detector, pixel by pixel.
 
     Attributes
     ----------
     mean : float32 array, shape (ny, nx)
-        Mean of the frames.
+        Mean of the accepted frames.
     uncertainty : float32 array, shape (ny, nx)
-        Uncertainty of the mean, infinite if no frame is accepted.
+        Standard deviation of the mean, in the same unit; infinite if `clipped_mean` accepts no frame, and 0 everywhere
+        in an image that the user made with another program.
     count : int16 array, shape (ny, nx)
-        Number of accepted frames.
+        Number of frames accepted in each pixel.
     vignetted : bool
-        For a flat, True if its light came through the telescope, so that it contains vignetting.
+        For a flat, True if its light came through the telescope, so that it contains vignetting. Otherwise False.
     """
 
     mean: Float32
@@ -37,22 +38,26 @@ class CombinedFrame:
 
 
 def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip: float = 5.0) -> CombinedFrame:
-    """Return the mean of the frames that are near their median, then of those near that mean.
+    """Average frames pixel by pixel in two steps that reject outliers.
+
+    First, values near the median of the frames are averaged, then values near this average.
 
     Parameters
     ----------
     frames : array, shape (n, ny, nx)
         The frames.
     variance : callable
-        Function of the expected values of pixels [m, nx] and their rows (a slice). It returns the variance of these
-        pixels in one frame.
+        Function of the expected values of pixels [m, nx] and of their row numbers (a slice). It returns the variance of
+        these pixels in a single frame.
     clip : float, optional
-        Largest distance in standard deviations.
+        A value is rejected if it differs from the median (first step) or from the first average (second step) by more
+        than this number of standard deviations.
 
     Returns
     -------
     CombinedFrame
-        The mean with its uncertainty.
+        The mean with its uncertainty. If the last step rejects all values of a pixel, its mean is the number with which
+        they were compared, its count 0 and its uncertainty infinite.
 
     Raises
     ------
@@ -61,8 +66,8 @@ def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip:
 
     Notes
     -----
-    The variance is known in advance, so that few frames are sufficient. From one or two frames, the lower value is used
-    for the first step, since cosmic rays and stars only add light.
+    The variance is given, not measured from the scatter, so a few frames are sufficient. With one or two frames, the
+    first step uses the lower value in place of the median, because cosmic rays and stars only add light.
     """
     if not len(frames):
         raise BadInput("no frames to combine")

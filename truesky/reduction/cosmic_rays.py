@@ -16,14 +16,20 @@ from lake_schema.arrays import Bool
 from lake_schema.errors import OutOfRange
 from truesky.reduction.calibration import COSMIC_RAY, SATURATED, ReducedImage
 
-# Limit for the neighbours of a hit relative to the main limit; minimum contrast to fine structure; iterations.
-_NEIGHBOUR_FACTOR, _CONTRAST, _ROUNDS = 0.3, 5.0, 4
-# Rows that are searched at a time (to limit memory), and additional rows on both sides.
-_ROWS, _MARGIN = 1024, 64
+# Threshold for neighbours of a hit pixel as a fraction of the main threshold (`sigfrac` of astroscrappy).
+_NEIGHBOUR_FACTOR = 0.3
+# Smallest ratio of a hit pixel's Laplacian to the fine structure of its surroundings (`objlim` of astroscrappy).
+_CONTRAST = 5.0
+# Number of iterations of the search (`niter` of astroscrappy).
+_ROUNDS = 4
+# Number of image rows that are searched at a time, to limit memory.
+_ROWS = 1024
+# Number of additional rows on both sides of a searched strip, so that hits at its edges are found correctly.
+_MARGIN = 64
 
 
 def check_limit(limit: float) -> None:
-    """Check the limit of `find_hits`; raises OutOfRange if it is outside 1 to 1000."""
+    """Check the threshold of the cosmic ray search; raises OutOfRange if `limit` is outside 1 to 1000."""
     if not 1.0 <= limit <= 1e3:
         raise OutOfRange("--cosmic-rays", limit, 1.0, 1e3)
 
@@ -34,14 +40,19 @@ def find_hits(image: ReducedImage, limit: float) -> Bool:
     Parameters
     ----------
     image : ReducedImage
-        Image with weights.
+        Calibrated image; the noise is taken from its weights. Pixels with weight 0 are not searched.
     limit : float
-        Limit of a pixel's Laplacian in standard deviations of the noise, 1 to 1000.
+        A pixel is hit if the Laplacian of the image exceeds this multiple of its noise, 1 to 1000.
 
     Returns
     -------
     bool array, shape (ny, nx)
-        True for hit pixels.
+        True for hit pixels; False everywhere if no pixel has a weight.
+
+    Raises
+    ------
+    OutOfRange
+        If `limit` is out of range.
 
     Notes
     -----
@@ -68,7 +79,10 @@ def find_hits(image: ReducedImage, limit: float) -> Bool:
 
 
 def flag_hits(image: ReducedImage, hit: Bool) -> ReducedImage:
-    """Flag hit pixels, and set their weight to 0, except in saturated pixels."""
+    """Return a copy of the image in which hit pixels have the flag COSMIC_RAY and the weight 0.
+
+    Saturated pixels are not changed, even if they are True in `hit` (bool[ny, nx]).
+    """
     hit = hit & (image.flags & SATURATED == 0)
     flags = np.where(hit, image.flags | COSMIC_RAY, image.flags).astype(np.uint8)
     return replace(image, weight=np.where(hit, np.float32(0.0), image.weight), flags=flags)

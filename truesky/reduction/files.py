@@ -1,7 +1,8 @@
-"""Write and read masters, calibrated images and stacks as FITS files.
+"""Write and read masters (combined calibration frames), calibrated images and stacks as FITS files.
 
-A master has the extensions VALUE, UNCERTAINTY and COUNT. A calibrated image and a stack have SCI, WHT (inverse
-variance) and FLG (bits with names in its header). A primary header applies to all extensions.
+A master has the extensions VALUE, UNCERTAINTY and COUNT (number of combined frames). A calibrated image and a stack
+have SCI, WHT (inverse variance) and FLG (flag bits, whose meanings are in the header). The primary header applies to
+all extensions.
 """
 
 from __future__ import annotations
@@ -29,15 +30,18 @@ from truesky.render.camera import astrometry
 from truesky.render.channels import registry
 from truesky.render.effects.light import illumination
 
+# Kinds of masters of a CCD.
 KINDS = ("bias", "dark", "flat")
-# Kinds for infrared detectors, whose ramps have no bias.
+# Kinds of masters of an infrared detector, whose ramps have no bias.
 INFRARED_KINDS = ("dark", "linearity", "flat")
-# Corrections that can be omitted.
+# Names of corrections that a user can omit: corrections by masters, then corrections by mission parameters.
 CORRECTIONS = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "persistence")
+# Unit of each kind of master in FITS notation; a flat is dimensionless.
 _UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1"}
-# Cards that must be equal in a master and the calibrated frame, because the patterns of the detector depend on them.
+# Header cards that must be equal in a master and the frame to calibrate. SEED is the seed of all random numbers of the
+# simulation, on which the pixel pattern of a detector depends.
 SHARED_CARDS = ("INSTRUME", "DETECTOR", "SEED")
-# Cards of a raw file's header that do not apply to a calibrated image. Cards of amplifiers end with a number or letter.
+# Keywords of raw headers that do not apply to a calibrated image, and are therefore not copied to it.
 _RAW_CARDS: tuple[str, ...] = (
     "BUNIT",
     "GAIN",
@@ -50,10 +54,14 @@ _RAW_CARDS: tuple[str, ...] = (
     "NAMPS",
 )
 _RAW_CARDS += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
+# Keywords of single amplifiers, which are not copied to a calibrated image: they end with a number or a letter.
 _AMPLIFIER_CARDS = re.compile(r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT)[A-Z]")
-# Largest number of pixels in a user's master.
+# Largest allowed number of pixels in a master that the user made with another program.
 _MAX_PIXELS = 1 << 28
+# Names of the simulated effects that the correction "nonlinearity" undoes: nonlinearity of CCDs, of each read of an
+# infrared ramp, and of the total signal of a ramp.
 _NONLINEARITY_EFFECTS = {"nonlinearity", "ramp_nonlinearity", "signal_nonlinearity"}
+# Keywords that describe the structure of a FITS file; they are not copied from the raw file.
 _STRUCTURE_CARDS: tuple[str, ...] = (
     "SIMPLE",
     "BITPIX",
@@ -71,32 +79,32 @@ _STRUCTURE_CARDS += ("GCOUNT", "EXTNAME", "BZERO", "BSCALE", "ZCMPTYPE", "COMMEN
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """A calibrated image and its header."""
+    """A calibrated image that was read from a file, and its primary header as cards (keyword, value, comment)."""
 
     reduced: ReducedImage
     cards: tuple[Card, ...]
 
     def card(self, keyword: str) -> Any:
-        """Return the value of a card, or None if the header does not have it."""
+        """Return the value of a keyword in the header, or None if the header does not have it."""
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
 
 def master_kinds(frame: Frame) -> tuple[str, ...]:
-    """Return the kinds of masters with which a frame is calibrated."""
+    """Return the kinds of masters that calibrate a frame: `INFRARED_KINDS` for infrared ramps, otherwise `KINDS`."""
     return INFRARED_KINDS if frame.scene.ramp else KINDS
 
 
 def master_path(folder: Path, frame: Frame, kind: str) -> Path:
-    """Return the path of the master for a frame.
+    """Return the path of the file with the master that calibrates a frame.
 
     Parameters
     ----------
     folder : Path
-        Folder of the masters.
+        Folder of the master files.
     frame : Frame
-        The frame.
+        Frame to calibrate, or one of the frames that are combined to the master.
     kind : str
-        Kind of master, see `master_kinds`.
+        Kind of master: "bias", "dark", "flat" or "linearity".
 
     Returns
     -------
@@ -105,9 +113,10 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
 
     Notes
     -----
-    Files of ground cameras, which all have one channel, are named by the camera, and flats also by the band. The names
-    of user cameras are joined by dots. With underscores, camera a_b in band c would have the same file as camera a in
-    band b_c. A dark of NISP is named by the numbers of its ramp. Both channels of NISP have the same linearity file.
+    File names begin with the channel, such as VIS or NISP-P. Names of ground cameras begin with the camera, because all
+    ground cameras share one channel; their flats also have the band. For cameras that the user defined, parts of the
+    name are joined by dots: with underscores, camera a_b in band c would have the same file as camera a in band b_c. A
+    dark of NISP is named by its readout mode (groups-reads-drops). Both channels of NISP use the same linearity file.
     """
     exposure = frame.exposure
     if frame.scene.ramp:
@@ -123,20 +132,20 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
 def write_master(
     path: Path, combined: CombinedFrame, kind: str, frames: Sequence[Frame], extra_cards: Sequence[Card] = ()
 ) -> None:
-    """Write a master atomically.
+    """Write a master to a FITS file, which appears under its name only when it is complete.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file, which is replaced if it exists.
     combined : CombinedFrame
-        The master.
+        Pixels of the master, their uncertainty and number of frames.
     kind : str
-        Kind of master.
+        Kind of master: "bias", "dark", "flat" or "linearity".
     frames : sequence of Frame
-        Frames that were combined.
+        Frames that were combined, at least one; the header lists their exposures.
     extra_cards : sequence of Card, optional
-        Further cards of the header.
+        Further header cards (keyword, value, comment).
     """
     first = frames[0]
     cards: tuple[Card, ...] = (
@@ -158,19 +167,19 @@ def write_master(
 
 
 def _through_optics(flat: Frame) -> bool:
-    """Return True if the light of the flat came through the telescope, as for a dome flat."""
+    """Return True if the light of the flat came through the telescope and is vignetted, as in a dome flat."""
     return illumination.EFFECT.name in flat.applied and registry.CHANNELS[flat.exposure.channel].on_ground
 
 
 def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, float]:
-    """Read a master for a frame.
+    """Read a master, and check that it can calibrate a frame.
 
     Parameters
     ----------
     path : Path
-        The file.
+        File of `write_master`, or an image that the user made with another program.
     kind : str
-        Kind of master.
+        Kind of master: "bias", "dark", "flat" or "linearity".
     frame : Frame
         Frame to calibrate.
 
@@ -179,17 +188,19 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     combined : CombinedFrame
         The master.
     time : float
-        Mean exposure time of its frames in seconds; infinite for a user's master.
+        Mean exposure time of the combined frames in seconds; infinite for a user's master.
 
     Raises
     ------
     BadInput
-        If the file is of another kind, shape or detector, or from another seed.
+        If the file does not exist, or is for another kind, shape, instrument, detector or seed of the simulation. Only
+        the shape of a user's master is checked.
 
     Notes
     -----
-    A user's master is an image of the detector's pixels in the same units, with NaN for unknown pixels. Its card
-    VIGNETTE tells if a flat contains vignetting; without the card, flats of ground cameras do.
+    A user's master is an image of the detector's pixels in the units of this program, without uncertainty. NaN and
+    infinity are replaced by 1 in a flat and by 0 in other kinds. The card VIGNETTE is T if a flat contains vignetting;
+    without this card, flats of ground cameras are assumed to contain it.
     """
     shape = (frame.scene.ny, frame.scene.nx)
     user_plane, user_header = external.read_planes(
@@ -220,28 +231,37 @@ def _refuse_other_shape(path: Path, shape: tuple[int, ...], expected: tuple[int,
 
 
 def _user_master(values: Float, neutral: float, vignetted: bool) -> CombinedFrame:
-    """Return a master without uncertainty; `neutral` replaces NaN, `vignetted` is for flats."""
+    """Return a master of the user's pixel values with uncertainty 0.
+
+    Values that are not finite are replaced by `neutral` and get the count 0. `vignetted` is True for a flat that
+    contains vignetting.
+    """
     defined = np.isfinite(values)
     mean = np.where(defined, values, neutral).astype(np.float32)
     return CombinedFrame(mean, np.zeros(values.shape, np.float32), defined.astype(np.int16), vignetted)
 
 
 def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibration.Masters:
-    """Read the masters of a frame's detector.
+    """Read the masters (bias, dark and flat) with which a frame of a CCD is calibrated.
 
     Parameters
     ----------
     folder : Path
-        Folder of the masters.
+        Folder of the master files.
     frame : Frame
         Frame to calibrate.
     without : sequence of str, optional
-        Kinds that are not read but replaced by constants.
+        Kinds of masters that are not read: a flat is replaced by 1, a bias or dark by 0.
 
     Returns
     -------
     calibration.Masters
         The masters.
+
+    Raises
+    ------
+    BadInput
+        If a file does not exist, or does not belong to the detector.
     """
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     for kind in KINDS:
@@ -256,23 +276,23 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> cal
 
 
 def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[str]) -> tuple[Card, ...]:
-    """Return the header of a calibrated image: the cards of the raw image, and cards about the calibration.
+    """Return the header of a calibrated image: cards of the raw image, and cards about the calibration.
 
     Parameters
     ----------
     frame : Frame
         The raw frame.
     unit : str
-        Unit of the pixels in FITS notation.
+        Unit of the calibrated pixels in FITS notation, such as "electron/s".
     electrons : float
-        Electrons of the exposure per unit.
+        Number of electrons of the exposure that correspond to the value 1 in the calibrated image.
     without : sequence of str
-        Corrections that were not applied, from `CORRECTIONS`.
+        Names of corrections that were not applied, from `CORRECTIONS`.
 
     Returns
     -------
     tuple of Card
-        Cards.
+        Header cards (keyword, value, comment).
     """
     raw_cards = (
         card
@@ -304,23 +324,23 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
 
 
 def flag_cards() -> tuple[Card, ...]:
-    """Return cards with the meaning of the bits of FLG."""
+    """Return header cards FLAG1, FLAG2, FLAG4, ... with the meaning of each bit of the flag map (extension FLG)."""
     return tuple((f"FLAG{bit}", text, "meaning of bit in FLG") for bit, text in FLAGS)
 
 
 def write_image(path: Path, reduced: ReducedImage, cards: tuple[Card, ...], extensions: Sequence[Image] = ()) -> None:
-    """Write a calibrated image or a stack atomically.
+    """Write a calibrated image or a stack to a FITS file, which appears under its name only when it is complete.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file, which is replaced if it exists.
     reduced : ReducedImage
-        The pixels.
+        Pixels, weights and flags for the extensions SCI, WHT and FLG.
     cards : tuple of Card
-        Header.
+        Primary header. Its WCS is also copied to the three extensions.
     extensions : sequence of Image, optional
-        Further extensions.
+        Further extensions after FLG.
     """
     wcs_cards = tuple(
         card for card in cards if card[0] in _WCS_CARDS or card[0].startswith(("A_", "B_", "PV1_", "PV2_"))
@@ -340,12 +360,12 @@ _WCS_CARDS = tuple(
 
 
 def read_image(path: Path) -> ImageFile:
-    """Read a file of `write_image`.
+    """Read a calibrated image or a stack that `write_image` wrote.
 
     Raises
     ------
     BadInput
-        If the file has other extensions.
+        If the file does not exist, its extensions do not begin with SCI, WHT and FLG, or its WCS is incomplete.
     """
     units = read_images(user_files.check_file(path, "calibrated image"))
     if [unit.name for unit in units[1:4]] != ["SCI", "WHT", "FLG"]:

@@ -1,4 +1,8 @@
-"""Read the raw frames of a lake with the facts about each exposure and detector."""
+"""Find the raw frames in a lake (a folder of simulated tables and images), and read their pixels and headers.
+
+Each frame comes with the planned exposure and with the mission parameters (of telescope, camera and detector) that were
+used to simulate it.
+"""
 
 from __future__ import annotations
 
@@ -37,17 +41,17 @@ class Frame:
     Attributes
     ----------
     path : Path
-        The file.
+        FITS file with the raw pixels.
     exposure : ExposureRow
-        Planned exposure.
+        Row of the table `exposures`: time, pointing, filter and settings of the exposure.
     scene : Scene
-        Parameters of the effects, from the lake's plan and mission.
+        Exposure of this detector with all parameters of the simulated effects (gain, noise, readout mode, ...).
     applied : frozenset of str
-        Names of the effects in the frame, from its header.
+        Names of the optical and detector effects that were simulated in the frame, from its header.
     cards : tuple of Card
-        Header that applies to all arrays; the WCS is for the detector's pixels.
+        Primary header as (keyword, value, comment). The WCS is for the pixels without prescan and overscan.
     psf : Path, optional
-        File of the PSF in the same folder; None if the lake has none.
+        PSF file that was written with the frame; None if the lake does not contain it.
     """
 
     path: Path
@@ -59,36 +63,40 @@ class Frame:
 
     @property
     def detector(self) -> str:
-        """Return the name of the detector."""
+        """Return the name of the detector, for example "3-4" or "DET22"."""
         assert self.scene.detector is not None
         return self.scene.detector.name
 
     @property
     def stem(self) -> str:
-        """Return the stem of the names of files made from this frame."""
+        """Return the file name without suffix for products of this frame: exposure number, channel, band, detector."""
         return f"{self.exposure.exposure_id:06d}_{self.exposure.channel}_{self.exposure.band}_{self.detector}"
 
     @property
     def mean_gain(self) -> float:
-        """Return the mean gain of the amplifiers in electrons per ADU."""
+        """Return the gain in electrons per ADU, averaged over the amplifiers of the detector."""
         return float(np.mean(self.scene.amplifier_values("gain", "electron / adu")))
 
     def card(self, keyword: str) -> Any:
-        """Return the value of a card of the common header, or None."""
+        """Return the value of a keyword in the primary header, or None if the header does not have it."""
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
     def electrons(self) -> Float:
-        """Return the electrons above the level of each amplifier's overscan, float64[ny, nx]."""
+        """Read the pixels and return them in electrons above the overscan level of their amplifier, float64[ny, nx]."""
         return np.asarray(read_back.electrons(self.path).data, np.float64)
 
     def saturated_pixels(self) -> Bool:
-        """Return True for pixels at or above the saturation level of their amplifier, bool[ny, nx]."""
+        """Return a mask that is True for pixels at or above the saturation level of their amplifier, bool[ny, nx]."""
         levels = self._amplifier_values("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
         return amplifiers.pixels_at_least(adu, levels, self.scene)
 
     def fringes(self) -> Float32 | None:
-        """Return the fringes relative to the sky, from the mission parameters, or None without fringes."""
+        """Return the simulated fringe pattern as a fraction of the sky, float32[ny, nx].
+
+        The pattern is recomputed from the mission parameters and the seed in the header. The result is None if the
+        frame was simulated without fringes.
+        """
         effect = fringes.EFFECT
         if effect.name not in self.applied:
             return None
@@ -102,23 +110,31 @@ class Frame:
 
     @property
     def ramp(self) -> tuple[int, int, int]:
-        """Return groups, reads and drops of the ramp."""
+        """Return the readout mode of an infrared ramp: groups, reads per group, and dropped reads between groups."""
         groups, reads, drops = (int(self.card(key)) for key in ("NG", "NR", "ND"))
         return groups, reads, drops
 
     def misfit_pixels(self) -> Bool:
-        """Return True for pixels whose ramp does not fit, bool[ny, nx]; False everywhere for ramps of two groups."""
+        """Return a mask, bool[ny, nx], of pixels whose infrared ramp is not well fitted by a straight line.
+
+        A fit is bad if its chi^2 exceeds the header value QUALLIM, or if the file marks it as bad. The mask is False
+        everywhere if the file has no quality extension. Ramps of two groups have no chi^2, so their mask is also False.
+        """
         units = images.read_images(self.path)
         if len(units) < 3:
             return np.zeros((self.scene.ny, self.scene.nx), bool)
         border, quality = int(self.card("REFPIX")), np.asarray(units[2].data)
         quality = quality[border : len(quality) - border, border : quality.shape[1] - border]
-        # The extension contains either one bit or chi^2.
+        # The quality extension contains either one bit (the header then has QUALFLAG) or chi^2 of the fit.
         flagged = any(key == "QUALFLAG" for key, _, _ in units[2].cards)
         return np.asarray(quality > (0 if flagged else float(self.card("QUALLIM"))))
 
     def _amplifier_values(self, keyword: str) -> float | Float:
-        """Return the value of a card in the common header, or values per amplifier from the headers of the arrays."""
+        """Return the value of a keyword from the primary header, or else one value per amplifier.
+
+        Values of amplifiers are read from the headers of the image extensions. Raises KeyError if one does not have the
+        keyword.
+        """
         if (value := self.card(keyword)) is not None:
             return float(value)
         headers = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
@@ -128,28 +144,32 @@ class Frame:
 def from_lake(
     root: Path, detector_names: Sequence[str] = (), exposures: Iterable[int] = (), request: str | None = None
 ) -> dict[tuple[str, str], list[Frame]]:
-    """Return the frames in a lake by camera and detector.
+    """Return the raw frames of all image types (science, bias, flat, ...) in a lake, by camera and detector.
+
+    Files with other contents, such as maps of the true sky, are left out.
 
     Parameters
     ----------
     root : Path
-        Root of the lake.
+        Folder of the lake.
     detector_names : sequence of str, optional
-        Detectors to return; all by default.
+        Names of the detectors; all detectors by default.
     exposures : iterable of int, optional
-        Numbers of the exposures to return; all by default.
+        Numbers of the exposures; all exposures by default.
     request : str, optional
-        Request whose frames are returned, if the lake has several.
+        Name of the request (simulation job) whose frames are returned. It is required if requests have different
+        frames.
 
     Returns
     -------
     dict of (str, str) to list of Frame
-        Frames by (camera, detector), in the order of exposures.
+        Frames by (camera, detector), each list sorted by exposure number. Empty if the table `products` lists no raw
+        frame and no detector or exposure was given.
 
     Raises
     ------
     BadInput
-        If the lake has no frame of a detector or an exposure.
+        If the lake has no table `products` of the request, or no frame of one of the given detectors or exposures.
     """
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
@@ -190,18 +210,21 @@ def from_lake(
 
 
 def _applied_effects(cards: Iterable[Card]) -> frozenset[str]:
-    """Return the names of the effects with the state `on` in a header."""
+    """Return the names of the effects that a header lists as applied: cards EFFECT<n> with the value "name: on..."."""
     texts = [str(value) for keyword, value, _ in cards if keyword.startswith("EFFECT")]
     return frozenset(name for name, _, state in (text.partition(": ") for text in texts) if state.startswith("on"))
 
 
 def select_types(frames: Sequence[Frame], image_types: Sequence[str]) -> list[Frame]:
-    """Return the frames with one of the image types."""
+    """Return the frames whose image type (such as "bias" or "flat") is in `image_types`, in the same order."""
     return [frame for frame in frames if frame.exposure.image_type in image_types]
 
 
 def common_values(frames: Sequence[Frame], keywords: Sequence[str]) -> Mapping[str, Any]:
-    """Return the values of cards that all frames share; raises BadInput if one differs."""
+    """Return the values of header keywords that all frames must share, by keyword; None for a missing keyword.
+
+    Raises BadInput if two frames have different values. `frames` must not be empty.
+    """
     for keyword in keywords:
         values = {str(frame.card(keyword)) for frame in frames}
         if len(values) > 1:

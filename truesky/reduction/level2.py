@@ -1,7 +1,8 @@
-"""Write the level 2 files of a detector: calibrated image, catalogue, PSF and WCS for other tools.
+"""Write the level 2 files (products of a ground-based survey) of a detector: image, catalogue, PSF and WCS.
 
-NAME.fits has SCI, WHT and FLG, NAME.cat is a FITS_LDAC catalogue, NAME.psf a PSFEx file, and NAME.head has the WCS of
-each array as TPV. The image is written last: if it exists, all files exist.
+NAME.fits is the calibrated image with SCI, WHT (inverse variance) and FLG (flags), and NAME.cat is a FITS_LDAC
+catalogue of sources. NAME.psf is a PSFEx file. NAME.head has the WCS of each extension as text in the convention TPV,
+for SourceExtractor, SCAMP and SWarp. The image is written last: if it exists, all files exist.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry
 from truesky.render.products import head_files
 
-# Default diameter of the aperture, in FWHM of a point source.
+# Default diameter of the aperture of MAG_APER, as a multiple of the FWHM of the PSF.
 _APERTURE_FWHM = 3.0
-# Beginnings of the cards of an image's header that are not copied to the catalogue.
+# Header cards of the image are not copied to the catalogue if their keyword begins with one of these texts.
 _OMITTED_CARDS = ("EFFECT", "EFKEY", "COMMENT", "HISTORY")
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueSettings:
-    """Settings of the catalogue.
+    """Settings of the source catalogue of a calibrated image.
 
     Attributes
     ----------
     limits : Limits
-        Detection limits.
+        Detection threshold and smallest number of pixels of a source.
     diameter : float, optional
-        Diameter of the aperture of MAG_APER in arcsec, 0.01 to 1000; None for 3 FWHM of a point source.
+        Diameter of the aperture of MAG_APER in arcsec, 0.01 to 1000; None for 3 FWHM of the PSF.
 
     Raises
     ------
@@ -56,7 +57,10 @@ class CatalogueSettings:
 
 
 def check_psfs(frames: Sequence[Frame]) -> None:
-    """Check that the lake has the PSF of every frame, before anything is written; raises BadInput otherwise."""
+    """Check that the lake has a PSF file for every frame; raises BadInput for the first frame without one.
+
+    Call this before files are written. Usually only images of ground cameras have a PSF file.
+    """
     for frame in frames:
         _psf_file(frame)
 
@@ -69,25 +73,31 @@ def _psf_file(frame: Frame) -> Path:
 
 
 def write(path: Path, frame: Frame, image: ReducedImage, cards: Sequence[Card], settings: CatalogueSettings) -> int:
-    """Write all files of an image.
+    """Detect sources in a calibrated image, and write the image, catalogue, PSF and .head file.
 
     Parameters
     ----------
     path : Path
-        Path of the image.
+        Path of the image; the other files have the same name with the suffixes .cat, .psf and .head.
     frame : Frame
-        The raw frame.
+        The raw frame from which the image was made.
     image : ReducedImage
-        The calibrated image.
+        The calibrated image in counts.
     cards : sequence of Card
-        Header of the image, with MAGZERO and GAIN.
+        Header of the image, with MAGZERO (AB magnitude of 1 count), GAIN (electrons per count), PIXSCALE (arcsec),
+        PSFFWHM (arcsec) and the WCS.
     settings : CatalogueSettings
-        Settings of the catalogue.
+        Detection limits, and diameter of the aperture.
 
     Returns
     -------
     int
         Number of sources in the catalogue.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no PSF file for the frame.
     """
     psf = _psf_file(frame)
     header_values = {keyword: value for keyword, value, _ in cards}

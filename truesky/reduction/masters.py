@@ -2,13 +2,14 @@
 
     python -m truesky.reduction.masters --lake LAKE [--name REQUEST] --out FOLDER [--detectors 3-4 ..]
 
-Files are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and .._flat.fits (response; 1 if all
-light is counted). Each has its uncertainty and the number of frames per pixel. A flat is divided by the light of its
-lamp, as the mission parameters define it.
+Files of detector 3-4 of VIS are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and
+.._flat.fits (response; 1 if all light is counted). For each pixel, a file also has the uncertainty and the number of
+combined frames. A flat is divided by the light of its lamp, which is known from the mission parameters.
 
-For NISP, files are NISP-P_4-16-4_DET22_dark.fits (for each ramp), NISP_DET22_linearity.fits (b of N (1 - b N) in
-1/electron, from flats at three or more intensities) and NISP-P_euclid_y_DET22_flat.fits (for the mixture of lamps that
-is most similar to the sky).
+Files of detector DET22 of NISP are NISP-P_4-16-4_DET22_dark.fits (one for each readout mode: groups, reads, drops),
+NISP_DET22_linearity.fits and NISP-P_euclid_y_DET22_flat.fits (one for each band, for the mixture of lamps whose colour
+is most similar to the sky). The linearity is the coefficient b in 1/electron: of N electrons, N (1 - b N) are measured.
+It is fitted to flats of one lamp at three or more intensities.
 """
 
 from __future__ import annotations
@@ -33,28 +34,30 @@ from truesky.render.effects.light import calibration_lamp, illumination
 
 
 def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, CombinedFrame, list[Frame]]]:
-    """Make the masters that a detector's calibration frames allow: bias, dark, and a flat of each band.
+    """Combine the calibration frames of a CCD to master frames: a bias, a dark, and a flat of each band.
+
+    The dark is omitted if there are no dark frames, and the flats if there are no flat frames.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames of the detector.
+        Frames of the detector, at least one; all image types except bias, dark and flat are ignored.
     scratch : Path
-        Folder for temporary files, 4 bytes per pixel and frame.
+        Folder for temporary files, which take 4 bytes per pixel and frame.
 
     Yields
     ------
     kind : str
-        Kind of master.
+        Kind of master: "bias", "dark" or "flat".
     master : CombinedFrame
-        The master.
+        The master: bias in electrons, dark in electrons per second, or flat as response.
     frames : list of Frame
         Frames that were combined.
 
     Raises
     ------
     BadInput
-        If there is no bias frame.
+        If there is no bias frame, or if frames of a master differ in instrument, detector, seed or mission parameters.
     """
     shape = frames[0].scene.ny, frames[0].scene.nx
     masters = {kind: calibration.neutral_master(shape, 0.0) for kind in ("bias", "dark")}
@@ -71,7 +74,7 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
 
 
 def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:
-    """Return the frames by master: flats by band, others together."""
+    """Divide frames of one kind into groups that give one master each: flats by band, biases or darks all together."""
     groups: dict[str, list[Frame]] = {}
     for frame in frames:
         groups.setdefault(frame.exposure.band if kind == "flat" else "", []).append(frame)
@@ -81,10 +84,14 @@ def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:
 def _combine_frames(
     kind: str, frames: Sequence[Frame], masters: Mapping[str, CombinedFrame], stack: Array
 ) -> CombinedFrame:
-    """Combine frames of a kind to a master; `stack`, float32[n, ny, nx], is temporary space."""
+    """Combine n frames of a kind ("bias", "dark" or "flat") to a master.
+
+    `masters` has the bias and dark that are subtracted from the frames. `stack`, float32[n, ny, nx], is overwritten as
+    temporary space.
+    """
     unit = np.zeros(stack.shape[1:])
     for number, frame in enumerate(frames):
-        # Electrons per unit of the master.
+        # Electrons of the frame that correspond to the value 1 in the master (lamp light, seconds, or 1 for a bias).
         frame_unit = (
             _lamp_charge(frame) if kind == "flat" else frame.exposure.exposure_time_s if kind == "dark" else 1.0
         )
@@ -101,19 +108,22 @@ def _combine_frames(
 
 
 def _counted_charge(frame: Frame, bias: CombinedFrame, dark: CombinedFrame) -> Float:
-    """Return the counted electrons without bias and dark current."""
+    """Return the electrons of a frame without bias and dark current, corrected for crosstalk and nonlinearity."""
     electrons = amplifiers.undo_effects(frame.electrons() - bias.mean, frame.scene, frame.applied)
     return np.asarray(electrons - dark.mean * frame.scene.exposure_time_s)
 
 
 def _lamp_charge(frame: Frame) -> Float:
-    """Return the electrons that the lamp of a flat would give if all light were counted, float64[ny, nx]."""
+    """Return the electrons per pixel that the lamp of a flat would give at a response of 1, float64[ny, nx]."""
     electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
     return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command, print a line per master, and return the exit status."""
+    """Run the command `truesky masters`, print a line per master frame, and return the exit status.
+
+    `argv` are the arguments of the command; None means the arguments of the process.
+    """
     parser = argparse.ArgumentParser(prog="truesky masters", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake with rendered calibration frames")
     parser.add_argument("--name", help="request whose frames are used, if the lake has several")
@@ -150,7 +160,7 @@ def _write_masters(options: argparse.Namespace) -> int:
 
 
 def _required_types(frame: Frame) -> tuple[str, ...]:
-    """Return the image types from which masters are made; a detector needs at least one of them."""
+    """Return image types of which a detector needs at least one frame: dark or flat for infrared, bias for a CCD."""
     return ("dark", "flat") if frame.scene.ramp else ("bias",)
 
 

@@ -1,4 +1,4 @@
-"""Model point sources on a frame's detector."""
+"""Return the PSF that was used to simulate a frame, and the fraction of its light in an aperture."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from truesky.reduction.frames import Frame
 from truesky.render.channels import registry
 from truesky.render.psf import from_file
 
-# Number of positions on a detector at which the PSF is computed.
+# Number of positions on a detector for which the PSF is computed from mission parameters; 1 means only the centre.
 _POSITIONS = 1
 
 
 def profile(frame: Frame) -> Any:
-    """Return the PSF at the centre of a frame's detector, a galsim object in the detector's axes without the pixel."""
+    """Return the PSF at the centre of a frame's detector as a galsim object, in arcsec along the detector's axes.
+
+    The PSF is not convolved with the pixel. It is read from the PSF file of the exposure, if it has one, and otherwise
+    computed from the mission parameters.
+    """
     scene, exposure = frame.scene, frame.exposure
     assert scene.detector is not None
     assert scene.band is not None
@@ -33,16 +37,16 @@ def enclosed_fraction(psf: Any, scale: float, radius: float) -> float:
     Parameters
     ----------
     psf : galsim object
-        PSF without the pixel.
+        PSF not convolved with the pixel, with a total flux of 1.
     scale : float
         Pixel scale in arcsec.
     radius : float
-        Radius of the aperture in pixels.
+        Radius of the aperture in pixels, centred on the source.
 
     Returns
     -------
     float
-        Fraction of the light.
+        Fraction of the light, 0 to 1.
     """
     side = 2 * int(np.ceil(radius)) + 5
     image = psf.drawImage(nx=side, ny=side, scale=scale, dtype=float).array

@@ -4,9 +4,9 @@
                                  [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
                                  [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
 
-Each frame of the sky gives a file with the extensions SCI, WHT (inverse variance) and FLG (bits). SCI is in electrons,
-in electrons per second, or for level 2 in counts of the mean gain. Level 2 adds a catalogue of sources, the PSF and a
-.head file in the same folder.
+Each frame of the sky gives a FITS file with the extensions SCI, WHT (inverse variance) and FLG (flag bits). The unit of
+SCI is the electron, with --rate electrons per second, and with --level2 counts (electrons / mean gain of amplifiers).
+Level 2 adds a catalogue of sources, the PSF and a .head file (WCS as text) in the same folder.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from truesky.reduction.infrared.persistence_prediction import PersistencePredict
 from truesky.render.channels import registry
 from truesky.render.channels.image_types import SKY_TYPES
 
-# Default limit of cosmic rays for level 2 (van Dokkum 2001).
+# Default threshold of the cosmic ray search for level 2, in standard deviations of the noise (van Dokkum 2001).
 _COSMIC_RAY_SIGMA = 4.5
 
 
@@ -43,11 +43,11 @@ class ReductionOptions:
     Attributes
     ----------
     unit : str
-        Unit of the pixels: electron, electron/s or adu.
+        Unit of the output pixels: "electron", "electron/s" or "adu".
     without : tuple of str
-        Corrections that are omitted, from files.CORRECTIONS.
+        Names of corrections that are omitted, such as "flat", see `files.CORRECTIONS`.
     cosmic_rays : float
-        Limit of cosmic rays in standard deviations; 0 to skip the search.
+        Threshold of the cosmic ray search in standard deviations of the noise, 1 to 1000; 0 to skip the search.
     """
 
     unit: str = "electron"
@@ -58,7 +58,7 @@ class ReductionOptions:
 def reduce_frame(
     frame: Frame, masters: Masters, reduction: ReductionOptions, prediction: PersistencePrediction | None = None
 ) -> tuple[ReducedImage, tuple[Card, ...]]:
-    """Calibrate a frame with the masters of its detector.
+    """Calibrate a raw frame with the masters (combined bias, dark and flat frames) of its detector.
 
     Parameters
     ----------
@@ -67,16 +67,17 @@ def reduce_frame(
     masters : Masters
         Masters of the detector.
     reduction : ReductionOptions
-        Options.
+        Unit of the result, omitted corrections, and threshold for cosmic rays.
     prediction : PersistencePrediction, optional
-        Persistence in a NISP detector; None to leave it in the image.
+        Predicts the persistence in frames of a NISP detector, which is subtracted. None to leave it in the image; it is
+        ignored for other cameras.
 
     Returns
     -------
     image : ReducedImage
         The calibrated image.
     cards : tuple of Card
-        Its header.
+        Header of the calibrated image.
     """
     electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(reduction.unit) or frame.mean_gain
     corrected_effects = frame.applied - set(reduction.without)
@@ -94,7 +95,10 @@ def reduce_frame(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command, print a line per image, and return the exit status."""
+    """Run the command `truesky reduce`, print a line per calibrated image, and return the exit status.
+
+    `argv` are the arguments of the command; None means the arguments of the process.
+    """
     parser = argparse.ArgumentParser(prog="truesky reduce", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake with rendered frames")
     parser.add_argument("--name", help="request whose frames are used, if the lake has several")
@@ -157,7 +161,11 @@ def _write_images(options: argparse.Namespace) -> int:
 def _with_masters(
     frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
 ) -> Iterator[tuple[Frame, Masters]]:
-    """Yield frames of a detector with masters, which are read once per band and ramp."""
+    """Yield each frame of a detector with its masters (combined bias, dark and flat frames).
+
+    Frames are grouped by band and infrared readout mode, and the masters are read once per group. Raises BadInput if
+    `folder` is None and `without` does not omit every kind of master.
+    """
     groups = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
     for group in dict.fromkeys(groups):
         group_frames = [frame for frame, frame_group in zip(frames, groups, strict=True) if frame_group == group]
@@ -171,7 +179,7 @@ def _with_masters(
 
 
 def _sees_sky(frame: Frame) -> bool:
-    """Return True for frames of the sky, including NISP frames of standard stars and nebulae."""
+    """Return True if the frame is an exposure of the sky; for NISP also of standard stars and planetary nebulae."""
     kind = frame.exposure.image_type
     return kind in SKY_TYPES or (bool(frame.scene.ramp) and registry.CHANNELS[frame.exposure.channel].sees_sky(kind))
 

@@ -1,7 +1,8 @@
-"""Resample calibrated images to the pixels of another map of the sky, by drizzle with pixels of full size.
+"""Resample calibrated images to the pixels of another map of the sky, by drizzle with pixfrac = 1.
 
-The electrons of a pixel are distributed evenly over its area on the sky. A pixel of the grid receives those that fall
-into it. The total light is conserved, and neighbouring pixels of the grid have correlated noise.
+The light of an input pixel is distributed evenly over the pixel's area on the sky. A pixel of the output grid receives
+the light that falls into it. The total light is conserved except at the edges, where partly covered pixels get the
+light of completely covered ones. Neighbouring pixels of the grid have correlated noise.
 
 References
 ----------
@@ -23,51 +24,53 @@ from lake_schema.errors import BadInput, OutOfRange
 from truesky.reduction.calibration import ReducedImage
 from truesky.render.camera import astrometry, pointing
 
-# Distance in pixels of projected positions. A cubic spline between them has an error of 1e-6 pixels.
+# Spacing in pixels of the positions that are projected with the WCS. Cubic splines between them are exact to 1e-6.
 _NODES = 64
-# Largest side of a grid in pixels.
+# Largest allowed side of an output grid in pixels.
 _MAX_SIDE = 60_000
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Pixels of a map of the sky, with the shape (ny, nx)."""
+    """Map of the sky to which images are resampled: its WCS, and its shape (ny, nx) in pixels."""
 
     wcs: WCS
     shape: tuple[int, int]
 
     def window(self, x: int, y: int, shape: tuple[int, int]) -> Grid:
-        """Return a section of the grid.
+        """Return a rectangular section of the grid, whose pixels have the same positions on the sky.
 
         Parameters
         ----------
         x, y : int
-            First pixel of the section.
+            Column and row of the section's first pixel, from 0. The section may extend beyond the grid.
         shape : (int, int)
-            Shape of the section.
+            Shape (ny, nx) of the section.
 
         Returns
         -------
         Grid
-            The section.
+            The section, whose pixel coordinates begin at 0.
         """
         return Grid(astrometry.shift_pixels(self.wcs, -x, -y), shape)
 
 
 @dataclass(frozen=True, slots=True)
 class ResampledImage:
-    """An image on a grid; all arrays are float32[ny, nx].
+    """An image that was resampled to an output grid; all arrays are float32[ny, nx] of this grid.
 
     Attributes
     ----------
     image : float32 array
-        Light in each pixel of the grid, 0 without data.
+        Light in each pixel of the grid, in the unit of the input image; 0 without data. A pixel that is only partly
+        covered has the light that it would have if it were covered completely with the same mean brightness.
     cover : float32 array
-        Fraction of each pixel that good pixels of the image cover.
+        Fraction of the area of each grid pixel that is covered by good input pixels, 0 to about 1.
     variance : float32 array
-        Variance of each pixel.
+        Variance of each single pixel.
     density : float32 array
-        Variance of a sum over many pixels per pixel. It is larger than `variance`, because neighbours share noise.
+        Variance of the sum over a large area, divided by its number of pixels. It is larger than `variance`, because
+        neighbouring pixels have correlated noise.
     """
 
     image: Float32
@@ -77,26 +80,26 @@ class ResampledImage:
 
 
 def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -> Grid:
-    """Return a gnomonic map with north up that covers several images.
+    """Return a grid in gnomonic projection with north up that covers several images.
 
     Parameters
     ----------
     images : sequence of (WCS, tuple of int)
-        WCS and shape of each image.
+        WCS and shape (ny, nx) of each image, at least one image.
     scale : float
-        Pixel scale in arcsec, 0.001 to 100.
+        Pixel scale of the grid in arcsec, 0.001 to 100.
 
     Returns
     -------
     Grid
-        The grid.
+        The grid. The mean of the images' positions is the reference point of its projection.
 
     Raises
     ------
     OutOfRange
         If the scale is out of range.
     BadInput
-        If a side of the grid would be too long.
+        If a side of the grid would be longer than 60,000 pixels.
     """
     if not 1e-3 <= scale <= 100.0:
         raise OutOfRange("scale of the stack, arcsec", scale, 1e-3, 100.0)
@@ -114,7 +117,7 @@ def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -
     system.wcs.radesys, system.wcs.lonpole = "ICRS", 180.0
     system.wcs.set()
     x, y = astrometry.pixel_of_sky(system, ra, dec)
-    # Add a pixel on each side, because edges are curved.
+    # Add a pixel on each side, because the edges of images are curved on the sky.
     first = [int(np.floor(v.min())) - 1 for v in (x, y)]
     nx, ny = (int(np.ceil(v.max())) + 2 - low for v, low in zip((x, y), first, strict=True))
     if max(nx, ny) > _MAX_SIDE:
@@ -124,29 +127,29 @@ def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -
 
 def _corners(shape: tuple[int, ...]) -> tuple[Float, Float]:
     ny, nx = shape
-    # Include the centres of the sides, since distortion bends the sides.
+    # Include the centres of the four sides: distortion may bend a side outwards, beyond its corners.
     x, y = np.meshgrid([-0.5, nx / 2, nx - 0.5], [-0.5, ny / 2, ny - 0.5])
     return x.ravel(), y.ravel()
 
 
 def pixel_map(system: WCS, shape: tuple[int, ...], grid: Grid) -> tuple[Float, Float]:
-    """Return the positions and areas of an image's pixels on a grid.
+    """Return the position and the area of each pixel of an image, in pixels of an output grid.
 
     Parameters
     ----------
     system : WCS
         WCS of the image.
     shape : tuple of int
-        Shape of the image.
+        Shape (ny, nx) of the image.
     grid : Grid
-        The grid.
+        The output grid.
 
     Returns
     -------
     pixmap : float array, shape (ny, nx, 2)
-        x and y on the grid of each pixel of the image.
+        Coordinates (x, y) of each image pixel's centre on the grid, from 0. They may be outside the grid.
     area : float array, shape (ny, nx)
-        Area of each pixel of the image, in pixels of the grid.
+        Area of each image pixel in units of a grid pixel.
     """
     nodes = [np.linspace(0.0, n - 1.0, max(n // _NODES + 1, 4)) for n in shape]
     columns, rows = np.meshgrid(nodes[1], nodes[0])
@@ -159,23 +162,23 @@ def pixel_map(system: WCS, shape: tuple[int, ...], grid: Grid) -> tuple[Float, F
 
 
 def resample(image: ReducedImage, pixmap: Float, area: Float, shape: tuple[int, int]) -> ResampledImage:
-    """Resample the pixels of an image with a weight above 0 to a grid.
+    """Resample an image to an output grid; only its pixels with a weight above 0 are used.
 
     Parameters
     ----------
     image : ReducedImage
         The image.
     pixmap : float array, shape (ny, nx, 2)
-        Positions of its pixels from `pixel_map`.
+        Coordinates (x, y) of the image's pixels on the grid, from `pixel_map`.
     area : float array, shape (ny, nx)
-        Areas of its pixels from `pixel_map`.
+        Areas of the image's pixels in grid pixels, from `pixel_map`.
     shape : (int, int)
-        Shape of the grid.
+        Shape (ny, nx) of the grid.
 
     Returns
     -------
     ResampledImage
-        The image on the grid.
+        The image on the grid, with cover 0 in grid pixels that no good image pixel reaches.
 
     Notes
     -----
@@ -190,7 +193,8 @@ def resample(image: ReducedImage, pixmap: Float, area: Float, shape: tuple[int, 
     image_drizzle.add_image(brightness, data2=(variance / area**2).astype(np.float32), **common)
     density_drizzle = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
     density_drizzle.add_image((variance / area).astype(np.float32), **common)
-    # Drizzle's weight is the fraction of the image pixel's area that falls into the pixel of the grid.
+    # Drizzle's weights are sums of fractions of image pixels. Times the area of an image pixel they are the covered
+    # fraction of a grid pixel.
     cover = np.asarray(image_drizzle.out_wht, np.float32) * float(np.mean(area))
     return ResampledImage(
         _without_nan(image_drizzle.out_img),

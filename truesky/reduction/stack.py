@@ -2,10 +2,10 @@
 
     python -m truesky.reduction.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
 
-The extensions are SCI (electrons per second and pixel, including the sky), WHT (inverse variance per pixel of sums over
-many pixels) and FLG. With --lake, the extension PSF has a point source near the centre, with three samples per pixel.
-Neighbouring pixels share noise, so the variance of a single pixel is smaller than 1 / WHT, by the factor in the card
-CORRVAR.
+The extensions of the stack are SCI (electrons per second in each pixel, including the sky), WHT and FLG (flag bits).
+The sum over n pixels has the variance n / WHT. The noise of neighbouring pixels is correlated, so the variance of a
+single pixel is smaller: 1 / WHT divided by the header value CORRVAR. With --lake, the extension PSF has the image of a
+point source near the centre, with three samples per pixel along each axis.
 """
 
 from __future__ import annotations
@@ -32,17 +32,23 @@ from truesky.reduction.resampling import Grid, ResampledImage, covering_grid, pi
 from truesky.reduction.stacking import Contribution, Stack
 from truesky.render.camera import astrometry
 
-# Cards that must be equal in all images of a stack.
+# Header keywords whose values must be equal in all images of a stack.
 _SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
-# Other required cards; the second group must be numbers above 0.
-_REQUIRED_CARDS, _NUMBER_CARDS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
+# Other keywords that each image must have.
+_REQUIRED_CARDS = ("IMAGETYP", "DETECTOR")
+# Keywords that each image must have with a number above 0 as value.
+_NUMBER_CARDS = ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
 
 
 def to_rate(image: ImageFile) -> ReducedImage:
-    """Return an image in electrons per second."""
+    """Convert a calibrated image from its unit (electrons or counts) to electrons per second.
+
+    An image that is already in electrons per second is returned unchanged. Weights are converted, too. The header must
+    have EXPTIME (exposure time in seconds) and GAIN (electrons per unit of the image).
+    """
     if image.card("BUNIT") == "electron/s":
         return image.reduced
-    # Signal that 1 e-/s gives in the exposure, in units of the image (BUNIT).
+    # Value in the image that 1 electron per second gives: exposure time divided by electrons per unit.
     units_per_rate = float(image.card("EXPTIME")) / float(image.card("GAIN"))
     counts = image.reduced
     return ReducedImage(
@@ -53,23 +59,23 @@ def to_rate(image: ImageFile) -> ReducedImage:
 
 
 def stack_images(images: Sequence[tuple[ReducedImage, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
-    """Stack images.
+    """Resample images to a common grid that covers every image, and average them without outliers.
 
     Parameters
     ----------
     images : sequence of (ReducedImage, WCS)
-        Images in electrons per second, with their WCS.
+        Images in electrons per second, with their WCS; at least one.
     scale : float
-        Pixel scale of the stack in arcsec.
+        Pixel scale of the stack in arcsec, 0.001 to 100.
 
     Returns
     -------
     stack : Stack
-        The stack.
+        The average.
     grid : Grid
-        Its pixels.
+        WCS and shape of the stack.
     weights : list of float
-        Weight of each image.
+        Weight of each image: the median of its weights above 0, or 0 if it has no good pixel.
     """
     grid = covering_grid([(system, image.image.shape) for image, system in images], scale)
     placed: list[ResampledImage] = []
@@ -83,7 +89,10 @@ def stack_images(images: Sequence[tuple[ReducedImage, WCS]], scale: float) -> tu
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command, print a line about the stack, and return the exit status."""
+    """Run the command `truesky stack`, print a line about the stack, and return the exit status.
+
+    `argv` are the arguments of the command; None means the arguments of the process.
+    """
     parser = argparse.ArgumentParser(prog="truesky stack", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("images", nargs="+", type=Path, help="files of truesky.reduction.reduce")
     parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
@@ -139,7 +148,10 @@ def _refuse_different(paths: Sequence[Path], images: Sequence[ImageFile]) -> Non
 
 
 def _refuse_other(path: Path, image: ImageFile) -> None:
-    """Check that a file is an image of truesky.reduction.reduce."""
+    """Check that a file is a calibrated image of the command `truesky reduce` with all required keywords.
+
+    Raises BadInput for a stack, a missing keyword, or a number that is not above 0.
+    """
     if image.card("IMAGETYP") == "stack":
         raise BadInput(f"{user_files.format_path(path)}: is a stack: use the images from which it was made")
     for keyword in (*_SHARED_CARDS, *_REQUIRED_CARDS, *_NUMBER_CARDS):
@@ -151,7 +163,10 @@ def _refuse_other(path: Path, image: ImageFile) -> None:
 
 
 def _find_frames(root: Path, images: Sequence[ImageFile], request: str | None) -> list[Frame]:
-    """Return the frames in the lake from which the images were made."""
+    """Return the raw frames in the lake from which the images were made, in the order of `images`.
+
+    Frames are identified by exposure number and detector. Raises BadInput if one is missing.
+    """
     numbers = {int(image.card("EXPOSURE")) for image in images}
     names = sorted({str(image.card("DETECTOR")) for image in images})
     frames_by_key = {
@@ -167,7 +182,7 @@ def _find_frames(root: Path, images: Sequence[ImageFile], request: str | None) -
 
 
 def _central_psf(contributions: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
-    """Return the PSF near the centre of the stack, at a position where it is deepest."""
+    """Return the extension PSF: the effective PSF in the deepest part of the stack, with its position in the header."""
     x, y = _deepest_place(stack.reduced.weight)
     ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
     cards: tuple[Card, ...] = (
@@ -179,7 +194,11 @@ def _central_psf(contributions: Sequence[Contribution], grid: Grid, stack: Stack
 
 
 def _deepest_place(weight: Float) -> tuple[float, float]:
-    """Return (x, y) of the central pixel among the deepest quarter, if possible away from edges."""
+    """Return (x, y) of a central pixel in the deepest part of a stack: the 25 % of the pixels with the highest weights.
+
+    If possible, the pixel is at least half a PSF image away from pixels without data. The result is (0, 0) if all
+    weights are 0.
+    """
     if not weight.any():
         return 0.0, 0.0
     deep = weight >= np.percentile(weight[weight > 0.0], 75.0)

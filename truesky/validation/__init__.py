@@ -1,1 +1,1 @@
-"""Validation: figures of the simulated sky compared with expectations from theory and from observations."""
+"""Validation: numbers measured in the simulated sky are compared with expectations from theory and observations."""

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-# This must be set before any module imports numpy.
+# Set the number of threads before any import of numpy, because numpy reads this variable only once.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from lake_schema import command, user_files
@@ -32,7 +32,11 @@ from truesky.validation.verdicts import FAIL, UNDECIDED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Return the exit status: 0 = success, 1 = unexpected failure of a check or of the disc, 2 = wrong call."""
+    """Run the validation of a lake or of the simulated universe, and return the exit status.
+
+    The status is 0 for success, 1 if a check fails that is not known to fail or a file cannot be read or written, and 2
+    for wrong arguments. `argv` are the arguments of the command; None means the arguments of the process.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.validation",
         description=__doc__,
@@ -58,7 +62,7 @@ def _validate(options: argparse.Namespace) -> int:
     for name in ("name", "exposures", "report"):
         if getattr(options, name):
             raise BadInput(f"--{name} requires --lake")
-    # The figures take a quarter of an hour to compute, so the targets are checked first.
+    # Check that the output files can be written before the computation, which takes a quarter of an hour.
     if options.json is not None:
         user_files.check_target(options.json)
     if options.figures is not None:
@@ -80,7 +84,10 @@ def _validate(options: argparse.Namespace) -> int:
 
 
 def _validate_lake(options: argparse.Namespace) -> int:
-    """Validate a lake; print failed and undecided checks and the path of the report."""
+    """Validate the tables and images of a lake, print failed and undecided checks and the path of the report.
+
+    Returns the exit status: 1 if a check fails that is not known to fail, otherwise 0. Wrong options raise BadInput.
+    """
     for name in ("json", "figures", "quick"):
         if getattr(options, name):
             raise BadInput(f"--{name}: must not be used with --lake; the table and the report contain all results")

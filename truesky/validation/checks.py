@@ -1,4 +1,4 @@
-"""Expected values of the figures of the simulated universe, and checks of the figures against them."""
+"""Compare figures (numbers measured in the simulated universe, by name) with expected values from CSV files."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 
 from truesky.validation.verdicts import AT_LEAST, AT_MOST, FAIL, PASS, UNDECIDED, WITHIN, verdict
 
-# Expectations from the sources of the models, and observations by surveys.
+# CSV files with expected values: from the papers on which the models are based, and from observations by surveys.
 _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name("observed.csv"))
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One figure and its expectation.
+    """A figure (a number measured in the simulated universe) and the value that is expected for it.
 
     Attributes
     ----------
@@ -25,17 +25,18 @@ class Check:
     value : float
         Measured value.
     expected, tolerance : float
-        Expected value and allowed deviation, in the unit of the value; the tolerance of "least" and "most" is 0.
+        Expected value and allowed deviation, in the unit of `value`. For the kinds "least" and "most" the tolerance is
+        0, because it is already included in `expected`.
     kind : str
-        "around", "least" or "most".
+        "around" (within the tolerance of the expected value), "least" (at least the expected value) or "most".
     source : str
-        Source of the expectation.
+        Publication from which the expected value is taken.
     group : str
-        Group of the expectation, "" if none.
+        Heading under which a report lists the check; "" for none.
     known_failure : str
-        Reason for which the check is known to fail, "" if it must pass.
+        Reason why the check is known to fail; "" if it must pass.
     is_binding : bool
-        True if a failure counts. False if the expected value is quoted from memory.
+        True if a failure counts. False if the expected value is quoted from memory: the verdict is then undecided.
     """
 
     name: str
@@ -50,53 +51,61 @@ class Check:
 
     @property
     def lower_limit(self) -> float:
-        """Smallest value that passes."""
+        """Return the smallest value that passes the check, -inf for the kind "most"."""
         return -math.inf if self.kind == AT_MOST else self.expected - self.tolerance
 
     @property
     def upper_limit(self) -> float:
-        """Largest value that passes."""
+        """Return the largest value that passes the check, inf for the kind "least"."""
         return math.inf if self.kind == AT_LEAST else self.expected + self.tolerance
 
     @property
     def passes(self) -> bool:
-        """True if the value is as expected; the tolerance includes its error."""
+        """Return True if the value is within its limits.
+
+        The measurement error is not considered, because the tolerance already includes it. NaN does not pass.
+        """
         return verdict(self.value, 0.0, self.expected, self.tolerance, self.kind) == PASS
 
     @property
     def verdict(self) -> str:
-        """PASS or FAIL; UNDECIDED if the expectation is not binding."""
+        """Return PASS or FAIL, or UNDECIDED if the expected value is quoted from memory (`is_binding` is False)."""
         return (PASS if self.passes else FAIL) if self.is_binding else UNDECIDED
 
     @property
     def is_unexpected_failure(self) -> bool:
-        """True if the check fails and is not known to fail."""
+        """Return True if the verdict is FAIL and no reason for a known failure is given."""
         return self.verdict == FAIL and not self.known_failure
 
 
 def evaluate(figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
-    """Check every measured figure with an expectation; widen tolerances by at least `n_sigma` errors of the figure."""
+    """Check figures (measured values by name) against expectations.csv and observed.csv; others are ignored.
+
+    The standard error of a figure is expected under its name + "_error", and is 0 if missing. Tolerances are increased
+    by at least `n_sigma` standard errors.
+    """
     return [check for path in _LISTS for check in read(path, figures, n_sigma)]
 
 
 def read(path: Path, figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
-    """Check figures against the expectations of a file.
+    """Check figures (measured values by name) against the expected values in a file.
 
     Parameters
     ----------
     path : Path
-        CSV file with columns name, expected, kind (relative, absolute, factor, least, most), tolerance, source and
-        known_to_fail. Optional columns: group, errors (number of errors of the figure that widen the tolerance) and
-        confidence (M: quoted from memory, not binding).
+        CSV file with columns name, expected, kind, tolerance, source and known_to_fail (a reason, or empty). The
+        tolerance is a fraction of the expected value (kind relative), an absolute deviation (absolute, least, most) or
+        a factor of at least 1 (factor). Optional columns: group (a heading), errors (number of standard errors by which
+        the tolerance is increased) and confidence (M: quoted from memory, so a failure does not count).
     figures : mapping of str to float
-        Measured values by name, with errors by name + "_error".
+        Measured values by name, and their standard errors by name + "_error" (0 if missing).
     n_sigma : float
-        Smallest number of errors of the figure that widen the tolerance.
+        Tolerances are increased by at least this number of standard errors.
 
     Returns
     -------
     list of Check
-        One check for each expectation of a figure that was measured.
+        One check for each row of the file whose figure was measured, in the order of the file.
     """
     results = []
     with path.open(newline="", encoding="utf-8") as file:
@@ -120,7 +129,10 @@ def read(path: Path, figures: Mapping[str, float], n_sigma: float = 0.0) -> list
 
 
 def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
-    """Print every figure and every check; return the names of checks that do not pass."""
+    """Print every figure (measured value) and every check, and return the names of checks that do not pass.
+
+    The names include known failures and checks whose expected value is quoted from memory.
+    """
     expected = {check.name for check in results}
     for name, value in figures.items():
         if name not in expected and not name.endswith("_error"):

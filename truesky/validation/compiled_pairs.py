@@ -1,4 +1,4 @@
-"""Compiled sums over pairs of positions on the sky, for `truesky.validation.pairs`."""
+"""Loops over pairs of close positions on the sky, compiled by numba; `truesky.validation.pairs` calls them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,28 @@ from truesky.numerics.compiling import exact_jit
 def count_pairs(
     cube_starts: Int, cube_pairs: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float
 ) -> None:
-    """Add pairs to `sums` by the patches of both ends, separation, and kind.
+    """Count pairs of positions by the jackknife patches of both positions, separation, and kinds of the positions.
+
+    Pairs outside the separation bins are ignored.
 
     Parameters
     ----------
     cube_starts : int array, shape (c + 1,)
-        Row at which each cube begins; positions are sorted by cube.
+        Space is divided into cubes, and positions are sorted by cube. Element k is the row of the first position in
+        cube k; the last element is n.
     cube_pairs : int array, shape (2, m)
-        Cubes that may contain close pairs, each pair of cubes once, and each cube with itself.
+        Numbers of the cubes between which pairs are counted: each pair of cubes once, and each cube with itself.
     place : float array, shape (n, 3)
-        Unit vectors.
+        Positions as unit vectors.
     kind : int array, shape (n,)
-        0 or 1.
+        0 or 1, for example galaxies and random positions.
     patch : int array, shape (n,)
-        Patch of each position, from 0.
+        Number of the jackknife patch of each position, from 0.
     edge : float array, shape (b + 1,)
-        Edges of the separation bins as squared chords, ascending.
+        Edges of the separation bins as squares of chords on the unit sphere, ascending.
     sums : float array, shape (patches, patches, b, 3)
-        Numbers of pairs, changed in place; the last axis is the sum of the two kinds.
+        Numbers of pairs, to which the pairs are added in place. The index of the last axis is the sum of both kinds:
+        0 for 0-0, 1 for 0-1 and 2 for 1-1.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -48,20 +52,20 @@ def count_pairs(
 
 @exact_jit
 def sum_products(cube_starts: Int, cube_pairs: Int, place: Float, value: Float, edge: Float, sums: Float) -> None:
-    """Add numbers, separations and products of values of pairs to `sums`, by separation.
+    """Sum over pairs of positions, by separation: 1, the separation, and the products of quantities at both positions.
 
     Parameters
     ----------
     cube_starts, cube_pairs : int array
-        Cubes and their pairs, see `count_pairs`.
+        Cubes by which positions are sorted, and pairs of adjacent cubes, see `count_pairs`.
     place : float array, shape (n, 3)
-        Unit vectors.
+        Positions as unit vectors.
     value : float array, shape (n, k)
-        Values of k kinds at each position.
+        k quantities at each position.
     edge : float array, shape (b + 1,)
-        Edges of the separation bins as squared chords, ascending.
+        Edges of the separation bins as squares of chords on the unit sphere, ascending.
     sums : float array, shape (b, 2 + k)
-        Number of pairs, sum of separations (rad), and sums of the products of each kind; changed in place.
+        Number of pairs, sum of separations (rad), and sum of products of each quantity, which are increased in place.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -86,22 +90,25 @@ def sum_products(cube_starts: Int, cube_pairs: Int, place: Float, value: Float, 
 def sum_shear_products(
     cube_starts: Int, cube_pairs: Int, frame: Float, shear: Float, patch: Int, edge: Float, sums: Float
 ) -> None:
-    """Add numbers of pairs and products of their shear and convergence to `sums`, by patches and separation.
+    """Sum products of shear and convergence over pairs of positions, by jackknife patches and separation.
+
+    Pairs at the same position are ignored.
 
     Parameters
     ----------
     cube_starts, cube_pairs : int array
-        Cubes and their pairs, see `count_pairs`.
+        Cubes by which positions are sorted, and pairs of adjacent cubes, see `count_pairs`.
     frame : float array, shape (n, 3, 3)
-        Unit vectors to the east, to the north and towards each position.
+        For each position, unit vectors to the east, to the north, and from the observer to the position.
     shear : float array, shape (n, 3)
-        gamma1, gamma2, kappa at each position.
+        Shear gamma1, gamma2 in the axes (east, north), and convergence kappa at each position.
     patch : int array, shape (n,)
-        Patch of each position, from 0.
+        Number of the jackknife patch of each position, from 0.
     edge : float array, shape (b + 1,)
-        Edges of the separation bins as squared chords, ascending.
+        Edges of the separation bins as squares of chords on the unit sphere, ascending.
     sums : float array, shape (patches, patches, b, 7)
-        Number of pairs, xi+, xi-, cross component, kappa kappa, kappa gamma_t and kappa gamma_x; changed in place.
+        Number of pairs, and sums of xi+, xi-, the cross component, kappa kappa, kappa gamma_t and kappa gamma_x, which
+        are increased in place.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -117,7 +124,7 @@ def sum_shear_products(
                 k = last - 1
                 while square < edge[k]:
                     k -= 1
-                # Direction to the other position, in the frame of each.
+                # Components of the vector from i to j along east and north: (x, y) at i, (u, v) at j.
                 x = frame[i, 0, 0] * dx + frame[i, 0, 1] * dy + frame[i, 0, 2] * dz
                 y = frame[i, 1, 0] * dx + frame[i, 1, 1] * dy + frame[i, 1, 2] * dz
                 u = frame[j, 0, 0] * dx + frame[j, 0, 1] * dy + frame[j, 0, 2] * dz

@@ -1,7 +1,7 @@
-"""The area of the sky that a catalogue covers, divided into patches for jackknife errors.
+"""The area of the sky that a catalogue covers, as HEALPix cells, divided into patches for jackknife errors.
 
-Jackknife errors contain the structure that differs between patches. This is most of the cosmic variance for
-separations below the side of a patch. Fluctuations that a whole small field shares are not in the errors.
+Jackknife errors contain the differences between patches. For separations below the side of a patch, these are most of
+the cosmic variance. Fluctuations of the mean density of a whole small field are not included.
 """
 
 from __future__ import annotations
@@ -17,24 +17,29 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.randomness.rng import stream
 
-# Number of patches, and the smallest number of patches for which an error is estimated.
-PATCHES, MIN_PATCHES = 16, 6
-# If the generation cells are not recorded: mean number of sources per cell, and the highest order of such cells.
-_SOURCES_PER_CELL, _FINEST_ORDER = 40.0, 12
+# Largest number of patches into which a field is divided.
+PATCHES = 16
+# Smallest number of patches for which a jackknife error is estimated.
+MIN_PATCHES = 6
+# If a catalogue does not record the cells in which it was simulated, cells with sources are divided into four while
+# their mean number of sources is more than four times this number.
+_SOURCES_PER_CELL = 40.0
+# Highest HEALPix order of the cells that represent the area of a catalogue without recorded cells.
+_FINEST_ORDER = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Cells that a catalogue covers, and the patch of each cell.
+    """HEALPix cells that a catalogue covers, and the jackknife patch to which each cell belongs.
 
     Attributes
     ----------
     order : int
-        HEALPix order of the nested cells.
+        HEALPix order of the cells.
     cells : int array, shape (c,)
-        Cell numbers, ascending.
+        Numbers of the cells in the nested scheme, ascending.
     patch : int array, shape (c,)
-        Patch of each cell, from 0.
+        Number of the patch of each cell, from 0, ascending.
     """
 
     order: int
@@ -43,21 +48,21 @@ class Field:
 
     @property
     def n_patches(self) -> int:
-        """Number of patches."""
+        """Return the number of jackknife patches, 0 for a field without cells."""
         return int(self.patch.max(initial=-1)) + 1
 
     @property
     def area(self) -> float:
-        """Area of all cells in deg2."""
+        """Return the area of all cells in deg2."""
         return len(self.cells) * sky.cell_area(self.order)
 
     @property
     def patch_side(self) -> float:
-        """Side in deg of a square with the mean area of a patch."""
+        """Return the side, in deg, of a square with the mean area of a patch."""
         return float(np.sqrt(self.area / max(self.n_patches, 1)))
 
     def patch_of(self, index: Int) -> Int:
-        """Return the patch of each order-29 index, -1 outside the field."""
+        """Return the patch number of each position, given as nested HEALPix index of order 29; -1 outside the field."""
         cell = index >> 2 * (sky.MAX_ORDER - self.order)
         at = np.minimum(np.searchsorted(self.cells, cell), max(len(self.cells) - 1, 0))
         if not len(self.cells):
@@ -66,19 +71,22 @@ class Field:
 
 
 def from_version(catalogue: read.Version, index: Int) -> Field:
-    """Return the cells that a catalogue was drawn in or, if they are not recorded, the cells that contain sources.
+    """Find the area of the sky that a catalogue covers.
+
+    The area consists of the HEALPix cells in which the catalogue was simulated. If the catalogue does not record them,
+    it consists of the cells that contain sources.
 
     Parameters
     ----------
     catalogue : Version
-        Catalogue of a lake.
+        Published table of sources in a lake.
     index : int array, shape (n,)
-        Order-29 indices of its sources.
+        Positions of its sources as nested HEALPix indices of order 29. Used only if cells are not recorded.
 
     Returns
     -------
     Field
-        The cells, in patches.
+        The cells, divided into patches.
     """
     generation_cells = {
         cell for part in catalogue.manifest["parts"] for cell in part["facts"].get("generation_cells", ())
@@ -92,9 +100,11 @@ def from_version(catalogue: read.Version, index: Int) -> Field:
 
 
 def from_cells(order: int, cells: Int) -> Field:
-    """Divide cells (ascending numbers of one order) into at most PATCHES runs of consecutive cells.
+    """Divide HEALPix cells into at most 16 jackknife patches of consecutive cells with nearly equal numbers of cells.
 
-    No patch is smaller than a generation cell, unless the whole field is. `order` must be at least GENERATION_ORDER.
+    `cells` are nested cell numbers of the given order, ascending. Sources are simulated in cells of the order
+    GENERATION_ORDER (8), and `order` must not be lower. The mean area of a patch is at least one such cell, unless the
+    whole field is smaller.
     """
     n_patches = max(min(PATCHES, len(cells) >> 2 * (order - GENERATION_ORDER)), 1)
     return Field(order, cells, np.arange(len(cells)) * n_patches // max(len(cells), 1))
@@ -105,23 +115,23 @@ def _occupied_cells(index: Int, order: int) -> Int:
 
 
 def random_positions(field: Field, n: int, *identity: int | str) -> tuple[Float, Int]:
-    """Draw about `n` random positions, the same number in each cell.
+    """Draw about `n` random positions in a field, with the same number in each cell.
 
     Parameters
     ----------
     field : Field
-        Cells to fill.
+        Area to fill, with at least one cell.
     n : int
         Approximate number of positions; each cell gets at least one.
     *identity : int or str
-        Identity of the random stream.
+        Names and numbers that identify the random numbers: the same identity always gives the same positions.
 
     Returns
     -------
     place : float array, shape (m, 3)
-        Unit vectors.
+        Positions as unit vectors.
     patch : int array, shape (m,)
-        Patch of each position.
+        Number of the jackknife patch of each position.
     """
     per_cell = max(n // max(len(field.cells), 1), 1)
     places = [
@@ -132,19 +142,19 @@ def random_positions(field: Field, n: int, *identity: int | str) -> tuple[Float,
 
 
 def jackknife_error(samples: Float | Sequence[float], min_patches: int = MIN_PATCHES) -> Float:
-    """Return the jackknife standard error of a figure, NaN if there are fewer patches than `min_patches`.
+    """Return the jackknife standard error of a measured quantity.
 
     Parameters
     ----------
     samples : float array, shape (patches, ...)
-        The figure without each patch.
+        The quantity, measured once for each patch without the sources of this patch.
     min_patches : int
         Smallest number of patches for which an error is estimated.
 
     Returns
     -------
     float array, shape (...)
-        Standard error.
+        Standard error; NaN if there are fewer patches than `min_patches`.
     """
     values = np.asarray(samples, float)
     if len(values) < min_patches:

@@ -1,6 +1,7 @@
-"""Numbers of pairs of positions on the sky within a separation, and sums of products of their shears or other values.
+"""Count pairs of positions on the sky by separation, and sum products of shears or other values over these pairs.
 
-Positions are sorted into cubes as wide as the largest separation. Right ascension 0 and the poles need no special case.
+To find close pairs fast, space is divided into cubes as wide as the largest separation, so only adjacent cubes need to
+be compared. Positions are unit vectors, so right ascension 0 and the poles need no special case.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from lake_schema.arrays import Bool, Float, Int
 from truesky.randomness import rng
 from truesky.validation import compiled_pairs
 
-# Largest number of pairs of positions in neighbouring cubes that are examined; this takes 3 s.
+# Largest number of pairs of positions in adjacent cubes that are examined; this takes 3 s.
 MAX_PAIRS = 1e8
+# Number of sums over pairs in `sum_shear_products`: 1, xi+, xi-, cross, kappa kappa, kappa gamma_t, kappa gamma_x.
 CHANNELS = 7
-# Half of the 26 neighbours of a cube, and the cube itself.
+# Steps (x, y, z) from a cube to itself and to 13 of its 26 neighbours, so that each pair of cubes is compared once.
 _OFFSETS = [(0, 0, 0)] + [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
 ]  # fmt: skip
@@ -25,14 +27,14 @@ _OFFSETS = [(0, 0, 0)] + [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
-    """Sums of several quantities over pairs of points, for a jackknife over patches of the sky.
+    """Sums of several quantities over pairs of positions in bins of separation, with jackknife samples.
 
     Attributes
     ----------
     total : float array, shape (quantities, bins)
         Sums over all pairs.
     jackknife : float array, shape (patches, quantities, bins)
-        Sums over the pairs without a point in the given patch.
+        For each patch of the sky: sums over the pairs that have no position in this patch.
     """
 
     total: Float
@@ -40,23 +42,24 @@ class Sums:
 
 
 def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
-    """Count pairs with both ends of kind 0, with one end of each kind, and with both ends of kind 1.
+    """Count pairs of positions of two kinds (such as galaxies and random positions) by separation.
 
     Parameters
     ----------
     place : float array, shape (n, 3)
-        Unit vectors.
+        Positions as unit vectors.
     kind : int array, shape (n,)
-        0 or 1.
+        Kind of each position, 0 or 1.
     patch : int array, shape (n,)
-        Patch of each position, from 0.
+        Number of the jackknife patch of each position, from 0.
     edges : float array, shape (b + 1,)
         Edges of the separation bins, rad, ascending.
 
     Returns
     -------
     Sums
-        Numbers of pairs with c = 3.
+        Numbers of pairs of three types: both positions of kind 0, one of each kind, and both of kind 1. All numbers are
+        0 without positions.
     """
     order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
     sums, sorted_rows = _empty_sums(3, edges, patch), (np.ascontiguousarray(place[order]), kind[order].astype(np.int64))
@@ -67,23 +70,24 @@ def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
 
 
 def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Sums:
-    """Sum CHANNELS products over pairs: 1, xi+, xi-, cross, kappa kappa, kappa gamma_t, kappa gamma_x.
+    """Sum products of shear and convergence over pairs of galaxies, by separation.
 
     Parameters
     ----------
     ra, dec : float array, shape (n,)
         Positions, deg.
     shear : float array, shape (n, 3)
-        gamma1, gamma2 in the frame (east, north), and kappa.
+        Shear gamma1, gamma2 in the axes (east, north), and convergence kappa.
     patch : int array, shape (n,)
-        Patch of each position, from 0.
+        Number of the jackknife patch of each position, from 0.
     edges : float array, shape (b + 1,)
         Edges of the separation bins, rad, ascending.
 
     Returns
     -------
     Sums
-        Sums of the products with c = CHANNELS.
+        Seven sums: number of pairs, xi+, xi-, cross component, kappa kappa, kappa gamma_t and kappa gamma_x. They are
+        not divided by the number of pairs.
     """
     frame = frames(ra, dec)
     order, cube_starts, cube_pairs = _sort_into_cubes(frame[:, 2], edges[-1])
@@ -98,14 +102,14 @@ def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: F
 
 
 def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Float, Float]:
-    """Sum products of values over pairs of positions, by separation.
+    """Sum the products of quantities at both positions of a pair over all pairs, by separation.
 
     Parameters
     ----------
     place : float array, shape (n, 3)
-        Unit vectors.
+        Positions as unit vectors.
     values : float array, shape (n, k)
-        Values of k kinds at each position.
+        k quantities at each position.
     edges : float array, shape (b + 1,)
         Edges of the separation bins, rad, ascending.
 
@@ -114,7 +118,7 @@ def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Floa
     number, separation : float array, shape (b,)
         Number of pairs, and the sum of their separations in rad.
     product : float array, shape (k, b)
-        Sum of the products of the values at both ends.
+        Sum of the products of each quantity. No result is divided by the number of pairs.
     """
     order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
     sums = np.zeros((len(edges) - 1, 2 + values.shape[1]))
@@ -124,14 +128,17 @@ def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Floa
 
 
 def _sums_with_jackknife(sums: Float) -> Sums:
-    """Total and jackknife sums from sums of shape (patch, patch, bin, c)."""
+    """Compute sums over all pairs, and sums without the pairs that have a position in each patch.
+
+    `sums`, shape (patches, patches, bins, quantities), has the sums by the patches of both positions.
+    """
     total = sums.sum((0, 1))
     within_patch = np.einsum("iikc->ikc", sums)
     return Sums(total.T, np.swapaxes(total - sums.sum(0) - sums.sum(1) + within_patch, 1, 2))
 
 
 def frames(ra: Float, dec: Float) -> Float:
-    """Return unit vectors, shape (n, 3, 3), to the east, to the north and towards positions in deg."""
+    """Return three unit vectors at each position (deg): to the east, to the north and outwards, shape (n, 3, 3)."""
     lon, lat = np.radians(ra), np.radians(dec)
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], 1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], 1)
@@ -139,23 +146,24 @@ def frames(ra: Float, dec: Float) -> Float:
 
 
 def thin_sample(ids: Int, place: Float, max_separation: float, max_pairs: float = MAX_PAIRS) -> Bool:
-    """Select a random subset so that at most about `max_pairs` pairs are examined; depends on the identifiers alone.
+    """Select a random subset of positions, so that the search for close pairs examines at most about `max_pairs` pairs.
 
     Parameters
     ----------
     ids : int array, shape (n,)
-        Identifiers.
+        Identifiers of the positions. They determine the random numbers, so the result is reproducible.
     place : float array, shape (n, 3)
-        Unit vectors.
+        Positions as unit vectors.
     max_separation : float
-        Largest separation, rad.
+        Largest separation of the pairs, rad.
     max_pairs : float
-        Number of pairs in neighbouring cubes above which positions are dropped.
+        Largest number of pairs in adjacent cubes (as wide as `max_separation`). With fewer pairs, all positions are
+        selected.
 
     Returns
     -------
     bool array, shape (n,)
-        True for the positions to keep.
+        True for the selected positions.
     """
     _, cube_starts, cube_pairs = _sort_into_cubes(place, max_separation)
     number = np.diff(cube_starts).astype(float)
@@ -176,7 +184,11 @@ def _empty_sums(channels: int, edges: Float, patch: Int) -> Float:
 
 
 def _sort_into_cubes(place: Float, max_separation: float) -> tuple[Int, Int, Int]:
-    """Order of the positions by cube, row at which each cube begins, and pairs (2, m) of adjacent cubes."""
+    """Sort positions (unit vectors) into cubes whose side is the chord of `max_separation` (rad).
+
+    Returns the order of the positions by cube, the first row of each cube that contains positions (and the number of
+    positions at the end), and the pairs of cubes, shape (2, m), that are adjacent or the same.
+    """
     side = 2.0 * np.sin(0.5 * max_separation)
     n_side = int(2.0 / side) + 3
     at = np.floor((place + 1.0) / side).astype(np.int64) + 1

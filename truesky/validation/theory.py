@@ -1,4 +1,4 @@
-"""Predict two-point statistics of shear and of galaxies with known bias from non-linear theory.
+"""Predict two-point statistics of shear, and of galaxies with known bias, from the non-linear matter power spectrum.
 
 Notes
 -----
@@ -27,15 +27,21 @@ from lake_schema.arrays import Float
 from truesky.catalogue.matter import density_box
 from truesky.fluxes import cosmology
 
+# Wavenumbers at which the linear power is tabulated, as ln(k / (h/Mpc)).
 _LN_K = np.linspace(np.log(1e-4), np.log(1e5), 4000)
-# Distances between observer and sources, and nodes of the Hankel transforms in ln l.
-_STEPS, _FINE = 100, 40_000
-# Multipoles at which C_l is evaluated.
+# Number of distances between observer and sources at which the integrand of Limber's equation is evaluated.
+_STEPS = 100
+# Number of multipoles, evenly spaced in ln l, in the sums of Hankel transforms.
+_FINE = 40_000
+# Multipoles at which callers compute C_l before a Hankel transform.
 ELL = np.geomspace(1.0, 2e5, 160)
 
 
 def nonlinear_power(k: Float, z: float) -> Float:
-    """Return the non-linear matter power P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
+    """Return the non-linear matter power spectrum P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc.
+
+    This is the fitting formula halofit with the coefficients of Takahashi et al. (2012).
+    """
     nodes, today = np.exp(_LN_K), float(density_box.growth(z)) ** 2
     delta = nodes**3 * _linear_power_today() * today / (2 * np.pi**2)
 
@@ -63,20 +69,20 @@ def nonlinear_power(k: Float, z: float) -> Float:
 
 
 def linear_power(k: Float, z: float) -> Float:
-    """Return the linear matter power P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
+    """Return the linear matter power spectrum P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
     return np.asarray(density_box.linear_power(k) * float(density_box.growth(z)) ** 2)
 
 
 @cache
 def _linear_power_today() -> Float:
-    """Linear power at the nodes at z = 0, read-only."""
+    """Return the linear matter power in (Mpc/h)^3 at z = 0 for the wavenumbers exp(_LN_K), as a read-only array."""
     spectrum = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
     spectrum.flags.writeable = False
     return spectrum
 
 
 def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
-    """Return the mean convergence of sources per Mpc/h of unit overdensity at given distances.
+    """Return the lensing efficiency: mean convergence of sources per Mpc/h of matter with an overdensity of 1.
 
     Parameters
     ----------
@@ -90,7 +96,7 @@ def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
     Returns
     -------
     float array, shape (n,)
-        Convergence per Mpc/h.
+        Convergence in h/Mpc; 0 for matter behind all sources.
     """
     efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
     lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
@@ -104,25 +110,25 @@ def convergence_power(
     power_spectrum: Callable[[Float, float], Float] = nonlinear_power,
     x: Float | None = None,
 ) -> Float:
-    """Return C_l of the convergence.
+    """Return the angular power spectrum C_l of the convergence in Limber's approximation.
 
     Parameters
     ----------
     ell : float array, shape (n,)
-        Multipoles.
+        Multipoles l.
     chi : float array, shape (s,)
         Comoving distances of the sources, Mpc/h.
     weight : float array, shape (s,)
         Relative number of sources at each distance.
     power_spectrum : callable
-        Matter power P(k, z) in (Mpc/h)^3.
+        Function that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
     x : float array, shape (m,), optional
-        Comoving distances of the integration, Mpc/h; by default 100 distances up to the sources.
+        Comoving distances at which the matter is evaluated, Mpc/h; by default 100 distances up to the farthest source.
 
     Returns
     -------
     float array, shape (n,)
-        C_l.
+        C_l at each multipole.
     """
     x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS) if x is None else x
     z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(x, chi, weight)
@@ -132,14 +138,14 @@ def convergence_power(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shells:
-    """Galaxies in shells of comoving distance.
+    """Distribution of galaxies over shells of comoving distance, weighted with their bias.
 
     Attributes
     ----------
     chi, width : float array, shape (s,)
         Middle and width of each shell, Mpc/h.
     weight : float array, shape (s,)
-        Fraction of the galaxies per Mpc/h times their mean bias.
+        Fraction of all galaxies in the shell, divided by its width (Mpc/h), times the mean bias of these galaxies.
     """
 
     chi: Float
@@ -148,21 +154,21 @@ class Shells:
 
 
 def shells(chi: Float, bias: Float, edges: Float) -> Shells:
-    """Sort galaxies into shells of comoving distance.
+    """Compute the distribution of galaxies over shells of comoving distance, weighted with their bias.
 
     Parameters
     ----------
     chi : float array, shape (n,)
-        Comoving distances of the galaxies, Mpc/h.
+        Comoving distances of the galaxies, Mpc/h. Galaxies outside the shells are ignored.
     bias : float array, shape (n,)
-        Bias of each galaxy.
+        Linear bias of each galaxy relative to matter.
     edges : float array, shape (s + 1,)
-        Edges of the shells, Mpc/h.
+        Edges of the shells, Mpc/h, ascending.
 
     Returns
     -------
     Shells
-        Fraction of galaxies times bias in each shell.
+        The shells; the weight of an empty shell is 0. Without any galaxy in the shells all weights are NaN.
     """
     number = np.histogram(chi, edges)[0].astype(float)
     mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
@@ -173,21 +179,21 @@ def shells(chi: Float, bias: Float, edges: Float) -> Shells:
 def galaxy_power(
     ell: Float, tracers: Shells, power_spectrum: Callable[[Float, float], Float] = nonlinear_power
 ) -> Float:
-    """Return C_l of the numbers of galaxies.
+    """Return the angular power spectrum C_l of the density of galaxies in Limber's approximation, without shot noise.
 
     Parameters
     ----------
     ell : float array, shape (n,)
-        Multipoles.
+        Multipoles l.
     tracers : Shells
-        Galaxies by distance.
+        Distribution of the galaxies over distance, weighted with their bias.
     power_spectrum : callable
-        Matter power P(k, z) in (Mpc/h)^3.
+        Function that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
     float array, shape (n,)
-        C_l.
+        C_l at each multipole.
     """
     total = np.zeros(len(ell))
     for chi, width, weight in zip(tracers.chi, tracers.width, tracers.weight, strict=True):
@@ -197,16 +203,16 @@ def galaxy_power(
 
 
 def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
-    """Return the correlation function w of C_l.
+    """Return the angular correlation function w(theta) that corresponds to an angular power spectrum C_l.
 
     Parameters
     ----------
     theta : float array, shape (n,)
         Separations, rad.
     ell : float array, shape (m,)
-        Multipoles, ascending.
+        Multipoles above 0, ascending. Each contribution is damped by exp(-(2 l / l_max)^2), with the last one, l_max.
     c_l : float array, shape (m,)
-        C_l at these multipoles.
+        C_l at these multipoles, between which ln C_l is interpolated. C_l of 0 or less counts as 0.
 
     Returns
     -------
@@ -217,21 +223,21 @@ def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
 
 
 def shear_correlations(theta: Float, ell: Float, c_l: Float) -> tuple[Float, Float]:
-    """Return the shear correlation functions xi+ and xi- of C_l.
+    """Return the shear correlation functions xi+ and xi- that correspond to an angular power spectrum C_l.
 
     Parameters
     ----------
     theta : float array, shape (n,)
         Separations, rad.
     ell : float array, shape (m,)
-        Multipoles, ascending.
+        Multipoles above 0, ascending. Each contribution is damped by exp(-(2 l / l_max)^2), with the last one, l_max.
     c_l : float array, shape (m,)
-        C_l of the convergence at these multipoles.
+        C_l of the convergence at these multipoles, between which ln C_l is interpolated. C_l of 0 or less counts as 0.
 
     Returns
     -------
     xi_plus, xi_minus : float array, shape (n,)
-        Both functions at each separation.
+        xi+ and xi- at each separation.
     """
     return _hankel_transform(theta, ell, c_l, j0), _hankel_transform(theta, ell, c_l, _j4)
 
@@ -239,35 +245,38 @@ def shear_correlations(theta: Float, ell: Float, c_l: Float) -> tuple[Float, Flo
 def _hankel_transform(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float], Float]) -> Float:
     fine = np.geomspace(ell[0], ell[-1], _FINE)
     weight = fine**2 * np.exp(np.interp(np.log(fine), np.log(ell), np.log(np.maximum(c_l, 1e-300)))) / (2 * np.pi)
-    # A smooth cutoff at high multipoles avoids ringing at small separations.
+    # Cut off high multipoles smoothly: a sharp cutoff would cause oscillations at small separations.
     weight = weight * np.exp(-((fine / (0.5 * ell[-1])) ** 2))
     step = np.log(fine[1] / fine[0])
     return np.array([step * np.sum(weight * bessel(fine * t)) for t in theta])
 
 
 def _j4(x: Float) -> Float:
-    """Bessel function J4 from J0 and J1, which are ten times faster, or from its series for small x."""
+    """Return the Bessel function J4(x), x >= 0, computed from J0 and J1, which is ten times faster than scipy's jn.
+
+    For x < 0.5, where this formula loses digits, the power series is used.
+    """
     large_x = np.maximum(x, 0.5)
     value = (48.0 / large_x**3 - 8.0 / large_x) * j1(large_x) - (24.0 / large_x**2 - 1.0) * j0(large_x)
     return np.where(x < 0.5, x**4 / 384.0 * (1.0 - x**2 / 20.0 + x**4 / 960.0), value)
 
 
 def aperture_mass(edges: Float, plus: Float, minus: Float, radius: float) -> tuple[Float, Float]:
-    """Return the mean squares of the aperture mass and of its cross component; the latter is 0 without B modes.
+    """Compute the mean squares of the aperture mass and of its cross component from xi+ and xi-.
 
     Parameters
     ----------
     edges : float array, shape (n + 1,)
-        Edges of the separation bins, from 0.
+        Edges of the separation bins in any unit, ascending, beginning at 0.
     plus, minus : float array, shape (..., n)
         xi+ and xi- in each bin.
     radius : float
-        Radius of the aperture in the unit of `edges`, at most half the last edge.
+        Radius of the aperture in the unit of `edges`. Twice the radius should be an edge: only bins up to it are used.
 
     Returns
     -------
     mass, cross : float array, shape (...)
-        Mean squares.
+        Mean squares of the aperture mass (E modes) and of the cross component (B modes), which is 0 for pure lensing.
     """
     middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     x = np.minimum(middle / radius, 2.0)

@@ -1,4 +1,6 @@
-"""Two-point correlations of galaxies by separation on the sky, with jackknife samples without each patch of the field.
+"""Measure two-point correlation functions of positions and shears of galaxies, with jackknife errors.
+
+For jackknife errors, the field is divided into patches, and each function is also measured once without each patch.
 
 References
 ----------
@@ -19,29 +21,35 @@ from truesky.validation import field as fields
 from truesky.validation import pairs
 from truesky.validation.field import Field
 
+# One arcmin in radians.
 ARCMIN = np.radians(1.0 / 60.0)
-# Up to this separation (rad) all galaxies are used; beyond it a random subset has enough pairs.
+# Bins below and above this separation (rad) are measured separately. Each time, a random subset of the galaxies is used
+# if there are too many pairs; at small separations, all or more galaxies can be used.
 _FULL_SAMPLE_LIMIT = 2.5 * ARCMIN
-# Random positions per galaxy, and their largest number.
-_RANDOM_PER_GALAXY, _MAX_RANDOM = 2, 60_000
-# Number of random positions whose pairs represent all pairs of a field.
+# Number of random positions per galaxy for the estimator of Landy & Szalay.
+_RANDOM_PER_GALAXY = 2
+# Largest number of random positions for the estimator of Landy & Szalay, in a field with fewer cells than this number;
+# otherwise there is one position per cell.
+_MAX_RANDOM = 60_000
+# Approximate number of random positions whose pairs represent the distribution of separations in a field. A field with
+# more cells has one position per cell.
 _PLACES = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoPointFunction:
-    """Two-point functions by separation.
+    """One or more measured correlation functions in bins of separation, with jackknife samples.
 
     Attributes
     ----------
     edges : float array, shape (bins + 1,)
         Edges of the separation bins, rad.
     number : float array, shape (bins,)
-        Number of pairs.
-    value : float array, shape (c, bins)
-        Values of c functions.
-    jackknife : float array, shape (patches, c, bins)
-        Values without each patch.
+        Number of pairs of galaxies in each bin.
+    value : float array, shape (functions, bins)
+        Values of the functions, NaN in bins without pairs.
+    jackknife : float array, shape (patches, functions, bins)
+        Values measured without the galaxies of each patch.
     """
 
     edges: Float
@@ -51,13 +59,13 @@ class TwoPointFunction:
 
     @property
     def theta(self) -> Float:
-        """Mean separation per bin of evenly distributed pairs, rad."""
+        """Return the mean separation in each bin (rad) that evenly distributed pairs would have."""
         low, high = self.edges[:-1], self.edges[1:]
         return np.asarray(2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2))
 
     @property
     def error(self) -> Float:
-        """Jackknife standard error, shape (c, bins)."""
+        """Return the jackknife standard error, shape (functions, bins); NaN with fewer than six patches."""
         return fields.jackknife_error(self.jackknife)
 
 
@@ -67,20 +75,20 @@ def angular_correlation(ids: Int, ra: Float, dec: Float, index: Int, field: Fiel
     Parameters
     ----------
     ids : int array, shape (n,)
-        Identifiers.
+        Identifiers of the galaxies, by which a random subset is selected if there are too many pairs.
     ra, dec : float array, shape (n,)
         Positions, deg.
     index : int array, shape (n,)
-        Order-29 indices of the positions.
+        The same positions as nested HEALPix indices of order 29.
     field : Field
-        Area of the galaxies; those outside are ignored.
+        Area of the sky; galaxies outside are ignored.
     edges : float array, shape (bins + 1,)
         Edges of the separation bins, rad, ascending.
 
     Returns
     -------
     TwoPointFunction
-        w, with c = 1.
+        One function: w.
     """
     patch, place = field.patch_of(index), sky.unit_vectors(ra, dec)
     inside = patch >= 0
@@ -110,7 +118,11 @@ def angular_correlation(ids: Int, ra: Float, dec: Float, index: Int, field: Fiel
 
 
 def _landy_szalay(count: Float, n_points: Float) -> Float:
-    """w, shape (..., bin), from numbers of pairs (..., 3, bin) and of galaxies and random positions (..., 2)."""
+    """Return w, shape (..., bins), with the estimator of Landy & Szalay.
+
+    `count`, shape (..., 3, bins), has the numbers of pairs galaxy-galaxy, galaxy-random and random-random. `n_points`,
+    shape (..., 2), has the numbers of galaxies and of random positions. w is NaN or infinite without random pairs.
+    """
     galaxies, scattered = n_points[..., 0, None], n_points[..., 1, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         by_chance = 2.0 * count[..., 2, :] / scattered / (scattered - 1.0)
@@ -121,27 +133,27 @@ def _landy_szalay(count: Float, n_points: Float) -> Float:
 def shear_correlations(
     ids: Int, place: tuple[Float, Float], gamma: Float, index: Int, field: Field, edges: Float
 ) -> TwoPointFunction:
-    """Measure xi+, xi-, cross, <kappa kappa>, <kappa gamma_t> and <kappa gamma_x>.
+    """Measure the two-point functions of shear and convergence of galaxies.
 
     Parameters
     ----------
     ids : int array, shape (n,)
-        Identifiers.
+        Identifiers of the galaxies, by which a random subset is selected if there are too many pairs.
     place : tuple of float arrays, shape (n,)
         Right ascension and declination, deg.
     gamma : float array, shape (n, 3)
-        gamma1, gamma2 in the frame (east, north), and kappa.
+        Shear gamma1, gamma2 in the axes (east, north), and convergence kappa.
     index : int array, shape (n,)
-        Order-29 indices of the positions.
+        The same positions as nested HEALPix indices of order 29.
     field : Field
-        Area of the galaxies; those outside are ignored.
+        Area of the sky; galaxies outside are ignored.
     edges : float array, shape (bins + 1,)
         Edges of the separation bins, rad, ascending.
 
     Returns
     -------
     TwoPointFunction
-        The six functions, with c = 6.
+        Six functions: xi+, xi-, the cross component, <kappa kappa>, <kappa gamma_t> and <kappa gamma_x>.
     """
     patch = field.patch_of(index)
     inside = np.flatnonzero(patch >= 0)
@@ -157,7 +169,11 @@ def shear_correlations(
 
 
 def rebin(fine: TwoPointFunction, edges: Float) -> TwoPointFunction:
-    """Average a two-point function in wider bins; `edges` (rad) is a subset of its edges."""
+    """Average a two-point function in wider bins, weighted by the numbers of pairs.
+
+    `edges` (rad, ascending) are the edges of the new bins, each of which must be an edge of `fine`. New bins without
+    pairs have the value NaN.
+    """
     at = np.searchsorted(fine.edges, edges * (1 + 1e-9)) - 1
     number = np.nan_to_num(fine.number)
 
@@ -176,16 +192,16 @@ def mean_over_pairs(field: Field, theta: Float, values: Float) -> float:
     Parameters
     ----------
     field : Field
-        Area that the positions fill.
+        Area of the sky in which the positions are evenly distributed.
     theta : float array, shape (n,)
-        Separations, rad, ascending.
+        Separations at which the function is given, rad, ascending.
     values : float array, shape (n,)
-        Values of the function, 0 beyond the last separation.
+        Values of the function. It is constant below the first separation, and 0 beyond the last.
 
     Returns
     -------
     float
-        Mean over random pairs.
+        Mean over all pairs of about 1500 random positions, or of one position per cell if the field has more cells.
     """
     place, _ = fields.random_positions(field, _PLACES, "validation", "all pairs")
     separations = [np.arccos(np.clip(np.sum(place[i + 1 :] * vector, 1), -1, 1)) for i, vector in enumerate(place)]
@@ -193,7 +209,11 @@ def mean_over_pairs(field: Field, theta: Float, values: Float) -> float:
 
 
 def _split_edges(edges: Float) -> list[Float]:
-    """Small separations, for all galaxies, and large separations, for a subset."""
+    """Divide edges of separation bins (rad) at the last edge up to 2.5 arcmin into two arrays that share this edge.
+
+    Separations in the two arrays are measured with different random subsets of the galaxies, because more galaxies can
+    be used for small separations. An array without any bin is left out.
+    """
     cut = int(np.searchsorted(edges, _FULL_SAMPLE_LIMIT, side="right")) - 1
     return [part for part in (edges[: cut + 1], edges[max(cut, 0) :]) if len(part) > 1]
 

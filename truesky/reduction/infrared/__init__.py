@@ -1,1 +1,1 @@
-"""Reduce NISP frames: ramps, linearity, lamps, persistence."""
+"""Calibrate frames of the infrared detectors of NISP: ramps, nonlinearity, lamps of flats, and persistence."""

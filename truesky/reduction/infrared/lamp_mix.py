@@ -1,6 +1,7 @@
-"""Find the mixture of calibration lamps that is most similar to the sky in a band.
+"""Find the mixture of calibration lamps (LEDs of NISP) whose light in a band is most similar in colour to the sky.
 
-A flat of this mixture corrects the response to the sky, because a pixel's response depends on wavelength.
+The response of a pixel depends on wavelength. A flat that is made with the right mixture of lamps therefore shows the
+response to light with the colour of the sky.
 """
 
 from __future__ import annotations
@@ -16,32 +17,41 @@ from truesky.render.effects.light import calibration_lamp, chromatic_response
 from truesky.render.effects.scene import Scene
 from truesky.render.sky import diffuse_light
 
-# Importance in the fit of the sum of weights, the mean wavelength, the mean square, and equal weights.
-_SUM_WEIGHT, _MEAN_WEIGHT, _SQUARE_WEIGHT, _EVENNESS_WEIGHT = 1e4, 1e2, 1.0, 1e-2
-# Level of the sky whose colour is matched, e-/s per pixel: zodiacal light in the fields of surveys.
+# Importance, in the least squares fit of the lamps' weights, of the condition that their sum is 1.
+_SUM_WEIGHT = 1e4
+# Importance, in the fit of the lamps' weights, of the condition that lamps and sky have the same mean wavelength.
+_MEAN_WEIGHT = 1e2
+# Importance, in the fit of the lamps' weights, of the condition that lamps and sky have the same mean square of the
+# wavelength (relative to the sky's mean wavelength).
+_SQUARE_WEIGHT = 1.0
+# Importance, in the fit of the lamps' weights, of the condition that all weights are equal: makes the solution unique.
+_EVENNESS_WEIGHT = 1e-2
+# Brightness of the sky (zodiacal light in survey fields) whose colour is matched, in electrons/s per pixel.
 _SKY = 1.0
 
 
 def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
-    """Return weights of lamps such that the mean wavelength of their light in the band equals that of the sky.
+    """Return weights with which flats of several lamps must be averaged, so that their colour equals that of the sky.
+
+    The colour is the mean wavelength of the detected photons in the band.
 
     Parameters
     ----------
     scene : Scene
-        Scene of a flat in the band.
+        Exposure of a flat, which defines the band and the detector.
     lamps : sequence of int
-        Numbers of the lamps.
+        Numbers of the lamps, from 1; at least one lamp.
 
     Returns
     -------
     tuple of float
-        Weights, 0 or more, with sum 1.
+        Weight of each lamp, 0 or more, with sum 1.
 
     Notes
     -----
-    With many lamps, the mean square of the wavelength is matched as well as possible. An observer can compute the
-    weights from the passband, the spectrum of the Sun and the spectra of the lamps. If all lamps are on one side of
-    the sky's mean wavelength, the nearest lamp is used.
+    With three or more lamps, the mean square of the wavelength is matched as well as possible. An observer can compute
+    the weights from the passband, the spectrum of the Sun and the spectra of the lamps. If the wavelengths of all lamps
+    are on one side of the sky's mean wavelength, only the nearest lamp is used.
     """
     band = chromatic_response.band_of_scene(scene)
     band_width = float(band.wavelength[-1] - band.wavelength[0])
@@ -68,6 +78,9 @@ def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
 
 
 def _moments(band: Passband, photons: Float, origin: float, band_width: float) -> Float:
-    """Return mean and mean square of wavelength over the band's width, relative to `origin`."""
+    """Return the photon-weighted mean and mean square of x = wavelength / `band_width` - `origin`, shape (2,).
+
+    `photons` has the relative number of photons at each wavelength at which the passband `band` is tabulated.
+    """
     x = band.wavelength / band_width - origin
     return np.array([np.average(x, weights=photons), np.average(x**2, weights=photons)])

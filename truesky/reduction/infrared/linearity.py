@@ -1,7 +1,7 @@
-"""Measure the nonlinearity of each pixel from flats of one lamp at several levels.
+"""Measure the nonlinearity of each pixel of a NISP detector from flats of one lamp at several intensities.
 
-A lamp at level x gives a pixel g x electrons, of which Q are measured. The gain g and the b of N (1 - b N) are fitted
-for each pixel.
+A lamp with the relative intensity x gives a pixel N = g x electrons, of which about N (1 - b N) are measured. The
+response g and the coefficient b (1/electron) are fitted for each pixel.
 """
 
 from __future__ import annotations
@@ -17,15 +17,24 @@ from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 
-# Smallest number of levels, smallest ratio of the brightest to the faintest, iterations of the fit, and deviation
-# (in standard deviations) above which a frame is rejected.
-_MIN_LEVELS, _MIN_RANGE, _ROUNDS, _CLIP = 3, 3.0, 4, 5.0
-# Rows that are fitted at a time, to limit memory.
+# Smallest number of different lamp intensities for a fit.
+_MIN_LEVELS = 3
+# The ratio of the highest to the lowest lamp intensity must be larger than this.
+_MIN_RANGE = 3.0
+# Number of iterations of the fit.
+_ROUNDS = 4
+# A value of a pixel in a flat is rejected if it deviates from the fit by more than this number of standard deviations.
+_CLIP = 5.0
+# Number of detector rows that are fitted at a time, to limit memory.
 _ROWS = 32
 
 
 def longest_series(flats: Sequence[Frame]) -> list[Frame]:
-    """Return the longest series of flats with one channel, band, lamp and ramp at three or more levels, else []."""
+    """Return the longest series of flats to which the nonlinearity can be fitted, or [] without such a series.
+
+    Flats of a series have the same channel, band, lamp and readout mode. They have three or more different intensities,
+    of which the highest is more than three times the lowest.
+    """
     groups: dict[tuple[object, ...], list[Frame]] = defaultdict(list)
     for frame in flats:
         groups[frame.exposure.channel, frame.exposure.band, frame.scene.lamp, frame.ramp].append(frame)
@@ -44,25 +53,28 @@ def _level(frame: Frame) -> float:
 def fit(
     frames: Sequence[Frame], extra_charge: Callable[[Frame], tuple[Float, Float | float]], scratch: Path
 ) -> CombinedFrame:
-    """Return b of every pixel in 1/electron, with its uncertainty.
+    """Fit the nonlinearity of every pixel: the coefficient b in 1/electron, if N (1 - b N) of N electrons are measured.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Flats of `longest_series`.
+        Flats of one lamp at several intensities, from `longest_series`.
     extra_charge : callable
-        Function that returns the electrons of persistence [ny, nx] and of dark current in a frame.
+        Function of a frame that returns the electrons per pixel that do not come from the lamp: of persistence,
+        shape (ny, nx), and of dark current (the same shape or a number).
     scratch : Path
-        Folder for temporary files, 8 bytes per pixel and frame.
+        Folder for temporary files, which take 8 bytes per pixel and frame.
 
     Returns
     -------
     CombinedFrame
-        Weighted mean of each pixel's fit and the median of all pixels.
+        b and its uncertainty. To reduce noise, b is the weighted mean of the fit of the pixel and the median of all
+        pixels; pixels without a valid fit have the median.
 
     Notes
     -----
-    The levels of the lamp are assumed to be exact. Pixel-to-pixel differences of the traps are not known.
+    The intensities of the lamp are assumed to be exact. Persistence is predicted with the mean properties of traps,
+    because differences between pixels are not known to an observer.
     """
     scene, applied = frames[0].scene, frames[0].applied
     estimator, nonlinearity = Estimator.from_scene(scene, applied), RampNonlinearity.from_scene(scene, applied)
@@ -92,21 +104,22 @@ def fit(
 def _fit_rows(
     observed: Float, extra: Float, levels: Float, noise: Float, nonlinearity: RampNonlinearity
 ) -> tuple[Float, Float, Array]:
-    """Fit b of pixels [rows, nx] to frames [n, rows, nx]; return b, its uncertainty, and the number of accepted frames.
+    """Fit the response and the nonlinearity b of each pixel in some rows to n flats of different intensity.
 
     Parameters
     ----------
     observed, extra : float array, shape (n, rows, nx)
-        Measured electrons, and the electrons among them that are not light of the lamp.
+        Measured electrons; electrons among them that are dark current or persistence, not light of the lamp.
     levels, noise : float array, shape (n,)
-        Relative level of the lamp, and variance of the measured signal.
+        Intensity of the lamp relative to the brightest flat; variance of the measured signal in electrons^2.
     nonlinearity : RampNonlinearity
-        Nonlinearity of the ramp.
+        Effect of b on the measured signal of a ramp.
 
     Returns
     -------
     b, sigma, count : array, shape (rows, nx)
-        Results.
+        Coefficient b in 1/electron, 0 or more; its standard deviation, infinite with fewer than three accepted flats;
+        number of accepted flats.
     """
     b, accepted, x = np.zeros(observed.shape[1:]), np.ones(observed.shape, bool), levels[:, None, None]
     sigma = np.full(b.shape, np.inf)
@@ -121,13 +134,18 @@ def _fit_rows(
         enough = (accepted.sum(axis=0) >= _MIN_LEVELS) & np.isfinite(b_step)
         gain, b_step = np.where(enough, gain, 0.0), np.where(enough, b_step, 0.0)
         accepted = np.abs(y + b_step * c - gain * x) <= _CLIP * np.sqrt(noise)[:, None, None]
-        # Limit the nonlinearity to a tenth of the signal, since a dead pixel has no meaningful b.
+        # Limit b such that a tenth of the signal is lost at most: the fit of a dead pixel has no meaningful b.
         b = np.clip(b + b_step, 0.0, 0.1 / np.maximum(y.max(axis=0), 1.0))
     return b, np.where(enough, np.sqrt(sigma), np.inf), accepted.sum(axis=0).astype(np.int16)
 
 
 def _shrink_to_median(b: Float, sigma: Float, count: Array) -> CombinedFrame:
-    """Return the mean of each pixel's b and the median of all pixels, weighted by their variances."""
+    """Return the mean of each pixel's b and the median b of all pixels, weighted by their inverse variances.
+
+    `sigma` is the uncertainty of b in a pixel. The uncertainty of the median is the standard deviation of b between
+    pixels after subtraction of their noise, at least 1 % of the median. Pixels with b = 0 or infinite `sigma` get the
+    median.
+    """
     is_measured = np.isfinite(sigma) & (b > 0.0)
     median = float(np.median(b[is_measured])) if is_measured.any() else 0.0
     width = 1.4826 * float(np.median(np.abs(b[is_measured] - median))) if is_measured.any() else 0.0

@@ -1,8 +1,9 @@
-"""Make NISP masters of dark current, linearity and flats, and calibrate NISP images::
+"""Make NISP masters (combined calibration frames) of dark current, linearity and flats, and calibrate NISP images::
 
-    signal = (linearised(estimated - bias of the estimator) - dark time - persistence) / flat
+    image = (linearised(measured - bias) - persistence - dark current x exposure time) / flat
 
-The module `ramps` describes the estimator of the signal of a ramp.
+Here `measured` is the signal that the on-board software fits to the reads of a pixel (the ramp), and `bias` is the
+systematic error of this fit, see the module `ramps`.
 """
 
 from __future__ import annotations
@@ -27,27 +28,28 @@ from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 from truesky.render.effects.charge import ramp_nonlinearity
 from truesky.render.effects.light import calibration_lamp, illumination
 
-# Largest chi^2 of a ramp due to nonlinearity alone. Above it, a bad fit is not a sign of a cosmic ray.
+# A bad fit of a ramp counts as a cosmic ray only if nonlinearity alone would give a chi^2 below this value.
 _MAX_NONLINEAR_CHI2 = 1.0
-# Flats with this fraction of saturated pixels or more are rejected. A master flat uses flats of at least this fraction
-# of the brightest level.
-_MAX_SATURATED, _MIN_RELATIVE_LEVEL = 0.01, 0.3
+# Flats are rejected if at least this fraction of their pixels is saturated.
+_MAX_SATURATED = 0.01
+# A master flat uses only flats whose lamp intensity is at least this fraction of the brightest flat's.
+_MIN_RELATIVE_LEVEL = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Master:
-    """A master frame.
+    """A master (combined calibration frame), with the frames and cards that are written to its header.
 
     Attributes
     ----------
     kind : str
-        Kind of master.
+        Kind of master: "bias", "dark", "linearity" or "flat".
     combined : CombinedFrame
-        The master.
+        Pixels of the master, their uncertainty and number of frames.
     frames : sequence of Frame
         Frames that were combined.
     cards : tuple of Card
-        Further cards of its header.
+        Further header cards (keyword, value, comment).
     """
 
     kind: str
@@ -57,21 +59,21 @@ class Master:
 
 
 def incoming_charge(frame: Frame, b: Float | float, persistence: Float | float) -> Float:
-    """Return the electrons that each pixel received, including dark current, without persistence.
+    """Return the electrons of light and dark current in each pixel, corrected for nonlinearity and persistence.
 
     Parameters
     ----------
     frame : Frame
-        The frame.
+        The raw frame, which is read from its file.
     b : float or float array, shape (ny, nx)
-        b of N (1 - b N) in 1/electron; 0 for no correction.
+        Nonlinearity in 1/electron: of N electrons, N (1 - b N) are measured. 0 for no correction.
     persistence : float or float array, shape (ny, nx)
-        Electrons of persistence.
+        Electrons of persistence, which are subtracted.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Electrons.
+        Electrons of the exposure.
     """
     estimated = frame.electrons()
     estimated -= Estimator.from_scene(frame.scene, frame.applied).bias(estimated)
@@ -81,30 +83,37 @@ def incoming_charge(frame: Frame, b: Float | float, persistence: Float | float) 
 
 
 def declared_nonlinearity(frame: Frame) -> float:
-    """Return b of the typical pixel from the mission parameters, 0 for a frame without nonlinearity."""
+    """Return the nonlinearity b (1/electron) of the typical pixel from the mission parameters.
+
+    Of N electrons, N (1 - b N) are measured. The result is 0 if the frame was simulated without nonlinearity.
+    """
     nonlinear_effects = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & frame.applied
     return frame.scene.value("nonlinearity", "1 / electron") if nonlinear_effects else 0.0
 
 
 def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
-    """Make the masters that a detector's frames allow: a dark of each ramp, linearity, and a flat of each band.
+    """Make the masters of a NISP detector: a dark for each readout mode, the linearity, and a flat of each band.
+
+    A master is omitted if the frames do not allow it.
 
     Parameters
     ----------
     frames : sequence of Frame
-        All frames of one detector. Persistence of each frame in later frames is subtracted.
+        All frames of one detector, including those of the sky: the persistence of every frame is subtracted from later
+        frames.
     scratch : Path
-        Folder for temporary files, 4 bytes per pixel and frame (8 bytes for linearity).
+        Folder for temporary files, which take 4 bytes per pixel and frame (8 bytes for linearity).
 
     Yields
     ------
     Master
-        The masters.
+        First the darks, then the linearity, then the flats.
 
     Raises
     ------
     BadInput
-        If there is neither a dark nor a flat.
+        If there is neither a dark nor a flat with less than 1 % saturated pixels, or if frames of a dark or flat differ
+        in instrument, detector or seed.
     """
     prediction, darks = PersistencePrediction(frames), dict[tuple[int, int, int], CombinedFrame]()
     for group in _group_frames(
@@ -144,7 +153,10 @@ Corrections = tuple[PersistencePrediction, Float | float, Mapping[tuple[int, int
 
 
 def _dark_charge(frame: Frame, darks: Mapping[tuple[int, int, int], CombinedFrame] | None) -> Float | float:
-    """Return the electrons of dark current in a frame, from the master of its ramp, or else of another ramp."""
+    """Return the electrons of dark current in a frame, from the master dark of its readout mode.
+
+    If this mode has no master, another mode's is used. Without any master dark, the result is 0.
+    """
     if not darks:
         return 0.0
     master = darks.get(frame.ramp) or next(iter(darks.values()))
@@ -154,7 +166,11 @@ def _dark_charge(frame: Frame, darks: Mapping[tuple[int, int, int], CombinedFram
 def _combine_frames(
     frames: Sequence[Frame], units: Sequence[Float | float], corrections: Corrections, scratch: Path
 ) -> CombinedFrame:
-    """Return the mean of frames; `units` has the electrons [ny, nx] of each frame per unit of the master."""
+    """Return the clipped mean of frames in units of the master.
+
+    Each frame is divided by its element of `units`: the number of electrons (a scalar or [ny, nx]) that corresponds to
+    the value 1 in the master. `corrections` are the persistence, nonlinearity b and darks to subtract.
+    """
     prediction, b, darks = corrections
     lake_frames.common_values(frames, (*files.SHARED_CARDS,))
     scene = frames[0].scene
@@ -179,7 +195,11 @@ def _combine_frames(
 
 
 def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path) -> Master:
-    """Make a flat of each lamp divided by its light, and return the mixture that is most similar to the sky."""
+    """Make a master flat of one band.
+
+    The flats of each lamp are divided by the light of the lamp and combined. The result is their weighted mean, with
+    the weights for which the colour of the lamps is most similar to the sky.
+    """
     brightest = max(frame.scene.value("flat.signal", "electron") for frame in frames)
     bright_frames = [
         frame for frame in frames if frame.scene.value("flat.signal", "electron") >= _MIN_RELATIVE_LEVEL * brightest
@@ -211,7 +231,7 @@ def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path)
 
 
 def _lamp_charge(frame: Frame) -> Float:
-    """Return the electrons that the lamp of a flat would give if all light were counted, float64[ny, nx]."""
+    """Return the electrons per pixel that the lamp of a flat would give at a response of 1, float64[ny, nx]."""
     electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
     return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
 
@@ -219,30 +239,32 @@ def _lamp_charge(frame: Frame) -> Float:
 def calibrate(
     frame: Frame, masters: Masters, prediction: PersistencePrediction | None, effects: Sequence[str], unit: float
 ) -> ReducedImage:
-    """Calibrate a frame of the sky.
+    """Calibrate a NISP frame of the sky.
 
     Parameters
     ----------
     frame : Frame
-        The frame.
+        The raw frame, which is read from its file.
     masters : Masters
-        Masters of the detector. Their `bias` contains b of N (1 - b N).
+        Masters of the detector. Their `bias` contains the nonlinearity b in 1/electron, if N (1 - b N) of N electrons
+        are measured.
     prediction : PersistencePrediction or None
-        Persistence in the detector's frames; None to leave it in the image.
+        Predicts persistence from earlier frames of the detector; None to leave persistence in the image.
     effects : sequence of str
-        Effects of the frame that are undone.
+        Names of simulated effects that are corrected. Nonlinearity is corrected only if it is among them.
     unit : float
-        Electrons per unit of the image.
+        Number by which electrons are divided to get the unit of the image: 1 for electrons, the exposure time for
+        electrons per second.
 
     Returns
     -------
     ReducedImage
-        The calibrated image.
+        The calibrated image. Pixels with response 0 or below, or with NaN, have the value 0 and the weight 0.
 
     Notes
     -----
-    Weights contain the shot noise of the expected light, not of the counted light. Neighbouring pixels share charge, so
-    the noise of a single pixel is smaller than the noise of sums over many pixels suggests.
+    Weights contain the shot noise of a smooth model of the light, not of the counted light. They are for single pixels.
+    Neighbouring pixels share charge, so the variance of a sum over pixels is larger than the sum of their variances.
     """
     time = frame.scene.exposure_time_s
     dark = masters.dark.mean * time
@@ -269,7 +291,10 @@ def calibrate(
 
 
 def _hit_pixels(frame: Frame, charge: Float, b: Float) -> Bool:
-    """Return True for pixels with a step in their ramp, bool[ny, nx]."""
+    """Return a mask of pixels whose ramp has a step, probably by a cosmic ray, bool[ny, nx].
+
+    A bad fit of the ramp counts only if nonlinearity alone cannot explain it.
+    """
     nonlinearity = RampNonlinearity.from_scene(frame.scene, frame.applied)
     return np.asarray(
         frame.misfit_pixels()
@@ -278,21 +303,27 @@ def _hit_pixels(frame: Frame, charge: Float, b: Float) -> Bool:
 
 
 def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
-    """Read the masters for a frame.
+    """Read the masters (dark, linearity and flat) with which a NISP frame is calibrated.
 
     Parameters
     ----------
     folder : Path
-        Folder of the masters.
+        Folder of the master files.
     frame : Frame
         Frame to calibrate.
     without : sequence of str
-        Kinds that are not read but replaced by constants; "nonlinearity" also omits the linearity.
+        Kinds of masters that are not read: "dark" is replaced by 0, "flat" by 1, and "linearity" (or "nonlinearity") by
+        the value of the mission parameters.
 
     Returns
     -------
     Masters
-        The masters.
+        The masters. The linearity is stored as `bias`.
+
+    Raises
+    ------
+    BadInput
+        If a file does not exist, or does not belong to the detector.
     """
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     for kind in files.master_kinds(frame):

@@ -1,4 +1,7 @@
-"""Predict persistence as an observer can, from earlier frames of a detector and the mission parameters."""
+"""Predict persistence (charge of earlier exposures that an infrared detector releases later) in a frame.
+
+The prediction uses only what an observer has: earlier frames of the detector, and the mission parameters.
+"""
 
 from __future__ import annotations
 
@@ -16,31 +19,37 @@ from truesky.render.effects.charge.persistence import PersistenceModel
 from truesky.render.exposure import persistence
 
 _DAY_S = 86400.0
-# Number of frames whose charge is kept in memory, 4 bytes per pixel.
+# Number of earlier frames whose released charge is kept in memory, with 4 bytes per pixel.
 _CACHE_SIZE = 48
-# Image types without light.
+# Image types whose frames contain no light and therefore leave no persistence.
 _DARK_TYPES = ("bias", "dark", "persistence")
 
 
 @dataclass(slots=True)
 class PersistencePrediction:
-    """Prediction of persistence in the frames of a detector.
+    """Prediction of persistence in the frames of one detector.
 
     Attributes
     ----------
     frames : sequence of Frame
-        All frames of the detector, of any channel.
+        All frames of the detector in all channels (NISP-P images and NISP-S spectra).
 
     Notes
     -----
-    Pixel-to-pixel differences of the traps are not known. Persistence of exposures that are not in the lake is missed.
+    All pixels are assumed to have the same traps, because differences between pixels are not known. Persistence of
+    exposures that are not in `frames` is missed.
     """
 
     frames: Sequence[Frame]
     _charge_cache: OrderedDict[int, Float32] = field(default_factory=OrderedDict)
 
     def charge_in(self, frame: Frame) -> Float:
-        """Return the electrons of persistence in a frame, float64[ny, nx]."""
+        """Return the predicted electrons of persistence in a frame, float64[ny, nx].
+
+        The result is the sum of the charge from all earlier frames with light; it is 0 without such frames. The
+        camera's time window limits how long before `frame` they may begin. Frames with other simulation settings, and
+        further noise realisations of an exposure, are ignored.
+        """
         out = np.zeros((frame.scene.ny, frame.scene.nx))
         exposure, traps = frame.exposure, PersistenceModel.from_scene(frame.scene)
         start_mjd = exposure.mjd - persistence.window_days(exposure.camera, frame.scene.mission)
@@ -61,7 +70,11 @@ class PersistencePrediction:
         return out
 
     def _charge_at_reference(self, previous_frame: Frame, traps: PersistenceModel) -> Float32:
-        """Return the persistence of a frame at the reference time, in an exposure of nominal length, in electrons."""
+        """Return the electrons [ny, nx] that `previous_frame` releases in a standard later exposure.
+
+        The later exposure starts `traps.reference` seconds after `previous_frame` starts, and is
+        `traps.nominal_length` seconds long. Results are cached.
+        """
         number = previous_frame.exposure.exposure_id
         if number not in self._charge_cache:
             charge = np.where(previous_frame.saturated_pixels(), traps.full_well, previous_frame.electrons())

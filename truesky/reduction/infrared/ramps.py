@@ -1,16 +1,21 @@
-"""Model the estimated signal of a ramp: bias and noise of the estimator, and the effect of nonlinearity.
+"""Model the signal Q that NISP's on-board software estimates from a ramp: its bias, noise and nonlinearity.
 
-Let n be the number of differences of groups, d their mean (light and beta), a their variance, b the covariance of
-neighbours, T their sum, and SS the sum of squares about their mean. To second order the estimated signal is::
+A ramp consists of groups of averaged reads. Let n be the number of differences between successive groups, d their mean
+(including the constant beta that the software adds), T their sum, and SS the sum of their squares about the mean. S is
+the true signal in electrons, and E T the expected value of T. To second order the estimated signal is::
 
     Q = S + [2 d (T - E T) + SS - n A d] / (2 d + A),      A = 1 + alpha
 
-Its mean and variance follow from the moments of T and SS (effects/charge/ramp.py, effects/readout/macc.py). If
-N (1 - b N) of N electrons are measured, differences decrease along the ramp, and Q is their root mean square::
+The module effects/readout/macc.py defines alpha and beta. The mean and the variance of Q follow from the moments of T
+and SS, which depend on the variance a of a difference and the covariance b of neighbouring differences.
+
+If N (1 - b N) of N electrons are measured (with another b: the nonlinearity in 1/electron), differences decrease along
+the ramp, and Q is n times their root mean square::
 
     Q^2 = S^2 (1 - 2 k1 b S + k2 b^2 S^2)
 
-Here k1 and k2 depend on the frames in which a ramp is read. They are 1 if the signal itself is not linear.
+Here k1 and k2 depend on the times at which the ramp is read. They are 1 if the nonlinearity was simulated in the total
+signal and not in each read.
 """
 
 from __future__ import annotations
@@ -26,26 +31,27 @@ from truesky.render.effects.charge.ramp import Mode
 from truesky.render.effects.readout import macc, ramp_noise
 from truesky.render.effects.scene import Scene
 
-# Tabulated signals, e-.
+# Signals, in electrons, at which bias and variance of the estimate are tabulated for interpolation.
 _LEVELS = np.concatenate([[0.0], np.geomspace(1.0, 2e5, 200)])
-# Iterations of the linearisation; each adds three digits at 1e5 e-.
+# Iterations of the correction for nonlinearity. For 1e5 electrons in NISP, where b is 6e-7 per electron, each iteration
+# adds about one correct digit.
 _ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """Estimator of the signal of a ramp.
+    """Bias and noise of the on-board estimate of a ramp's signal.
 
     Attributes
     ----------
     mode : Mode
-        Readout mode.
+        Readout mode: numbers of groups, reads per group, and dropped reads.
     read_noise : float
-        Noise of one read in electrons.
+        Noise of one read in electrons (standard deviation).
     drift : float
-        Drift of the outputs in the signal in electrons.
+        Standard deviation, in electrons, of the signal due to drifts of the output amplifiers.
     coupling : float
-        Factor of the photon variance that remains if neighbours share charge.
+        Factor by which interpixel capacitance reduces the photon noise (variance) of a pixel, at most 1.
     rounding : float
         Variance of rounding to whole ADU in electrons^2.
     """
@@ -58,7 +64,11 @@ class Estimator:
 
     @classmethod
     def from_scene(cls, scene: Scene, applied: Container[str]) -> Estimator:
-        """Return the estimator for a detector; `applied` has the names of the effects in the frame."""
+        """Return the estimator with the mission parameters of the scene's detector and readout mode.
+
+        Drift and interpixel capacitance are included only if their names are in `applied`, the effects that were
+        simulated in the frame.
+        """
         side, diagonal = ipc.EFFECT.parameters(scene) if ipc.EFFECT.name in applied else (0.0, 0.0)
         return cls(
             ramp.mode_of_scene(scene),
@@ -69,11 +79,17 @@ class Estimator:
         )
 
     def bias(self, signal: Float) -> Float:
-        """Return the bias of the estimate (estimated minus true signal) in electrons, for a signal in electrons."""
+        """Return the mean of estimated minus true signal in electrons, for true signals in electrons (any shape).
+
+        Signals outside 0 to 200,000 electrons have the bias of the nearest limit.
+        """
         return np.asarray(np.interp(signal, _LEVELS, self._moments(_LEVELS)[0]))
 
     def variance(self, signal: Float) -> Float:
-        """Return the variance of the estimate in electrons^2, for an expected signal in electrons."""
+        """Return the variance of the estimated signal in electrons^2, for expected signals in electrons (any shape).
+
+        Signals outside 0 to 200,000 electrons have the variance of the nearest limit.
+        """
         return np.asarray(np.interp(signal, _LEVELS, self._moments(_LEVELS)[1]))
 
     def _moments(self, signal: Float) -> tuple[Float, Float]:
@@ -96,14 +112,17 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True)
 class RampNonlinearity:
-    """Effect of nonlinearity on the signal of a ramp.
+    """Effect of nonlinearity on the signal Q that is estimated from a ramp with the true signal S.
+
+    Of N electrons, N (1 - b N) are measured in each read. Then Q^2 = S^2 (1 - 2 k1 b S + k2 b^2 S^2), and chi^2 of the
+    fit is misfit_factor b^2 S^3.
 
     Attributes
     ----------
     k1, k2 : float
-        Coefficients of the loss, see the module's docstring.
+        Coefficients of the first and second order of the loss, which depend on the readout mode.
     misfit_factor : float
-        Factor of chi^2 due to the deviation of differences from their mean.
+        Coefficient of chi^2; 0 if nonlinearity was simulated in the total signal and not in each read.
     """
 
     k1: float
@@ -112,7 +131,11 @@ class RampNonlinearity:
 
     @classmethod
     def from_scene(cls, scene: Scene, applied: Container[str]) -> RampNonlinearity:
-        """Return the nonlinearity of a frame's ramp; `applied` has the names of the effects in the frame."""
+        """Return the coefficients for the readout mode of a scene.
+
+        If `applied` (effects that were simulated in the frame) contains the nonlinearity of the total signal, k1 and k2
+        are 1 and chi^2 is 0.
+        """
         mode = ramp.mode_of_scene(scene)
         if ramp_nonlinearity.SIGNAL.name in applied:
             return cls(1.0, 1.0, 0.0)
@@ -123,14 +146,18 @@ class RampNonlinearity:
         return cls(mean / all_frames, square / all_frames**2, (square - mean**2) / all_frames**2 / (1.0 + mode.alpha))
 
     def nonlinear_signal(self, signal: Float, b: Float) -> Float:
-        """Return the measured signal for a true signal, both in electrons; `b` is in 1/electron."""
+        """Return the measured signals for true signals, both in electrons; `b` is the nonlinearity in 1/electron.
+
+        Signals of 0 or less are returned unchanged.
+        """
         loss = b * np.maximum(signal, 0.0)
         return np.asarray(signal * np.sqrt(np.maximum(1.0 - 2.0 * self.k1 * loss + self.k2 * loss**2, 0.0)))
 
     def linearise(self, observed: Float, b: Float) -> Float:
-        """Return the true signal for a measured signal, both in electrons; `b` is in 1/electron.
+        """Return the true signals for measured signals, both in electrons; `b` is the nonlinearity in 1/electron.
 
-        For a measured signal that no true signal gives, the result is about the largest possible signal.
+        Signals of 0 or less are returned unchanged. If a measured signal is higher than any true signal can give, the
+        loss is limited, and the result is at most 3.2 times the measured signal.
         """
         out = np.array(observed, float)
         for _ in range(_ROUNDS):
@@ -139,9 +166,12 @@ class RampNonlinearity:
         return out
 
     def slope(self, signal: Float) -> Float:
-        """Return the decrease of the measured signal per unit of b, for small b, in electrons^2."""
+        """Return by how much a small b reduces the measured signal, divided by b, in electrons^2: k1 `signal`^2."""
         return np.asarray(self.k1 * np.maximum(signal, 0.0) ** 2)
 
     def chi_square(self, signal: Float, b: Float) -> Float:
-        """Return chi^2 of a ramp due to nonlinearity alone."""
+        """Return chi^2 of the fit to a ramp without noise; the signal is in electrons, nonlinearity `b` in 1/electron.
+
+        It is 0 for signals of 0 or less.
+        """
         return np.asarray(self.misfit_factor * b**2 * np.maximum(signal, 0.0) ** 3)

@@ -1,1 +1,4 @@
-"""Measure the contents of a lake and compare them with what its request and the mission database imply."""
+"""Validate a lake (folder of simulated tables and images) by measurements of its images and catalogues.
+
+The measured values are compared with headers, models and observations.
+"""

@@ -1,1 +1,1 @@
-"""Draw a universe and compare its statistics with published observations and with theory."""
+"""Simulate galaxies, halos and stars, measure their statistics, and compare these with observations and theory."""

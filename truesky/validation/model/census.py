@@ -1,6 +1,7 @@
-"""Count the galaxies of many small blocks of the sky: counts, colours, sizes, H alpha, luminosities and halos.
+"""Simulate galaxies and halos in many small blocks of the sky, and measure counts, colours, sizes, H alpha and halos.
 
-Figures are returned by name. The error of a count is under name + "_error"; it is the scatter between the blocks.
+Measured values are returned by name. Standard errors are under name + "_error"; most are computed from the scatter
+between blocks.
 """
 
 from __future__ import annotations
@@ -21,44 +22,59 @@ from truesky.fluxes import cosmology
 from truesky.fluxes.libraries import templates
 from truesky.validation.model import observed
 
+# Number of arcmin^2 in a deg^2.
 ARCMIN2 = 3600.0
+# Area of a generation cell (HEALPix cell in which galaxies are simulated as a whole), deg^2.
 AREA = sky.cell_area(GENERATION_ORDER)
+# Bands in which magnitudes are computed.
 BANDS = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
+# Columns of the simulated table `galaxies` that a Census keeps.
 COLUMNS = (
     *observed.COLUMNS, "ra", "dec", "z_obs", "bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction",
     "bulge_sersic_index",
 )  # fmt: skip
+# Columns of the simulated table `halos` that a Census keeps.
 HALO_COLUMNS = ("z_true", "log_mass")
-HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
+# Smallest H alpha fluxes of counted emitters, erg/s/cm^2.
+HALPHA_LIMITS = (5e-17, 1e-16, 2e-16, 3e-16)
+# Redshift ranges in which H alpha emitters are counted.
+HALPHA_SHELLS = ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
+# Ranges of I_E (AB mag) in which the median size is measured.
 SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
-# Redshift, half width, and the largest I_E - M_r - DM of any spectrum there, which sets the limit of M_r.
+# Redshift shells for the luminosity function: centre, half width, and the largest I_E - M_r - DM of any galaxy in the
+# shell. The last number gives the faintest M_r to which a sample limited in I_E is complete.
 SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
-HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
+# Lowest masses of counted halos, log10 of Msun/h.
+HALO_MASSES = (11.0, 12.0, 13.0)
+# Redshift shells in which halos are counted: centre and half width.
+HALO_SHELLS = ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
+# Smallest number of galaxies whose sizes are computed in a magnitude range, unless it has fewer galaxies. The largest
+# number is twice as high.
 _SIZED = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Census:
-    """Galaxies of the light cone and halos in blocks of the sky.
+    """Simulated galaxies and halos in several separate blocks of the sky.
 
     Attributes
     ----------
     blocks : int
         Number of blocks.
     area : float
-        Area of all blocks, deg2.
+        Area of all blocks together, deg2.
     limit : float
-        Magnitude limit of the galaxies.
+        Magnitude limit in I_E of the galaxies, AB mag.
     rows : mapping of str to array, shape (n,)
-        Columns of the galaxies by name.
+        Columns of the table `galaxies` by name, for central and satellite galaxies.
     block : int array, shape (n,)
-        Block of each galaxy.
+        Number of the block of each galaxy, from 0.
     mags : mapping of str to array, shape (n,)
-        Magnitudes of the galaxies by band, AB.
+        AB magnitudes of the galaxies by band.
     halos : mapping of str to array, shape (m,)
-        Columns of the halos by name.
+        Columns of the table `halos` by name.
     halo_block : int array, shape (m,)
-        Block of each halo.
+        Number of the block of each halo, from 0.
     """
 
     blocks: int
@@ -71,33 +87,36 @@ class Census:
     halo_block: Int
 
     def per_deg2(self, selected: Bool) -> Float:
-        """Return the number of selected galaxies per deg2 in each block."""
+        """Return the number per deg2, in each block, of the galaxies for which the mask `selected` is True."""
         return np.asarray(np.bincount(self.block[selected], minlength=self.blocks) * (self.blocks / self.area))
 
 
 def blocks(count: int, side_order: int) -> list[list[int]]:
-    """Return `count` nested blocks of 4^side_order generation cells each, distributed over the sky."""
+    """Select `count` blocks that are evenly distributed over the sky; return the numbers of the cells in each block.
+
+    A block consists of 4^`side_order` adjacent generation cells (nested HEALPix cells of order 8).
+    """
     n_blocks, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
     first = ((np.arange(count) + 0.31) * n_blocks / count).astype(int)
     return [[int(block) * inside + i for i in range(inside)] for block in first]
 
 
 def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) -> Census:
-    """Draw the galaxies and halos of blocks as the catalogue contains them.
+    """Simulate the galaxies and halos of several blocks, exactly as the catalogue would contain them.
 
     Parameters
     ----------
     universe : GalaxyModel
-        Model of the galaxies.
+        Model of the galaxies and halos.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag.
+        HEALPix map of the Milky Way's extinction A(V), mag.
     places : sequence of sequences of int
-        Generation cells of each block.
+        Numbers of the generation cells (nested HEALPix cells of order 8) of each block; at least one block.
 
     Returns
     -------
     Census
-        Galaxies and halos with their blocks.
+        Central and satellite galaxies, and halos, with the number of their block.
     """
     halo_cells, library = population.CellCache(universe.population), templates.galaxy_library()
     rows, hosts, mags = [], [], []
@@ -131,21 +150,21 @@ def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) 
 
 
 def magnitudes(rows: Mapping[str, Array], library: templates.Library, z_max: float) -> Mapping[str, Array]:
-    """Return AB magnitudes by band, before lensing magnification and the dust of the Milky Way.
+    """Return AB magnitudes by band, without lensing magnification and without extinction by the Milky Way.
 
     Parameters
     ----------
     rows : mapping of str to array, shape (n,)
-        Columns of table `galaxies`.
+        Columns of the table `galaxies` that describe the spectra: redshift, absolute magnitude, templates and dust.
     library : Library
-        Galaxy spectra.
+        Templates of galaxy spectra.
     z_max : float
-        Redshift that the tables of band ratios reach.
+        Largest redshift of the cached tables of flux ratios between bands; at least that of all galaxies.
 
     Returns
     -------
     mapping of str to float32 array, shape (n,)
-        Magnitudes by band.
+        Magnitudes in each of BANDS.
     """
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
     sed = band_ratios.Sed(*(rows[name] for name in names))
@@ -169,7 +188,10 @@ def _with_errors(per_block: dict[str, Float]) -> dict[str, float]:
 
 
 def counts(census: Census) -> dict[str, float]:
-    """Galaxies per arcmin2 with I_E < 26, slope of the counts, and fraction of satellites with I_E < 24.5."""
+    """Measure the number of galaxies with I_E < 26 per arcmin2, and two other statistics of counts.
+
+    These are the mean slope d log10(N) / d mag from I_E = 20 to 23, and the fraction of satellites at I_E < 24.5.
+    """
     vis = census.mags["euclid_vis"]
     per_block = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
     bright = vis < 24.5
@@ -181,7 +203,7 @@ def counts(census: Census) -> dict[str, float]:
 
 
 def colours(census: Census) -> dict[str, float]:
-    """Median colours of galaxies with I_E < 24.5."""
+    """Return the median colours g - r, r - i, I_E - H and J - H (AB mag) of galaxies with I_E < 24.5, by name."""
     mags = census.mags
     bright = mags["euclid_vis"] < 24.5
     pairs = {
@@ -195,19 +217,22 @@ def colours(census: Census) -> dict[str, float]:
 
 
 def half_light_of_rows(rows: Mapping[str, Array], part: Int) -> Float:
-    """Return the half-light radii (arcsec) of bulge and disc together for rows `part` of table `galaxies`."""
+    """Return the half-light radii (arcsec) of bulge and disc together for the galaxies with indices `part`.
+
+    `rows` has the columns of the table `galaxies`.
+    """
     names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
     bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)
     return half_light_radius(bulge, disc, fraction, sersic)
 
 
 def half_light_radius(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
-    """Return the half-light radius of a bulge and an exponential disc together, by bisection.
+    """Return the half-light radius of galaxies that consist of a Sersic bulge and an exponential disc, by bisection.
 
     Parameters
     ----------
     bulge, disc : float array, shape (n,)
-        Half-light radii of the components, arcsec.
+        Half-light radii of bulge and disc, arcsec.
     fraction : float array, shape (n,)
         Bulge-to-total ratio, 0 to 1.
     sersic : float array, shape (n,)
@@ -228,7 +253,11 @@ def half_light_radius(bulge: Float, disc: Float, fraction: Float, sersic: Float)
 
 
 def sizes(census: Census) -> dict[str, float]:
-    """Median radii by magnitude, range of the Sersic index, and largest relative error of two-component radii."""
+    """Measure sizes: median half-light radius (arcsec) in ranges of I_E, smallest and largest Sersic index of bulges.
+
+    The result also has a test with random galaxies. The model divides a half-light radius into radii of bulge and disc,
+    from which the half-light radius is computed again. The largest relative difference of the two is returned.
+    """
     vis, figures = census.mags["euclid_vis"], {}
     for bright, faint in SIZE_BINS:
         inside = np.flatnonzero((vis >= bright) & (vis < faint))
@@ -247,7 +276,11 @@ def sizes(census: Census) -> dict[str, float]:
 
 
 def halpha(census: Census) -> dict[str, float]:
-    """Ratio of the number of H alpha emitters to the published number, with its Poisson error."""
+    """Return the number of H alpha emitters divided by the number that a published luminosity function predicts.
+
+    This is model 3 of Pozzetti et al. (2016). The ratios are given for each redshift range and flux limit by name, with
+    Poisson errors.
+    """
     z, flux = census.rows["z_true"], census.rows["flux_halpha"]
     figures = {}
     for z_min, z_max in HALPHA_SHELLS:
@@ -260,21 +293,23 @@ def halpha(census: Census) -> dict[str, float]:
 
 
 def luminosities(census: Census, law: luminosity_function.Schechter, z_min: float, z_max: float) -> dict[str, float]:
-    """Return the ratio of the number of galaxies to the luminosity function in complete samples.
+    """Return the number of luminous galaxies divided by the number that the luminosity function predicts.
+
+    In each redshift shell, galaxies are counted down to the luminosity to which the sample is complete.
 
     Parameters
     ----------
     census : Census
-        Galaxies that were drawn.
+        Simulated galaxies.
     law : Schechter
         Luminosity function.
     z_min, z_max : float
-        Redshift range of the shells.
+        Only shells of SHELLS whose central redshift is between these limits are used.
 
     Returns
     -------
     dict of str to float
-        Ratios by shell, with errors.
+        Ratios by shell, with standard errors from the scatter between blocks.
     """
     z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
     ratios = {}
@@ -288,19 +323,19 @@ def luminosities(census: Census, law: luminosity_function.Schechter, z_min: floa
 
 
 def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float:
-    """Integrate a comoving density over a shell of redshift.
+    """Integrate a comoving number density over a redshift shell.
 
     Parameters
     ----------
     density : callable
-        Density in (Mpc/h)^-3 of redshifts.
+        Function of an array of redshifts that returns comoving number densities in (Mpc/h)^-3.
     at, half : float
-        Middle and half width of the shell.
+        Central redshift and half width of the shell.
 
     Returns
     -------
     float
-        Number per deg2.
+        Number of objects per deg2 in the shell.
     """
     grid = np.linspace(at - half, at + half, 41)
     value = density(grid)
@@ -309,7 +344,11 @@ def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float
 
 
 def halos(census: Census, published: Callable[[float, float], float]) -> dict[str, float]:
-    """Ratio of the number of halos above a mass to the number density `published(log_mass, z)` in thin shells."""
+    """Return the number of halos above several masses, in thin redshift shells, divided by the expected number.
+
+    `published(log_mass, z)` is the expected number density in (Mpc/h)^-3 of halos above a mass (log10 of Msun/h).
+    Ratios are returned by name, with standard errors from the scatter between blocks.
+    """
     z, mass = census.halos["z_true"], census.halos["log_mass"]
     ratios = {}
     for at, half in HALO_SHELLS:
@@ -322,7 +361,10 @@ def halos(census: Census, published: Callable[[float, float], float]) -> dict[st
 
 
 def redshifts(census: Census) -> tuple[Float, Float]:
-    """Redshift distribution of galaxies with I_E < 24.5: edges of bins of width 0.2, and fraction in each bin."""
+    """Return the redshift distribution of galaxies with I_E < 24.5: bin edges from 0 to 2.4, and fraction in each bin.
+
+    Fractions are relative to the galaxies within the bins.
+    """
     edges = np.arange(0.0, 2.41, 0.2)
     number = np.histogram(census.rows["z_true"][census.mags["euclid_vis"] < 24.5], edges)[0]
     return edges, number / number.sum()

@@ -1,8 +1,9 @@
-"""Clustering of the simulated universe: power of the box, bias of halos, and w(theta) against Limber's approximation.
+"""Measure the clustering of the simulated universe: matter power spectrum, bias of halos, and w(theta) on the sky.
 
-Halos and galaxies above a mass between two redshifts are drawn in blocks of the sky, hundreds of deg2 in total. Their
-w(theta) is measured from counts in pixels and compared with linear theory and linear bias. The Gaussian field of the
-box along the same lines of sight shows how the structure in these blocks differs from the mean.
+The universe is made from a periodic box with a Gaussian density field, whose replicas fill the light cone. Halos and
+galaxies above a mass between two redshifts are drawn in blocks of the sky of 54 deg2 each. Their w(theta) is measured
+from counts in pixels, and compared with linear theory and linear bias in Limber's approximation. The Gaussian field
+along the same lines of sight shows how the structure in these blocks differs from the mean.
 
 References
 ----------
@@ -31,37 +32,46 @@ from truesky.fluxes import cosmology
 from truesky.validation import pairs, theory
 from truesky.validation.theory import Shells
 
-# Blocks are cells of this order (53.7 deg2) in pixels of 6.9 arcmin. Small separations are counted in one smaller
-# cell per block, in pixels of 0.9 arcmin. Pixels are DEPTH orders finer than their block.
-BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
-# One pixel in this number is used as first pixel of a pair in the statistics of separations.
+# HEALPix order of the blocks in which large separations are measured (53.7 deg^2, with pixels of 6.9 arcmin).
+BLOCK_ORDER = 3
+# Each block contains one smaller HEALPix cell of this order. Sources in it are counted in pixels of 0.9 arcmin, to
+# measure the clustering at small separations.
+PIECE_ORDER = 6
+# Pixels have a HEALPix order higher than their block or cell by this number.
+DEPTH = 6
+# The distribution of separations in a block is computed from every n-th pixel to all pixels.
 _SPARSE = 16
-# Nodes of the separations of pairs, and of the separations at which w is summed over multipoles.
-_NODES, _THETAS = 2000, 300
-# Width of shells for the redshift distribution and the bias (Mpc/h), and highest multipole.
-_SHELL, _ELL_MAX = 80.0, 20_000
-# Cells per side of the grid on which the power of the Gaussian field is tabulated.
+# Number of bins of the distribution of separations.
+_NODES = 2000
+# Number of separations at which w is summed over multipoles.
+_THETAS = 300
+# Width of the shells of comoving distance for the prediction, Mpc/h.
+_SHELL = 80.0
+# Highest multipole in the sums for w.
+_ELL_MAX = 20_000
+# Cells per side of the grid on which the power spectrum of the Gaussian field is tabulated.
 _MODES = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracers:
-    """Points that trace the matter: halos and satellites.
+    """Points whose clustering follows the matter: halos (with their central galaxies) and satellite galaxies.
 
     Attributes
     ----------
     ra, dec : float array, shape (n,)
-        Position, deg.
+        Positions, deg.
     chi : float array, shape (n,)
-        Comoving distance, Mpc/h.
+        Comoving distances, Mpc/h.
     bias_growth : float array, shape (n,)
-        Bias of the halo times the growth factor.
+        Linear bias of the halo times the growth factor at its redshift (1 today).
     satellite : bool array, shape (n,)
         True for satellites.
     log_mass, proxy : float array, shape (n,)
-        log10 of halo mass and of proxy mass.
+        log10 of the mass of the halo, and of the proxy mass that determines the luminosity of the galaxy (for
+        satellites the mass of the subhalo), Msun/h.
     velocity : float array, shape (n,)
-        Line-of-sight velocity, km/s.
+        Peculiar velocity along the line of sight, km/s.
     """
 
     ra: Float
@@ -74,20 +84,21 @@ class Tracers:
     velocity: Float
 
     def select(self, mask: npt.NDArray[np.generic]) -> Tracers:
-        """Return the tracers selected by a mask or by indices."""
+        """Return only the tracers that a bool mask, shape (n,), or an array of indices selects."""
         return Tracers(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
 def concatenate(parts: Sequence[Tracers]) -> Tracers:
-    """Return the tracers of several parts together."""
+    """Join several sets of tracers to one; at least one set is required."""
     return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
 
 
-# ------------------------------------------------------------------------------------------------ the box
-
-
 def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
-    """P(k) of a cube over linear P(k) in bins of k between edges in h/Mpc."""
+    """Return the power spectrum of a periodic cube divided by the linear power at z = 0, in bins of wavenumber.
+
+    `field` has the overdensity (or the density divided by its mean) in cubic cells of side `cell` (Mpc/h). `edges` are
+    the edges of the bins in h/Mpc.
+    """
     n = field.shape[0]
     power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
     axis, half = 2 * np.pi * fft.fftfreq(n, cell), 2 * np.pi * fft.rfftfreq(n, cell)
@@ -101,26 +112,29 @@ def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> 
 
 
 def box_power(box: Box, edges: Float) -> Float:
-    """Return P(k) / P_linear(k) of the matter at z = 0 in bins of k between edges in h/Mpc."""
+    """Return the matter power spectrum of a box at z = 0 divided by the linear power, shape (bins,).
+
+    `edges`, shape (bins + 1,), are the edges of the wavenumber bins in h/Mpc.
+    """
     return _power_ratio(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
 
 
 def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
-    """Return the measured bias of the fields from which halos are drawn, relative to the requested bias.
+    """Return the measured bias of the density fields from which halos are drawn, divided by the intended bias.
 
     Parameters
     ----------
     box : Box
-        Box of matter.
+        Periodic box with the density fields of the universe.
     x : sequence of float
-        Bias times growth factor.
+        Intended values of bias times growth factor.
     edges : float array, shape (bins + 1,)
-        Edges of the bins, h/Mpc.
+        Edges of the wavenumber bins, h/Mpc.
 
     Returns
     -------
-    float array, shape (x, bins)
-        Bias against the matter of the box, divided by x.
+    float array, shape (len(x), bins)
+        Square root of the ratio of the power spectra of halos and matter, divided by x.
     """
     matter = box_power(box, edges)
     field, amplitude = density_box.biased_field(box.model, np.array(x))
@@ -132,34 +146,33 @@ def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
 
 
 def velocity_rms(box: Box, x: float) -> float:
-    """Return the rms in km/s of one velocity component of halos of bias `x` at z = 0 in the whole box."""
+    """Return the rms (km/s) of one component of the peculiar velocity at z = 0, averaged over halos with bias `x`."""
     field, amplitude = (value[0] for value in density_box.biased_field(box.model, np.array([x])))
     weight = np.exp(np.float32(amplitude) * box.smoothed[int(field)])
     square = [np.average(u**2, weights=weight) for u in box.velocity]
     return float(density_box.velocity_factor(box.model, 0.0) * np.sqrt(np.mean(square)))
 
 
-# ------------------------------------------------------------------------------------------------ on the sky
-
-
 def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_mass: float) -> Population:
-    """Return halos, and galaxies by their proxy mass, above a mass and between two redshifts.
+    """Return a model of the halos and galaxies above a mass and between two redshifts.
+
+    Galaxies are limited by their proxy mass (halo or subhalo mass with scatter, which determines the luminosity).
 
     Parameters
     ----------
     seed : int
-        Seed of the box of matter.
+        Seed of the universe's periodic box of matter.
     box_cells : int
-        Cells per side of the box.
+        Number of cells along each side of the box.
     z_min, z_max : float
         Redshift range.
     log_mass : float
-        log10 of the lowest mass, in the unit of table `halos`.
+        log10 of the lowest mass, Msun/h.
 
     Returns
     -------
     Population
-        Model from which `draw_tracers` draws.
+        Model, from which `draw_tracers` draws halos and galaxies.
     """
     table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     matched = matching.match_luminosities(table, inverse)
@@ -170,19 +183,21 @@ def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_
 
 
 def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
-    """Draw the halos and satellites inside a nested cell.
+    """Draw the halos and satellite galaxies whose positions are inside a HEALPix cell.
 
     Parameters
     ----------
     universe : Population
         Model of halos and satellites.
     order, block : int
-        HEALPix order and number of the cell.
+        HEALPix order and nested number of the cell.
 
     Returns
     -------
     Tracers
-        Halos, followed by satellites, per level of the halo grid.
+        Halos and satellites. Halos of different masses are drawn on HEALPix grids of different order (levels); for each
+        cell of a level the halos come first, then the satellites. Only cells of a level that overlap with the given
+        cell are drawn, so satellites inside it that belong to halos in other cells are missing.
     """
     parts = []
     for level in halos.LEVELS:
@@ -208,18 +223,18 @@ def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correlation:
-    """Angular correlation function relative to the mean of each block.
+    """Measured angular correlation function w, relative to the mean density of each block of the sky.
 
     Attributes
     ----------
     theta : float array, shape (bins,)
-        Mean separation, deg.
+        Mean separation of the pairs in each bin, deg.
     w : float array, shape (bins,)
-        Correlation function.
+        Correlation function, averaged over all blocks.
     error : float array, shape (bins,)
         Standard error from the scatter between blocks.
     pairs : Pairs
-        Separations over which w is averaged.
+        Distribution of the separations of pairs in a block, over which a prediction must be averaged.
     """
 
     theta: Float
@@ -230,18 +245,18 @@ class Correlation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Distributions of the separations of pairs of pixels in a block.
+    """Distributions of the separations between pixels of a block of the sky.
 
     Attributes
     ----------
     nodes : float array, shape (m,)
         Separations, deg.
     of_bin : float array, shape (bins, m)
-        Fraction of the pairs of each bin at each separation.
+        For each bin of separation: fraction of its pairs of pixels at each of the m separations.
     of_pixel : float array, shape (bins, m)
-        The same for pairs of the pixels of each bin with the whole block.
+        For the pixels in the pairs of each bin: distribution of their separations from all pixels of the block.
     of_all : float array, shape (m,)
-        The same for all pairs of the block.
+        Distribution of the separations of all pairs of pixels in the block.
     """
 
     nodes: Float
@@ -250,27 +265,31 @@ class Pairs:
     of_all: Float
 
     def subtract_block_mean(self, w: Float) -> tuple[Float, Float]:
-        """Return w per bin from w at the nodes, and w per bin relative to the mean of each block."""
+        """Average a predicted w, given at the m separations `nodes`, over the pairs of each bin.
+
+        Returns w in each bin, and the w that is measured in each bin if densities are relative to the mean of each
+        block.
+        """
         mean, pixel, block_mean = (shares @ w for shares in (self.of_bin, self.of_pixel, self.of_all))
         return mean, mean - 2.0 * pixel + block_mean
 
 
 def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
-    """Measure w(theta) of each kind of tracer in blocks.
+    """Measure w(theta) of several kinds of tracers (such as halos and galaxies) in blocks of the sky.
 
     Parameters
     ----------
     blocks : sequence of (int, sequence of Tracers or float arrays)
-        Number of each cell, and tracers, or values of its pixels, for each kind.
+        For each block, its nested HEALPix number, and for each kind the tracers in it or a map of its pixels.
     order : int
-        HEALPix order of the cells.
+        HEALPix order of the blocks.
     edges : float array, shape (bins + 1,)
-        Edges of the separation bins, deg.
+        Edges of the separation bins, deg, ascending.
 
     Returns
     -------
     list of Correlation
-        One for each kind.
+        One correlation function for each kind of tracers. Errors are NaN with a single block.
     """
     deltas = [[_overdensity(tracers, order, cell) for tracers in by_kind] for cell, by_kind in blocks]
     delta, chance = (np.array([[pair[i] for pair in row] for row in deltas]) for i in range(2))
@@ -290,13 +309,19 @@ def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: 
 
 
 def _separations(first: Float, second: Float, edges: Float) -> tuple[Int, Float]:
-    """Bin of the separation of each pair (-1 or the number of bins if outside), and the separation in deg."""
+    """Return the separation of all pairs of two sets of unit vectors in deg, and its bin between `edges` (deg).
+
+    The bin is -1 below the first edge, and the number of bins above the last. Both results are flat arrays.
+    """
     theta = np.degrees(np.arccos(np.clip(first @ second.T, -1.0, 1.0))).ravel()
     return np.searchsorted(edges, theta) - 1, theta
 
 
 def _pixel_pairs(order: int, cell: int, edges: Float) -> Pairs:
-    """Separations of every _SPARSE-th pixel from all pixels."""
+    """Return the distributions of separations between pixels of a block, from every 16th pixel to all pixels.
+
+    `order` and `cell` are the HEALPix order and nested number of the block; `edges` (deg) are the separation bins.
+    """
     place, bins = _vectors(order, cell), edges.size - 1
     fine = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
     of_bin, of_pixel, of_all = np.zeros((bins, _NODES)), np.zeros((bins, _NODES)), np.zeros(_NODES)
@@ -314,10 +339,11 @@ def _pixel_pairs(order: int, cell: int, edges: Float) -> Pairs:
 
 
 def _overdensity(tracers: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
-    """Overdensity of the pixels, and 1 / n, the anticorrelation of n points in a block of fixed total number.
+    """Return the overdensity of the pixels of a block relative to the mean of this block, and a correction of w.
 
-    The mean is that of the block. The common overdensity of a block contains no information about smaller scales and
-    dominates the noise.
+    Because n points are counted relative to their own mean, their w is too low by 1 / n. The correction is this number,
+    which a caller adds to w; it is 0 if `tracers` is a map. The mean of the block is removed because it dominates the
+    noise without telling anything about smaller scales.
     """
     if not isinstance(tracers, Tracers):
         return np.asarray(tracers - tracers.mean()), 0.0
@@ -332,19 +358,19 @@ def _vectors(order: int, cell: int) -> Float:
 
 
 def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
-    """Return tracers between two redshifts in shells of equal width, with bias times growth.
+    """Return the distribution of tracers over shells of comoving distance, weighted with bias times growth factor.
 
     Parameters
     ----------
     tracers : Tracers
-        Halos or galaxies.
+        Halos or galaxies; those outside the redshift range are ignored.
     z_min, z_max : float
         Redshift range.
 
     Returns
     -------
     Shells
-        Fraction of tracers times bias in each shell.
+        Shells of equal width, at most 80 Mpc/h, between the two redshifts.
     """
     first, last = (float(cosmology.comoving_distance(z)) for z in (z_min, z_max))
     edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
@@ -352,26 +378,26 @@ def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
 
 
 def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
-    """Predict w for a power spectrum in the separation bins of a measurement.
+    """Predict the angular correlation function w from a power spectrum in Limber's approximation.
 
     Parameters
     ----------
     tracer_shells : Shells
-        Tracers by distance.
+        Distribution of the tracers over distance, weighted with bias times growth factor.
     measured : Correlation
-        Measurement whose pairs are used.
+        Measurement for whose separation bins w is predicted.
     power : callable
-        P(k) in (Mpc/h)^3 of k in h/Mpc.
+        Function that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
     w, mean_subtracted : float array, shape (bins,)
-        w, and w relative to the mean of each block.
+        Predicted w in each bin, and the w that is measured if densities are relative to the mean of each block.
     """
     ell = np.geomspace(1.0, _ELL_MAX, 400)
     c_l = theory.galaxy_power(ell, tracer_shells, lambda k, _: power(k))
     multipoles = np.arange(1, _ELL_MAX + 1)
-    # A smooth cutoff at high multipoles avoids ringing at small separations.
+    # Cut off high multipoles smoothly: a sharp cutoff would cause oscillations at small separations.
     weight = (2 * multipoles + 1) / (4 * np.pi) * np.interp(np.log(multipoles), np.log(ell), c_l)
     weight *= np.exp(-((multipoles / (0.5 * _ELL_MAX)) ** 2))
     nodes = measured.pairs.nodes
@@ -381,21 +407,21 @@ def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float]
 
 
 def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> Float:
-    """Project the Gaussian field of the box along the lines of sight of the pixels of a block.
+    """Integrate the Gaussian density field of the universe along the line of sight of each pixel of a block.
 
     Parameters
     ----------
     box : Box
-        Box of matter.
+        Periodic box with the density field; its replicas fill the light cone.
     order, cell : int
-        HEALPix order and number of the nested block.
+        HEALPix order and nested number of the block.
     tracer_shells : Shells
-        Tracers by distance; they weight the field.
+        Distribution of tracers over distance, which is the weight of the field along the line of sight.
 
     Returns
     -------
-    float array, shape (pixels,)
-        Projected field.
+    float array, shape (4096,)
+        Weighted field in each pixel of the block, in nested order.
     """
     box_replicas, direction = (
         lightcone.draw_replicas(box, float(tracer_shells.chi[-1] + tracer_shells.width[-1])),
@@ -410,7 +436,10 @@ def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> F
 
 
 def gaussian_power(k: Float) -> Float:
-    """P(k) of the Gaussian field in (Mpc/h)^3 for k in h/Mpc; the field is constant within cells of the box."""
+    """Return the power spectrum P(k) in (Mpc/h)^3 of the simulated Gaussian field, for k in h/Mpc.
+
+    It includes the effect of finite cells, in which the field is constant, and is 0 for k of 1.2 h/Mpc or more.
+    """
     cell = density_box.box_model().cell
     on_modes = density_box._log_power(_MODES, cell).ravel()
     length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()

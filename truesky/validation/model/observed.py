@@ -1,9 +1,9 @@
-"""Galaxies of a sky compared with observations of surveys in observed.csv.
+"""Measure the quantities of simulated galaxies that observed.csv lists with values observed by surveys.
 
-Every row of the list is from outside this project. Rows of confidence P are published numbers that were looked up.
-Rows of confidence M are quoted from memory or read off a figure; they are shown, but do not count as failures.
-Magnitudes are before magnification and the dust of the Milky Way, as surveys correct theirs. Poisson errors of
-densities are under name + "_error".
+Rows of this file with the confidence P are published numbers that were looked up. Rows with the confidence M are quoted
+from memory or read off a plot; they are shown, but do not count as failures. Magnitudes are without lensing
+magnification and without extinction by the Milky Way, for which surveys correct theirs. Measured values are returned by
+name, and Poisson errors of log10 of number densities under name + "_error".
 """
 
 from __future__ import annotations
@@ -25,36 +25,54 @@ from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.high_redshift import QUASAR
 from truesky.fluxes.libraries import templates
 
+# Bands in which galaxies are counted.
 BANDS = ("euclid_vis", "lsst_r", "lsst_i")
+# Number of arcmin^2 in a deg^2.
 ARCMIN2 = 3600.0
+# Redshift ranges of the stellar mass function; the keys are the redshifts in the names of measured values.
 MASS_SHELLS = {0.35: (0.2, 0.5), 0.65: (0.5, 0.8), 0.95: (0.8, 1.1), 1.3: (1.1, 1.5), 1.75: (1.5, 2.0)}
-MASSES, MASS_HALF = (9.5, 10.0, 10.5, 11.0), 0.1
-RED_SHELLS, RED_MASSES, RED_HALF = {0.35: (0.2, 0.5), 0.95: (0.8, 1.1)}, (10.1, 10.6, 11.1), 0.25
+# Central stellar masses of the mass function, log10 of Msun.
+MASSES = (9.5, 10.0, 10.5, 11.0)
+# Half width of a mass bin of the stellar mass function, dex.
+MASS_HALF = 0.1
+# Redshift ranges of the fraction of red galaxies; the keys are the redshifts in the names of measured values.
+RED_SHELLS = {0.35: (0.2, 0.5), 0.95: (0.8, 1.1)}
+# Central stellar masses of the fraction of red galaxies, log10 of Msun.
+RED_MASSES = (10.1, 10.6, 11.1)
+# Half width of a mass bin for the fraction of red galaxies, dex.
+RED_HALF = 0.25
+# Redshift ranges of the star formation rate density.
 STAR_FORMATION_SHELLS = ((0.05, 0.3), (0.3, 0.7), (0.7, 1.2), (1.2, 1.8), (1.8, 2.5), (2.5, 3.5), (3.5, 4.5))
+# Absolute AB magnitudes at 1500 A at which the ultraviolet luminosity function is measured, by central redshift.
 ULTRAVIOLET = {3.0: (-22, -21, -20), 3.8: (-22, -21), 4.9: (-22, -21), 5.9: (-22,)}
-# Rest-frame wavelength of ultraviolet magnitudes (A), and the band that observes it at higher redshift.
-_ULTRAVIOLET_AT, _ULTRAVIOLET_BAND = 1500.0, "lsst_i"
+# Rest-frame wavelength of ultraviolet magnitudes, angstrom.
+_ULTRAVIOLET_AT = 1500.0
+# Band whose cached table of flux ratios gives the flux at 1500 A, because the band observes it at high redshift.
+_ULTRAVIOLET_BAND = "lsst_i"
+# Central wavelength of the r band, angstrom.
 _R_PIVOT = 6200.0
-# Vacuum wavelength of H alpha (A), and the band from which its continuum is derived.
-_HALPHA, _NEAR_INFRARED = 6564.6, "euclid_h"
+# Vacuum wavelength of H alpha, angstrom.
+_HALPHA = 6564.6
+# Band whose cached table of flux ratios gives the continuum at H alpha.
+_NEAR_INFRARED = "euclid_h"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GalaxySample:
-    """Galaxies of kinds 0 (central) and 1 (satellite).
+    """Central and satellite galaxies in an area of the sky, with magnitudes.
 
     Attributes
     ----------
     rows : mapping of str to array, shape (n,)
-        Columns of table `galaxies` by name.
+        Columns of the table `galaxies` by name.
     mags : mapping of str to float array, shape (n,)
-        Magnitudes by band, AB.
+        Apparent AB magnitudes by band.
     ultraviolet : float array, shape (n,)
-        Absolute magnitude at 1500 A.
+        Absolute AB magnitude at 1500 A (rest frame), for h = 0.67.
     area : float
-        Area, deg2.
+        Area of the sky, deg2.
     quasars : float, optional
-        Quasars per deg2 with r < 22.5, if known.
+        Number of quasars per deg2 with r < 22.5; None if not known.
     """
 
     rows: Mapping[str, Array]
@@ -67,15 +85,16 @@ class GalaxySample:
         return np.asarray(self.rows[name], float)
 
     def per_deg2(self, selected: Bool) -> float:
-        """Return the number of selected galaxies per deg2."""
+        """Return the number per deg2 of the galaxies for which the mask `selected`, shape (n,), is True."""
         return float(np.count_nonzero(selected) / self.area)
 
     def volume(self, z_min: float, z_max: float) -> float:
-        """Return the comoving volume of the sample between two redshifts in Mpc^3 (h = 0.67)."""
+        """Return the comoving volume between two redshifts in the sample's area of the sky, Mpc^3 (for h = 0.67)."""
         steradian = self.area * np.radians(1.0) ** 2
         return float(cosmology.comoving_volume(z_min, z_max) * steradian / cosmology.HUBBLE**3)
 
 
+# Columns of the table `galaxies` that the measurements require.
 COLUMNS = (
     "kind", "density_boost", "mag_r01", "z_true", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
     "log_halo_mass", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1", "flux_halpha", "flux_hbeta",
@@ -84,9 +103,11 @@ COLUMNS = (
 
 
 def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
-    """Return the galaxies of a version of table `galaxies`, and the generation cell of each central and satellite.
+    """Read a sample of galaxies from the published table `galaxies` of a lake.
 
-    The area is that of the cells in which the table was drawn.
+    Returns the central and satellite galaxies, and for each of them the number of the HEALPix cell (order 8) that
+    contains its observed position. The area of the sample is the area of all cells in which galaxies were simulated,
+    including cells without galaxies; if the table does not record them, only cells with galaxies count.
     """
     table = galaxies.rows([*COLUMNS, "_healpix_29"])
     cell = table["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
@@ -96,32 +117,36 @@ def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
 
 
 def from_table(table: pa.Table, area: float) -> GalaxySample:
-    """Return the sample of a table `galaxies` with COLUMNS in an area in deg2."""
+    """Return a sample from the table `galaxies` with the columns COLUMNS, for an area of the sky in deg2.
+
+    Central and satellite galaxies are kept, quasars are counted, and other kinds of sources are ignored.
+    """
     galaxies = table.filter(pa.array(table["kind"].to_numpy() < 2))
     sample = from_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
     quasars = table.filter(pa.array(table["kind"].to_numpy() == QUASAR))
     mag, z, boost = (quasars[name].to_numpy().astype(float) for name in ("mag_r01", "z_true", "density_boost"))
-    # The spectrum is f_nu ~ nu^-0.5 from 1450 A to the middle of r.
+    # Convert mag_r01, which for quasars is the magnitude at 1450 A in the rest frame, to the centre of r, for the
+    # spectrum f_nu ~ nu^-0.5.
     red = mag - 1.25 * np.log10(_R_PIVOT / (1450.0 * (1.0 + z)))
     return replace(sample, quasars=float(np.sum((red < 22.5) / boost)) / area)
 
 
 def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> GalaxySample:
-    """Return the sample of centrals and satellites given as columns.
+    """Return a sample of central and satellite galaxies that are given as columns, and compute their magnitudes.
 
     Parameters
     ----------
     rows : mapping of str to array, shape (n,)
-        COLUMNS of table `galaxies`, without quasars.
+        COLUMNS of the table `galaxies`, for central and satellite galaxies only.
     area : float
-        Area, deg2.
+        Area of the sky, deg2.
     z_max : float
-        Redshift that the tables of band ratios reach, at least the largest redshift of the rows.
+        Largest redshift of the cached tables of flux ratios between bands; at least that of all galaxies.
 
     Returns
     -------
     GalaxySample
-        Sample with magnitudes, without quasars.
+        The sample; its number of quasars is None.
     """
     library = templates.galaxy_library()
     sed = _spectra(rows)
@@ -136,21 +161,23 @@ def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching
 
 
 def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
-    """Return AB magnitudes in a band, before emission lines, magnification and the dust of the Milky Way.
+    """Compute apparent AB magnitudes of galaxies in a band from their redshift, absolute magnitude and spectrum.
+
+    Emission lines, lensing magnification and extinction by the Milky Way are not included.
 
     Parameters
     ----------
     rows : mapping of str to array, shape (n,)
-        COLUMNS of table `galaxies`.
+        Columns of the table `galaxies`: z_true, abs_mag_r01 and the description of the spectrum (sed_1, frac_1, ...).
     band : str
-        Name of the band.
+        Name of the band, such as "euclid_vis".
     z_max : float
-        Redshift that the table of band ratios reaches, at least the largest redshift of the rows.
+        Largest redshift of the cached table of flux ratios; at least that of all galaxies.
 
     Returns
     -------
     float array, shape (n,)
-        Magnitudes.
+        AB magnitudes.
     """
     sed, z = _spectra(rows), rows["z_true"].astype(float)
     table = band_ratios.load(templates.galaxy_library(), band, z_max, _dustiest(sed))
@@ -158,7 +185,12 @@ def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = mat
 
 
 def figures(sample: GalaxySample) -> dict[str, float]:
-    """Measure every figure of the list that a sky complete to I_E < 26 allows."""
+    """Measure all quantities of observed.csv, and return their values by name.
+
+    The sample should be complete to I_E = 26; otherwise values that need faint galaxies are too low. Without any
+    galaxy, medians and fractions are NaN, logarithms of number densities -inf, and numbers per area 0. Quasars are left
+    out if not known.
+    """
     return {
         **counts(sample),
         **masses(sample),
@@ -171,7 +203,10 @@ def figures(sample: GalaxySample) -> dict[str, float]:
 
 
 def counts(sample: GalaxySample) -> dict[str, float]:
-    """Galaxies per arcmin2 or deg2 by magnitude, and median redshifts."""
+    """Measure the numbers of galaxies brighter than limits in i and I_E (per arcmin2) and in r (per deg2).
+
+    The result also has log10 of the differential counts in i (per mag and deg2), and median redshifts.
+    """
     i_band, r_band, vis, z = sample.mags["lsst_i"], sample.mags["lsst_r"], sample.mags["euclid_vis"], sample["z_true"]
     values = {f"i_{limit}": sample.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
     for at in 19.25 + 0.5 * np.arange(11):
@@ -182,7 +217,10 @@ def counts(sample: GalaxySample) -> dict[str, float]:
 
 
 def masses(sample: GalaxySample) -> dict[str, float]:
-    """log10 of the density per Mpc^3 and dex, and the fraction of red galaxies, by stellar mass and redshift."""
+    """Measure the stellar mass function, log10 of galaxies per Mpc^3 and dex, in bins of mass and redshift.
+
+    The result also has the fraction of red galaxies, NaN in bins without galaxies.
+    """
     z, mass, red = sample["z_true"], sample["log_stellar_mass"], is_red(sample)
     values: dict[str, float] = {}
     for at, (z_min, z_max) in MASS_SHELLS.items():
@@ -198,7 +236,10 @@ def masses(sample: GalaxySample) -> dict[str, float]:
 
 
 def star_formation(sample: GalaxySample) -> dict[str, float]:
-    """log10 of Msun/yr/Mpc^3 by redshift; median and scatter of log10 SFR on the main sequence at 10^10 Msun."""
+    """Measure the star formation rate density, log10 of Msun/yr/Mpc^3, in redshift ranges.
+
+    The result also has the median and the scatter of log10 SFR (Msun/yr) of star-forming galaxies with 10^10 Msun.
+    """
     z, mass, rate, forming = sample["z_true"], sample["log_stellar_mass"], sample["log_sfr"], is_blue(sample)
     values = {}
     for z_min, z_max in STAR_FORMATION_SHELLS:
@@ -213,7 +254,11 @@ def star_formation(sample: GalaxySample) -> dict[str, float]:
 
 
 def lines(sample: GalaxySample) -> dict[str, float]:
-    """Emitters per deg2, ratio [O III] / H beta by stellar mass, and equivalent width of the brightest emitters."""
+    """Measure emission lines: numbers of H alpha and [O III] emitters per deg2 above flux limits (erg/s/cm^2).
+
+    The result also has the median log10 of [O III] / H beta by stellar mass and redshift, and the median rest-frame
+    equivalent width (angstrom) of H alpha and [N II] in bright emitters.
+    """
     z, mass = sample["z_true"], sample["log_stellar_mass"]
     oiii, halpha_nii = sample["flux_oiii"], sample["flux_halpha"] + (1.0 + 1.0 / 3.05) * sample["flux_nii"]
     halpha_range, oiii_range = (z > 0.9) & (z < 1.6), (z > 1.5) & (z < 2.3)
@@ -233,14 +278,20 @@ def lines(sample: GalaxySample) -> dict[str, float]:
 
 
 def environment(sample: GalaxySample) -> dict[str, float]:
-    """Fraction of red galaxies among centrals of groups and clusters."""
+    """Return the fraction of red galaxies among central galaxies of halos above 10^13.5 Msun/h at z = 1.
+
+    It is NaN without such galaxies.
+    """
     halo, z, red = sample["log_halo_mass"], sample["z_true"], is_red(sample)
     centrals = (sample.rows["kind"] == 0) & (halo > 13.5) & (z > 0.8) & (z < 1.2)
     return {"red_centrals_13.5_z1": float(np.mean(red[centrals])) if centrals.any() else np.nan}
 
 
 def ultraviolet(sample: GalaxySample) -> dict[str, float]:
-    """log10 of galaxies per Mpc^3 and mag at 1500 A, at magnitudes complete to I_E < 26."""
+    """Measure the ultraviolet luminosity function: log10 of galaxies per Mpc^3 and mag at 1500 A, by redshift.
+
+    The magnitudes are bright enough for samples that are complete to I_E = 26.
+    """
     z = sample["z_true"]
     values: dict[str, float] = {}
     for at, magnitudes in ULTRAVIOLET.items():
@@ -253,22 +304,28 @@ def ultraviolet(sample: GalaxySample) -> dict[str, float]:
 
 
 def is_red(sample: GalaxySample) -> Bool:
-    """Select galaxies redder than the middle between the red and the blue sequence."""
+    """Return a mask, bool[n], of galaxies whose g - r is above the middle between the red and the blue sequence.
+
+    The limit depends on the absolute magnitude, not on redshift.
+    """
     return np.asarray(sample["color_gr_01"] > 0.78 - 0.02 * (sample["abs_mag_r01"] + 20.0))
 
 
 def is_blue(sample: GalaxySample) -> Bool:
-    """Select galaxies bluer than the valley between the red and the blue sequence."""
+    """Return a mask, bool[n], of galaxies whose g - r is below the minimum between the red and the blue sequence.
+
+    The limit depends on the absolute magnitude and on redshift.
+    """
     redshift_step = np.clip(sample["z_true"] - 0.1, 0.0, 1.6)
     return np.asarray(sample["color_gr_01"] < 0.80 - 0.07 * (sample["abs_mag_r01"] + 20.0) - 0.16 * redshift_step)
 
 
 def _continuum(sample: GalaxySample, selected: Bool) -> Float:
-    """Observed f_lambda at redshifted H alpha of selected galaxies, erg s-1 cm-2 A-1."""
+    """Return the observed continuum of the selected galaxies at redshifted H alpha, erg/s/cm^2/angstrom."""
     library, rows = templates.galaxy_library(), {name: values[selected] for name, values in sample.rows.items()}
     sed = _spectra(rows)
     z = rows["z_true"].astype(float)
-    # At this redshift H alpha lies at the pivot wavelength of the band.
+    # Redshift at which H alpha is at the pivot wavelength of the band, where the table gives its continuum.
     at = passbands.pivot_wavelength(passbands.load(_NEAR_INFRARED)) / _HALPHA - 1.0
     table = band_ratios.load(library, _NEAR_INFRARED, matching.Z_LAST, _dustiest(sed))
     rest = rows["abs_mag_r01"] + band_ratios.offset(table, np.full(z.size, at), sed) + 2.5 * np.log10(1.0 + at)
@@ -282,7 +339,7 @@ def _spectra(rows: Mapping[str, Array]) -> band_ratios.Sed:
 
 
 def _dustiest(sed: band_ratios.Sed) -> float:
-    """Largest E(B-V) of the tables, at least 0.5; spectra of another library can be dustier."""
+    """Return the E(B-V) (mag) that the cached tables of flux ratios must reach for these spectra, at least 0.5."""
     return max(0.5, float(sed.ebv.max(initial=0.0)))
 
 
@@ -291,7 +348,7 @@ def _median(values: Sequence[float] | Float) -> float:
 
 
 def _log_density(name: str, number: int | np.signedinteger[Any], per: float) -> dict[str, float]:
-    """A logarithmic density and its Poisson error."""
+    """Return log10(number / per) by name, and its Poisson error by name + "_error"; -inf without error for number 0."""
     if not number:
         return {name: -np.inf}
     return {name: float(np.log10(number / per)), f"{name}_error": float(1.0 / (np.log(10.0) * np.sqrt(number)))}

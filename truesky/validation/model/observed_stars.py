@@ -1,7 +1,6 @@
-"""Stars of the Milky Way compared with observations in observed_stars.csv.
+"""Measure the quantities of the Milky Way model that observed_stars.csv lists with observed values.
 
-Every row of the list is from outside this project. Rows of confidence M are quoted from memory and do not count as
-failures.
+Rows of this file with the confidence M are quoted from memory and do not count as failures.
 """
 
 from __future__ import annotations
@@ -22,31 +21,34 @@ from truesky.randomness.rng import stream
 from truesky.validation.checks import Check, read
 from truesky.validation.model import star_counts
 
+# File with the observed values.
 LIST = Path(__file__).with_name("observed_stars.csv")
+# Galactic longitude and latitude (deg) of the lines of sight along which the mass of the bulge is measured.
 _BULGE = ((1, -4), (10, -10))
-# Mean mass, Msun.
+# Mean mass of a white dwarf, Msun.
 _WHITE_DWARF_MASS = 0.6
+# Absolute bolometric magnitude of the Sun.
 _SUN_M_BOL = 4.74
-# Distance (pc) at which Oort's constants are evaluated.
+# Distance (pc) of the stars from whose mean motions Oort's constants are computed.
 _OORT_DISTANCE = 50.0
 
 
 def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[str, float]:
-    """Measure every figure of the list (takes 2 s).
+    """Measure all quantities of observed_stars.csv in a model of the Milky Way (takes 2 s).
 
     Parameters
     ----------
     universe : StarModel
         Model of the stars.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag.
+        HEALPix map of the extinction A(V), mag.
     step : int
-        Step in the numbers of order-4 cells that sample the whole sky.
+        For counts on the whole sky, every `step`-th HEALPix cell of order 4 is used.
 
     Returns
     -------
     dict of str to float
-        Figures by name.
+        Measured values by name.
     """
     limits = (15.0, 18.0, 20.0)
     pole = star_counts.count_brighter(universe, (0.0, 90.0), limits)
@@ -62,7 +64,7 @@ def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[st
 
 
 def checks_by_group(values: Mapping[str, float]) -> dict[str, list[Check]]:
-    """Check figures against every row of the list, by group."""
+    """Compare measured values (by name) with observed_stars.csv, and return the checks by the group in this file."""
     groups: dict[str, list[Check]] = {}
     for check in read(LIST, values):
         groups.setdefault(check.group, []).append(check)
@@ -70,7 +72,10 @@ def checks_by_group(values: Mapping[str, float]) -> dict[str, list[Check]]:
 
 
 def local_densities(universe: stars.StarModel) -> dict[str, float]:
-    """Densities at the Sun in pc^-3, companions per star, and M_H of the red clump."""
+    """Return number densities of stars at the Sun (pc^-3), companions per star, and M_H (mag) of the red clump.
+
+    The densities are of systems with a primary below 1 Msun, giants, giants with M_V < 1, and white dwarfs.
+    """
     galaxy, pieces = universe.galaxy, universe.galaxy.pieces
     at_sun = np.arange(pieces.number.size) < galaxy.first[-1, 0]
     number, stage = pieces.number * at_sun, pieces.stage
@@ -87,7 +92,10 @@ def local_densities(universe: stars.StarModel) -> dict[str, float]:
 
 
 def _clump_magnitude(galaxy: milky_way.MilkyWay) -> float:
-    """Most frequent M_H, between -3 and 0, of giants of the thin disc."""
+    """Return the M_H (mag), between -3 and 0, at which giants of the thin disc are most frequent: the red clump.
+
+    If the model divides the thin disc by age (Besancon), only its youngest part is used.
+    """
     pieces, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
     edges = np.arange(-3.0, 0.01, 0.1)
     number, _ = np.histogram(pieces.m_h.mean(0), edges, weights=pieces.number * thin * (pieces.stage == GIANT))
@@ -96,7 +104,10 @@ def _clump_magnitude(galaxy: milky_way.MilkyWay) -> float:
 
 
 def isochrone_points() -> dict[str, float]:
-    """Turn-off temperatures (K) and mass (Msun), M_bol of the tip, and M_H of the Sun from isochrones."""
+    """Return properties of isochrones: turn-off temperatures (K) of halo and thick disc, and turn-off mass (Msun).
+
+    The result also has M_bol of the tip of the red giant branch, and M_H of the Sun.
+    """
     old = isochrones.isochrones([12.5, 10.0, 4.6], [-1.5, -0.5, 0.0])
     main = old.main_sequence + 4
     hot = old.log_teff[:, :main].argmax(1)
@@ -112,7 +123,11 @@ def isochrone_points() -> dict[str, float]:
 
 
 def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
-    """Return statistics of g - r (SDSS) of stars with 18 < r < 19.5 in `area` deg2 at b = 60, without dust."""
+    """Measure g - r (SDSS) of simulated stars with 18 < r < 19.5 in `area` deg2 at Galactic latitude 60, without dust.
+
+    The statistics are the fraction bluer than 0.5, the most frequent colour of halo stars, and the colour of the blue
+    edge (5th percentile) of halo dwarfs.
+    """
     galaxy = universe.galaxy
     rngs = (stream(star_counts.SEED, "colours", name) for name in ("number", "labels"))
     drawn = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, 90.0, 60.0, area, 21.0), *rngs)
@@ -139,7 +154,11 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
 
 
 def motions() -> dict[str, float]:
-    """Oort's constants (km/s/kpc) of the mean of the youngest stars, and lag and dispersion (km/s) of the halo."""
+    """Return Oort's constants A and B (km/s/kpc) of the youngest stars, and the kinematics of the halo.
+
+    These are the lag of halo stars behind the local standard of rest, and the dispersion of their line-of-sight
+    velocities towards the Galactic centre (km/s).
+    """
     lon = np.arange(0.0, 360.0, 5.0)
     zeros, young = np.zeros((3, lon.size)), np.full(lon.size, 0.1)
     mean = [_longitude_motion(lon, distance_pc, zeros, young) for distance_pc in (_OORT_DISTANCE, 0.5 * _OORT_DISTANCE)]
@@ -167,7 +186,12 @@ def motions() -> dict[str, float]:
 
 
 def _longitude_motion(lon: Float, distance_pc: float, deviates: Float, age: Float) -> Float:
-    """Proper motion along Galactic longitude in the plane, mas/yr, from a small step in longitude."""
+    """Return the proper motion along Galactic longitude (mas/yr) of thin disc stars in the Galactic plane.
+
+    `lon` are their longitudes in deg, `distance_pc` their distance in pc, and `age` their ages in Gyr. `deviates`,
+    shape (3, n), are standard normal random numbers for their velocities; 0 gives the mean motion. The direction of
+    longitude on the sky is found from a small step in longitude.
+    """
     ra, dec = sky.equatorial(lon, np.zeros(lon.size))
     distance, thin = np.full(lon.size, distance_pc), np.zeros(lon.size, np.int64)
     east, north, _ = kinematics.velocities(ra, dec, distance, thin, age, deviates)
@@ -178,7 +202,7 @@ def _longitude_motion(lon: Float, distance_pc: float, deviates: Float, age: Floa
 
 
 def bulge(galaxy: milky_way.MilkyWay) -> dict[str, float]:
-    """Mass of the bulge along lines of sight, Msun deg^-2."""
+    """Return the stellar mass of the bulge per deg^2 (Msun) along several lines of sight, by name."""
     pieces, inside = galaxy.pieces, np.arange(galaxy.pieces.number.size) >= galaxy.first[-1, 0]
     each = np.where(pieces.stage == WHITE_DWARF, _WHITE_DWARF_MASS, 10.0 ** pieces.log_mass.mean(0))
     mass = float((each * pieces.number * inside).sum() / galaxy.local[-1].sum())

@@ -1,4 +1,4 @@
-"""Plot the figures of the simulated universe."""
+"""Plot the measurements of the simulated universe with observations and theory for comparison."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from truesky.catalogue.halos import luminosity_function
 from truesky.fluxes import cosmology
 from truesky.validation.model import census
 
-# Galaxies per arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST
-# Science Book (2009).
+# Observed numbers of galaxies per arcmin^2 brighter than a magnitude i (key): GAMA and zCOSMOS (Driver et al. 2016),
+# VVDS (Le Fevre et al. 2005), LSST Science Book (2009).
 _OBSERVED = {20: 0.57, 21: 1.45, 22: 3.7, 23: 9.0, 24: 21.0, 25: 44.5, 26: 94.0}
 
 
@@ -27,22 +27,22 @@ def draw(
     bands: Sequence[int],
     figures: Mapping[str, float],
 ) -> None:
-    """Write universe.png: counts, redshifts, luminosities, halos, w(theta) and C_l of the convergence.
+    """Write universe.png with six plots: counts, redshifts, luminosities, halos, w(theta) and C_l of the convergence.
 
     Parameters
     ----------
     folder : Path
         Folder of the file; it is made if it does not exist.
     sample : Census
-        Galaxies that were counted.
+        Simulated galaxies.
     curves : mapping of str to tuple
-        (theta in deg, w, error, linear theory) by tracer and scale, such as "halos_wide".
+        Arrays (theta in deg, measured w, error, predicted w) by kind of tracer and scale, such as "halos_wide".
     power : float array, shape (planes, bands)
-        C_l of the convergence over theory.
+        C_l of the convergence divided by linear theory, for two source redshifts; nothing is plotted if it is empty.
     bands : sequence of int
         Edges of the bands in l.
     figures : mapping of str to float
-        Measured figures by name.
+        Measured values by name.
     """
     import matplotlib
 

@@ -1,6 +1,6 @@
-"""Lensing by the simulated universe: C_l and rms of the convergence, B modes, and the shear around massive halos.
+"""Measure lensing by the simulated universe: C_l and rms of the convergence, B modes, and shear around massive halos.
 
-The maps of the catalogue and those of boxes with other seeds are compared with linear theory.
+The lensing maps of the catalogue, and maps of universes with other random seeds, are compared with linear theory.
 """
 
 from __future__ import annotations
@@ -19,40 +19,47 @@ from truesky.fluxes import cosmology
 from truesky.validation import theory as theories
 from truesky.validation.model.clustering import Tracers
 
-# The error of a mean is the scatter of the cells of this nside.
+# The error of the mean convergence is computed from the scatter between HEALPix cells of this nside.
 _PATCHES = 2
+# Number of distances over which linear theory is integrated.
 _STEPS = 1500
+# HEALPix nside of the directions in which the convergence is computed along single lines of sight.
 _SIGHT_NSIDE = 128
-# Radii of rings around halos (deg), and number of directions.
-RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
+# Radii, in deg, of the rings around halos in which the tangential shear is measured.
+RINGS = (0.1, 0.2, 0.4, 0.8)
+# Number of points on each ring around a halo at which the shear is measured.
+_DIRECTIONS = 8
 
 
 def linear_theory(ell: Float, chi: float) -> Float:
-    """C_l of the convergence of sources at `chi` Mpc/h, from linear theory and Limber's approximation."""
+    """Return C_l of the convergence at multipoles `ell` from linear theory in Limber's approximation.
+
+    All sources are at the comoving distance `chi` (Mpc/h).
+    """
     return theories.convergence_power(ell, np.array([chi]), np.ones(1), theories.linear_power, _distances(chi))
 
 
 def _distances(chi: float) -> Float:
-    """Comoving distances (Mpc/h) up to sources at `chi`, over which linear theory is integrated."""
+    """Return evenly spaced comoving distances (Mpc/h) in front of sources at `chi` (Mpc/h), for integrals."""
     return np.linspace(2.0, chi - 0.5, _STEPS)
 
 
 def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
-    """Return C_l over theory in bands of l, with each l weighted by its number of modes.
+    """Return measured C_l of the convergence divided by linear theory, averaged in bands of l.
 
     Parameters
     ----------
-    power : float array
-        C_l from l = 0.
+    power : float array, shape (l_max + 1,)
+        Measured C_l, beginning at l = 0, at least up to the last edge.
     chi : float
         Comoving distance of the sources, Mpc/h.
     edges : sequence of int
-        Edges of the bands in l.
+        Edges of the bands in l, ascending, above 0.
 
     Returns
     -------
     float array, shape (bands,)
-        Mean ratio in each band.
+        Mean ratio in each band, weighted by 2 l + 1.
     """
     ell = np.arange(edges[0], edges[-1] + 1)
     nodes = np.unique(np.geomspace(edges[0], edges[-1], 60).astype(int))
@@ -65,25 +72,27 @@ def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
 
 
 def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
-    """Return the convergence along lines of sight, and the factors of its multipoles for maps.
+    """Compute maps of the convergence from a box of matter, like the maps of the catalogue before their last step.
+
+    In the last step, which is left out here, the multipoles of the maps are multiplied by `gain`.
 
     Parameters
     ----------
     box : Box
-        Box of matter.
+        Periodic box with the density field; its replicas fill the light cone.
     nside : int
-        Resolution of the maps.
+        HEALPix resolution of the maps.
     redshifts : sequence of float
-        Redshift of the sources of each plane.
+        Redshift of the sources of each map (plane).
     l_max : int
         Highest multipole.
 
     Returns
     -------
     kappa : float32 array, shape (planes, pixels)
-        Convergence, nested.
+        Convergence along the line of sight to the centre of each pixel, in nested order.
     gain : float array, shape (planes, l_max + 1)
-        Factor by which multipoles are multiplied in maps of the catalogue.
+        Factors by which the multipoles of these maps are multiplied in the maps of the catalogue.
     """
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
@@ -96,32 +105,35 @@ def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: in
 
 
 def gaussian_box(seed: int, n: int) -> Box:
-    """Return a box without smoothed fields and velocities, which lensing does not need; it is not cached."""
+    """Return a box of matter with `n` cells per side that has only the density field, for lensing.
+
+    Smoothed fields and velocities are left out, and the box is not stored in the disc cache.
+    """
     model = density_box.box_model()
     g = density_box._gaussian(seed, n, model.cell)
     return Box(model, n, seed, (g,), np.array([g.var(dtype=float)]), ())
 
 
 def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
-    """Return C_l over theory of the maps of a catalogue with another seed.
+    """Return C_l of the convergence divided by linear theory, for the lensing maps of a universe with another seed.
 
     Parameters
     ----------
     seed : int
         Seed of the box of matter.
     n : int
-        Cells per side of the box.
+        Number of cells along each side of the box.
     nside : int
-        Resolution of the maps.
+        HEALPix resolution of the maps.
     redshifts : sequence of float
-        Redshift of the sources of each plane.
+        Redshift of the sources of each map (plane).
     edges : sequence of int
-        Edges of the bands in l.
+        Edges of the bands in l, ascending.
 
     Returns
     -------
     float array, shape (planes, bands)
-        Ratio to linear theory.
+        Mean ratio to linear theory in each band.
     """
     kappa, gain = convergence_maps(gaussian_box(seed, n), nside, redshifts, edges[-1])
     rows = []
@@ -132,21 +144,21 @@ def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edge
 
 
 def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
-    """Return C_l over theory of the maps of the catalogue.
+    """Return C_l of the convergence divided by linear theory, for the lensing maps of the catalogue.
 
     Parameters
     ----------
     planes : Planes
-        Lensing maps.
+        Lensing maps for sources at several distances (planes).
     numbers : sequence of int
-        Planes to measure.
+        Indices of the planes to measure.
     edges : sequence of int
-        Edges of the bands in l.
+        Edges of the bands in l, ascending.
 
     Returns
     -------
-    float array, shape (planes, bands)
-        Ratio to linear theory.
+    float array, shape (len(numbers), bands)
+        Mean ratio to linear theory in each band.
     """
     rows = []
     for number in numbers:
@@ -156,7 +168,11 @@ def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) 
 
 
 def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]:
-    """Return the rms of the convergence along lines of sight through the box, and the rms from linear theory."""
+    """Return, for sources at each redshift, the rms of the convergence of single lines of sight, and linear theory.
+
+    Each pair has the rms that is measured with rays through the box (with its finite cells), and the rms predicted for
+    the same cells.
+    """
     chosen, chi = lensing.settings(), np.asarray(cosmology.comoving_distance(np.array(redshifts)))
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE, np.arange(12 * _SIGHT_NSIDE**2), nest=True)).astype(np.float32)
     kappa = convergence.convergence(box, direction, hp.nside2resol(_SIGHT_NSIDE), chi, 1, chosen.stretch)
@@ -173,16 +189,18 @@ def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float,
 
 
 def skipping_rms(box: Box, redshift: float, step: float) -> float:
-    """Return the rms of the convergence from single cells at a fixed step; it is larger than that of all cells.
+    """Return the rms of the convergence if the density is sampled only in single cells along the line of sight.
+
+    It shows the error of a too large step: the rms is larger than with all cells along the line of sight.
 
     Parameters
     ----------
     box : Box
-        Box of matter.
+        Periodic box with the density field.
     redshift : float
         Redshift of the sources.
     step : float
-        Step along the line of sight, Mpc/h.
+        Distance between sampled cells along the line of sight, Mpc/h.
 
     Returns
     -------
@@ -202,7 +220,10 @@ def skipping_rms(box: Box, redshift: float, step: float) -> float:
 
 
 def map_rms(chi: float, l_max: int) -> float:
-    """Return the rms of a map up to multipole `l_max` from linear theory, for sources at `chi` Mpc/h."""
+    """Return the rms that linear theory predicts for a convergence map with multipoles from 2 to `l_max`.
+
+    All sources are at the comoving distance `chi` (Mpc/h).
+    """
     ell = np.arange(2, l_max + 1)
     nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
     power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
@@ -210,21 +231,22 @@ def map_rms(chi: float, l_max: int) -> float:
 
 
 def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
-    """Measure moments and the share of B modes of the maps of one plane.
+    """Measure means, rms values and the B-mode fraction of the lensing maps for sources at one distance.
 
     Parameters
     ----------
     planes : Planes
-        Lensing maps.
+        Lensing maps for sources at several distances (planes).
     number : int
-        Number of the plane.
+        Index of the plane.
     name : str
-        Name of the plane in the names of the figures.
+        Text that identifies the plane in the names of the results, such as "z1.0".
 
     Returns
     -------
     dict of str to float
-        Figures by name; deflections are in arcmin.
+        Measured values by name. The mean convergence is in units of its standard error, deflections are in arcmin, and
+        the B modes are the ratio of B-mode to E-mode power.
     """
     fields, chi, l_max = planes.maps[number], float(planes.chi[number]), int(lensing.settings().l_max * planes.nside)
     kappa = fields[:, lensing.KAPPA].astype(float)
@@ -244,21 +266,21 @@ def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
 
 
 def tangential_shear(planes: Planes, halos: Tracers, chi: float) -> tuple[Float, Float]:
-    """Return the mean tangential shear of sources around halos, and its error.
+    """Measure the mean tangential shear of sources around halos, interpolated from the lensing maps.
 
     Parameters
     ----------
     planes : Planes
-        Lensing maps.
+        Lensing maps for sources at several distances.
     halos : Tracers
-        Halos.
+        Halos, at least one.
     chi : float
         Comoving distance of the sources, Mpc/h.
 
     Returns
     -------
     mean, error : float array, shape (rings,)
-        Shear in each ring of RINGS.
+        Mean tangential shear at each radius of RINGS, and its standard error from the scatter between halos.
     """
     mean, error = [], []
     for radius in RINGS:
@@ -268,7 +290,7 @@ def tangential_shear(planes: Planes, halos: Tracers, chi: float) -> tuple[Float,
             offset = np.radians(np.full((2, halos.ra.size), [[east], [north]]))
             ra, dec = lensing.displace(halos.ra, halos.dec, *offset)
             lens_values = lensing.interpolate(planes, ra, dec, np.full(ra.size, chi))
-            # The position angle is from north to east; gamma1 > 0 is north-south.
+            # The position angle `turn` counts from north to east; gamma1 > 0 elongates images along east-west.
             shear_sum += lens_values[1] * np.cos(2 * turn) - lens_values[2] * np.sin(2 * turn)
         mean.append(np.mean(shear_sum) / _DIRECTIONS)
         error.append(np.std(shear_sum) / _DIRECTIONS / np.sqrt(shear_sum.size))

@@ -1,12 +1,12 @@
-"""Clustering at and within the size of halos: w(theta) of bright galaxies over that of a power law.
+"""Measure the clustering of bright galaxies at separations up to the size of halos, relative to a power law.
 
-The galaxies have M_r < -20 and a redshift of about 0.5. Pairs of galaxies in order-5 cells are compared with pairs of
-random points. Both are relative to the mean density of all cells, not to the mean of each cell. The power law is
-projected with Limber's equation and the distances of the galaxies.
+The galaxies have M_r - 5 log h < -20 and redshifts of 0.4 to 0.6. Pairs of galaxies in HEALPix cells of order 5 are
+compared with pairs of random points, to get w(theta). Densities are relative to the mean of all cells. The w of the
+power law is computed with Limber's equation and the distances of the galaxies.
 
 Notes
 -----
-Pairs across the borders of cells are in neither count.
+Pairs across the borders of cells are counted neither for galaxies nor for random points.
 
 References
 ----------
@@ -29,27 +29,42 @@ from truesky.randomness.rng import stream
 from truesky.validation import pairs
 from truesky.validation.model import clustering
 
-# Projected separations (Mpc/h); redshifts and luminosities of the galaxies; length (Mpc/h) and slope of the power law.
+# Edges of the bins of projected separation, Mpc/h.
 EDGES = np.array([0.04, 0.16, 0.32, 1.28, 5.12])
-Z_MIN, Z_MAX, MAX_ABS_MAG = 0.4, 0.6, -20.0
-LENGTH, SLOPE = 5.5, 1.8
+# Lowest redshift of the galaxies whose clustering is measured.
+Z_MIN = 0.4
+# Highest redshift of the galaxies whose clustering is measured.
+Z_MAX = 0.6
+# Galaxies must be brighter than this absolute magnitude M_r - 5 log h.
+MAX_ABS_MAG = -20.0
+# Correlation length of the observed power law, Mpc/h.
+LENGTH = 5.5
+# Slope (negative exponent) of the observed power law.
+SLOPE = 1.8
+# HEALPix order of the cells in which pairs are counted.
 ORDER = 5
-# Random points per cell, and bins of distance.
-_RANDOM, _BINS = 20_000, 40
+# Number of random points in each cell.
+_RANDOM = 20_000
+# Number of bins of the galaxies' distance distribution.
+_BINS = 40
 
 
 def galaxy_population(seed: int, box_cells: int) -> Population:
-    """Return halos that host galaxies brighter than MAX_ABS_MAG in a box with `box_cells` cells per side."""
+    """Return a model of the halos that host galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6.
+
+    `seed` and `box_cells` (cells per side) define the periodic box of matter of the universe.
+    """
     matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     space = Volume(Z_MIN - 0.05, Z_MAX + 0.05, MAX_ABS_MAG)
     return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
 
 
 def figures(universe: Population, count: int) -> dict[str, float]:
-    """Return w over that of the power law in each bin, and its error from the scatter between cells.
+    """Measure w of bright galaxies divided by w of the power law, in bins of projected separation.
 
-    The population comes from `galaxy_population`; `count` order-5 cells are distributed over the sky. Names contain the
-    lower edge of each bin.
+    `universe` comes from `galaxy_population`. Galaxies are drawn in `count` (at least 2) HEALPix cells of order 5,
+    distributed over the sky. Names of the results contain the lower edge of the bin in Mpc/h; errors are from the
+    scatter between cells.
     """
     low, high = (float(cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
@@ -76,15 +91,18 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 
 
 def _count_pairs(ra: Float, dec: Float, theta: Float) -> Float:
-    """Ordered pairs in each bin of separation with edges `theta` in rad."""
+    """Return the number of ordered pairs (each pair counts twice) in separation bins with edges `theta` (rad).
+
+    Positions are in deg.
+    """
     same = np.zeros(ra.size, np.int64)
     return np.asarray(2.0 * pairs.count_pairs(sky.unit_vectors(ra, dec), same, same, theta).total[0])
 
 
 def power_law(chi: Float, theta: Float) -> Float:
-    """Return w of xi = (r / LENGTH)^-SLOPE, averaged over the pairs of each bin.
+    """Return w in each separation bin for the spatial correlation function xi(r) = (r / 5.5 Mpc/h)^-1.8.
 
-    The galaxies lie at comoving distances `chi` (Mpc/h); the bins of separation have edges `theta` (rad).
+    `chi` are the comoving distances of the galaxies (Mpc/h), and `theta` the edges of the bins (rad).
     """
     share, edges = np.histogram(chi, _BINS, density=True)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]

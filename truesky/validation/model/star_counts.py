@@ -1,4 +1,4 @@
-"""Compare drawn stars and brown dwarfs with published counts of other codes."""
+"""Count simulated stars and brown dwarfs per deg2, for a comparison with counts of other codes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from truesky.fluxes.libraries import brown_dwarfs as spectra_of_dwarfs
 from truesky.fluxes.libraries import model_stars
 from truesky.randomness.rng import stream
 
+# Seed of the random numbers with which stars are drawn.
 SEED = 7
+# Area of a generation cell (HEALPix cell in which stars are simulated as a whole), deg^2.
 AREA = sky.cell_area(GENERATION_ORDER)
-# HEALPix order of the cells that sample the whole sky.
+# HEALPix order of the cells at whose centres the stars of the whole sky are counted.
 _SKY_ORDER = 4
-# Northern latitude -> stars deg-2 to H = 18, 22, 26 (Vega). The counts are means over longitude without dust,
-# companions and white dwarfs. The laws of density and mass are the same as here; above 0.55 Msun the tables are those
-# of BaSTI (Pietrinferni et al. 2004).
+# Reference counts by northern Galactic latitude (deg): stars per deg^2 brighter than each of LIMITS, as means over
+# longitude without dust, companions and white dwarfs. They were computed with the density laws and the mass function of
+# this simulator, but above 0.55 Msun with the isochrones of BaSTI (Pietrinferni et al. 2004).
 COUNTS = {
     90: (1997, 10951, 36048),
     60: (2650, 14683, 46733),
@@ -31,54 +33,57 @@ COUNTS = {
     30: (7664, 46523, 123315),
     20: (15541, 104005, 247463),
 }
+# Magnitude limits in H (Vega) of the reference counts of stars.
 LIMITS = (18.0, 22.0, 26.0)
-# L dwarfs deg-2 to J = 22, 24, 26 (Vega), then T dwarfs.
+# Reference counts of brown dwarfs by Galactic latitude (deg): L dwarfs per deg^2 brighter than J = 22, 24 and 26
+# (Vega), then T dwarfs brighter than the same limits.
 DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
-# Parallax error (mas) at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
+# Expected parallax errors (mas) by G magnitude: the law of PyGaia scaled to Gaia DR2, which publishes 0.04, 0.1, 0.7.
 PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
 
 
 def cells_at_latitude(b: float, cells: int, south: bool = False) -> list[int]:
-    """Return generation cells at Galactic latitude `b`, evenly distributed in longitude.
+    """Return generation cells (nested HEALPix cells of order 8) at Galactic latitude `b`, evenly spaced in longitude.
 
     Parameters
     ----------
     b : float
         Galactic latitude, deg.
     cells : int
-        Number of positions; cells that contain several are returned once.
+        Number of positions. A cell that contains several positions is returned once.
     south : bool
-        If True, every other position lies at -b. The Sun is north of the plane, so there are more stars in the south.
+        If True, every other position is at -b. The Sun is north of the Galactic plane, so there are more stars in the
+        south.
 
     Returns
     -------
     list of int
-        Generation cells, ascending.
+        Numbers of the cells, ascending.
     """
     lon = np.arange(cells) * 360.0 / cells
-    # The parallel at a pole is too short, so the latitudes there differ.
+    # Near a pole, use different latitudes: all longitudes would be in the same few cells.
     lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
     return sorted({int(cell) for cell in sky.cell_at(*sky.equatorial(lon, lat), GENERATION_ORDER)})
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
-    """Return the number of stars drawn per deg2 at a latitude, without companions, white dwarfs and brown dwarfs.
+    """Count simulated stars per deg2 at a Galactic latitude, without companions, white dwarfs and brown dwarfs.
 
     Parameters
     ----------
     b : float
         Galactic latitude, deg.
     cells : int
-        Number of cells to draw there.
+        Number of generation cells (nested HEALPix cells of order 8) in which stars are simulated.
     universe : StarModel
         Model of the stars.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag.
+        HEALPix map of the extinction A(V), mag.
 
     Returns
     -------
-    float array, shape (limits,)
-        Stars per deg2 brighter than each of LIMITS.
+    float array, shape (3,)
+        Stars per deg2 brighter than H = 18, 22 and 26 (Vega).
     """
     drawn, total = cells_at_latitude(b, cells), np.zeros(len(LIMITS))
     for cell in drawn:
@@ -91,7 +96,10 @@ def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Fl
 
 
 def absolute_v(universe: stars.StarModel) -> Float:
-    """Return M_V of each piece of an isochrone or white-dwarf track from which stars are drawn, at its middle."""
+    """Return M_V (Vega) at the middle of each stretch of an isochrone or white dwarf sequence, shape (n,).
+
+    Stars are drawn from these stretches, which are the `pieces` of the model.
+    """
     galaxy, pieces = universe.galaxy, universe.galaxy.pieces
     metals = np.where(pieces.track < 0, 0.0, galaxy.tracks.metallicity[pieces.track])
     teff, log_g = 10.0 ** pieces.log_teff.mean(0), pieces.log_g.mean(0)
@@ -109,23 +117,23 @@ def absolute_v(universe: stars.StarModel) -> Float:
 def count_brighter(
     universe: stars.StarModel, place: tuple[float, float], limits: Sequence[float], a_v: Float | None = None
 ) -> Float:
-    """Return the expected number per deg2 of single stars and primaries brighter than V (Vega).
+    """Return the expected number per deg2 of single stars and primaries of binaries brighter than limits in V.
 
     Parameters
     ----------
     universe : StarModel
         Model of the stars.
     place : tuple of float
-        Galactic l and b, deg.
+        Galactic longitude and latitude of the line of sight, deg.
     limits : sequence of float
-        V magnitudes.
+        Limits in V, Vega mag.
     a_v : float array, shape (s,), optional
-        Dust A(V) in front of each shell of distance, mag; None if there is no dust.
+        Extinction A(V) in front of each of the model's s shells of distance, mag; None for no dust.
 
     Returns
     -------
     float array, shape (limits,)
-        Stars per deg2.
+        Stars per deg2 brighter than each limit.
     """
     galaxy = universe.galaxy
     m_v, owner = (
@@ -146,23 +154,25 @@ def count_brighter(
 
 
 def count_whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
-    """Return the expected number of single stars and primaries brighter than V on the whole sky, behind dust.
+    """Return the expected number of stars on the whole sky brighter than a limit in V, with extinction by dust.
+
+    Single stars and primaries of binaries are counted.
 
     Parameters
     ----------
     universe : StarModel
         Model of the stars.
     limit : float
-        V magnitude (Vega).
+        Limit in V, Vega mag.
     dust : float32 array, shape (pixels,)
-        Map of A(V), mag.
+        HEALPix map of the extinction A(V), mag.
     step : int
-        Step in the numbers of order-4 cells that sample the sky.
+        Stars are counted at the centre of every `step`-th HEALPix cell of order 4.
 
     Returns
     -------
     float
-        Number of stars.
+        Number of stars on the whole sky.
     """
     cells, total = np.arange(step // 2, 12 << 2 * _SKY_ORDER, step), 0.0
     distance = milky_way.shell_distances(universe.galaxy)
@@ -175,7 +185,11 @@ def count_whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step
 
 
 def dwarf_counts(b: float, area: float) -> Float:
-    """Return L and T dwarfs per deg2 at a latitude, as in DWARFS, from one draw over `area` deg2 without dust."""
+    """Count simulated brown dwarfs per deg2 at Galactic latitude `b` (deg), without dust.
+
+    The result has L dwarfs brighter than J = 22, 24 and 26 (Vega), then T dwarfs. They are simulated once, in an area
+    of `area` deg2.
+    """
     galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
     drawn = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
     j = types.abs_mag_j[drawn.template] + 5.0 * np.log10(drawn.distance) - 5.0

@@ -1,8 +1,8 @@
 """Measure the simulated universe: counts, sizes, clustering, lensing and stars.
 
-Galaxies of cells distributed over the sky are drawn with the default settings of a request, counted and measured.
-Halos, and the galaxies of massive halos, are correlated over hundreds of deg2. The lensing maps are compared with
-linear theory in several boxes, and the stars with published counts.
+Galaxies are simulated with default settings in cells distributed over the sky, then counted and measured. The
+clustering of massive halos and of their galaxies is measured over 3200 deg2 in a full validation. Lensing maps of
+universes with several random seeds are compared with linear theory, and the stars with reference counts.
 """
 
 from __future__ import annotations
@@ -31,19 +31,39 @@ from truesky.request.schema import Universe
 from truesky.validation.model import census, clustering, observed, pictures, shear, small_scales, star_counts
 from truesky.validation.theory import Shells
 
+# Seed of the universe.
 SEED = 7
+# Edges of the wavenumber bins in which the matter power spectrum is measured, h/Mpc.
 POWER_EDGES = np.array([0.02, 0.05, 0.10, 0.15, 0.20])
-BIASES, BIAS_EDGES = (0.7, 1.0, 1.4, 2.0, 2.9), np.array([0.03, 0.10])
-# Sample for the clustering: redshift range, and log10 of the lowest halo and proxy mass.
-Z_MIN, Z_MAX, MIN_LOG_MASS = 0.4, 0.8, 12.0
-WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
+# Values of bias times growth factor for which the bias of halos is measured.
+BIASES = (0.7, 1.0, 1.4, 2.0, 2.9)
+# Edges of the wavenumber bin in which the bias is measured, h/Mpc.
+BIAS_EDGES = np.array([0.03, 0.10])
+# Lowest redshift of the halos and galaxies whose clustering is measured.
+Z_MIN = 0.4
+# Highest redshift of the halos and galaxies whose clustering is measured.
+Z_MAX = 0.8
+# Lowest mass (log10 of Msun/h) of the halos whose clustering is measured. It is also the lowest proxy mass of the
+# galaxies, which determines their luminosity.
+MIN_LOG_MASS = 12.0
+# Edges of the separation bins in large blocks of the sky, deg.
+WIDE_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5])
+# Edges of the separation bins in small cells, deg.
+NARROW_EDGES = np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
+# Names of the two samples whose clustering is measured.
 TRACERS = ("halos", "galaxies")
+# Edges of the bands of multipoles l in which C_l of the convergence is measured.
 BANDS = (30, 64, 128, 256, 384, 512)
+# Lensing maps that are measured: index, and redshift of the sources.
 PLANES = ((7, 1.0), (12, 2.4))
-# Redshifts of sources, and a step along the line of sight (Mpc/h) that samples only one cell in five.
-SIGHTS, SKIPPING = (1.0, 2.3), 20.0
-# K-corrections and I_E - M_r - DM at z = 0.1, 0.5, 1, 2 of three templates.
+# Redshifts of the sources for which the rms of the convergence along lines of sight is measured.
+SIGHTS = (1.0, 2.3)
+# Step along the line of sight (Mpc/h) that is too large: it samples only one cell of the box in five.
+SKIPPING = 20.0
+# Redshifts of the published values in K_CORRECTIONS.
 K_REDSHIFTS = (0.1, 0.5, 1.0, 2.0)
+# Published values by band and number of the galaxy template: K-corrections for sdss_r01, and I_E - M_r - DM (mag) for
+# euclid_vis.
 K_CORRECTIONS = {
     "sdss_r01": {0: (0.16, 1.60, 3.29, 5.06), 13: (0.005, 0.54, 1.17, 1.12), 25: (-0.14, -0.42, -0.75, -1.31)},
     "euclid_vis": {0: (-0.43, 0.07, 1.15, 3.63), 13: (-0.27, -0.17, 0.29, 0.91), 25: (-0.15, -0.46, -0.73, -1.25)},
@@ -52,28 +72,29 @@ K_CORRECTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class SampleSize:
-    """Amount of sky to draw.
+    """Amount of sky to simulate for each measurement; 0 or () skips a measurement.
 
     Attributes
     ----------
     settings : Universe
-        Settings of the universe.
+        Settings of the universe, as in a request.
     blocks : int
-        Number of blocks of generation cells.
+        Number of blocks in which galaxies are simulated to the default depth, at least 2.
     side_order : int
-        A block contains 4^side_order generation cells.
+        A block consists of 4^side_order generation cells (HEALPix cells of order 8).
     deep_blocks : int
-        Blocks of one cell to I_E < 28.
+        Number of single generation cells (HEALPix cells of order 8) in which galaxies are simulated to I_E = 28.
     wide_blocks : int
-        Blocks of 54 deg2 per box for clustering.
+        Number of blocks of 54 deg2 for the clustering, for each random seed, at least 2.
     nearby_blocks : int
-        Blocks of 215 deg2 for satellites at z = 0.1.
+        Number of blocks of 215 deg2 for satellites at z = 0.1.
     halo_cells : int
-        Order-5 cells in which halos are counted; clustering at the size of halos uses four times as many.
+        Number of HEALPix cells of order 5 in which halos are counted; the clustering within halos uses four times as
+        many.
     box_seeds : tuple of int
-        Seeds of further boxes for power, clustering and lensing.
+        Further random seeds of the box of matter, for power spectrum, clustering and lensing.
     star_cells : int
-        Cells per latitude for stars.
+        Number of generation cells in which stars are simulated at each Galactic latitude.
     """
 
     settings: Universe
@@ -87,22 +108,25 @@ class SampleSize:
     star_cells: int
 
 
+# Sample for a full validation, which takes a quarter of an hour.
 FULL = SampleSize(Universe(), 160, 0, 8, 20, 3, 16, (8, 9), 12)
+# Small sample for a quick run (20 s), with too little sky for reliable verdicts.
 QUICK = SampleSize(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, (), 0)
 
 
-# ------------------------------------------------------------------------------------------------ figures
-
-
 def theory() -> dict[str, float]:
-    """Compute sigma_8, the distance to z = 2.3 (Mpc/h), and the largest offsets from published K-corrections."""
+    """Compute sigma_8, the comoving distance to z = 2.3 (Mpc/h), and offsets from published K-corrections.
+
+    For each band and galaxy template, the offset (mag) with the largest absolute value over all redshifts is returned.
+    """
     k = np.geomspace(1e-4, 50.0, 20_000)
     x = 8.0 * k
     window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
     variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
     figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
     wavelength, template_numbers = rest_grid.rest_grid(), list(K_CORRECTIONS["sdss_r01"])
-    # The published numbers are for observed spectra with weak lines, which the library otherwise bridges.
+    # Do not remove weak emission lines from the templates (as the library usually does): the published numbers include
+    # them.
     flux = templates.galaxy_spectra(wavelength, bridge_width=-1.0)[template_numbers].astype(np.float32)
     library = templates.Library(wavelength, flux, tuple(map(str, template_numbers)))
     z, zeros = np.array(K_REDSHIFTS), np.zeros(len(K_REDSHIFTS), int)
@@ -116,7 +140,11 @@ def theory() -> dict[str, float]:
 
 
 def matter(size: SampleSize) -> dict[str, float]:
-    """Measure the power of the box, the bias of halos, and velocities."""
+    """Measure the matter in the universe's periodic box: power spectrum, bias of halos, and velocities.
+
+    Power spectrum and bias are relative to theory; the rms velocity of halos of 10^12 Msun/h is in km/s. The power
+    spectrum is left out without further random seeds.
+    """
     cells = size.settings.box_cells
     box = density_box.load(SEED, cells)
     boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.box_seeds)]
@@ -140,7 +168,11 @@ def _figures_by_edge(pattern: str, edges: Sequence[float] | Float, values: Float
 
 
 def mass_function() -> Callable[[float, float], float]:
-    """Return the mass function: number of halos in (Mpc/h)^-3 above a log10 mass at redshift z, before any draw."""
+    """Return the theoretical cumulative mass function of halos as a function of (log_mass, z).
+
+    The function returns the number density in (Mpc/h)^-3 of halos above a mass, given as log10 of Msun/h, at redshift
+    z.
+    """
     masses = matching.masses()
 
     def number(min_log_mass: float, z: float) -> float:
@@ -152,7 +184,10 @@ def mass_function() -> Callable[[float, float], float]:
 
 
 def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
-    """Draw the galaxies of small blocks, and measure all figures from them."""
+    """Simulate galaxies in many small blocks of the sky, and measure counts, colours, sizes, lines, masses and halos.
+
+    Returns the measured values by name, and the simulated galaxies.
+    """
     universe = galaxies.model(SEED, size.settings)
     dust, law = dust_map.load(SEED), luminosity_function.schechter()
     sample = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
@@ -170,38 +205,41 @@ def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
 def compare_with_limber(
     measured: clustering.Correlation, tracer_shells: Shells, power: Callable[[Float], Float]
 ) -> tuple[Float, Float, Float, Float]:
-    """Return a measured w, corrected for the mean of each block, and Limber's w.
+    """Correct a measured w for the finite size of the blocks, and predict w in Limber's approximation.
+
+    w was measured relative to the mean density of each block, which makes it too low. The difference is computed from
+    the prediction and added.
 
     Parameters
     ----------
     measured : Correlation
-        Measured w relative to the mean of each block.
+        Measured angular correlation function w, relative to the mean density of each block.
     tracer_shells : Shells
-        Tracers by distance.
+        Distribution of the tracers over distance, weighted with bias times growth factor.
     power : callable
-        P(k) in (Mpc/h)^3 of k in h/Mpc.
+        Function that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
     theta, w, error, expected : float array, shape (bins,)
-        Separation in deg, corrected w and its error, and Limber's w. The correction for the block mean is that of
-        Limber's w.
+        Separation in deg, corrected w and its standard error, and predicted w.
     """
     expected, mean_subtracted = clustering.limber(tracer_shells, measured, power)
     return measured.theta, measured.w + expected - mean_subtracted, measured.error, expected
 
 
 def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
-    """Measure w(theta) of halos and galaxies over Limber's in all boxes.
+    """Measure w(theta) of halos and galaxies, divided by predictions in Limber's approximation, for all random seeds.
 
-    Returns the figures, the curves by tracer and scale, and the halos of the first box.
+    Returns the measured values by name, the curves (theta, w, error, prediction) by name, such as "halos_wide", and the
+    halos that were simulated with the first seed.
     """
     n_blocks, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.box_seeds)
     cells = ((np.arange(size.wide_blocks) + 0.37) * n_blocks / size.wide_blocks).astype(int).tolist()
     wide_samples, narrow_samples, curves = [], [], {}
     figures: dict[str, float] = {}
     for seed in seeds:
-        # Boxes of other seeds are not cached.
+        # Store boxes of other seeds in a temporary folder, so that they do not fill the disc cache.
         with nullcontext() if seed == SEED else cache.use_temporary_dir():
             universe = clustering.population_above(seed, size.settings.box_cells, Z_MIN, Z_MAX, MIN_LOG_MASS)
             for cell in cells:
@@ -245,7 +283,10 @@ def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, An
 
 
 def abundances(size: SampleSize) -> dict[str, float]:
-    """Ratio of halos above a mass to the mass function, in thin shells of order-5 cells; errors from their scatter."""
+    """Measure the number of halos above several masses in thin redshift shells, divided by the mass function.
+
+    Halos are simulated in HEALPix cells of order 5; errors are computed from the scatter between these cells.
+    """
     number, cells = (
         mass_function(),
         ((np.arange(size.halo_cells) + 0.43) * (12 << 10) / size.halo_cells).astype(int).tolist(),
@@ -271,7 +312,10 @@ def abundances(size: SampleSize) -> dict[str, float]:
 
 
 def nearby_satellites(size: SampleSize) -> dict[str, float]:
-    """Fraction of satellites among galaxies with M_r < -20 at z = 0.1, the volume limit of SDSS."""
+    """Measure the fraction of satellites among galaxies with M_r - 5 log h < -20 at 0.05 < z < 0.15, as in SDSS.
+
+    The result also has the number of these galaxies.
+    """
     universe = clustering.population_above(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
     cells = ((np.arange(size.nearby_blocks) + 0.4) * 192 / size.nearby_blocks).astype(int).tolist()
     sample = clustering.concatenate([clustering.draw_tracers(universe, 2, cell) for cell in cells])
@@ -282,9 +326,10 @@ def nearby_satellites(size: SampleSize) -> dict[str, float]:
 
 
 def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[str, float], Float]:
-    """Measure lensing maps, their power in several boxes, and shear around halos.
+    """Measure lensing maps, their power spectrum for several random seeds, and the shear around massive halos.
 
-    Returns the figures, and C_l over theory with shape (planes, bands).
+    Returns the measured values by name, and C_l of the convergence divided by linear theory, shape (planes, bands).
+    Without further random seeds, the power spectrum is not measured and this array is empty.
     """
     cells, nside = size.settings.box_cells, size.settings.lensing_nside
     box = density_box.load(SEED, cells)
@@ -315,7 +360,11 @@ def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[s
 
 
 def milky_way(size: SampleSize) -> dict[str, float]:
-    """Stars and dwarfs against other code, the errors of Gaia."""
+    """Measure relative differences of simulated star and brown dwarf counts from reference counts.
+
+    For each Galactic latitude, the difference with the largest absolute value is returned. The result also has the
+    simulated parallax errors of Gaia (mas).
+    """
     universe, dust, figures = milky_way_stars.model(), dust_map.load(SEED), {}
     for b, published in star_counts.COUNTS.items():
         offset = star_counts.counts(b, size.star_cells, universe, dust) / np.array(published) - 1.0
@@ -327,7 +376,10 @@ def milky_way(size: SampleSize) -> dict[str, float]:
 
 
 def run(size: SampleSize, folder: Path | None = None) -> dict[str, float]:
-    """Measure all figures; write their plots to a folder if given."""
+    """Run all measurements of the simulated universe, and return the measured values by name.
+
+    If `folder` is given, plots are written to it. The value "cpu_s" is the CPU time that was used, in seconds.
+    """
     started = time.process_time()
     figures, sample = count_galaxies(size)
     new_figures, curves, halos = measure_clustering(size)

@@ -1,1 +1,1 @@
-"""Checks of the catalogues of a lake against observations, requirements and theory; one file per check."""
+"""Checks of the galaxy and star catalogues of a lake: observations, mission requirements and theory; one file each."""

@@ -1,9 +1,9 @@
-"""Check the angular clustering of galaxies: w(theta) to limits in I_E, and of luminous galaxies at z = 0.5.
+"""Check the angular correlation function w(theta) of galaxies brighter than limits in I_E (VIS band of Euclid).
 
-For limits in I_E the expected w is that of non-linear matter in Limber's approximation, with the redshifts of the
-galaxies and the bias of their halos. From 0.3 deg the prediction is good to 20 %. Below, galaxies within one halo and
-the cells of the box matter, and the tolerance is 50 %. Luminous galaxies are compared with the power law that
-surveys found.
+The expected w is computed from the non-linear matter power spectrum in Limber's approximation, with the redshifts of
+the galaxies and the bias of their halos. Above 0.3 deg the tolerance is 20 %. Below, it is 50 %, because the prediction
+does not include pairs of galaxies within one halo and the finite resolution of the simulated matter. Luminous galaxies
+at z = 0.5 are compared with the power law that surveys found.
 
 References
 ----------
@@ -30,25 +30,47 @@ from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row
 from truesky.validation.model import observed, small_scales
 from truesky.validation.two_points import ARCMIN, TwoPointFunction
 
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
 NAME = "clustering"
+# Publication on which the expected values are based.
 SOURCE = "Limber's approximation with the bias of the galaxies' halos (Tinker et al. 2010, ApJ 724, 878)"
-BAND, LIMITS = "euclid_vis", (22.0, 23.0, 24.0)
+# Band in which galaxies are selected (I_E).
+BAND = "euclid_vis"
+# Magnitude limits in I_E of the samples whose clustering is measured, AB mag.
+LIMITS = (22.0, 23.0, 24.0)
+# Columns of the table `galaxies` (magnitude at 5600 A, spectra and dust) from which magnitudes in any band are
+# computed.
 _SED = ("abs_mag_r01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+# Columns of the table `galaxies` that the check of clustering reads.
 COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "mag_r01", "log_halo_mass", *_SED)
-# Largest magnitude at 5600 A minus I_E of a galaxy, and largest shortfall of the depth of a catalogue, mag.
-_REDDEST, _DEPTH_MARGIN = 3.0, 0.1
+# Galaxies are read if their magnitude at 5600 A (mag_r01) is at most this much fainter than the limit in I_E, mag. No
+# galaxy with a larger mag_r01 is brighter than the limit in I_E.
+_REDDEST = 3.0
+# A catalogue counts as complete to a magnitude limit if it ends at most this much (mag) before the limit.
+_DEPTH_MARGIN = 0.1
+# The clustering of a sample with fewer galaxies than this number is not measured.
 _MIN_GALAXIES = 200
-# Edges of the separations, arcmin; lower edge from which the smaller tolerance applies, and both tolerances.
+# Edges of the bins of angular separation of two galaxies in which w is measured, arcmin.
 EDGES = np.array([0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 18.0, 36.0, 60.0, 90.0])
-_LINEAR, _NEAR_TOLERANCE, _FAR_TOLERANCE = 18.0, 0.5, 0.2
-# Width of shells of distance, Mpc/h.
+# Bins that begin at this separation (arcmin) or beyond have the tolerance 20 % instead of 50 %.
+_LINEAR = 18.0
+# Relative tolerance of w at separations below 18 arcmin.
+_NEAR_TOLERANCE = 0.5
+# Relative tolerance of w at separations above 18 arcmin.
+_FAR_TOLERANCE = 0.2
+# Width of the shells of comoving distance into which galaxies are divided for the expected w(theta), Mpc/h.
 _SHELL = 100.0
-# Faintest I_E of luminous galaxies at z < 0.6.
+# I_E (AB mag) of the faintest galaxies in the luminous sample (M_r - 5 log h < -20 at 0.4 < z < 0.6). A catalogue that
+# is less deep does not have the whole sample.
 _LUMINOUS = 23.5
 
 
 def measure(galaxies: read.Version) -> Result:
-    """Check the angular clustering of table `galaxies` of a lake."""
+    """Check the angular clustering of the table `galaxies` of a lake.
+
+    Returns rows (measured w divided by the expected w, with verdicts) and arrays for plots. The only row is
+    "not_applicable" if a required column is missing.
+    """
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
         return _no_result(f"table galaxies has no column {', '.join(missing)}")
@@ -60,7 +82,12 @@ def measure(galaxies: read.Version) -> Result:
 
 
 def compare(columns: Mapping[str, Array], field: Field) -> Result:
-    """Check the clustering of galaxies that may be brighter than the faintest limit, given as columns, in a field."""
+    """Check the angular clustering of galaxies in a field.
+
+    `columns` are the COLUMNS of central and satellite galaxies, complete to the faintest limit in I_E if possible. The
+    rows are measured w divided by expected w in bins of separation, with verdicts. Limits that the catalogue does not
+    reach, samples with fewer than 200 galaxies and too small fields give rows "not_applicable".
+    """
     if len(columns["id"]) < _MIN_GALAXIES:
         return _no_result(
             f"{len(columns['id'])} galaxies may be brighter than I_E = {max(LIMITS):g}; {_MIN_GALAXIES} are required"
@@ -115,25 +142,27 @@ def _rows(name: str, correlation: TwoPointFunction, w_theory: Float, note: str) 
 def expected_correlation(
     columns: Mapping[str, Array], selected: Bool, field: Field, correlation: TwoPointFunction
 ) -> tuple[tuple[Float, Float], Float]:
-    """Return the expected w of galaxies in a field, relative to the mean of the field.
+    """Return the expected angular correlation function w of galaxies in a field.
+
+    w is relative to the mean density of the field, as it is measured: the mean of w over all pairs is subtracted.
 
     Parameters
     ----------
     columns : mapping of str to array, shape (n,)
-        Columns of the galaxies.
+        Columns `z_true` and `log_halo_mass` of the galaxies.
     selected : bool array, shape (n,)
-        Galaxies to use.
+        True for the galaxies of the sample, whose halo masses must be finite.
     field : Field
-        Area of the galaxies.
+        Area of the sky that contains the galaxies.
     correlation : TwoPointFunction
-        Measured w; the expected one is returned for its bins.
+        Measured w, which defines the separation bins.
 
     Returns
     -------
     curve : tuple of float arrays
-        Separations in arcmin, and w there.
+        Separations in arcmin and expected w at these separations, for plots.
     w : float array, shape (bins,)
-        w in each bin.
+        Expected w in each bin.
     """
     z, mass = columns["z_true"][selected].astype(float), columns["log_halo_mass"][selected].astype(float)
     chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
@@ -142,14 +171,19 @@ def expected_correlation(
     c_l = theory.galaxy_power(theory.ELL, theory.shells(chi, bias, edges))
     curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
     w = theory.correlation(curve, theory.ELL, c_l)
-    # The mean of a field removes what all of its pairs have in common.
+    # Subtract the mean of w over all pairs: w was measured relative to the mean density of this field.
     field_mean = two_points.mean_over_pairs(field, curve, w)
     in_range = curve < correlation.edges[-1]
     return (curve[in_range] / ARCMIN, w[in_range] - field_mean), np.interp(correlation.theta, curve, w) - field_mean
 
 
 def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
-    """Compare galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6 with the power law."""
+    """Check w of galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6, divided by the w of the observed power law.
+
+    `deepest` is the depth of the catalogue in I_E (AB mag). Returns one row with its verdict for each separation bin
+    that expectations.csv lists, or a row "not_applicable" if the catalogue is not deep enough, has fewer than 200 such
+    galaxies, or covers a too small field.
+    """
     z_min, z_max = small_scales.Z_MIN, small_scales.Z_MAX
     z = columns["z_true"].astype(float)
     selected = (columns["abs_mag_r01"] < small_scales.MAX_ABS_MAG) & (z > z_min) & (z < z_max)

@@ -1,12 +1,13 @@
-"""Check band fluxes of galaxies against their spectra, and the colours of red galaxies against the observed locus.
+"""Check fluxes of galaxies in each band against their spectra, and colours of red galaxies against observations.
 
-The median magnitude in each band is compared with that of the spectra in table `galaxies`, behind the Milky Way and
-magnified. An error in one band makes all colours with this band wrong.
+The magnitudes from the table `galaxy_fluxes` are compared with magnitudes that are computed from the spectra in the
+table `galaxies`, including extinction by the Milky Way and lensing magnification. The median difference is checked.
 
 Notes
 -----
-The spectra have no emission lines, which make medians 0.01 mag brighter. The extinction is that of flat spectra. For
-red spectra it is off by 0.06 A(V) in the widest band; the tolerance is larger by this amount.
+The spectra here have no emission lines, which make galaxies 0.01 mag brighter in the median. The extinction is computed
+for flat spectra. For red spectra it is wrong by up to 0.06 A(V) in the widest band, so the tolerance is larger by this
+amount.
 
 References
 ----------
@@ -29,26 +30,51 @@ from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.model import observed
 
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
 NAME = "colours"
+# Source of the expected magnitudes, as text for the report.
 SOURCE = "the spectra in table galaxies, by the published passbands"
+# Source of the observed colours of red galaxies.
 _LOCUS = "Eisenstein et al. 2001, AJ 122, 2267"
+# Columns of the table `galaxies` that the check of magnitudes and colours reads.
 COLUMNS = ("id", "_healpix_29", "kind", "z_true", "mag_r01", "a_v", "kappa", "gamma1", "gamma2", "abs_mag_r01",
            "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")  # fmt: skip
+# Beginning of the names of flux columns; the name of the band follows.
 _FLUX = "f_nu_"
-# Limits of magnitude and redshift, within which lines are few and intergalactic gas does not absorb; largest and
-# smallest number of galaxies.
-_MAX_MAG, _MAX_REDSHIFT, _MAX_GALAXIES, _MIN_GALAXIES = 23.0, 1.5, 30_000, 100
-_TOLERANCE, _PER_DUST = 0.03, 0.06
-# Nodes of A(V) for the interpolation of the extinction.
+# Faintest magnitude at 5600 A (mag_r01) of the checked galaxies.
+_MAX_MAG = 23.0
+# Largest redshift of the checked galaxies: below it, intergalactic gas does not absorb and emission lines are weak.
+_MAX_REDSHIFT = 1.5
+# Approximate largest number of galaxies; of more galaxies, a random subset is checked.
+_MAX_GALAXIES = 30_000
+# With fewer galaxies than this number, the check is not applicable.
+_MIN_GALAXIES = 100
+# Tolerance of the median difference between a magnitude from the table of fluxes and one computed from the spectrum, if
+# the Milky Way has no dust in the field, mag.
+_TOLERANCE = 0.03
+# Additional tolerance of the median magnitude difference, in mag per magnitude of the Milky Way's extinction A(V): the
+# extinction is computed for flat spectra.
+_PER_DUST = 0.06
+# Number of values of A(V) at which the extinction in a band is computed; it is interpolated between them.
 _NODES = 12
-# Redshift ranges and luminosity of red galaxies with known colours.
-_RED, _RED_MAG = ((0.15, 0.25), (0.25, 0.35)), -20.5
-_LOCUS_TOLERANCE, _MIN_RED_GALAXIES = 0.05, 20
+# Ranges of redshift (lowest, highest) in which the colours of luminous red galaxies are checked.
+_RED = ((0.15, 0.25), (0.25, 0.35))
+# Red galaxies must be brighter than this M_r - 5 log h, mag.
+_RED_MAG = -20.5
+# Tolerance of the median deviation of luminous red galaxies from the observed relation of two colours, mag.
+_LOCUS_TOLERANCE = 0.05
+# With fewer red galaxies than this number in a redshift range, their colours are not checked.
+_MIN_RED_GALAXIES = 20
+# Edges of the bins of the plotted colour-colour histogram, for both colours, mag.
 _EDGES = np.linspace(-0.5, 2.5, 91)
 
 
 def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
-    """Check the colours of tables `galaxies` and `galaxy_fluxes` of a lake."""
+    """Check the magnitudes and colours of the tables `galaxies` and `galaxy_fluxes` of a lake.
+
+    Returns rows (measured values with expected values and verdicts) and arrays for plots. The only row is
+    "not_applicable" if a required column is missing, or if `galaxy_fluxes` lacks a selected galaxy.
+    """
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
         return _no_result(f"table galaxies has no column {', '.join(missing)}")
@@ -75,21 +101,24 @@ def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
 
 
 def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field) -> Result:
-    """Check the fluxes of galaxies in a field.
+    """Check the fluxes of galaxies in several bands against their spectra.
 
     Parameters
     ----------
     columns : mapping of str to array, shape (n,)
-        COLUMNS of the galaxies.
+        COLUMNS of the table `galaxies`.
     flux : mapping of str to array, shape (n,)
-        Fluxes by band, uJy.
+        Fluxes of the same galaxies by band, uJy.
     field : Field
-        Area of the galaxies.
+        Area of the sky that contains the galaxies, with jackknife patches for errors.
 
     Returns
     -------
     Result
-        One row per band, rows of the red locus, and series for figures.
+        One row per band with its verdict and the median magnitude difference: magnitude of the flux minus magnitude
+        computed from the spectrum. With the bands g, r and i of LSST, also rows for the colours of red galaxies, and a
+        colour-colour histogram for plots. With fewer than 100 galaxies or without bands, the only row is
+        "not_applicable".
     """
     if len(columns["id"]) < _MIN_GALAXIES or not flux:
         return _no_result(
@@ -105,7 +134,7 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
     for band, magnitudes in mag.items():
         dust = _transmission(band, columns["a_v"].astype(float))
         offset = magnitudes - observed.apparent_magnitudes(columns, band) + 2.5 * np.log10(magnified * dust)
-        # A band without flux is also a fault.
+        # Count galaxies without flux in the band as infinitely faint, so that many of them make the check fail.
         offset = np.where(np.isfinite(offset), offset, np.inf)
         value, error = _median(offset, patch, field.n_patches)
         note = (
@@ -125,7 +154,10 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
 
 
 def _transmission(band: str, a_v: Float) -> Float:
-    """Transmission of the Milky Way for a flat spectrum in a band at A(V) of each galaxy (mag)."""
+    """Return the fraction of a galaxy's light in a band that dust in the Milky Way transmits, for each A(V) (mag).
+
+    The spectrum of the galaxies is assumed to be flat in f_nu.
+    """
     curve, nodes = passbands.load(band), np.linspace(0.0, max(float(a_v.max()), 1e-3), _NODES)
     weight = curve.response / curve.wavelength
     through = band_fluxes.milky_way_transmission(curve.wavelength, nodes)
@@ -133,7 +165,11 @@ def _transmission(band: str, a_v: Float) -> Float:
 
 
 def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
-    """Median and its error, the larger of the jackknife error and the error from the scatter of the values."""
+    """Return the median of magnitude differences and its standard error.
+
+    The error is the larger of the jackknife error over patches and the error from the scatter of the values within 1
+    mag of the median. A jackknife error that cannot be computed is ignored.
+    """
     middle = float(np.median(values))
     rest = [np.median(values[patch != left_out]) for left_out in range(n_patches)]
     typical = values[np.isfinite(values)]
@@ -144,7 +180,11 @@ def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
 
 
 def _locus_rows(columns: Mapping[str, Array], gr: Float, ri: Float) -> list[Row]:
-    """Check luminous red galaxies: r - i = (g - r) / 4 + 0.18 up to z = 0.4, a relation quoted from memory."""
+    """Check the colours of luminous red galaxies against the observed locus r - i = (g - r) / 4 + 0.18 at z < 0.4.
+
+    Returns one row for each redshift range. The relation is quoted from memory, so the verdict is always "undecided",
+    or "not_applicable" with fewer than 20 galaxies.
+    """
     m_r, z = columns["abs_mag_r01"], columns["z_true"]
     red = (columns["color_gr_01"] > 0.78 - 0.02 * (m_r + 20.0)) & (m_r < _RED_MAG)
     rows = []

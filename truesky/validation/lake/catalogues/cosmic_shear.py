@@ -1,10 +1,10 @@
-"""Check the shear of galaxies at z = 1: xi+ and xi- against theory, B modes, and consistency of shear with convergence.
+"""Check the gravitational shear of galaxies at z = 1: xi+ and xi- against theory, B modes, and shear with convergence.
 
 Notes
 -----
-Two-point functions of shear do not depend on its sign and vary from field to field. The mean shear around convergence
-depends on the sign and follows from the convergence in the same field: <kappa gamma_t>(theta) is the mean of
-<kappa kappa> within theta minus <kappa kappa>(theta).
+xi+ and xi- do not depend on the sign of the shear, and vary from field to field. The mean tangential shear around
+convergence does depend on the sign, and follows from the convergence in the same field: <kappa gamma_t>(theta) is the
+mean of <kappa kappa> within theta minus <kappa kappa>(theta).
 
 References
 ----------
@@ -28,25 +28,58 @@ from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.two_points import ARCMIN, TwoPointFunction
 
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
 NAME = "shear"
+# Sources of the expected values: of xi+ and xi-, of B modes, and of the shear around convergence.
 SOURCE = "non-linear theory (Takahashi et al. 2012, ApJ 761, 152) by Limber's approximation"
 _NO_B = "gravity makes no B modes (Schneider, van Waerbeke & Mellier 2002, A&A 389, 729)"
 _BELONGS = "shear and convergence are of one potential (Kaiser 1995, ApJ 439, L1)"
+# Columns of the table `galaxies` that the check of gravitational shear reads.
 COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "gamma1", "gamma2", "kappa")
-Z_MIN, Z_MAX = 0.8, 1.2
-# Smallest number of galaxies; number of shells of distance, of points of the plotted theory and of nodes for its mean.
-_MIN_GALAXIES, _SHELLS, _CURVE, _NODES = 200, 40, 20, 40
-# Separations, arcmin: first edge, number of octaves, fine bins per octave, smallest compared separation; apertures.
-_FIRST, _OCTAVES, _EACH, _FROM = 0.15, 9, 4, 0.6
+# Lowest redshift of the galaxies whose shear is checked.
+Z_MIN = 0.8
+# Highest redshift of the galaxies whose shear is checked.
+Z_MAX = 1.2
+# With fewer galaxies than this number, the check is not applicable.
+_MIN_GALAXIES = 200
+# Number of shells of comoving distance into which galaxies are divided for the expected power spectrum of convergence.
+_SHELLS = 40
+# Number of separations at which the predicted xi+ and xi- are plotted.
+_CURVE = 20
+# Number of separations at which xi+ is evaluated to average it over all pairs of the field.
+_NODES = 40
+# Lower edge of the first wide bin of separations between galaxies, arcmin.
+_FIRST = 0.15
+# Number of wide bins of separation between galaxies; the upper edge of each is twice its lower edge.
+_OCTAVES = 9
+# Number of fine bins into which each wide bin of separation is divided, for B modes and the shear around convergence.
+_EACH = 4
+# Smallest separation of galaxies at which measured xi+ and xi- are compared with theory, arcmin.
+_FROM = 0.6
+# Radii of the circular apertures in which B modes are measured, arcmin; apertures larger than the field are left out.
 _APERTURES = (2.4, 4.8, 9.6, 19.2)
-_THEORY, _CROSS, _CONVERGENCE = 0.2, 0.1, 0.2
-# Range in arcmin in which xi- is lower than theory, and the resolution of lensing maps that all checks require.
-_LOW, _NSIDE = (2.4, 19.2), 1024
+# Relative tolerance of the measured xi+ and xi- compared with theory.
+_THEORY = 0.2
+# Largest allowed deviation from 0 of the B-mode fraction in apertures, and of the cross component divided by xi+.
+_CROSS = 0.1
+# Relative tolerance of the mean tangential shear around convergence, compared with the value that follows from the
+# convergence.
+_CONVERGENCE = 0.2
+# Range of separations (arcmin) in which xi- is known to be lower than theory; deviations there are known failures.
+_LOW = (2.4, 19.2)
+# HEALPix nside of the lensing maps below which deviations of xi+ and xi- from theory count as known failures: such maps
+# are too coarse.
+_NSIDE = 1024
+# Reason why xi- is known to fail.
 _LOW_WHY = "structure between the scales of halos and of the box is missing: xi- is up to 23 % low from 5' to 10'"
 
 
 def measure(galaxies: read.Version) -> Result:
-    """Check the shear of table `galaxies` of a lake."""
+    """Check the gravitational shear of the table `galaxies` of a lake.
+
+    Returns rows (measured values with expected values and verdicts) and arrays for plots. The only row is
+    "not_applicable" if a required column is missing.
+    """
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
         return _no_result(f"table galaxies has no column {', '.join(missing)}")
@@ -57,21 +90,23 @@ def measure(galaxies: read.Version) -> Result:
 
 
 def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Result:
-    """Check the shear of galaxies in a field.
+    """Check the gravitational shear of galaxies at 0.8 < z < 1.2 in a field.
 
     Parameters
     ----------
     columns : dict of str to array, shape (n,)
-        COLUMNS of the galaxies.
+        COLUMNS of the table `galaxies`.
     field : Field
-        Area of the galaxies.
+        Area of the sky that contains the galaxies, with jackknife patches for errors.
     nside : int
-        Resolution of the lensing maps.
+        HEALPix resolution of the lensing maps from which the shear was interpolated. Below 1024, differences from
+        theory count as known failures.
 
     Returns
     -------
     Result
-        Rows of all tests of shear, and series for figures.
+        Rows of all tests (measured values with expected values and verdicts), and arrays for plots. The only row is
+        "not_applicable" for fewer than 200 galaxies, a uniform shear, or a too small field.
     """
     z = columns["z_true"].astype(float)
     indices = np.flatnonzero((columns["kind"] < 2) & (z > Z_MIN) & (z < Z_MAX))
@@ -115,7 +150,7 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
 
 
 def expected_power(z: Float) -> Float:
-    """Return C_l of the convergence of galaxies with redshifts `z`, at the multipoles theory.ELL."""
+    """Return the expected C_l of the convergence of galaxies with redshifts `z`, at the multipoles theory.ELL."""
     number, edge = np.histogram(np.asarray(cosmology.comoving_distance(z)), _SHELLS)
     return theory.convergence_power(theory.ELL, 0.5 * (edge[1:] + edge[:-1]), number.astype(float))
 
@@ -123,10 +158,12 @@ def expected_power(z: Float) -> Float:
 def _theory_rows(
     coarse: TwoPointFunction, predictions: tuple[Float, Float], common: tuple[float, float], note: str, nside: int
 ) -> list[Row]:
-    """Compare xi+ and xi- with theory.
+    """Check xi+ and xi- divided by their predictions: one row with a verdict for each function and separation bin.
 
-    `common` is the part of both that a whole field shares. Jackknife errors do not contain it; its uncertainty is as
-    large as its value.
+    `coarse` are the measured functions in wide separation bins, and `predictions` the expected xi+ and xi- in these
+    bins. `common` has the mean of each prediction over all pairs of the field. It is added in quadrature to the
+    jackknife errors, which do not include the variance of the mean shear of a whole field. `note` describes the sample,
+    and `nside` is the HEALPix resolution of the lensing maps.
     """
     rows = []
     rough = f"lensing maps contain structure only to l = {nside}" if nside < _NSIDE else ""
@@ -141,7 +178,10 @@ def _theory_rows(
 
 
 def _b_mode_rows(fine: TwoPointFunction, coarse: TwoPointFunction, note: str) -> list[Row]:
-    """Check the share of B modes in apertures, and the cross component over xi+."""
+    """Check that there are no B modes: their fraction in apertures, and the cross component divided by xi+.
+
+    `fine` and `coarse` are the measured functions in fine and wide bins. Apertures larger than the field are left out.
+    """
     rows, fine_edges = [], fine.edges / ARCMIN
     for radius in _APERTURES:
         if 2.0 * radius > fine_edges[-1] * (1 + 1e-9):
@@ -181,7 +221,10 @@ def _b_mode_share(mass: Float, cross: Float) -> Float:
 
 
 def _convergence_rows(fine: TwoPointFunction, wide: list[float], note: str) -> list[Row]:
-    """Check the mean shear around convergence against that expected from the convergence."""
+    """Check the mean tangential shear around convergence, divided by the value that follows from <kappa kappa>.
+
+    `wide` are the edges of the separation bins in arcmin; each bin gives one row with a verdict.
+    """
     rows = []
     curves = [_tangential_shear(fine.edges, values) for values in (fine.value, fine.jackknife)]
     for low, high in pairwise(wide):
@@ -208,7 +251,11 @@ def _convergence_rows(fine: TwoPointFunction, wide: list[float], note: str) -> l
 
 
 def _tangential_shear(edges: Float, values: Float) -> tuple[Float, Float]:
-    """<kappa gamma_t>, shape (..., bin), as measured and as derived from <kappa kappa>."""
+    """Return <kappa gamma_t>, shape (..., bins), as measured, and as derived from the measured <kappa kappa>.
+
+    `values`, shape (..., 6, bins), are xi+, xi-, the cross component, <kappa kappa>, <kappa gamma_t> and
+    <kappa gamma_x>. `edges` (rad) are the edges of their separation bins.
+    """
     kappa_kappa, kappa_gamma = np.nan_to_num(values[..., 3, :]), np.nan_to_num(values[..., 4, :])
     area = edges[1:] ** 2 - edges[:-1] ** 2
     inside = np.cumsum(kappa_kappa * area, -1) - 0.5 * kappa_kappa * area

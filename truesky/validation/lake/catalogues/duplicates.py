@@ -1,4 +1,4 @@
-"""Check that no source is listed twice, by identifier and by position, and that no cell has far too many sources."""
+"""Check that a catalogue has no repeated identifiers or positions, and no HEALPix cell with far too many sources."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from lake_schema.sky import MAX_ORDER
 from lake_schema.store import read
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
-NAME, SOURCE = "duplicates", "a source has one identifier and one place"
-# Allowed excess of the densest cell over the median cell: 0.05 deg2 of the deepest sky vary by 20 %.
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
+NAME = "duplicates"
+# Reason why no duplicates are expected, for the column `source` of the table `validation`.
+SOURCE = "a source has one identifier and one place"
+# Allowed excess of the number of galaxies in the densest HEALPix cell over the median of all cells, as a fraction of
+# the median. Galaxy counts in 0.05 deg2 vary by 20 %.
 _DENSITY_TOLERANCE = 0.6
 
 
 def rows(catalogue: read.Version) -> list[Row]:
-    """Check table `galaxies` or `stars` for duplicates."""
+    """Check the table `galaxies` or `stars` for repeated identifiers, repeated positions and too dense cells.
+
+    Returns rows (measured values with expected values and verdicts). The density is checked only for galaxies in four
+    or more cells. The only row is "not_applicable" if the table has no rows.
+    """
     table = catalogue.rows(["id", "ra", "dec", "_healpix_29"])
     if not table.num_rows:
         return [not_applicable(NAME, Place(), f"table {catalogue.table} has no rows", SOURCE, catalogue.table)]

@@ -1,6 +1,6 @@
-"""Check counts, redshifts, masses, star formation, lines and colours of galaxies against observations of surveys.
+"""Check counts, redshifts, masses, star formation, emission lines and colours of galaxies against survey observations.
 
-The list is observed.csv, the same as for the simulated universe. Errors are jackknife errors over patches of the lake.
+The observed values are in observed.csv. Errors are jackknife errors over patches of the catalogue's area.
 """
 
 from __future__ import annotations
@@ -20,28 +20,53 @@ from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row
 from truesky.validation.model import observed
 from truesky.validation.model.observed import GalaxySample
 
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
 NAME = "observed"
-# Number of jackknife patches, and smallest number for which an error is estimated.
-_PATCHES, _MIN_PATCHES = 8, 4
-# Names of figures with a magnitude limit in i, r or I_E; margin by which a galaxy may be fainter in I_E; depth that all
-# other figures require; allowed shortfall of the faintest galaxy of a catalogue.
+# Largest number of patches into which the area of a catalogue is divided for jackknife errors.
+_PATCHES = 8
+# With fewer patches of sky than this number, jackknife errors of the measured quantities are not estimated. Errors in
+# plots require six patches.
+_MIN_PATCHES = 4
+# Names of measured quantities with a magnitude limit in i, r or I_E, which is the number in the name.
 _LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
-_REDDER, _FULL_DEPTH, _DEPTH_MARGIN = 0.5, 26.0, 0.1
+# A galaxy at a magnitude limit in i or r may have an I_E that is fainter than the limit by this difference, mag.
+_REDDER = 0.5
+# Depth in I_E (AB mag) that a catalogue must have to measure quantities without a magnitude limit.
+_FULL_DEPTH = 26.0
+# A catalogue is deep enough if it ends at most this much (mag) before the required depth in I_E.
+_DEPTH_MARGIN = 0.1
 
 
-# Plotted bins of redshift with limits in I_E and i; percentiles of the colours, and fewest galaxies per bin.
-_REDSHIFTS, _REDSHIFT_LIMIT = np.linspace(0.0, 3.0, 31), 24.5
-_COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _MIN_GALAXIES = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
+# Edges in redshift of the bins of the plotted redshift distribution of galaxies.
+_REDSHIFTS = np.linspace(0.0, 3.0, 31)
+# Magnitude limit in I_E of the plotted redshift distribution.
+_REDSHIFT_LIMIT = 24.5
+# Edges of the redshift bins in which the distribution of galaxy colours is plotted.
+_COLOUR_BINS = np.linspace(0.0, 1.2, 25)
+# Magnitude limit in i of the plotted colours.
+_COLOUR_LIMIT = 22.5
+# Percentiles of the distribution of colours in a redshift bin that are plotted, %.
+_LEVELS = (5, 16, 50, 84, 95)
+# Redshift bins with fewer galaxies than this number are left out of the plot of colours.
+_MIN_GALAXIES = 30
 
 
 def measure(galaxies: read.Version) -> Result:
-    """Check table `galaxies` of a lake; return one row for each figure in observed.csv."""
+    """Check the table `galaxies` of a lake against the observations in observed.csv.
+
+    Returns one row (measured and observed value with verdict) for each quantity that can be measured, and arrays for
+    plots.
+    """
     sample, cell = observed.from_version(galaxies)
     return Result(Place(), compare(sample, cell), _series(sample, cell) if len(cell) else {})
 
 
 def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
-    """Redshift distribution (arcmin-2 per unit z) and colours against redshift, with jackknife errors."""
+    """Return arrays for plots: the redshift distribution (arcmin^-2 per unit z), and colours by redshift.
+
+    Both have jackknife errors. `cell` is the number of the HEALPix cell of each galaxy. Colours are left out if no bin
+    has enough galaxies.
+    """
     groups = _groups(cell)
     patch = np.zeros(len(cell), np.int64)
     for number, group in enumerate(groups):
@@ -72,11 +97,15 @@ def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
 
 
 def compare(sample: GalaxySample, cell: Int) -> list[Row]:
-    """Check a sample of galaxies; `cell` is the generation cell of each galaxy."""
+    """Check a sample of galaxies against observed.csv, and return one row with a verdict for each quantity.
+
+    `cell` is the number of the HEALPix cell (order 8) of each galaxy, for jackknife errors. Quantities for which the
+    catalogue is not deep enough get the verdict "not_applicable".
+    """
     figures = observed.figures(sample)
     errors = _errors(sample, cell)
     out = []
-    # Magnitudes here are before magnification, so some are fainter than the limit of the catalogue.
+    # Take a percentile as depth: without lensing magnification, a few galaxies are fainter than the catalogue's limit.
     deepest = float(np.percentile(sample.mags["euclid_vis"], 99.0)) if len(cell) else 0.0
     for check in checks.evaluate(figures):
         if (depth := _required_depth(check.name)) > deepest + _DEPTH_MARGIN:
@@ -88,7 +117,7 @@ def compare(sample: GalaxySample, cell: Int) -> list[Row]:
 
 
 def _required_depth(name: str) -> float:
-    """I_E of the faintest galaxies that a figure contains, at most 26, which is enough for all figures."""
+    """Return the depth in I_E (AB mag) that a catalogue must have to measure the quantity `name`, at most 26."""
     match = _LIMIT.fullmatch(name)
     return min(float(match[1]) + _REDDER, _FULL_DEPTH) if match else _FULL_DEPTH
 
@@ -99,7 +128,10 @@ def _groups(cell: Int) -> list[Int]:
 
 
 def _errors(sample: GalaxySample, cell: Int) -> dict[str, float]:
-    """Jackknife error of each figure, empty if there are too few cells."""
+    """Return the jackknife error of each measured quantity by name.
+
+    Quantities without a finite error above 0 are left out. The result is empty with fewer than four HEALPix cells.
+    """
     cells, groups = np.unique(cell), _groups(cell)
     if len(groups) < _MIN_PATCHES:
         return {}

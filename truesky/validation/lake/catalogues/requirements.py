@@ -1,4 +1,4 @@
-"""Check requirements of the mission on the sky: density of galaxies, their redshifts, and density of H alpha emitters.
+"""Check requirements of the Euclid mission that concern the sky: numbers and redshifts of galaxies, H alpha emitters.
 
 Requirements that no table of a lake can test are listed as not applicable.
 """
@@ -14,12 +14,27 @@ from lake_schema.store import read
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.verdicts import AT_LEAST
 
+# Name of this check in the table `validation` (measured values with expected values and verdicts).
 NAME = "requirement"
+# Source of the requirements.
 SOURCE = "requirements named by Serrano et al. 2024"
+# Band of the magnitude limit of the galaxies whose number and redshifts are required (I_E).
 _BAND = "euclid_vis"
-_LIMIT, _PER_ARCMIN2, _REDSHIFT = 24.5, 30.0, 0.8
-_LINE, _EMITTERS, _FROM, _TO = 2e-16, 3500.0, 0.4, 1.8
-# Requirements that a lake cannot test, with reasons.
+# Magnitude limit in I_E of the galaxies whose number and redshifts are required, AB mag.
+_LIMIT = 24.5
+# Required number of galaxies per arcmin^2 with I_E < 24.5; fewer fail the check.
+_PER_ARCMIN2 = 30.0
+# Required median redshift of galaxies with I_E < 24.5; a lower one fails the check.
+_REDSHIFT = 0.8
+# A galaxy counts as an H alpha emitter if its H alpha flux is at least this value, erg/s/cm^2.
+_LINE = 2e-16
+# Required number of H alpha emitters per deg^2; fewer fail the check.
+_EMITTERS = 3500.0
+# Lowest redshift of counted H alpha emitters.
+_FROM = 0.4
+# Highest redshift of counted H alpha emitters.
+_TO = 1.8
+# Requirements that a lake cannot test: name and reason.
 _UNDETERMINED = (
     ("mean_redshift_of_bins", "no photometric redshifts are measured"),
     ("psf_ellipticity_known", "no model of the PSF is fitted to the stars"),
@@ -32,7 +47,11 @@ _UNDETERMINED = (
 
 
 def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
-    """Check the requirements with tables `galaxies` and `galaxy_fluxes`."""
+    """Check the mission requirements with the tables `galaxies` and `galaxy_fluxes` of a lake.
+
+    Returns rows (measured values with required minimum and verdict). Requirements get the verdict "not_applicable" if
+    no table can test them, if the catalogue is not deep enough, or if `galaxy_fluxes` lacks I_E or some galaxies.
+    """
     out = [_undetermined_row(name, why) for name, why in _UNDETERMINED]
     if f"f_nu_{_BAND}" not in fluxes.schema.names:
         return [*out, not_applicable(NAME, Place(), f"table galaxy_fluxes has no column f_nu_{_BAND}", SOURCE)]
@@ -64,7 +83,7 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     density, lines = (_mean(values) for values in per_cell)
     redshifts = z[bright]
     spread = float(redshifts.std() / np.sqrt(max(len(redshifts), 1))) if len(redshifts) else np.nan
-    # Because galaxies cluster, medians of cells scatter more than single redshifts imply.
+    # Use the scatter of the median redshift between cells as error, if larger: galaxies are clustered.
     medians = [float(np.median(z[bright & (cell == c)])) for c in cells if (bright & (cell == c)).sum() > 20]
     error = max(spread, float(np.std(medians) / np.sqrt(len(medians)))) if len(medians) > 1 else np.inf
     median = float(np.median(redshifts)) if len(redshifts) else np.nan

@@ -1,1 +1,1 @@
-"""Checks of images against their headers and the tables of the lake; one file per check."""
+"""Checks of simulated images: measured numbers are compared with the headers and the catalogues; one file per check."""

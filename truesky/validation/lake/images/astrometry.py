@@ -1,9 +1,9 @@
-"""Check the positions of stars against the catalogue and the WCS of the frame.
+"""Check the measured positions of stars in an image against the catalogue and the WCS of the image.
 
 Notes
 -----
-Windowed centroids of undersampled stars depend on the position within the pixel. Odd harmonics of this dependence are
-fitted as well.
+Windowed centroids of undersampled stars have errors that depend on the position within the pixel. These errors are
+fitted together with the offsets, as sine functions of the position.
 """
 
 from __future__ import annotations
@@ -16,13 +16,21 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = "Serrano et al. 2024, app. C: below 1 mas rms; ground cameras 5 mas"
-# Tolerance of the mean offset, mas; that of the linear term at the edge of the detector is twice as large.
+# Tolerance of the mean offset between measured and expected positions of stars, in mas: for Euclid's VIS and NISP-P,
+# and for cameras on the ground (EXT).
 TOLERANCE = {"VIS": 1.0, "NISP-P": 1.0, "EXT": 5.0}
-_MIN_STARS, _CLIP = 12, 4.0
+# With fewer measured stars than this number, the check is not applicable.
+_MIN_STARS = 12
+# Stars whose offset deviates from the fit by more than this number of standard deviations are rejected.
+_CLIP = 4.0
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the mean offset along columns and rows, and the linear term at the edge of the detector."""
+    """Check the offsets (measured minus expected positions) of the stars of a frame along x and along y.
+
+    For each axis, the result has one row (measurement with expected value and verdict) for the mean offset and one for
+    the linear variation at the edge of the detector, in mas. Offsets on the sky are added to `context.series`.
+    """
     assert context.measurements is not None
     stars, mas = context.measurements.stars, 1000.0 * context.frame.scale
     ny, nx = context.frame.electrons.shape
@@ -53,7 +61,7 @@ def check(context: FrameContext) -> list[Row]:
         residuals[axis] = offset - phased
         means.append((value[0], error[0]))
     context.series |= {"u": u, "v": v, "id": stars.id}
-    # Offsets on the sky do not include the effect of the position within the pixel.
+    # Convert offsets from pixels to mas along east and north, without the fitted effect of the position in the pixel.
     cd = context.frame.wcs.pixel_scale_matrix * 3.6e6
     context.series["east"], context.series["north"] = (row[0] * residuals["x"] + row[1] * residuals["y"] for row in cd)
     (x, dx), (y, dy) = means
@@ -62,23 +70,25 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def fit_offsets(offset: Float, noise: Float, u: Float, v: Float, position: Float) -> tuple[Float, Float, Float]:
-    """Fit mean, linear terms and the effect of the position within the pixel to the offsets of stars along one axis.
+    """Fit the offsets of stars along one axis: a mean, linear terms, and the effect of the position within the pixel.
+
+    Outliers are rejected in four iterations.
 
     Parameters
     ----------
     offset, noise : float array, shape (n,)
-        Offsets of the stars and their expected errors, pixels.
+        Offset (measured minus expected position) of each star, and its expected standard error, pixels.
     u, v : float array, shape (n,)
-        Positions on the detector, -1 to 1.
+        Positions along columns and rows of the detector, scaled to -1 to 1.
     position : float array, shape (n,)
-        Position along the axis in pixels; centroid errors depend on its fraction.
+        Positions in pixels along the axis of the offset; centroid errors depend on the fractional part.
 
     Returns
     -------
     value, error : float array, shape (3,)
-        Mean, and linear terms in u and v, with their errors, pixels.
+        Mean offset, and changes of the offset per unit of u and of v, with their standard errors, pixels.
     phased : float array, shape (n,)
-        Effect of the position within the pixel on each star, pixels.
+        Fitted effect of the position within the pixel on each star's offset, pixels.
     """
     phase = 2.0 * np.pi * position
     columns = [np.ones(len(offset)), u, v, *(np.sin(k * phase) for k in (1, 2, 3))]

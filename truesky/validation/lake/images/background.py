@@ -1,4 +1,4 @@
-"""Check the level of blank sky against the sky and the dark current in the header."""
+"""Check the level of blank sky in an image against the sky brightness and the dark current in its header."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from truesky.validation.lake.measure.frame_context import FrameCheck, FrameConte
 from truesky.validation.lake.measure.rows import Row, not_applicable
 
 SOURCE = "SKYRATE and DARKRATE of the header, which the sky's model sets (Leinert et al. 1998 in space)"
-# Tolerance of the level, for faint sources, wings, scattered light and the decrease towards the edge of the field.
+# Relative tolerance of the level of blank sky. It allows for faint sources, wings of stars, scattered light and
+# vignetting, which the expected level does not include.
 TOLERANCE = 0.05
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the mean of blank sky over the level expected from the header."""
+    """Check the ratio of the measured level of blank sky to the level expected from the header.
+
+    Returns one row (measurement with expected value and verdict). The check does not apply if the expected level is 0.
+    """
     assert context.tiles is not None
     header, seconds = context.frame.header, context.frame.seconds
     expected = (float(header["SKYRATE"]) + float(header["DARKRATE"])) * seconds

@@ -1,4 +1,7 @@
-"""Check offsets that all detectors of an exposure share; they can be too small to detect on one detector."""
+"""Check position and magnitude offsets, averaged over all detectors of an exposure and over all exposures.
+
+Such mean offsets can be too small to be significant on a single detector.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,21 @@ from truesky.validation.lake.measure.frame_context import ExposureCheck, Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
 SOURCE = "Serrano et al. 2024, app. C: absolute astrometry below 1 mas (ground cameras 5 mas), 0.02 mag"
-_MAGNITUDE, _MIN_DETECTORS = 0.02, 2
+# Tolerance of the measured minus the catalogue magnitude of stars, averaged over detectors, mag.
+_MAGNITUDE = 0.02
+# Offsets are averaged only over at least this number of frames (one detector in one exposure).
+_MIN_DETECTORS = 2
+# Names of the averaged quantities: offsets of positions to the east and north, and of magnitudes.
 _NAMES = ("east", "north", "magnitude")
 
 
 def rows(results: Sequence[Result]) -> list[Row]:
-    """Check the weighted means over the detectors of each exposure, and over all exposures of a channel and band."""
+    """Check mean offsets of stars: over the detectors of each exposure, and over all exposures of a channel and band.
+
+    `results` are the results of all frames (exposures of one detector). Each returned row is a mean with its expected
+    value and verdict. A channel and band gets a row "not_applicable" if no quantity was measured in two frames of one
+    exposure or, with several exposures, in two frames of any exposures.
+    """
     out: list[Row] = []
     with_offsets = [result for result in results if "mean_off" in result.series]
     for channel, band in dict.fromkeys((result.place.channel, result.place.band) for result in with_offsets):
@@ -38,7 +50,11 @@ def rows(results: Sequence[Result]) -> list[Row]:
 
 
 def _mean_rows(place: Place, results: Sequence[Result], label: str) -> list[Row]:
-    """Average results and check the means; `label` names what is averaged."""
+    """Return rows with the mean offsets over several detectors, each with its expected value 0 and a verdict.
+
+    `label` says in the row's note which detectors are averaged. Quantities measured in fewer than two frames are
+    left out.
+    """
     out = []
     tolerances = TOLERANCE[str(place.channel)], TOLERANCE[str(place.channel)], _MAGNITUDE
     for name, tolerance in zip(_NAMES, tolerances, strict=True):
@@ -54,16 +70,23 @@ def _mean_rows(place: Place, results: Sequence[Result], label: str) -> list[Row]
 
 
 def _value(series: Mapping[str, Float], name: str) -> Float:
-    """Offset of a detector and its error, NaN if not measured."""
+    """Return the mean difference between measured and true values of a detector's stars, and its standard error.
+
+    `name` is "east" or "north" (mas), or "magnitude" (mag; both values are NaN if no magnitude was measured).
+    """
     if name == "magnitude":
         return np.asarray(series.get("mean_dm", (np.nan, np.nan)))
     return np.asarray(series["mean_off"][_NAMES.index(name)])
 
 
 def weighted_mean(values: Float, errors: Float) -> tuple[float, float]:
-    """Return the weighted mean and its error, which includes the scatter of the values beyond their errors."""
+    """Return the weighted mean of values and its standard error.
+
+    If the values scatter more than their `errors` explain, the additional variance is included in the weights and in
+    the standard error.
+    """
     middle = float(np.median(values))
-    # Differences between detectors add to the photon noise.
+    # Estimate the real variance between detectors: the scatter of the values minus their photon noise.
     intrinsic_variance = max(float(np.mean((values - middle) ** 2 - errors**2)), 0.0)
     weight = 1.0 / (errors**2 + intrinsic_variance)
     return float((weight * values).sum() / weight.sum()), float(weight.sum() ** -0.5)

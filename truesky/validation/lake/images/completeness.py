@@ -1,10 +1,10 @@
-"""Check which of the known sources the program sep detects in a cutout of each frame.
+"""Check the completeness of detection: which of the known sources the program sep detects in a cutout of each frame.
 
 Notes
 -----
-A source counts as detected if an object covers its position, even if the object is a cosmic ray or a neighbour. Objects
-cover a fraction c of all positions by chance. If a fraction p of the sources is covered, (p - c) / (1 - c) are
-detected. This estimate has no meaning if objects cover most positions.
+A source counts as detected if the pixels of a detected object cover its position, even if the object is a cosmic ray or
+a neighbour. Objects cover a fraction c of all positions by chance. If a fraction p of the sources is covered, the
+fraction (p - c) / (1 - c) is really detected. This estimate has no meaning if objects cover most of the image.
 """
 
 from __future__ import annotations
@@ -21,24 +21,40 @@ from truesky.validation.verdicts import AT_LEAST
 SOURCE = (
     "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width, not deblended"
 )
-# Side of the cutout, pixels, and width of a bin, mag.
-_SIDE, _BIN = 1024, 0.5
-_THRESHOLD, _PIXELS = 1.5, 5
-# Tolerances of the detected fraction one to four magnitudes above the 50 % limit, and of this limit, mag.
-_BRIGHT, _LIMIT = 0.15, 0.75
-# Signal-to-noise ratio of sources at the 50 % limit, and typical radius of a galaxy, arcsec.
-_SIGMA, _GALAXY = 10.0, 0.5
+# Side, in pixels, of the square cutout of a frame in which sources are detected.
+_SIDE = 1024
+# Width of the magnitude bins in which the fraction of detected sources is measured, mag.
+_BIN = 0.5
+# Threshold of a pixel value for detection with the program sep, in standard deviations of the noise.
+_THRESHOLD = 1.5
+# Groups of fewer adjacent pixels above the threshold than this number do not count as a detected object.
+_PIXELS = 5
+# Allowed fraction of missed sources among those that are one to four magnitudes brighter than the 50 % limit (magnitude
+# at which half of the sources are detected).
+_BRIGHT = 0.15
+# Tolerance of the 50 % limit (magnitude at which half of the sources are detected), mag.
+_LIMIT = 0.75
+# Expected signal-to-noise ratio of sources at the 50 % limit (magnitude at which half of the sources are detected).
+_SIGMA = 10.0
+# Typical radius of a galaxy, arcsec; it widens the aperture for which the expected 50 % limit is computed.
+_GALAXY = 0.5
+# With fewer known sources than this number, a fraction of detected sources is not measured.
 _MIN_SOURCES = 20
-# Largest fraction of pixels that objects may cover.
+# If objects cover more than this fraction of the pixels, the check does not apply.
 _CROWDED = 0.75
 
 
 class Crowded(Exception):
-    """Objects cover more pixels than sep can process at a time."""
+    """Exception: detected objects cover more pixels than sep can process at a time."""
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the 50 % limit against that expected from the noise, and the detected fraction of brighter sources."""
+    """Check the completeness of source detection in a frame with blank sky.
+
+    The rows (measurements with expected value and verdict) are the magnitude at which half of the sources are detected,
+    compared with the noise of the frame, and the detected fraction of brighter sources. A quantity with too few sources
+    is left out; without any, or in a crowded frame, the row is "not_applicable".
+    """
     try:
         magnitude, is_found, chance, note = search_sources(context)
     except Crowded as crowd:
@@ -55,7 +71,7 @@ def check(context: FrameContext) -> list[Row]:
     faintest = [i for i in below if i > 0 and well_sampled[i - 1] and fraction[i - 1] >= 0.5]
     if not faintest or len(magnitude) < _MIN_SOURCES:
         why = "no magnitude at which half are found"
-        # Sources well above the noise must be detected even if the 50 % limit cannot be measured.
+        # The 50 % limit cannot be measured: check only that sources brighter than the expected limit are detected.
         rows = _bright_rows(context, magnitude, is_found, chance, _expected_limit(context))
         return rows or [not_applicable("completeness", context.place, why, SOURCE)]
     i = faintest[0]
@@ -80,12 +96,19 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _found_fraction(covered: Float, chance: float) -> Float:
-    """Fraction of detected sources from the fraction of covered sources."""
+    """Return the fraction of sources that are really detected.
+
+    `covered` is the fraction of sources whose position an object covers, and `chance` the fraction of all positions
+    that objects cover.
+    """
     return np.maximum(covered - chance, 0.0) / (1.0 - chance)
 
 
 def _bright_rows(context: FrameContext, magnitude: Float, is_found: Bool, chance: float, limit: float) -> list[Row]:
-    """Check the detected fraction of sources one to four magnitudes above a limit; no row if there are too few."""
+    """Check the detected fraction of sources that are one to four magnitudes brighter than `limit`.
+
+    Returns one row with expected value and verdict, or no row with fewer than 20 such sources.
+    """
     bright = (magnitude < limit - 1.0) & (magnitude > limit - 4.0)
     n = int(bright.sum())
     if n < _MIN_SOURCES:
@@ -99,23 +122,24 @@ def _bright_rows(context: FrameContext, magnitude: Float, is_found: Bool, chance
 
 
 def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
-    """Detect objects in a cutout and compare them with the known sources.
+    """Detect objects in a cutout of a frame, and find which known sources they cover.
 
     Parameters
     ----------
     context : FrameContext
-        A frame with blank sky.
+        A frame with its known sources and measured tiles of blank sky.
 
     Returns
     -------
     magnitude : float array, shape (n,)
-        AB magnitudes of the known sources in the cutout.
+        AB magnitudes of the known sources in the cutout, without those near saturated pixels or within about 8 pixels
+        of its edge.
     is_found : bool array, shape (n,)
         True if an object covers the source.
     chance : float
-        Fraction of all pixels that objects cover.
+        Fraction of all unsaturated pixels that objects cover, 0 if all pixels are saturated.
     note : str
-        Numbers of sources, pixels and objects.
+        Description of the sample: numbers of sources, pixels and objects.
 
     Raises
     ------
@@ -124,7 +148,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
     """
     assert context.tiles is not None
     ny, nx = context.frame.electrons.shape
-    # The cutout is next to the middle, since detectors that are read in parts have no pixels there.
+    # Place the cutout next to the centre: some detectors have unread rows or gaps at the centre.
     first_row, first_column = (max(min(n // 2 + 8, n - _SIDE), 0) for n in (ny, nx))
     cutout = np.ascontiguousarray(
         context.frame.electrons[first_row : first_row + _SIDE, first_column : first_column + _SIDE], np.float64
@@ -134,7 +158,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
     width = float(context.frame.header["PSFFWHM"]) / context.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
-    # Without deblending the pixels that objects cover are the same to 0.5 %, in a third of the time.
+    # Do not deblend objects: this changes the covered pixels by 0.5 % only, and takes a third of the time.
     try:
         objects, segmentation = sep.extract(
             cutout - level,
@@ -147,7 +171,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
             segmentation_map=True,
         )
     except Exception as error:
-        # sep raises plain exceptions; this text identifies its limit of pixels.
+        # sep raises instances of Exception itself; only the message identifies an overflow of its pixel buffer.
         if "pixel buffer full" not in str(error):
             raise
         raise Crowded(str(error).partition(".")[0]) from None
@@ -165,7 +189,11 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
 
 
 def _expected_limit(context: FrameContext) -> float:
-    """AB magnitude of a source whose flux is ten times the noise within the PSF; galaxies are wider by 0.5"."""
+    """Return the AB magnitude of a source whose flux is ten times the noise of the sky in a typical aperture.
+
+    The radius of the aperture is the FWHM of the PSF, plus (in quadrature) 0.5 arcsec times the fraction of galaxies
+    among the sources.
+    """
     extended = _GALAXY * float(np.mean(~context.sources.point))
     radius = np.hypot(float(context.frame.header["PSFFWHM"]), extended) / context.frame.scale
     noise = context.noise * np.sqrt(np.pi) * radius

@@ -1,4 +1,4 @@
-"""Check the fraction of blank-sky pixels that cosmic rays hit: pixels far above the level without a known source."""
+"""Check the fraction of blank-sky pixels hit by cosmic rays: pixels far above the sky level without a known source."""
 
 from __future__ import annotations
 
@@ -14,14 +14,24 @@ SOURCE = (
     "VIS: 1 cm-2 s-1 with STARDUST track lengths, 2 to 3 % of the pixels in 565 s (Niemi 2015); NISP: 2.6 cm-2 s-1 "
     "through 7 um of HgCdTe"
 )
-# VIS: fraction of the pixels that is hit per second, and its relative tolerance.
-_VIS, _VIS_TOLERANCE = 0.025 / 565.0, 0.4
-# NISP: hits per pixel (18 um) and second, and pixels per hit, including neighbours to which charge leaks; tolerance.
-_NISP, _PIXELS, _NISP_TOLERANCE = 2.6 * 1.8e-3**2, 2.0, 0.6
+# Expected fraction of the pixels of VIS that cosmic rays hit per second of exposure time.
+_VIS = 0.025 / 565.0
+# Relative tolerance of the fraction of pixels hit by cosmic rays in VIS.
+_VIS_TOLERANCE = 0.4
+# Expected number of cosmic rays that hit a pixel of NISP (18 x 18 um) per second: 2.6 per cm^2.
+_NISP = 2.6 * 1.8e-3**2
+# Expected number of pixels above the detection limit per cosmic ray in NISP, including neighbours to which charge
+# leaks.
+_PIXELS = 2.0
+# Relative tolerance of the fraction of pixels hit by cosmic rays in NISP.
+_NISP_TOLERANCE = 0.6
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the fraction of blank pixels that are hit over the expected fraction."""
+    """Check the ratio of the fraction of blank pixels that are hit to the fraction expected for the exposure time.
+
+    Returns one row (measurement with expected value and verdict).
+    """
     assert context.tiles is not None
     usable = context.tiles.blank | context.tiles.hit
     hit = context.tiles.hit & _has_step(context)
@@ -30,7 +40,7 @@ def check(context: FrameContext) -> list[Row]:
         expected, tolerance = _VIS * context.frame.seconds, _VIS_TOLERANCE
     else:
         expected, tolerance = _NISP * _PIXELS * float(context.frame.header["ELAPTIME"]), _NISP_TOLERANCE
-    # Pixels of one track are not independent, so the error is from the scatter of the tiles.
+    # Take the error from the scatter between tiles, because the pixels of one track are not independent.
     tile_shares = hit.sum(axis=(1, 2)) / np.maximum(usable.sum(axis=(1, 2)), 1)
     error = float(tile_shares.std() / np.sqrt(len(tile_shares))) if hits else float(np.sqrt(expected / pixels))
     note = f"{pixels} pixels without sources, {hits} of them hit"
@@ -51,7 +61,11 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _has_step(context: FrameContext) -> Any:
-    """Pixels of the tiles whose ramp has a step; hot pixels have none."""
+    """Return a mask of the tiles' pixels that a cosmic ray may have hit during an infrared ramp (series of reads).
+
+    These are pixels in which chi^2 of the fit to the ramp, or the flag of a bad fit, is above 0. Hot pixels, whose
+    charge increases evenly, are thus left out. The result is True for detectors that are read only once.
+    """
     assert context.tiles is not None
     if context.frame.quality is None:
         return True

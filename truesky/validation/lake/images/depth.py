@@ -1,8 +1,8 @@
-"""Check the depth of a stack of frames from the noise of blank sky in the aperture of a source.
+"""Check the depth that a stack of four frames would have, from the noise of blank sky in one frame.
 
-For NISP the depth is that of a point source at 5 sigma, with the noise-equivalent area of a Gaussian of the width
-PSFFWHM. For VIS it is the S/N at magnitude 24.5 of a galaxy with half-light radius 0.3" in an aperture of diameter
-1.3"; the requirement is 10.
+For NISP the depth is the AB magnitude of a point source at 5 sigma, with the noise-equivalent area of a Gaussian of the
+width PSFFWHM (header). For VIS it is the S/N of a galaxy of AB magnitude 24.5 with half-light radius 0.3" in an
+aperture of diameter 1.3"; the requirement is 10.
 """
 
 from __future__ import annotations
@@ -14,15 +14,25 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_LEAST
 
 SOURCE = "requirements named by Serrano et al. 2024: NISP 24 AB (point, 5 sigma), VIS S/N 10 at 24.5 (extended)"
-# Number of exposures per position in the reference sequence.
+# Number of exposures of a field in Euclid's observing sequence, which form the stack whose depth is computed.
 _DITHERS = 4
-_POINT, _POINT_SIGMA, _GALAXY = 24.0, 5.0, 24.5
-# Fraction of the light of an exponential disc with radius 0.3" within a diameter of 1.3", with the PSF of VIS.
-_APERTURE_FRACTION, _DIAMETER = 0.80, 1.3
+# Required depth of NISP for point sources, AB mag.
+_POINT = 24.0
+# Signal-to-noise ratio at which the depth of NISP is defined.
+_POINT_SIGMA = 5.0
+# AB magnitude of the galaxy for which the S/N in VIS is required.
+_GALAXY = 24.5
+# Fraction of a galaxy's light in the aperture of VIS, for an exponential disc of half-light radius 0.3".
+_APERTURE_FRACTION = 0.80
+# Diameter of the aperture in which the S/N of a galaxy in VIS is computed, arcsec.
+_DIAMETER = 1.3
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the depth of four frames like this one."""
+    """Check the depth of a stack of four frames with the noise of the given frame against the mission requirement.
+
+    Returns one row (measurement with requirement and verdict): S/N for VIS, AB magnitude for NISP.
+    """
     assert context.tiles is not None
     spread = float(
         np.sqrt(np.mean((context.tiles.pixels - context.tiles.level[:, None, None])[context.tiles.blank] ** 2))

@@ -1,10 +1,10 @@
-"""Check the gain from two frames of a detector, whose difference is free of the pixel response.
+"""Check the gain with the difference of two frames of a detector, which is free of the pixel response.
 
 Notes
 -----
-Counts of S electrons have the variance S. Charge sharing between neighbours, by capacitance or because full pixels
-repel charge, moves part of this variance to covariances with neighbours; variance and covariances are added. Offsets
-of rows or columns and slopes cause covariances at larger distances, which are measured there and subtracted.
+A signal of S electrons has the variance S. Charge sharing between neighbouring pixels (by capacitance, or because full
+pixels repel charge) moves part of this variance to covariances with neighbours, so variance and covariances are added.
+Offsets of rows or columns and gradients also cause covariances. They are measured at larger distances and subtracted.
 
 References
 ----------
@@ -27,16 +27,32 @@ from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.rows import Row, not_applicable
 
 SOURCE = "photon transfer of two frames (Janesick 2007); covariances: Antilogus et al. 2014, JINST 9, C03048"
+# Tolerance of the measured gain divided by the gain in the header, which should be 1.
 TOLERANCE = 0.015
-# Distance in pixels over which charge is shared: for sky, and above the given level in e-.
-_SKY_REACH, _BRIGHT_REACH, _BRIGHT_LEVEL = 1, 2, 5000.0
-# Largest ratio of the levels of two frames, for sky and for flats (earlier exposures leave traces in flats); largest
-# level as a fraction of the full well; smallest number of pixels per amplifier.
-_MAX_SKY_RATIO, _MAX_FLAT_RATIO, _MAX_FULL, _MIN_PIXELS = 30.0, 1.03, 0.7, 60_000
+# Distance, in pixels, over which neighbouring pixels share charge in frames of the sky.
+_SKY_REACH = 1
+# Distance, in pixels, over which neighbouring pixels share charge in frames with a level above _BRIGHT_LEVEL.
+_BRIGHT_REACH = 2
+# Level, in electrons, above which pixels share charge over _BRIGHT_REACH instead of _SKY_REACH pixels.
+_BRIGHT_LEVEL = 5000.0
+# The gain is measured from the difference of two frames of the sky only if the ratio of their signal levels is at most
+# this value.
+_MAX_SKY_RATIO = 30.0
+# The gain is measured from the difference of two flats only if the ratio of their signal levels is at most this value.
+# It is small because persistence of earlier exposures remains in flats.
+_MAX_FLAT_RATIO = 1.03
+# The gain is not measured with frames whose signal level is above this fraction of the saturation level.
+_MAX_FULL = 0.7
+# The gain of an amplifier with fewer pixels of blank sky than this number is not measured.
+_MIN_PIXELS = 60_000
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the gain of each amplifier and their mean."""
+    """Check the measured gain of each amplifier, and the mean of all amplifiers, divided by the gain in the header.
+
+    Returns rows (measurements with expected value 1 and verdict). The row is "not_applicable" if no amplifier can be
+    measured or the two frames have different sizes.
+    """
     assert context.partner is not None
     other_frame = frames.open_frame(context.partner.path, context.frame.instrument)
     if other_frame.electrons.shape != context.frame.electrons.shape:
@@ -71,7 +87,12 @@ def _tiles(frame: Frame, sources: Reference) -> Tiles:
 def _pair_gain(
     frame: Frame, tile_pair: list[Tiles], amplifiers: tuple[Amplifier, Amplifier], factor: float, max_ratio: float
 ) -> tuple[float, float, float, int] | None:
-    """Gain over that in the header, its error, level (e-), and number of pixels; None if not measurable."""
+    """Measure the gain of one amplifier from blank pixels in two frames, divided by the gain in the header.
+
+    Returns the ratio, its standard error, the level of the first frame (e-) and the number of pixels. The result is
+    None if there are too few pixels, if the levels are too high or too different, or if there is no photon noise.
+    `factor` is the variance per electron of light (1, except for infrared ramps).
+    """
     a, b = (tiles.in_amplifier(amplifier) for tiles, amplifier in zip(tile_pair, amplifiers, strict=True))
     a, b = a.select(_shared_tiles(a, b)), b.select(_shared_tiles(b, a))
     common = a.blank & b.blank
@@ -98,7 +119,7 @@ def _pair_gain(
 
 
 def _shared_tiles(a: Tiles, b: Tiles) -> Bool:
-    """True for the tiles of `a` that are also in `b`."""
+    """Return a mask that is True for the tiles of `a` whose position (first row and column) is also in `b`."""
     positions = set(zip(b.row.tolist(), b.column.tolist(), strict=True))
     return np.array([position in positions for position in zip(a.row.tolist(), a.column.tolist(), strict=True)], bool)
 

@@ -1,8 +1,9 @@
-"""Check the noise of blank sky and overscan against the header, and the gain from the noise of the sky.
+"""Check the noise of blank sky and of the overscan against the header, and measure the gain from the noise of the sky.
 
 Notes
 -----
-Counts of S electrons have the variance S, so S / (variance - read variance) is the gain over the gain in the header.
+A signal of S electrons has the variance S. If the header has a wrong gain, S / (variance - read variance) is the true
+gain divided by the gain in the header.
 """
 
 from __future__ import annotations
@@ -15,27 +16,35 @@ from truesky.validation.lake.measure.frames import Amplifier
 from truesky.validation.lake.measure.rows import Row
 
 SOURCE = "photon transfer (Janesick 2007); up the ramp: Kubik et al. 2016, PASP 128, 104504"
-# Tolerances of the ratio of noises and of the ratio of gains.
-_NOISE, _GAIN = 0.05, 0.015
-# For ramps, capacitance between pixels removes 5 % of the noise, and stripes of the outputs add about the same.
+# Tolerance of the measured noise divided by the expected noise, which should be 1.
+_NOISE = 0.05
+# Tolerance of the measured gain divided by the gain in the header, which should be 1.
+_GAIN = 0.015
+# Tolerance of the gain of infrared detectors. Capacitance between pixels removes 5 % of the noise, and stripes of the
+# output amplifiers add about the same.
 _GAIN_OF_RAMPS = 0.06
-# Up to this level (e-) the pixel response (1 % rms) contributes little noise, as its share grows with the level.
+# The gain is not measured if the sky level is above this value, e-: differences in the response of pixels (1 % rms)
+# then add too much to the noise.
 _MAX_LEVEL = 400.0
-# Smallest number of pixels per amplifier for the gain.
+# The gain of an amplifier with fewer pixels of blank sky than this number is not measured.
 _MIN_PIXELS = 60_000
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the noise of the overscan and of blank sky, and the gain of each amplifier."""
+    """Check the noise of the overscan and of blank sky, and the gain, for each amplifier of a frame.
+
+    Returns rows (measured value divided by the value expected from the header, with verdict). Amplifiers without
+    overscan or with fewer than two blank tiles are left out.
+    """
     return [*_overscan_rows(context), *_sky_rows(context)]
 
 
 def _overscan_rows(context: FrameContext) -> list[Row]:
     rows = []
     for amplifier in context.frame.amplifiers:
-        # Without drawn read noise the overscan has rounding to whole ADU alone, which is not random.
+        # Skip amplifiers without simulated read noise: all pixels of their overscan have nearly the same whole number.
         if amplifier.samples and np.isfinite(amplifier.noise) and amplifier.header_read_noise > 0.0:
-            # The read noise in the header does not include rounding to whole ADU.
+            # Add the noise of rounding to whole ADU, which the read noise in the header does not include.
             expected = np.hypot(amplifier.header_read_noise, amplifier.gain / np.sqrt(12.0))
             value = amplifier.noise / expected
             error = value / np.sqrt(amplifier.samples)
@@ -71,7 +80,7 @@ def _sky_rows(context: FrameContext) -> list[Row]:
             value, error = blank_sky.variance(tiles)
         else:
             value, error = covariances.pixel_variance(tiles.pixels, tiles.blank, 0)
-        # Pixel response is noise in a single frame, although not noise of the sky.
+        # Add the pixel response to the variance: in a single frame it cannot be separated from noise.
         base_variance += (context.frame.instrument.pixel_response_rms * level) ** 2
         expected = factor * level + base_variance
         note = f"{pixels} blank pixels in tiles of {blank_sky.SIDE}, level {level:.4g} e-"
@@ -105,14 +114,21 @@ def _sky_rows(context: FrameContext) -> list[Row]:
 
 
 def read_variance(amplifier: Amplifier) -> float:
-    """Return the read variance per pixel in e-^2: measured in the overscan, or from the header if there is none."""
+    """Return the variance of a pixel without light in e-^2, from read noise and rounding to whole ADU.
+
+    It is measured in the overscan, or computed from the header if the amplifier has no overscan.
+    """
     if amplifier.samples and np.isfinite(amplifier.noise):
         return amplifier.noise**2
     return amplifier.header_read_noise**2 + amplifier.gain**2 / 12.0
 
 
 def ramp_factor(context: FrameContext) -> float:
-    """Return the variance of a ramp's signal over its electrons, without read noise; groups share photons."""
+    """Return the photon noise of the signal of an infrared ramp: its variance divided by its number of electrons.
+
+    The ratio differs from 1 because reads of the ramp are averaged in groups. It depends on the readout mode in the
+    header (NG groups of NR reads with ND dropped reads between them). Read noise is not included.
+    """
     groups, reads, drops = (int(context.frame.header[key]) for key in ("NG", "NR", "ND"))
     n, step = groups - 1, reads + drops
     alpha = (1.0 - reads**2) / (3.0 * reads * step)

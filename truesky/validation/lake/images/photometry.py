@@ -1,9 +1,9 @@
-"""Check the magnitudes of stars against the band fluxes of the catalogue, and their slope with magnitude.
+"""Check the measured magnitudes of stars against the catalogue: mean offset, and its slope with magnitude.
 
 Notes
 -----
-The light beyond an aperture, and the part of it that was subtracted with the sky next to the star, follow from the
-wings of the brightest stars in the frame (measure/wings.py).
+A finite aperture misses the wings of a star, and some light of the wings is subtracted with the sky around the star.
+Both losses are computed from the wings of the brightest stars in the frame (measure/wings.py).
 """
 
 from __future__ import annotations
@@ -20,19 +20,28 @@ from truesky.validation.lake.measure.stars import StarMeasurements
 from truesky.validation.lake.measure.wings import Wings
 
 SOURCE = "Serrano et al. 2024, app. C: below 0.02 mag, aperture and PSF photometry"
+# Tolerance of the measured minus the catalogue magnitude (mag), and of the slope of this difference (mag per mag).
 TOLERANCE = 0.02
-# Factor 2.5 / ln 10.
+# Error of a magnitude divided by the relative error of the flux: 2.5 / ln 10.
 _MAGNITUDE = 1.0857
-# Stars are measured in the aperture that contains about this fraction of a point source; smallest number of stars.
-_APERTURE_FRACTION, _MIN_STARS = 0.8, 8
-# Index of the aperture at which the wings begin; in wider apertures the error of the sky dominates.
+# Stars are measured in the aperture that contains about this fraction of the light of a point source.
+_APERTURE_FRACTION = 0.8
+# With fewer measured stars than this number, the check is not applicable.
+_MIN_STARS = 8
+# Index, in the list of apertures, of the widest one that is used for total light; the wings beyond it are a power law.
+# In wider apertures the error of the sky dominates.
 _JOIN_APERTURE = -3
-# Fraction of the full well above which nonlinearity matters.
+# Stars whose brightest pixel is above this fraction of the saturation level are not used, because of nonlinearity.
 _LINEAR = 0.2
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the offset from the magnitudes of the catalogue and its slope, for apertures and for PSF fits."""
+    """Check the magnitudes of the stars of a frame, by aperture photometry and by PSF fits.
+
+    For each method the rows (measurements with expected value 0 and verdict) are the offset from the catalogue at the
+    median magnitude, and the slope of the offset with magnitude. With fewer than eight stars in the linear range, the
+    row is "not_applicable".
+    """
     assert context.measurements is not None
     stars, zero_point = context.measurements.stars, float(context.frame.header["ZEROPNT"])
     magnitude, error = magnitudes(context.measurements, zero_point, context.frame.seconds)
@@ -61,10 +70,12 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _fit_line(offset: Float, error: Float, mag: Float, usable: Bool) -> tuple[Float, Float, Bool]:
-    """Fit a line to magnitude offsets: (offset at the median magnitude, slope), their errors, and the stars used."""
+    """Fit a line to the magnitude offsets of the `usable` stars, and reject outliers such as stars with cosmic rays.
+
+    Returns (offset at the median magnitude, slope), their standard errors, and a mask of the stars used.
+    """
     used, spread, line = usable, _spread(offset[usable]), np.zeros(2)
     relative_mag = mag - float(np.median(mag[usable]))
-    # Stars hit by a cosmic ray are outliers from a line through the others.
     for _ in range(3):
         residual = offset - line[0] - line[1] * relative_mag
         used = usable & (np.abs(residual - np.median(residual[usable])) < 5.0 * spread)
@@ -87,12 +98,16 @@ def _rows(context: FrameContext, name: str, line: Float, errors: Float, used: Bo
 
 
 def _wing_error(measurements: StarMeasurements) -> float:
-    """Error of the offset from that of the wings, mag."""
+    """Return the error of the stars' mean magnitude offset due to the uncertain strength of the PSF's wings, mag."""
     return _MAGNITUDE * _lost_fraction(measurements, replace(measurements.wings, strength=measurements.wings.error))
 
 
 def _lost_fraction(measurements: StarMeasurements, wings: Wings) -> float:
-    """Fraction of all light that an aperture lacks: beyond it, or subtracted with the sky."""
+    """Return the fraction of a star's total light that the widest used aperture misses.
+
+    The fraction consists of the light beyond this aperture, and of light of the wings inside it that was subtracted
+    as sky. `wings` has the power law of the PSF's wings.
+    """
     join_radius = float(measurements.radii[_JOIN_APERTURE])
     return wings.fraction_beyond(join_radius) + np.pi * join_radius**2 * float(
         wings.profile(measurements.sky_at).mean()
@@ -104,21 +119,23 @@ def _spread(values: Float) -> float:
 
 
 def magnitudes(measurements: StarMeasurements, zero_point: float, seconds: float) -> tuple[Float, Float]:
-    """Return the AB magnitudes of all light of the stars, and their errors from photons and sky.
+    """Return the total AB magnitudes of stars from aperture photometry, and their errors from photon and sky noise.
+
+    The flux in an aperture with about 80 % of the light is corrected to the total flux of a point source.
 
     Parameters
     ----------
     measurements : StarMeasurements
-        Stars and their curves of growth.
+        Measured stars of a frame with their curves of growth (light within several radii).
     zero_point : float
-        Magnitude of 1 e-/s.
+        AB magnitude of a source that gives 1 electron per second.
     seconds : float
         Exposure time, s.
 
     Returns
     -------
     magnitude, error : float array, shape (n,)
-        AB magnitudes and their errors.
+        AB magnitudes and their standard errors; NaN or infinite for stars without positive flux.
     """
     enclosed, total = growth_curve(measurements)
     aperture = int(np.argmin(np.abs(enclosed / total - _APERTURE_FRACTION)))
@@ -128,7 +145,10 @@ def magnitudes(measurements: StarMeasurements, zero_point: float, seconds: float
 
 
 def growth_curve(measurements: StarMeasurements) -> tuple[Float, float]:
-    """Return the mean light of a point source in each aperture, and all its light, relative to the widest one."""
+    """Return the median curve of growth of the brighter half of the stars: light of a point source in each aperture.
+
+    The second value is the total light, including the wings. Both are relative to the light in the widest aperture.
+    """
     bright = np.argsort(-measurements.stars.flux, kind="stable")[: max(len(measurements.stars) // 2, _MIN_STARS)]
     growth = measurements.stars.growth[bright]
     enclosed = np.median(growth / growth[:, -1:], axis=0)

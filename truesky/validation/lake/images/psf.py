@@ -1,4 +1,4 @@
-"""Check the width and the ellipticity of point sources."""
+"""Check the FWHM and the ellipticity of stars in an image."""
 
 from __future__ import annotations
 
@@ -11,13 +11,20 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = 'PSFFWHM of the header; VIS: McCracken et al. 2025 (0.16"), requirement e < 0.15 (Cropper et al. 2016)'
-# Tolerance of the FWHM over that in the header, and largest ellipticity (a^2 - b^2) / (a^2 + b^2) in space.
-_WIDTH, _ROUND = 0.08, 0.15
+# Relative tolerance of the measured FWHM of stars compared with the FWHM in the header.
+_WIDTH = 0.08
+# Largest allowed ellipticity (a^2 - b^2) / (a^2 + b^2), with the axes a and b, of stars in images from space. It is
+# computed from the medians of both components of the ellipticity.
+_ROUND = 0.15
+# With fewer measured stars than this number, the check is not applicable.
 _MIN_STARS = 12
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the FWHM over that in the header and, in space, the mean ellipticity."""
+    """Check the measured FWHM of stars divided by the FWHM in the header and, in space, their median ellipticity.
+
+    Returns one row (measurement with expected value and verdict) for each quantity.
+    """
     assert context.measurements is not None
     measurements, stars = context.measurements, context.measurements.stars
     header_fwhm = float(context.frame.header["PSFFWHM"]) / context.frame.scale

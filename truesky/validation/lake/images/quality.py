@@ -1,8 +1,9 @@
-"""Check the fits of ramps: distribution of chi^2 in all pixels, and fraction above the limit in the header.
+"""Check the chi^2 of the fits to infrared ramps: its distribution over all pixels, and the fraction of bad fits.
 
 Notes
 -----
-NG groups have NG - 1 differences. They determine one number, the signal, so there are NG - 2 degrees of freedom.
+A ramp of NG groups of reads has NG - 1 differences, to which one number is fitted: the signal. Therefore chi^2 has
+NG - 2 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -16,14 +17,19 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = "chi^2 with NG - 2 degrees of freedom (Kubik et al. 2016, PASP 128, 104504)"
-# Tolerance of the quartiles over the expected ones; a rounded chi^2 determines them to a fraction of one.
+# Relative tolerance of the median and quartiles of chi^2 of the ramp fits. The file has chi^2 as rounded integers,
+# which limits the accuracy.
 _MIDDLE = 0.06
-# Fraction of ramps that may fail to fit: reads share photons, and cosmic rays hit some pixels.
+# Fraction of pixels that may have a bad fit, because of cosmic rays and correlated noise of the groups.
 _FLAGGED = 0.03
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the median and quartiles of chi^2 over the expected ones, and the fraction of pixels that do not fit."""
+    """Check the median and the quartiles of chi^2 divided by the expected values, and the fraction of bad fits.
+
+    Returns rows (measurements with expected value and verdict). If the file contains only a flag per pixel instead of
+    chi^2, the only row is the fraction of bad fits.
+    """
     quality = np.asarray(context.frame.quality)
     if "QUALFLAG" in context.frame.header:
         return [_flagged_row(context, quality > 0)]
@@ -43,7 +49,11 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _quantile(count: Array, edges: Array, part: float) -> float:
-    """Quantile of rounded values, as if each were evenly distributed over its interval."""
+    """Return the quantile of rounded values, for the fraction `part` (0 to 1) of values that are below it.
+
+    `count` says how many values were rounded to each of the integers 0, 1, 2, ..., and `edges` are these integers with
+    one more at the end. Values are assumed to be evenly distributed within 0.5 of their integer.
+    """
     below: Float = np.append(0.0, np.cumsum(count)) / count.sum()
     return float(np.interp(part, below, edges - 0.5))
 

@@ -1,4 +1,4 @@
-"""Check that positions and magnitudes of the same stars agree between images of a channel and band."""
+"""Check that positions and magnitudes of the same stars agree between consecutive exposures of a channel and band."""
 
 from __future__ import annotations
 
@@ -13,12 +13,21 @@ from truesky.validation.lake.measure.frame_context import ExposureCheck, Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
 SOURCE = "Serrano et al. 2024, app. C: below 1 mas rms between images (ground cameras 5 mas), 0.02 mag"
-_MAGNITUDE, _MIN_STARS = 0.02, 8
+# Tolerance of the mean magnitude difference of the same stars in two exposures, mag.
+_MAGNITUDE = 0.02
+# Two exposures with fewer stars in common than this number are not compared.
+_MIN_STARS = 8
+# Names of the measured series: offsets to the east and north (mas), and AB magnitudes.
 _NAMES = ("east", "north", "measured")
 
 
 def rows(results: Sequence[Result]) -> list[Row]:
-    """Check the mean differences of stars that two consecutive exposures share."""
+    """Check the mean differences of positions and magnitudes of stars between consecutive exposures.
+
+    `results` are the results of all frames (exposures of one detector). Each returned row is a mean difference with its
+    expected value 0 and a verdict. A channel and band without two consecutive exposures with eight common stars gets a
+    row "not_applicable".
+    """
     out: list[Row] = []
     with_offsets = [result for result in results if "east" in result.series]
     for channel, band in dict.fromkeys((result.place.channel, result.place.band) for result in with_offsets):
@@ -38,7 +47,7 @@ def rows(results: Sequence[Result]) -> list[Row]:
 
 
 def _star_offsets(results: Sequence[Result]) -> Mapping[int, Float]:
-    """Offsets (mas) and magnitude of each star by identifier, NaN if unknown."""
+    """Return, by identifier of the star, its offsets to the east and north (mas) and its magnitude, NaN if unknown."""
     by_star: dict[int, Float] = {}
     for result in results:
         n = len(result.series["id"])
@@ -65,7 +74,7 @@ def _pair_rows(place: Place, other: str, a: Mapping[int, Float], b: Mapping[int,
 
 
 def _clipped_mean(values: Float) -> tuple[float, float]:
-    """Mean without outliers, and its standard error."""
+    """Return the mean of the values within 4 sigma of their median, and its standard error."""
     middle = np.median(values)
     spread = 1.4826 * float(np.median(np.abs(values - middle))) + 1e-9
     used = values[np.abs(values - middle) < 4.0 * spread]

@@ -1,6 +1,6 @@
-"""Check that stars saturate if their expected peak is above the full well, and that fainter stars do not.
+"""Check that stars far above the saturation level (2.5 times) are saturated, and stars far below (0.4 times) are not.
 
-The expected peak of a star is its flux times the fraction of a point source in its brightest pixel.
+The expected peak of a star is its flux times the fraction of a point source's light in the brightest pixel.
 """
 
 from __future__ import annotations
@@ -14,13 +14,25 @@ from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.verdicts import AT_LEAST, AT_MOST
 
 SOURCE = "part of a point's light in its brightest pixel, from the frame's own fainter stars; SATURATE of the header"
-# Peaks in units of the full well above which a star must saturate, and below which it must not.
-_OVER, _UNDER = 2.5, 0.4
-_TOLERANCE, _MIN_STARS, _ISOLATION_RADIUS = 0.1, 5, 30.0
+# Stars must be saturated if the expected value of their brightest pixel is above this multiple of the saturation level.
+_OVER = 2.5
+# Stars must not be saturated if the expected value of their brightest pixel is below this multiple of the saturation
+# level.
+_UNDER = 0.4
+# Allowed fraction of the stars above _OVER that are not saturated, and of the stars below _UNDER that are saturated.
+_TOLERANCE = 0.1
+# The bright stars, or the faint stars, are not checked if they are fewer than this number.
+_MIN_STARS = 5
+# A star is used only if there is no brighter source within this distance, pixels.
+_ISOLATION_RADIUS = 30.0
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the fractions of bright and faint stars that have a saturated pixel."""
+    """Check the fraction of bright stars, and of faint stars, that have a saturated pixel.
+
+    Returns one row (measurement with expected value and verdict) for each group with at least five stars, or a row
+    "not_applicable" if both groups have fewer.
+    """
     assert context.measurements is not None
     stars = context.measurements.stars
     part = float(np.median(stars.peak / stars.flux))
@@ -39,7 +51,7 @@ def check(context: FrameContext) -> list[Row]:
         n = int(chosen.sum())
         if n >= _MIN_STARS:
             value = float(full[chosen].mean())
-            # The error of a fraction after Agresti and Coull is not 0 if all stars agree.
+            # Use the error of a fraction by Agresti and Coull, which is not 0 if all stars are (or are not) saturated.
             adjusted_share = (full[chosen].sum() + 2.0) / (n + 4.0)
             error = float(np.sqrt(adjusted_share * (1.0 - adjusted_share) / (n + 4.0)))
             out.append(
@@ -61,7 +73,10 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _isolated_stars(context: FrameContext) -> tuple[Float, Bool]:
-    """Expected e- of points without a brighter source nearby, and True if they have a saturated pixel."""
+    """Find the point sources without a brighter source within 30 pixels.
+
+    Returns their expected light (e-), and a mask that is True for sources with a saturated pixel within 2 pixels.
+    """
     sources, (ny, nx) = context.sources, context.frame.electrons.shape
     inside = sources.point & (sources.x > 8) & (sources.x < nx - 9) & (sources.y > 8) & (sources.y < ny - 9)
     index = np.flatnonzero(inside & (sources.expected > 1e-3 * context.frame.saturation_level))

@@ -1,9 +1,9 @@
-"""Check slitless spectra: flux of first orders, positions of their traces, and positions of emission lines.
+"""Check slitless spectra of NISP: flux of first orders, positions of their traces, and positions of emission lines.
 
 Notes
 -----
-For point sources with an isolated first order, light is summed across the trace above the level on both sides. For
-sources with bright lines, a line is the light above the median of its spectrum, and its position is the centroid.
+For point sources with an isolated first order, light is summed across the trace, and the background on both sides is
+subtracted. An emission line is the light above the median of the spectrum around it; its position is the centroid.
 """
 
 from __future__ import annotations
@@ -21,31 +21,51 @@ from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.verdicts import AT_LEAST
 
 SOURCE = "rendered_spectra of the lake; the extracted flux of stars: Serrano et al. 2024, app. C"
-# Tolerances: flux over the expected one, position of the trace (pixels), position of a line (pixels).
-_FLUX, _TRACE, _LINE = 0.05, 0.1, 0.3
-# Half height of the summed strip, and distances from the trace between which the level is measured, pixels.
-_HALF, _FROM, _TO = 6, 9, 15
-# Smallest S/N of a spectrum and of a line, largest overlapped fraction of a trace, smallest number of values, largest
-# number of spectra.
-_MIN_SNR, _MIN_LINE_SNR, _MAX_OVERLAP, _MIN_NUMBER, _MAX_SPECTRA = 60.0, 8.0, 0.1, 5, 150
-# Half widths of the window for a line and of the window for its level, pixels.
-_LINE_REACH, _LEVEL_REACH = 3, 12
-# Smallest significance of a detected line (sigma), and fraction of the expected lines that may be missed.
-_MIN_SIGNIFICANCE, _MAX_MISSED = 3.0, 0.5
+# Relative tolerance of the median ratio of measured and expected flux in the first spectral order.
+_FLUX = 0.05
+# Tolerance of the median offset of measured from expected traces, pixels across the trace.
+_TRACE = 0.1
+# Tolerance of the median offset of measured from expected positions of emission lines, pixels along the trace.
+_LINE = 0.3
+# Light is summed up to this distance from the trace, pixels.
+_HALF = 6
+# The background is measured from this distance on both sides of the trace, pixels.
+_FROM = 9
+# The background is measured up to this distance on both sides of the trace, pixels.
+_TO = 15
+# Only spectra with a larger estimated signal-to-noise ratio than this are measured.
+_MIN_SNR = 60.0
+# Only emission lines with a larger expected signal-to-noise ratio than this are searched in the spectra.
+_MIN_LINE_SNR = 8.0
+# Spectra of which a larger fraction of the trace overlaps with other spectra are not measured.
+_MAX_OVERLAP = 0.1
+# A median of fewer spectra or emission lines than this number is not computed.
+_MIN_NUMBER = 5
+# Largest number of spectra that are measured; the brightest are selected.
+_MAX_SPECTRA = 150
+# A line is detected only within this distance from its expected position, pixels.
+_LINE_REACH = 3
+# The continuum of a line is measured up to this distance from its expected position, pixels.
+_LEVEL_REACH = 12
+# A line counts as detected only if its light above the continuum exceeds this number of standard deviations of the
+# noise.
+_MIN_SIGNIFICANCE = 3.0
+# Fraction of the expected lines that may be missed.
+_MAX_MISSED = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtractedSpectrum:
-    """Spectrum along a trace, one value per pixel.
+    """Spectrum that was extracted along its trace, with one value per pixel along the trace.
 
     Attributes
     ----------
     t : float array, shape (n,)
-        Parameter along the trace, 0 to 1.
+        Position along the trace, from 0 at its first wavelength to 1 at its last.
     light : float array, shape (n,)
-        Light of the source, e-.
+        Light of the source above the background, summed across the trace, e-.
     offset : float
-        Centroid across minus the expected trace, pixels.
+        Measured minus expected position of the trace, pixels across the trace; NaN if the total light is not positive.
     """
 
     t: Float
@@ -54,8 +74,13 @@ class ExtractedSpectrum:
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Check the first orders of a frame."""
-    # Orders other than the first may be in the table; they have no value in `overlapped`.
+    """Check the spectra of first order in a dispersed frame of NISP.
+
+    The rows (measurements with expected value and verdict) are the fraction of expected lines that are detected, and
+    the medians of flux ratios, trace offsets and line offsets. With fewer than five values, the row of a median is
+    "not_applicable", and the row of the detected fraction is left out.
+    """
+    # Select the first orders explicitly: the table may contain other orders, which have no value in `overlapped`.
     condition = (pc.field("order") == 1) & (pc.field("overlapped") < _MAX_OVERLAP)
     first = context.spectra.filter(condition).to_pylist()
     points = set(context.sources.id[context.sources.point].tolist())
@@ -72,7 +97,7 @@ def check(context: FrameContext) -> list[Row]:
     lines = line_offsets[np.isfinite(line_offsets)].tolist()
     out = []
     if len(line_offsets) >= _MIN_NUMBER:
-        # If wavelengths are far off, no lines are detected at the expected positions, and no shift can be measured.
+        # Check the detected fraction as well: with very wrong wavelengths no line is found, so no shift is measured.
         part = len(lines) / len(line_offsets)
         adjusted_share = (len(lines) + 2.0) / (len(line_offsets) + 4.0)
         out.append(
@@ -109,19 +134,20 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | None:
-    """Extract a first order; None if it is not entirely on the detector.
+    """Extract the spectrum of a source in the first order along its trace.
 
     Parameters
     ----------
     image : float array, shape (ny, nx)
         Pixels of the frame, e-.
     row : mapping of str to object
-        Row of `rendered_spectra`.
+        Row of the table `rendered_spectra`, which describes the trace by polynomials.
 
     Returns
     -------
     ExtractedSpectrum or None
-        Spectrum along the trace; None also if it covers fewer than 50 columns (or rows) of the detector.
+        Spectrum along the trace. None if the trace with its background regions is not entirely on the detector, or is
+        shorter than 50 pixels.
     """
     along_x = abs(row["x_last"] - row["x_first"]) >= abs(row["y_last"] - row["y_first"])
     plane = image if along_x else image.T
@@ -148,7 +174,7 @@ def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | 
     strip = plane[trace_rows[None, :] + offsets[:, None], columns[None, :]].astype(float)
     level = np.median(strip[np.abs(offsets) >= _FROM], axis=0)
     inner = strip[np.abs(offsets) <= _HALF] - level
-    # Each row is cleaned along the trace; isolated bright pixels are from cosmic rays.
+    # Remove cosmic rays: single pixels that are much brighter than their neighbours along the trace.
     inner = _remove_outliers(inner)
     weight = inner.sum(axis=1)
     centre = (weight * np.arange(-_HALF, _HALF + 1)).sum() / weight.sum() if weight.sum() > 0.0 else np.nan
@@ -156,11 +182,14 @@ def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | 
 
 
 def _remove_outliers(inner: Float) -> Float:
-    """Replace single pixels far above their neighbours along the row."""
+    """Replace pixels far above the median of their neighbours in the same row by this median.
+
+    `inner` has the light across the trace (rows) and along the trace (columns).
+    """
     typical = np.median(np.stack([np.roll(inner, step, axis=1) for step in (-3, -2, -1, 1, 2, 3)]), axis=0)
     spread = 1.4826 * np.median(np.abs(inner - typical))
     is_outlier = inner > typical + 8.0 * spread + 1.0 * np.abs(typical)
-    # A line is bright in several rows, a cosmic ray in one or two.
+    # Replace only if one or two pixels of a column are outliers: an emission line is bright in more rows.
     return np.where(is_outlier & (is_outlier.sum(axis=0) <= 2), typical, inner)
 
 
@@ -172,7 +201,11 @@ def _polynomial(coefficients: Float, t: Float) -> Float:
 
 
 def _line_offsets(context: FrameContext, row: Mapping[str, Any]) -> list[float]:
-    """Measured minus expected positions of bright lines in a spectrum, pixels along the trace; NaN if not detected."""
+    """Return measured minus expected positions of the bright emission lines of a spectrum, pixels along the trace.
+
+    A line that is not detected gives NaN. Lines near other lines or near the end of the trace are left out. The list is
+    empty if the spectrum has no bright line or cannot be extracted.
+    """
     bright = [
         wavelength
         for wavelength, snr in zip(row["line_wavelength"] or (), row["line_snr"] or (), strict=True)
@@ -195,7 +228,8 @@ def _line_offsets(context: FrameContext, row: Mapping[str, Any]) -> list[float]:
         continuum = spectrum.light[in_window & (np.abs(pixel) > _LINE_REACH)]
         level = np.median(continuum)
         noise = 1.4826 * np.median(np.abs(continuum - level))
-        # The window follows the line until it stays, because continuum light pulls towards the middle of the window.
+        # Move the window to the measured centroid and repeat, because light of the continuum biases the centroid
+        # towards the centre of the window.
         centre, significance = 0.0, 0.0
         for _ in range(10):
             window = np.exp(-0.5 * ((pixel - centre) / 1.2) ** 2)

@@ -1,4 +1,4 @@
-"""Measure the blank sky of a frame in tiles without sources: level and noise."""
+"""Measure the level and the noise of blank sky (pixels without known sources) in square tiles of a frame."""
 
 from __future__ import annotations
 
@@ -12,37 +12,48 @@ from truesky.validation.lake.measure import masks
 from truesky.validation.lake.measure.frames import Amplifier, Frame
 from truesky.validation.lake.measure.references import Reference
 
-# Side of a tile, pixels; step in tiles along rows and columns of large detectors.
-SIDE, TILE_STEP = 64, 2
+# Side of a square tile, pixels.
+SIDE = 64
+# On large detectors (more pixels than _LARGE), only every n-th tile along rows and along columns is measured.
+TILE_STEP = 2
+# A detector is large if it has more pixels than this number.
 _LARGE = 2 << 20
-# The light of a point source at r arcsec is this times its flux / r^3, per square arcsec (obscured aperture, 3 bars).
+# Wings of a point source: surface brightness per arcsec^2 at r arcsec is this number times the flux / r^3, as for a
+# telescope with central obscuration and three bars.
 _WING = 9.3e-3
-# Fraction of a pixel's noise that a source may contribute to a blank pixel; factor for the radius of galaxies; smallest
-# radius, arcsec.
-_VISIBLE_FRACTION, _GALAXY_WIDENING, _MIN_RADIUS = 0.1, 1.5, 1.0
+# A pixel is not blank if a known source may contribute more than this fraction of the pixel's noise.
+_VISIBLE_FRACTION = 0.1
+# Radius of the masked disc around a galaxy, divided by that of a point source with the same light.
+_GALAXY_WIDENING = 1.5
+# Smallest radius of the masked disc around a visible source, arcsec. It is also at least twice the FWHM of the PSF.
+_MIN_RADIUS = 1.0
+# Largest radius of the masked disc around a source, pixels.
 _MAX_RADIUS = 400
-# Standard deviations from the median of a tile beyond which a pixel is an outlier; smallest number of blank pixels.
-_CLIP, _MIN_PIXELS = 5.0, 400
-# Step in rows and columns of the pixels that give the first estimate of the level.
+# A pixel is an outlier if it differs from the mean of its tile by more than this number of standard deviations.
+_CLIP = 5.0
+# Tiles with fewer pixels of blank sky than this number are not used.
+_MIN_PIXELS = 400
+# The first estimate of the sky level of a tile uses every n-th pixel along rows and along columns.
 _SAMPLE_STEP = 4
-# Standard deviations above its tile from which a pixel counts as hit.
+# A pixel without a known source counts as hit by a cosmic ray if it is at least this number of standard deviations
+# above the mean of its tile.
 _HIT = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tiles:
-    """Square tiles of a frame.
+    """Square tiles of 64 x 64 pixels of a frame, with masks of blank sky and of cosmic rays.
 
     Attributes
     ----------
-    pixels : float32 array, shape (t, SIDE, SIDE)
-        Pixels, e-.
-    blank : bool array, shape (t, SIDE, SIDE)
-        True for blank pixels.
-    hit : bool array, shape (t, SIDE, SIDE)
-        True for pixels far above the level of the tile without a known source.
+    pixels : float32 array, shape (t, 64, 64)
+        Pixels of the t tiles, e-.
+    blank : bool array, shape (t, 64, 64)
+        True for pixels of blank sky: without a known source, neither an outlier nor next to one, and read out.
+    hit : bool array, shape (t, 64, 64)
+        True for pixels without a known source that are far above the level of their tile (cosmic rays).
     row, column : int array, shape (t,)
-        First row and column of each tile.
+        Row and column of each tile's first pixel in the frame, from 0.
     """
 
     pixels: Array
@@ -53,22 +64,25 @@ class Tiles:
 
     @property
     def level(self) -> Float:
-        """Mean of the blank pixels of each tile, e- per pixel."""
+        """Return the mean of the blank pixels of each tile in e-, shape (t,); NaN for a tile without blank pixels."""
         return np.asarray((self.pixels * self.blank).sum(axis=(1, 2)) / self.blank.sum(axis=(1, 2)))
 
     def in_amplifier(self, amplifier: Amplifier) -> Tiles:
-        """Return the tiles that lie entirely in an amplifier."""
+        """Return only the tiles whose pixels are all read by the given amplifier."""
         rows, columns = amplifier.pixels
         return self.select((self.row >= rows.start) & (self.row + SIDE <= rows.stop)
                           & (self.column >= columns.start) & (self.column + SIDE <= columns.stop))  # fmt: skip
 
     def select(self, mask: Bool) -> Tiles:
-        """Return the tiles selected by a mask."""
+        """Return only the tiles for which `mask`, shape (t,), is True."""
         return Tiles(self.pixels[mask], self.blank[mask], self.hit[mask], self.row[mask], self.column[mask])
 
 
 def rough_noise(frame: Frame) -> float:
-    """Return the rms noise (e-) of a blank pixel from the middle half of differences of neighbours."""
+    """Return the rms noise of a pixel of blank sky in e-, from differences between adjacent pixels.
+
+    It is computed from the quartiles of these differences, so sources and cosmic rays hardly matter.
+    """
     sample = frame.electrons[5::37, :].astype(float)
     step = np.diff(sample, axis=1).ravel()
     low, high = np.percentile(step, [25.0, 75.0])
@@ -76,23 +90,24 @@ def rough_noise(frame: Frame) -> float:
 
 
 def tiles(frame: Frame, sources: Reference, noise: float, tile_step: int | None = None) -> Tiles:
-    """Divide a frame into tiles, and mask sources, outliers and pixels that are not read out.
+    """Divide a frame into square tiles, and find their pixels of blank sky and their cosmic rays.
 
     Parameters
     ----------
     frame : Frame
-        A frame.
+        Raw frame in electrons, at least 64 x 64 pixels.
     sources : Reference
-        Its known sources.
+        Known sources of the frame.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
     tile_step : int, optional
-        Step in tiles along rows and columns; by default TILE_STEP for large detectors, else 1.
+        Only every n-th tile along rows and columns is used. The default is 2 for detectors of more than 2 million
+        pixels, otherwise 1.
 
     Returns
     -------
     Tiles
-        Tiles with enough blank pixels.
+        Tiles with at least 400 pixels of blank sky; there may be none.
     """
     ny, nx = frame.electrons.shape
     if tile_step is None:
@@ -114,9 +129,12 @@ def tiles(frame: Frame, sources: Reference, noise: float, tile_step: int | None 
 
 
 def _not_blank(pixels: Array, hidden: Bool, noise: float) -> Bool:
-    """Mask of pixels that are not blank sky: sources, outliers and their neighbours, and pixels not read out."""
+    """Return a mask of the tiles' pixels that are not blank sky.
+
+    These are sources (`hidden`), outliers and their neighbours, and pixels that were not read out, whose value is 0.
+    """
     bad = hidden | (pixels == 0.0)
-    # Sources cover little of most tiles, so the median of a sample is a good first level.
+    # Estimate the level of each tile by the median of every 16th pixel: sources cover only a small part of most tiles.
     sample = pixels[:, ::_SAMPLE_STEP, ::_SAMPLE_STEP]
     middle = np.median(np.where(bad[:, ::_SAMPLE_STEP, ::_SAMPLE_STEP], np.median(sample), sample), axis=(1, 2))
     out = np.empty(pixels.shape, bool)
@@ -126,9 +144,11 @@ def _not_blank(pixels: Array, hidden: Bool, noise: float) -> Bool:
 
 @exact_jit
 def _mark_outliers(pixels: Array, bad: Bool, middle: Float, noise: float, out: Bool) -> None:
-    """Mark pixels (t, ny, nx) far from the mean of the other pixels of their tile, in three iterations.
+    """Set `out` to True for pixels that differ from the mean of their tile by more than 5 standard deviations.
 
-    The first iteration starts from the levels `middle` and the rms `noise` (e-); pixels that are `bad` do not count.
+    `pixels`, `bad` and `out` have the shape (t, ny, nx). Mean and standard deviation are computed from the pixels that
+    are neither `bad` nor outliers, in three iterations. They start from the levels `middle`, shape (t,), and the rms
+    `noise`, all in e-.
     """
     tiles, ny, nx = pixels.shape
     for t in range(tiles):
@@ -141,13 +161,13 @@ def _mark_outliers(pixels: Array, bad: Bool, middle: Float, noise: float, out: B
                     out[t, i, j] = is_outlier = abs(off) > limit
                     if not (is_outlier or bad[t, i, j]):
                         n, first, second = n + 1, first + off, second + off * off
-            # Sums are relative to the old mean, which is near the new one, so no digits are lost.
+            # The sums are relative to the previous mean, which is near the new mean, so rounding errors are small.
             step = first / max(n, 1)
             mean, spread = mean + step, np.sqrt(max(second / max(n, 1) - step * step, 0.0))
 
 
 def _source_mask(frame: Frame, sources: Reference, noise: float) -> Bool:
-    """Pixels in which a known source may be visible."""
+    """Return a mask of a frame's pixels to which a known source may contribute more than a tenth of the noise."""
     ny, nx = frame.electrons.shape
     out = np.zeros((ny, nx), bool)
     if not len(sources.x):
@@ -155,20 +175,24 @@ def _source_mask(frame: Frame, sources: Reference, noise: float) -> Bool:
     width = float(frame.header["PSFFWHM"])
     radius = np.cbrt(_WING * np.maximum(sources.expected, 0.0) * frame.scale**2 / (_VISIBLE_FRACTION * noise))
     radius = np.maximum(radius * np.where(sources.point, 1.0, _GALAXY_WIDENING), max(2.0 * width, _MIN_RADIUS))
-    # Sources that are invisible even at their peak are not masked: their light is part of the noise of the sky.
+    # Do not mask sources whose peak is below a tenth of the noise: their light counts as part of the sky.
     radius[sources.expected * frame.scale**2 < _VISIBLE_FRACTION * noise * width**2] = 0.0
     masks.mark_discs(sources.x, sources.y, np.minimum(radius / frame.scale, _MAX_RADIUS), out)
     return out
 
 
 def variance(tiles: Tiles) -> tuple[float, float]:
-    """Return the variance of a blank pixel around the mean of its tile (e-^2), and its standard error."""
+    """Return the variance of blank pixels around the mean of their tile in e-^2, and its standard error.
+
+    The variance is averaged over the tiles, weighted by their numbers of blank pixels. With a single tile the error is
+    infinite.
+    """
     blank = tiles.blank
     n = blank.sum(axis=(1, 2))
     off = np.where(blank, tiles.pixels - tiles.level[:, None, None], 0.0).astype(float)
     tile_variance = (off**2).sum(axis=(1, 2)) / (n - 1)
     weight = n / n.sum()
     value = float((weight * tile_variance).sum())
-    # The error is from the scatter of the tiles.
+    # Standard error from the scatter of the variance between tiles.
     error = float(np.sqrt((weight**2 * (tile_variance - value) ** 2).sum())) if len(n) > 1 else np.inf
     return value, error

@@ -1,7 +1,7 @@
 """Measure fluxes of stars by fitting the effective PSF of the frame, which is built from its brighter stars.
 
-The effective PSF is the fraction of a point source's light in a pixel as a function of the distance from the point. It
-includes the width of the pixel and is represented by cubic splines.
+The effective PSF is the fraction of a point source's light in a pixel, as a function of the pixel's offset (x, y) from
+the source. It includes the response of the pixel and is represented by cubic splines.
 
 References
 ----------
@@ -21,29 +21,44 @@ from lake_schema.arrays import Bool, Float
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.stars import StarMeasurements
 
-# Radius of the fit in FWHM, and its smallest value in pixels; knots per FWHM, and their smallest distance in pixels.
-_REACH, _MIN_REACH, _KNOTS, _FINEST = 2.0, 3.0, 4.0, 1.0 / 3.0
-# Weight of the second differences, in units of the mean weight of a coefficient.
+# Half of the side of the square around a star in which the PSF is defined, in FWHM.
+_REACH = 2.0
+# Half of the side of the square around a star in which the PSF is defined is at least this number of pixels.
+_MIN_REACH = 3.0
+# Number of knots, per FWHM of the stars, of the splines that represent the PSF.
+_KNOTS = 4.0
+# Smallest distance between knots of the splines that represent the PSF, pixels.
+_FINEST = 1.0 / 3.0
+# Weight, in the fit of the PSF, of the squared second differences of the spline coefficients, relative to the mean
+# weight of the data on a coefficient. It makes the splines smooth.
 _SMOOTH = 1e-5
-# Fewest stars for a PSF; relative variation of the PSF between stars, and its floor relative to the peak; standard
-# deviations of an outlier.
-MIN_STARS, _PSF_VARIATION, _FLOOR, _OUTLIER = 8, 0.03, 3e-3, 5.0
-# Number of iterations of a fit, and largest shift of a position per iteration, pixels.
-_ROUNDS, _STEP = 5, 0.3
+# A PSF is not built from fewer bright stars than this number. A star with fewer good pixels than this number is not
+# fitted.
+MIN_STARS = 8
+# Error of a pixel value due to differences between the PSFs of stars, as a fraction of the value.
+_PSF_VARIATION = 0.03
+# Smallest error of a pixel value when the PSF is built, as a fraction of the peak value.
+_FLOOR = 3e-3
+# Pixels that deviate from the fit by more than this number of standard deviations are rejected.
+_OUTLIER = 5.0
+# Number of iterations of the fit of a star's flux and position.
+_ROUNDS = 5
+# Half of the largest shift of a star's position in a fit, pixels.
+_STEP = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class EffectivePsf:
-    """Effective PSF as cubic splines.
+    """Effective PSF: fraction of a point source's light in a pixel, as cubic splines of the pixel's offset (x, y).
 
     Attributes
     ----------
     coefficients : float array, shape (k, k)
-        Spline coefficients (rows, columns).
+        Spline coefficients, first axis along rows (y), second along columns (x).
     step : float
         Distance between knots, pixels.
     reach : float
-        The PSF extends from -reach to reach, pixels.
+        The PSF is defined for offsets from -reach to reach along both axes, pixels.
     """
 
     coefficients: Float
@@ -51,7 +66,10 @@ class EffectivePsf:
     reach: float
 
     def evaluate(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
-        """Return the value, and its slopes along columns and rows, at distances (pixels) from the point."""
+        """Return the PSF and its derivatives with respect to x and y at offsets (pixels) from the source.
+
+        All arrays have the shape (m,). Offsets outside the range of the PSF are extrapolated and not useful.
+        """
         (i, first, rise), (j, second, climb) = (_basis(axis, self.step, self.reach) for axis in (x, y))
         coefficients = self.coefficients[j[:, :, None], i[:, None, :]]
         return (
@@ -62,7 +80,10 @@ class EffectivePsf:
 
 
 def _basis(x: Float, step: float, reach: float) -> tuple[np.ndarray, Float, Float]:
-    """Indices, values and slopes, each of shape (m, 4), of the splines that are not 0 at x."""
+    """Return indices, values and derivatives of the four cubic B-splines that are not 0 at each x, shape (m, 4).
+
+    Knots have the distance `step` and begin at -`reach`, in pixels.
+    """
     place = (x + reach) / step
     first = np.clip(np.floor(place).astype(int), 0, _knots(step, reach) - 4)
     t = place - first
@@ -76,23 +97,23 @@ def _knots(step: float, reach: float) -> int:
 
 
 def build(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> EffectivePsf:
-    """Build the effective PSF from pixels of stars.
+    """Fit the effective PSF to pixels of several stars, and repeat the fit without outliers.
 
     Parameters
     ----------
     x, y : float array, shape (m,)
-        Distances of the pixels from their stars, pixels.
+        Offset of each pixel from the position of its star, pixels.
     value : float array, shape (m,)
         Fraction of the star's light in each pixel.
     weight : float array, shape (m,)
-        Inverse variance of the value.
+        Inverse variance of each value.
     fwhm : float
-        FWHM, pixels.
+        FWHM of the stars, pixels.
 
     Returns
     -------
     EffectivePsf
-        The PSF; coefficients are NaN if they are not determined.
+        The PSF. Its coefficients are NaN if the pixels do not determine them, and 0 without pixels.
     """
     step, reach = max(fwhm / _KNOTS, _FINEST), fit_radius(fwhm)
     k = _knots(step, reach)
@@ -110,7 +131,11 @@ def build(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> Effec
 
 
 def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int) -> Float:
-    """Least-squares coefficients with small second differences, from a banded normal matrix; NaN if it is singular."""
+    """Return the k^2 spline coefficients of a smoothed least-squares fit; all are NaN if the matrix is singular.
+
+    `index` and `basis`, shape (m, 16), have the coefficients on which each pixel depends, and their factors. The sum of
+    squared second differences of the coefficients is added with a small weight. The normal matrix is banded.
+    """
     heavy, width = basis * weight[:, None], 3 * k + 3
     band = np.zeros((width + 1, k * k))
     for i in range(16):
@@ -120,7 +145,7 @@ def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: F
                 band[lag] += np.bincount(index[:, j], heavy[:, i] * basis[:, j], k * k)
     smooth = _SMOOTH * band[0].mean()
     for step in (1, k):
-        # Second differences are those of three neighbours along a row or a column.
+        # Add the squares of a - 2 b + c for each three adjacent coefficients along rows, then along columns.
         middle = np.arange(k * k).reshape(k, k)
         first = (middle[:, :-2] if step == 1 else middle[:-2]).ravel()
         for i, a in enumerate((1.0, -2.0, 1.0)):
@@ -134,28 +159,35 @@ def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: F
 
 
 def fit_radius(fwhm: float) -> float:
-    """Return the radius in pixels within which stars are fitted."""
+    """Return half of the side (pixels) of the square around a star in which the PSF is defined, for a FWHM in pixels.
+
+    The square whose pixels are fitted is 0.6 pixels narrower on each side.
+    """
     return max(_REACH * fwhm, _MIN_REACH)
 
 
 def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float, noise: float) -> tuple[Float, Float]:
-    """Fit the fluxes and positions of stars with the effective PSF of the frame.
+    """Measure fluxes of stars by PSF fitting: build the effective PSF of a frame, and fit it to each star.
+
+    Positions are fitted as well.
 
     Parameters
     ----------
     frame : Frame
-        Frame with the stars.
+        Raw frame with the stars.
     measurements : StarMeasurements
-        Stars of the frame.
+        Measured stars of the frame: positions, sky levels, first estimates of fluxes, and the FWHM.
     total_light : float array, shape (n,)
-        All light of each star, e-; required for the brighter stars, NaN if unknown.
+        Total light of each star from aperture photometry, e-; NaN if unknown. The PSF is built from the brighter half
+        of the stars with a value.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
 
     Returns
     -------
     flux, error : float array, shape (n,)
-        Fitted light and its error, e-; NaN if there are too few stars for a PSF.
+        Fitted light and its standard error, e-. NaN for stars that cannot be fitted, and for all stars if fewer than
+        eight are available for the PSF.
     """
     stars, n = measurements.stars, len(measurements.stars)
     bright = np.flatnonzero(np.isfinite(total_light) & (total_light > 0.0))
@@ -166,12 +198,12 @@ def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float,
     parts = [np.stack([u, v, cut / total_light[i], total_light[i] ** 2 / (noise**2 + np.maximum(cut, 0.0))])
              for i, (u, v, cut) in ((i, pixels[i]) for i in bright)]  # fmt: skip
     u, v, value, weight = np.concatenate(parts, axis=1)
-    # Without this floor the many pixels of the wings would outweigh the few pixels of the core.
+    # Add an error floor: otherwise the many faint pixels of the wings would outweigh the few pixels of the core.
     variance = 1.0 / weight + (_PSF_VARIATION * value) ** 2 + (_FLOOR * value.max()) ** 2
     psf = build(u, v, value, 1.0 / variance, measurements.fwhm)
     if not np.isfinite(psf.coefficients).all():
         return np.full(n, np.nan), np.full(n, np.nan)
-    # Arrays have the same number of pixels for each star; padding is masked.
+    # Copy the pixels of all stars to arrays (star, pixel); `is_pixel` is 0 for padding of stars with fewer pixels.
     max_pixels = max(len(cut) for *_, cut in pixels)
     u, v, cut, is_pixel = (np.zeros((n, max_pixels)) for _ in range(4))
     for i, star_values in enumerate(pixels):
@@ -181,9 +213,12 @@ def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float,
 
 
 def _star_pixels(frame: Frame, measurements: StarMeasurements, i: int) -> tuple[Float, Float, Float]:
-    """x and y relative to a star, and e- above the sky corrected for vignetting, of the pixels around it."""
+    """Return the pixels around star number `i`: offsets x and y from the star, and light, as flat arrays.
+
+    The light is in e- above the sky, corrected for nonlinearity and vignetting.
+    """
     stars, reach = measurements.stars, fit_radius(measurements.fwhm)
-    # The position may shift, so the fit uses a slightly smaller radius than that of the PSF.
+    # Use a slightly smaller square than the range of the PSF, because the fit may shift the position.
     x, y, radius = float(stars.x[i]), float(stars.y[i]), reach - 2.0 * _STEP
     across, up = (np.arange(int(np.ceil(at - radius)), int(np.floor(at + radius)) + 1) for at in (x, y))
     cut = frame.linearize(frame.electrons[up[0] : up[-1] + 1, across[0] : across[-1] + 1].astype(float)) - stars.sky[i]
@@ -194,9 +229,11 @@ def _star_pixels(frame: Frame, measurements: StarMeasurements, i: int) -> tuple[
 def _fit_stars(
     psf: EffectivePsf, place: tuple[Float, Float], cut: Float, is_pixel: Bool, flux: Float, noise: float
 ) -> tuple[Float, Float]:
-    """Fitted flux (e-) and its error per star, NaN if too few pixels are good.
+    """Fit flux and position of n stars with a PSF; return the fluxes and their standard errors in e-.
 
-    `place` are x and y of the pixels, `cut` their e-, each of shape (n, m); `flux` is the initial flux.
+    `place` are the offsets x and y of the pixels from their star, and `cut` their light in e- above the sky, all of
+    shape (n, m); `is_pixel` is False for padding. `flux` is the first estimate in e-. Results are NaN for stars with
+    fewer than eight good pixels or without positive flux.
     """
     flux, good = flux.astype(float), is_pixel
     u, v, failed = np.zeros_like(flux), np.zeros_like(flux), np.zeros(len(flux), bool)
@@ -212,7 +249,7 @@ def _fit_stars(
             )
         failed |= (good.sum(axis=1) < MIN_STARS) | ~(flux > 0.0)
         heavy = weight * (good & ~failed[:, None])
-        # Dividing by the flux gives flux and position steps similar weights.
+        # Divide by the flux, so that the solution is the relative change of the flux and the shift in pixels.
         flux_step, du, dv = _solve_step((value, -rise, -climb), heavy, residual / np.where(failed, 1.0, flux)[:, None])
         u, v = (np.clip(a + b, -2 * _STEP, 2 * _STEP) for a, b in ((u, du), (v, dv)))
         flux = flux * (1.0 + flux_step)
@@ -221,9 +258,10 @@ def _fit_stars(
 
 
 def _solve_step(columns: Sequence[Float], weight: Float, residual: Float) -> list[Float]:
-    """Least-squares solution of the three columns (n, m) for the residuals of each star; 0 if no pixel is good.
+    """Return the weighted least-squares solution for each of n stars: three coefficients of `columns`, each (n,).
 
-    The matrix is well conditioned, since a PSF and its slopes along two axes are nearly orthogonal.
+    `columns` are three arrays of shape (n, m) whose linear combination is fitted to `residual`, shape (n, m): the PSF
+    and its two derivatives, which are nearly orthogonal. The solution is 0 for a star whose weights are all 0.
     """
     basis = np.stack(columns, axis=2)
     weighted = np.swapaxes(basis * weight[:, :, None], 1, 2)

@@ -1,4 +1,7 @@
-"""Input of the checks of images: a frame, its references, and measurements that several checks share."""
+"""Input of the checks of images: a raw frame, its known sources, and measurements that several checks use.
+
+The module also defines what a check is: a name, a condition and a function that returns rows with verdicts.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,27 @@ from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.lake.measure.stars import StarMeasurements
 
+# Image types (values of the FITS keyword IMAGETYP) of exposures of the sky that are validated as such. Others, such as
+# exposures of standard stars, are not included.
 SKY_TYPES = ("science", "deep", "self_calibration")
+# Channel whose images are slitless spectra.
 DISPERSED = "NISP-S"
+# Channels with infrared detectors, which are read several times during an exposure (a ramp).
 RAMPS = ("NISP-P", "NISP-S")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartnerFrame:
-    """Another frame of the same detector.
+    """A second frame of the same detector, with which the gain is measured from the difference of two frames.
 
     Attributes
     ----------
     path : Path
-        Science file.
+        FITS file of the second frame.
     exposure_id : int
-        Exposure.
+        Number of its exposure.
     sources : Reference
-        Known sources of the frame.
+        Known sources of the second frame.
     """
 
     path: Path
@@ -40,28 +47,29 @@ class PartnerFrame:
 
 @dataclass(slots=True, eq=False)
 class FrameContext:
-    """A frame with its references and measurements.
+    """A raw frame (one detector of an exposure) with its known sources and the measurements that several checks use.
 
     Attributes
     ----------
     place : Place
-        Channel, band, exposure and detector.
+        Channel, band, exposure number and detector of the frame.
     frame : Frame
-        The frame.
+        Pixels in electrons, and header.
     sources : Reference
-        Known sources.
+        Known sources on the detector, from the tables of the lake.
     spectra : Table, optional
-        Rows of `rendered_spectra`, at least those of first orders; only for dispersed frames.
+        Rows of the table `rendered_spectra` on this detector, at least those of first orders; None for frames without
+        spectra.
     noise : float
-        rms of a pixel of blank sky, e-; 0 if not measured.
+        rms noise of a pixel of blank sky, e-; 0 if not measured.
     tiles : Tiles, optional
-        Tiles of blank sky; only for direct images of the sky.
+        Tiles of blank sky; None for frames of lamps or without light, and for spectra.
     measurements : StarMeasurements, optional
-        Measured stars; only for direct images of the sky.
+        Measured stars; None for frames of lamps or without light, and for spectra.
     partner : PartnerFrame, optional
-        Another frame with which the gain is measured.
+        Second frame of the detector for the measurement of the gain; None without such a frame.
     series : dict of str to object
-        Numbers for figures and for checks of several frames, added by the checks.
+        Measured numbers by name, which checks add for the plots of the report and for checks of several frames.
     """
 
     place: Place
@@ -76,27 +84,27 @@ class FrameContext:
 
     @property
     def channel(self) -> str:
-        """Channel of the frame, from its header."""
+        """Return the channel in the header: VIS, NISP-P (images), NISP-S (spectra) or EXT (ground cameras)."""
         return str(self.frame.header["CHANNEL"])
 
     @property
     def sees_sky(self) -> bool:
-        """True for images of the sky, not of lamps or darks."""
+        """Return True if the image type is in SKY_TYPES, also for spectra, and False for others, such as flats."""
         return self.frame.header["IMAGETYP"] in SKY_TYPES
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Results of one frame or of a check of catalogues.
+    """Results of all checks of one frame, or of one check of catalogues.
 
     Attributes
     ----------
     place : Place
-        Place of the measurement.
+        Channel, band, exposure and detector of the frame; all None for catalogues.
     rows : list of Row
-        Rows with verdicts.
+        Measured values with expected values and verdicts.
     series : mapping of str to object
-        Numbers for figures and for checks of several frames.
+        Measured numbers by name, for the plots of the report and for checks of several frames.
     """
 
     place: Place
@@ -106,18 +114,18 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class FrameCheck:
-    """A check of one frame.
+    """A check that is applied to single frames, such as the check of the background.
 
     Attributes
     ----------
     name : str
         Name of the check.
     source : str
-        Source of the expectation.
+        Publication or header keywords from which the expected values are taken.
     why_not_applicable : callable
-        Function of the context that returns the reason why the check does not apply, "" if it applies.
+        Function of a FrameContext that returns the reason why the check cannot be applied to this frame, or "".
     measure : callable
-        Function of the context that returns the rows.
+        Function of a FrameContext that returns rows: measured values with expected values and verdicts.
     """
 
     name: str
@@ -126,23 +134,26 @@ class FrameCheck:
     measure: Callable[[FrameContext], list[Row]]
 
     def run(self, context: FrameContext) -> list[Row]:
-        """Return the rows of the check, or one row with the reason if it does not apply."""
+        """Apply the check to a frame, and return its rows (measured values with expected values and verdicts).
+
+        If the check cannot be applied, the only row has the verdict "not_applicable" and the reason.
+        """
         why = self.why_not_applicable(context)
         return [not_applicable(self.name, context.place, why, self.source)] if why else self.measure(context)
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureCheck:
-    """A check of all frames together.
+    """A check that combines the results of many frames, such as the mean offset of an exposure.
 
     Attributes
     ----------
     name : str
         Name of the check.
     source : str
-        Source of the expectations.
+        Publication from which the expected values are taken.
     rows : callable
-        Function of the results of all frames that returns the rows.
+        Function of the results of all frames that returns rows: combined values with expected values and verdicts.
     """
 
     name: str
@@ -153,25 +164,31 @@ class ExposureCheck:
 def measure_frame(
     path: Path, place: Place, sources: Reference, spectra: Any = None, instrument: Instrument | None = None
 ) -> FrameContext:
-    """Open a science file and make the measurements that several checks share.
+    """Open a raw FITS file, and make the measurements that several checks use: noise, blank sky and stars.
 
     Parameters
     ----------
     path : Path
-        Science file.
+        FITS file of one detector of an exposure.
     place : Place
-        Channel, band, exposure and detector.
+        Channel, band, exposure number and detector.
     sources : Reference
         Known sources of the frame.
     spectra : Table, optional
-        Rows of `rendered_spectra` of a dispersed frame.
+        Rows of the table `rendered_spectra` for a frame with slitless spectra.
     instrument : Instrument, optional
-        Camera of the frame; None for a linear detector without vignetting.
+        Nonlinearity, vignetting and pixel response of the camera; None for a linear detector without vignetting.
 
     Returns
     -------
     FrameContext
-        The frame with noise, tiles and stars if it shows the sky.
+        The frame. The noise is measured for frames of the sky and spectra; blank sky and stars are measured for direct
+        images of the sky only.
+
+    Raises
+    ------
+    BadInput
+        If the header lacks a required keyword.
     """
     frame = frames.open_frame(path, instrument)
     context = FrameContext(place, frame, sources, spectra)
@@ -184,7 +201,11 @@ def measure_frame(
 
 
 def require_stars(min_stars: int) -> Callable[[FrameContext], str]:
-    """Return a function that returns the reason if a frame has fewer than `min_stars` usable stars, else ""."""
+    """Return a condition for checks that need at least `min_stars` measured stars.
+
+    The condition is a function of a FrameContext that returns "" for a frame with enough stars, and otherwise the
+    reason why the check cannot be applied.
+    """
 
     def why_not_applicable(context: FrameContext) -> str:
         if context.measurements is None:
@@ -196,12 +217,12 @@ def require_stars(min_stars: int) -> Callable[[FrameContext], str]:
 
 
 def require_blank_sky(context: FrameContext) -> str:
-    """Return the reason if a frame has no blank sky, else ""."""
+    """Return "" if a frame has two or more tiles of blank sky, and otherwise why checks that need them do not apply."""
     if context.tiles is None:
         return "no direct image of the sky"
     return "" if len(context.tiles.row) > 1 else "no blank sky between its sources"
 
 
 def all_rows(checks: Sequence[FrameCheck], context: FrameContext) -> list[Row]:
-    """Return the rows of all checks of a frame."""
+    """Apply all checks to a frame, and return their rows (measured values with expected values and verdicts)."""
     return [row for check in checks for row in check.run(context)]

@@ -1,4 +1,4 @@
-"""Read raw files of a detector as a reduction pipeline does: by their headers alone.
+"""Read raw FITS files of a detector as a reduction pipeline does: only with the information in their headers.
 
 References
 ----------
@@ -21,44 +21,48 @@ from lake_schema.arrays import Array, Bool, Float, Float32
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 
+# Pattern of a FITS section, a rectangle of pixels such as [1:2048,1:4096]: first and last column, first and last row.
 _SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
-# Keywords of a celestial WCS, with SIP or TPV distortions.
+# Pattern of the FITS keywords of a celestial WCS, including SIP and TPV distortions.
 _WCS_KEYWORD = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)[12]|(CD|PC)[12]_[12]|PV\d_\d+|[AB]P?_(ORDER|\d_\d)|LONPOLE|LATPOLE|RADESYS"
 )
-# Suffix of the name of the chi^2 plane of a ramp.
+# End of the name of the extension that has chi^2 of the fits to infrared ramps.
 _QUALITY = ".CHI2"
+# Keyword in the header of the extension with the quality of ramp fits, if it has flags instead of chi^2.
 _FLAGS = "QUALFLAG"
-# Keyword of a header with an uncertain pointing (FITS paper I); the .head file next to it then has the true WCS.
+# Keyword of a header with an uncertain pointing (systematic error, FITS paper I). The true WCS is then in the .head
+# file in the same folder.
 _UNCERTAIN_POINTING = "CSYER1"
-# Fraction of the overscan columns that is not used, since they contain charge released by traps.
+# Fraction of the overscan columns that is not used, half of it at each side: columns next to the image contain charge
+# released by traps.
 _SKIPPED = 0.5
-# Differences of neighbours in the overscan that are outliers, in units of their scatter.
+# Differences between neighbours in the overscan are outliers beyond this number of standard deviations.
 _CLIP = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Amplifier:
-    """Readout of one amplifier.
+    """An amplifier of a detector, with its properties from the header and from its overscan.
 
     Attributes
     ----------
     name : str
-        Name of the amplifier.
+        Name of the amplifier or of its FITS extension.
     pixels : (slice, slice)
-        Rows and columns of the detector.
+        Rows and columns of the detector that the amplifier reads.
     gain : float
-        Gain, e-/ADU.
+        Gain in the header, e-/ADU.
     level : float
-        Level without light, ADU.
+        Level without light: mean of the overscan, or BIAS of the header without overscan, ADU.
     noise : float
-        rms of the overscan, e-; NaN if there is no overscan.
+        rms noise of the overscan, e-; NaN if there is no overscan.
     header_read_noise : float
         rms read noise in the header, e-.
     samples : int
-        Number of pixels of the overscan.
+        Number of pixels of the overscan that were used, 0 without overscan.
     saturation_level : float
-        Level of the lowest saturated pixel, e-.
+        Pixels at or above this level are saturated, e- above the level without light.
     """
 
     name: str
@@ -73,22 +77,24 @@ class Amplifier:
 
 @dataclass(frozen=True, slots=True)
 class NonlinearityCurve:
-    """Nonlinearity of an amplifier.
+    """Nonlinearity of an amplifier: a loss at high signals, and a loss of the first electrons at low signals.
 
     Attributes
     ----------
     high : float
-        Relative loss at the converter's range: n is read as n / (1 + high) there.
+        Relative loss at high signals: n at the upper limit of the analogue-to-digital converter is read as
+        n / (1 + high).
     low : float
-        Fraction of the first electrons that is missing.
+        Fraction of the first electrons that is lost.
     knee : float
-        Scale of the loss of the first electrons, e-.
+        Signal up to which electrons are lost at low signals (scale of an exponential), e-.
     range : float
-        Range of the converter, ADU.
+        Largest value of the analogue-to-digital converter, ADU.
 
     Notes
     -----
-    A signal of n electrons is read as s - low * knee * (1 - exp(-s / knee)) with s = n / (1 + high * n / range).
+    A signal of n electrons is read as s - low * knee * (1 - exp(-s / knee)) with s = n / (1 + high * n / range), where
+    the range is converted to electrons.
     """
 
     high: float = 0.0
@@ -97,7 +103,10 @@ class NonlinearityCurve:
     range: float = 65535.0
 
     def linearize(self, read: Float, max_signal: float) -> Float:
-        """Return the collected electrons of electrons that were read; `max_signal` is the converter's range in e-."""
+        """Correct measured electrons `read` for nonlinearity, and return the electrons that the pixels collected.
+
+        `max_signal` is the range of the analogue-to-digital converter in e-. Negative signals are not changed.
+        """
         signal = np.asarray(read, float)
         for _ in range(3):
             signal = read - self.low * self.knee * np.expm1(-np.maximum(signal, 0.0) / self.knee)
@@ -106,16 +115,16 @@ class NonlinearityCurve:
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """Properties of a camera from the mission database that are not faults of a frame.
+    """Known properties of a camera, from the mission database, for which checks correct the measurements.
 
     Attributes
     ----------
     curve : NonlinearityCurve
         Nonlinearity of the amplifiers.
     vignetting : float
-        Fraction of the light that is lost at the corner of the focal plane.
+        Fraction of the light that is lost at the corner of the focal plane, 0 to 1.
     pixel_response_rms : float
-        rms of the relative response of pixels.
+        Standard deviation of the relative response of pixels.
     """
 
     curve: NonlinearityCurve = NonlinearityCurve()
@@ -125,22 +134,22 @@ class Instrument:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A detector of an exposure.
+    """A raw frame: the pixels of one detector in one exposure, converted to electrons.
 
     Attributes
     ----------
     electrons : float32 array, shape (ny, nx)
-        Electrons above the level of each amplifier.
+        Electrons above the level without light of each amplifier; 0 in pixels that no amplifier reads.
     amplifiers : tuple of Amplifier
         Amplifiers of the detector.
     quality : uint8 array, shape (ny, nx), optional
-        chi^2 of a ramp.
+        chi^2 of the fit to an infrared ramp, or 1 for a bad fit if the header has QUALFLAG; None for other detectors.
     header : mapping of str to object
-        Header of the whole file.
+        Primary header by keyword.
     wcs : WCS
-        World coordinates of the detector's pixels; the first pixel is (0, 0).
+        World coordinate system of the detector's pixels without overscan.
     instrument : Instrument
-        Camera of the frame.
+        Nonlinearity, vignetting and pixel response of the camera.
     """
 
     electrons: Float32
@@ -151,9 +160,10 @@ class Frame:
     instrument: Instrument = Instrument()
 
     def illumination(self, x: Float, y: Float) -> Float:
-        """Return the fraction of light after vignetting at pixel positions.
+        """Return the fraction of the light that reaches pixel positions (x, y), counted from 0, after vignetting.
 
-        The fraction is 1 - vignetting r^2 with r = 1 at the corner of DETSIZE.
+        The fraction is 1 - vignetting r^2, with the distance r from the optical axis in units of the distance of the
+        corner of the focal plane (keyword DETSIZE).
         """
         if self.instrument.vignetting == 0.0:
             return np.ones(len(x))
@@ -162,27 +172,27 @@ class Frame:
         return np.asarray(1.0 - self.instrument.vignetting * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
 
     def linearize(self, read: Float) -> Float:
-        """Return the collected electrons of electrons that were read."""
+        """Correct measured electrons (any shape) for the camera's nonlinearity with the mean gain of the amplifiers."""
         max_signal = self.instrument.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
         return self.instrument.curve.linearize(read, max_signal)
 
     @property
     def seconds(self) -> float:
-        """Exposure time, s."""
+        """Return the exposure time (EXPTIME) in seconds."""
         return float(self.header["EXPTIME"])
 
     @property
     def scale(self) -> float:
-        """Pixel scale, arcsec per pixel."""
+        """Return the pixel scale (PIXSCALE) in arcsec per pixel."""
         return float(self.header["PIXSCALE"])
 
     @property
     def saturation_level(self) -> float:
-        """Level of the lowest saturated pixel of all amplifiers, e-."""
+        """Return the lowest saturation level of the amplifiers, e-."""
         return min(amplifier.saturation_level for amplifier in self.amplifiers)
 
     def saturated_pixels(self) -> Bool:
-        """Return a mask of the saturated pixels."""
+        """Return a mask, bool[ny, nx], of pixels at or above the saturation level of their amplifier."""
         out = np.zeros(self.electrons.shape, bool)
         for amplifier in self.amplifiers:
             out[amplifier.pixels] = self.electrons[amplifier.pixels] >= amplifier.saturation_level
@@ -190,12 +200,15 @@ class Frame:
 
 
 def open_frame(path: Path, instrument: Instrument | None = None) -> Frame:
-    """Open a science file of an instrument from the mission database; None for a linear detector without vignetting.
+    """Read a raw FITS file of one detector and convert its pixels to electrons.
+
+    `instrument` has the known nonlinearity, vignetting and pixel response of the camera; None means a linear detector
+    without vignetting.
 
     Raises
     ------
     BadInput
-        If the header lacks a keyword that a pipeline requires.
+        If the header lacks a keyword that a pipeline requires, or has an invalid section.
     """
     units = images.read_images(path)
     try:
@@ -218,7 +231,7 @@ def _frame(units: Sequence[images.Image], path: Path) -> Frame:
     quality = next((unit for unit in planes if unit.name.endswith(_QUALITY)), None)
     quality_header = {} if quality is None else _header(quality)
     quality_plane = None if quality is None else np.asarray(quality.data)[section(quality_header["DATASEC"])]
-    # The keyword that marks a plane of flags is in the header of the plane.
+    # Copy the keyword QUALFLAG, which marks flags instead of chi^2, from the header of the extension.
     first |= {_FLAGS: quality_header[_FLAGS]} if _FLAGS in quality_header else {}
     return Frame(electrons, tuple(amplifiers), quality_plane, first, _wcs(_header(signal[0]), path, first))
 
@@ -231,7 +244,11 @@ _AmplifierData = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, An
 
 
 def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
-    """Amplifiers of an array: their pixels on the detector, data, overscan columns (or None), cards and name."""
+    """Divide an image array into its amplifiers according to the sections in the header.
+
+    For each amplifier the result has its rows and columns on the detector, its pixels, its overscan (or None), the
+    header and the name.
+    """
     if "NAMPS" in header:
         return [_numbered_amplifier(header, array, n) for n in range(1, int(header["NAMPS"]) + 1)]
     ny, nx = array.shape
@@ -243,7 +260,7 @@ def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
 
 
 def _numbered_amplifier(header: dict[str, Any], array: Array, n: int) -> _AmplifierData:
-    """Amplifier `n` of an array that contains several."""
+    """Return amplifier number `n` (from 1) of an array that contains several; keywords end with this number."""
     cards = {**header, "GAIN": header[f"GAIN{n}"]}
     if f"RDN{n}" in header and header.get("RDNDRAWN", 1.0) > 0.0:
         cards["RDNDRAWN"] = header[f"RDN{n}"]
@@ -256,13 +273,13 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
     gain, read_noise = float(cards["GAIN"]), float(cards["RDNDRAWN"])
     level, noise, samples = float(cards.get("BIAS", 0.0)), np.nan, 0
     if bias is not None:
-        # The middle half of the overscan is farthest from the pixels, whichever side they are on.
+        # Use the middle half of the overscan columns: at the edge next to the image, traps release charge.
         cut = int(0.5 * _SKIPPED * bias.shape[1])
         overscan = bias[:, cut : bias.shape[1] - cut].astype(float)
         level = float(overscan.mean())
-        # Differences in both directions remove offsets of rows and columns.
+        # Take differences between adjacent columns, then between adjacent rows: offsets of rows and columns cancel.
         step = np.diff(np.diff(overscan, axis=1), axis=0)
-        # Outliers from cosmic rays are left out.
+        # Leave out outliers, which are due to cosmic rays.
         step = step[np.abs(step) < _CLIP * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
         noise = float(np.std(step) / 2.0) * gain if step.size else np.nan
         samples = overscan.size
@@ -271,7 +288,7 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
 
 
 def section(text: str) -> tuple[slice, slice]:
-    """Return the slices (rows, columns) of a section [x1:x2,y1:y2], which counts from 1 and includes both ends.
+    """Convert a FITS section "[x1:x2,y1:y2]", which counts from 1 and includes both ends, to slices (rows, columns).
 
     Raises
     ------
@@ -286,7 +303,11 @@ def section(text: str) -> tuple[slice, slice]:
 
 
 def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
-    """WCS of the detector's pixels without leading overscan; the true WCS if the header is uncertain."""
+    """Return the WCS of the detector's pixels without prescan.
+
+    If the header marks its pointing as uncertain and a .head file exists in the same folder, the true WCS in this file
+    is used.
+    """
     cards = header if "CTYPE1" in header else first
     head_file = path.with_suffix(".head")
     if (_UNCERTAIN_POINTING in header or _UNCERTAIN_POINTING in first) and head_file.is_file():
@@ -305,19 +326,20 @@ def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
 
 
 def sky_to_pixel(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:
-    """Return pixel columns and rows, from 0, of sky positions.
+    """Convert sky positions to pixel coordinates, including distortion.
 
     Parameters
     ----------
     wcs : WCS
-        World coordinates of the pixels.
+        World coordinate system of the pixels.
     ra, dec : float array, shape (n,)
         Positions, deg.
 
     Returns
     -------
     x, y : float array, shape (n,)
-        Columns and rows; values are not accurate if the inversion does not converge.
+        Columns and rows from 0. Far outside the image, where the inversion of the distortion does not converge, they
+        are not accurate, and no error is raised.
     """
     if not len(ra):
         return np.zeros(0), np.zeros(0)

@@ -1,4 +1,4 @@
-"""Masks of pixels: discs around sources, and dilation."""
+"""Make masks of pixels: discs around sources, and masks that are enlarged by neighbouring pixels."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from truesky.numerics.compiling import exact_jit
 
 @exact_jit
 def mark_discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
-    """Mark pixels within a radius of positions.
+    """Set the pixels of a mask to True whose centres are within discs around positions.
 
     Parameters
     ----------
     x, y : float array, shape (n,)
-        Positions, pixels; no disc if one is not finite.
+        Centres of the discs, pixels from 0. Discs with a coordinate that is not finite are skipped.
     radius : float array, shape (n,)
-        Radius in pixels, edge included; 0 or NaN marks nothing, infinity marks all pixels.
+        Radius of each disc, pixels, edge included; 0 or NaN marks nothing, infinity marks all pixels.
     out : bool array, shape (ny, nx)
-        Mask, changed in place; pixels that are already marked stay marked.
+        Mask, changed in place; pixels that are already True stay True.
     """
     ny, nx = out.shape
     for i in range(len(x)):
@@ -34,21 +34,21 @@ def mark_discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
 
 
 def dilate(mask: Bool, corners: bool = False, times: int = 1) -> Bool:
-    """Return a mask dilated by neighbours along rows and columns.
+    """Return a copy of a mask in which the neighbours of True pixels are also True.
 
     Parameters
     ----------
     mask : bool array, shape (..., ny, nx)
-        Mask.
+        One or more masks, which are not changed.
     corners : bool
-        If True, diagonal neighbours are included.
+        If True, the eight neighbours including the diagonal ones are set, otherwise the four along rows and columns.
     times : int
-        Number of iterations.
+        Number of repetitions; 0 returns an unchanged copy.
 
     Returns
     -------
     bool array, shape (..., ny, nx)
-        Dilated mask.
+        Enlarged mask.
     """
     out = mask.copy()
     for _ in range(times):

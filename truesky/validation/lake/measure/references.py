@@ -1,4 +1,4 @@
-"""Reference data for the sources of a frame, from the tables of the lake."""
+"""Known sources of a frame with their true positions and magnitudes, from the tables of the lake."""
 
 from __future__ import annotations
 
@@ -13,30 +13,38 @@ from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.store import read
 from lake_schema.tables.stars import EPOCH
 
+# Value of the column `method` of the table `rendered_truth` for point sources.
 POINT = 0
-# Columns of `rendered_truth` that a reference requires.
+# Columns of the table `rendered_truth` (true positions and electrons of drawn sources) that are read.
 TRUTH = ("id", "x", "y", "expected", "method", "psf_x", "psf_y")
-# AB magnitude of 1 microjansky.
+# AB magnitude of a flux density of 1 microjansky.
 ZERO = 23.9
-_JULIAN_2000, _MJD_2000, _YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
+# Epoch J2000.0 in Julian years.
+_JULIAN_2000 = 2000.0
+# Epoch J2000.0 as modified Julian date.
+_MJD_2000 = 51544.5
+# Number of days in a Julian year.
+_YEAR = 365.25
+# Number of milliarcseconds in a degree.
+_MAS_A_DEG = 3.6e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Catalogue:
-    """Stars of a lake by ascending identifier, and band fluxes.
+    """Stars of a lake with positions and proper motions, and their fluxes in several bands.
 
     Attributes
     ----------
     id : int array, shape (n,)
-        Identifiers of the stars.
+        Identifiers of the stars with positions, ascending.
     ra, dec : float array, shape (n,)
-        Positions at EPOCH, deg.
+        Positions at the epoch of the table `stars`, deg.
     pm_ra, pm_dec : float array, shape (n,)
-        Proper motions, mas/yr.
+        Proper motions along right ascension (times cos dec) and declination, mas/yr.
     flux_id : int array, shape (m,)
-        Identifiers of the band fluxes.
+        Identifiers of the stars with fluxes, ascending.
     fluxes : dict of str to float array, shape (m,)
-        Fluxes by band, uJy.
+        Fluxes of these stars by band, uJy.
     """
 
     id: Int
@@ -48,7 +56,10 @@ class Catalogue:
     fluxes: dict[str, Float]
 
     def positions_at(self, ids: Int, mjd: float) -> tuple[Float, Float]:
-        """Return right ascension and declination (deg) of stars at a time (MJD), NaN if not in the catalogue."""
+        """Return right ascension and declination (deg) of the stars with identifiers `ids` at the time `mjd`.
+
+        Proper motion is included, parallax is not. Stars that are not in the catalogue have NaN.
+        """
         if not self.id.size:
             return np.full(len(ids), np.nan), np.full(len(ids), np.nan)
         at, is_known = _find(self.id, ids)
@@ -58,7 +69,10 @@ class Catalogue:
         return np.where(is_known, ra, np.nan), np.where(is_known, dec, np.nan)
 
     def magnitudes(self, ids: Int, band: str) -> Float:
-        """Return AB magnitudes in a band, NaN if not in the catalogue."""
+        """Return the AB magnitudes of the stars with identifiers `ids` in a band.
+
+        They are NaN for stars without flux in the catalogue and if the band was not read, and infinite for flux 0.
+        """
         if band not in self.fluxes or not self.flux_id.size:
             return np.full(len(ids), np.nan)
         at, is_known = _find(self.flux_id, ids)
@@ -69,24 +83,25 @@ class Catalogue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Known sources of a detector.
+    """Known sources on a detector in one exposure: where and how bright they were simulated, and catalogue values.
 
     Attributes
     ----------
     id : int array, shape (n,)
-        Identifiers.
+        Identifiers of the sources.
     x, y : float array, shape (n,)
-        Positions in pixels from 0, as drawn.
+        Positions at which the sources were drawn in the image, pixels from 0.
     expected : float array, shape (n,)
-        Expected electrons.
+        Expected electrons of each source in the exposure, without noise.
     point : bool array, shape (n,)
         True for point sources.
     psf_x, psf_y : float array, shape (n,)
-        Windowed centroid of a point source of this colour at this position, minus its position, pixels.
+        Windowed centroid minus true position of a point source with this colour at this place, pixels; NaN if unknown.
+        It is not 0 because the PSF is asymmetric.
     ra, dec : float array, shape (n,)
         Catalogue positions of stars at the time of the exposure, deg; NaN for other sources.
     mag : float array, shape (n,)
-        AB magnitudes of the catalogue.
+        AB magnitudes of stars from the catalogue; NaN for other sources.
     """
 
     id: Int
@@ -105,21 +120,21 @@ class Reference:
 
 
 def load_catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence[str]) -> Catalogue:
-    """Read stars and their fluxes; tables that the lake does not have are left empty.
+    """Read stars and their fluxes from the tables `stars` and `star_fluxes` of a lake.
 
     Parameters
     ----------
     tables : mapping of str to Version
-        Tables of the lake by name.
+        Tables of the lake by name. If one of the two is missing, the corresponding arrays are empty.
     ids : int array, shape (n,)
-        Identifiers of the stars to read, ascending.
+        Identifiers of the stars to read, in any order; identifiers that are not in the tables are ignored.
     bands : sequence of str
-        Bands whose fluxes are read.
+        Bands whose fluxes are read; bands without a column are ignored.
 
     Returns
     -------
     Catalogue
-        Stars and fluxes.
+        Stars and fluxes. A missing proper motion is 0.
     """
     empty = np.zeros(0)
     columns = {name: empty for name in ("id", "ra", "dec", "pm_ra", "pm_dec")}
@@ -142,23 +157,23 @@ def load_catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence
 
 
 def build_reference(truth: pa.Table, catalogue: Catalogue, band: str, mjd: float) -> Reference:
-    """Return the reference data of one frame.
+    """Combine the true positions of a frame's sources with catalogue positions and magnitudes.
 
     Parameters
     ----------
     truth : Table
-        Rows of `rendered_truth` of the frame.
+        Rows of the table `rendered_truth` for the frame, with the columns TRUTH.
     catalogue : Catalogue
-        Catalogue of the lake.
+        Stars of the lake.
     band : str
-        Band of the exposure.
+        Band of the exposure, for the magnitudes.
     mjd : float
-        Time of the exposure, MJD.
+        Time of the exposure, MJD, for the proper motion.
 
     Returns
     -------
     Reference
-        Sources with positions and magnitudes of the catalogue.
+        Known sources of the frame in the order of `truth`.
     """
     ids = truth["id"].to_numpy()
     psf_offsets = {name: pc.fill_null(truth[name], np.nan).to_numpy() for name in ("psf_x", "psf_y")}

@@ -2,8 +2,8 @@
 
 Notes
 -----
-Positions are windowed centroids. The window is a Gaussian whose FWHM is the half-light diameter of a point source, as
-for the centroid offsets in the tables of the lake.
+Positions are windowed centroids. The window is a Gaussian whose FWHM is the half-light diameter of a point source. The
+columns psf_x and psf_y of the table `rendered_truth` (centroid offsets of the PSF) are defined with the same window.
 
 References
 ----------
@@ -24,54 +24,68 @@ from truesky.validation.lake.measure.frames import Frame, sky_to_pixel
 from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.wings import Wings
 
+# FWHM of a Gaussian in standard deviations.
 FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
-# Half the side of the cutout of a star in FWHM, and at least pixels; the sky is measured outside this fraction of it.
-_REACH, _MIN_REACH, _SKY_FROM = 10.0, 20, 0.75
-# Radii of the apertures as fractions of half the side; they also give the half-light radius.
+# Half of the side of the square cutout around a star, in FWHM of the PSF.
+_REACH = 10.0
+# Half of the side of the square cutout around a star is at least this number of pixels.
+_MIN_REACH = 20
+# The sky around a star is measured beyond this fraction of half the side of its cutout.
+_SKY_FROM = 0.75
+# Radii of the apertures in which the light of a star is summed, as fractions of half the side of its cutout.
 _APERTURES = np.array([0.02, 0.03, 0.04, 0.055, 0.075, 0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.75])
-# Smallest S/N, largest fraction of the full well in the brightest pixel, and largest relative light of neighbours.
-_MIN_SNR, _MAX_FULL, _MAX_BLEND = 60.0, 0.6, 0.01
-# Neighbours are searched within this number of FWHM.
+# Only stars with a larger expected signal-to-noise ratio than this are measured.
+_MIN_SNR = 60.0
+# Stars whose brightest pixel is above this fraction of the saturation level are not measured.
+_MAX_FULL = 0.6
+# Stars whose neighbours together have more than this fraction of the star's light are not measured.
+_MAX_BLEND = 0.01
+# Sources within this distance of a star, in FWHM of the PSF, count as its neighbours.
 _BLEND_REACH = 8.0
+# Largest number of stars that are measured in a frame; the brightest are selected.
 MAX_STARS = 400
-# Radius at which a Gaussian falls to a third, in units of half its FWHM.
+# The FWHM is fitted to pixels within this radius, in units of half the FWHM; a Gaussian falls to a third there.
 _PROFILE_EXTENT = 1.26
-# Number of jackknife groups of stars for the error of the FWHM.
+# Number of groups of stars that are left out in turn, to estimate the error of the FWHM by a jackknife.
 _PARTS = 8
-# Radius in pixels within which the light depends on the position within the pixel.
+# Pixels within this radius of a star, in pixels, are never masked or replaced by the mean profile, because their light
+# depends strongly on the star's position within the pixel.
 _CORE = 3.0
-# Standard deviations above the mean profile of stars from which a pixel is contaminated.
+# A pixel is contaminated if it exceeds 1.5 times the median profile of stars by more than this number of standard
+# deviations.
 _HIT = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stars:
-    """Measured stars of a frame.
+    """Positions, fluxes and shapes of the measured stars of a frame.
 
     Attributes
     ----------
     id : int array, shape (n,)
-        Identifiers.
+        Identifiers of the stars.
     x, y : float array, shape (n,)
-        Positions from the catalogue and the WCS, pixels from 0.
+        Expected positions, from the catalogue and the WCS, pixels from 0.
     dx, dy : float array, shape (n,)
-        Windowed centroid minus this position and minus the offset of the PSF, pixels.
+        Measured windowed centroid minus the expected position, minus the known centroid offset of the PSF, pixels.
     error : float array, shape (n,)
-        Error of dx and of dy from photons and read noise, pixels.
+        Standard error of dx and of dy due to photon and read noise, pixels.
     growth : float array, shape (n, apertures)
-        Light within the radii, corrected for vignetting, e-.
+        Curve of growth: measured light within each aperture, corrected for vignetting, e-.
     flux : float array, shape (n,)
-        Expected light, e-.
+        Expected light of the star in the exposure, e-.
     mag : float array, shape (n,)
         AB magnitude of the catalogue.
-    size, e1, e2 : float array, shape (n,)
-        rms radius in the window, pixels, and ellipticity.
+    size : float array, shape (n,)
+        rms radius of the light within the Gaussian window along one axis, pixels.
+    e1, e2 : float array, shape (n,)
+        Ellipticity (xx - yy) / (xx + yy) and 2 xy / (xx + yy), from second moments within the Gaussian window.
     sky : float array, shape (n,)
-        Sky level, e- per pixel.
+        Level of the sky around the star, e- per pixel.
     peak : float array, shape (n,)
-        Brightest pixel above the sky, e-.
+        Value of the brightest pixel above the sky, e-.
     snr : float array, shape (n,)
-        Signal-to-noise ratio.
+        Signal-to-noise ratio of the flux in the window.
     """
 
     id: Int
@@ -94,26 +108,27 @@ class Stars:
         return len(self.id)
 
     def select(self, mask: Bool) -> Stars:
-        """Return the stars selected by a mask."""
+        """Return only the stars for which `mask`, shape (n,), is True."""
         return Stars(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMeasurements:
-    """Stars of a frame, and the profile of a point source.
+    """Measured stars of a frame, and the mean profile of a point source in this frame.
 
     Attributes
     ----------
     stars : Stars
         Measured stars.
     radii : float array, shape (apertures,)
-        Radii of the apertures, pixels.
+        Radii of the apertures of the curve of growth, pixels.
     half_light, fwhm, fwhm_error : float
-        Half-light radius and FWHM of a point source, and the error of the FWHM, pixels.
+        Half-light radius and FWHM of a point source, and the standard error of the FWHM, pixels. NaN if there are too
+        few stars for the FWHM or its error.
     sky_at : float array, shape (m,)
-        Distances from the star of the pixels in which the sky is measured, pixels.
+        Distances from the star to the m pixels of its cutout in which the sky is measured, pixels.
     wings : Wings
-        Wings of a point source.
+        Power law that describes the light of a point source at large distances.
     """
 
     stars: Stars
@@ -126,21 +141,23 @@ class StarMeasurements:
 
 
 def select_stars(frame: Frame, sources: Reference, noise: float) -> Int:
-    """Return indices of isolated, unsaturated and bright stars, brightest first.
+    """Select the isolated stars with an expected S/N above 60, away from the edges of a frame.
+
+    Saturation is not checked here.
 
     Parameters
     ----------
     frame : Frame
-        A frame.
+        Raw frame in electrons.
     sources : Reference
         Known sources of the frame.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
 
     Returns
     -------
     int array, shape (n,)
-        Indices of the sources.
+        Indices of the stars in `sources`, brightest first.
     """
     width = float(frame.header["PSFFWHM"]) / frame.scale
     area = np.pi * (1.5 * width) ** 2
@@ -166,21 +183,21 @@ def _reach(frame: Frame) -> int:
 
 
 def measure_stars(frame: Frame, sources: Reference, noise: float) -> StarMeasurements:
-    """Measure up to MAX_STARS stars of a frame.
+    """Measure the isolated, bright and unsaturated stars of a frame, at most 400, and the profile of a point source.
 
     Parameters
     ----------
     frame : Frame
-        A frame.
+        Raw frame in electrons.
     sources : Reference
         Known sources of the frame.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
 
     Returns
     -------
     StarMeasurements
-        Stars and the profile of a point source.
+        Measured stars, brightest first; without any star the arrays are empty.
     """
     index = select_stars(frame, sources, noise)
     reach = _reach(frame)
@@ -242,7 +259,10 @@ def measure_stars(frame: Frame, sources: Reference, noise: float) -> StarMeasure
 
 
 def _cutouts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, Int, Int]:
-    """Square cutouts around positions, and the column and row of their first pixels."""
+    """Return square cutouts of an image with 2 `reach` + 1 pixels along each side, centred on positions (pixels).
+
+    Also returns the column and the row of the first pixel of each cutout. Cutouts must be inside the image.
+    """
     first_column, first_row = (np.rint(axis).astype(int) - reach for axis in (x, y))
     side = 2 * reach + 1
     cuts = [image[b : b + side, a : a + side] for a, b in zip(first_column, first_row, strict=True)]
@@ -250,7 +270,11 @@ def _cutouts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, 
 
 
 def _neighbour_mask(sources: Reference, index: Int, first_column: Int, first_row: Int, noise: float, side: int) -> Bool:
-    """Mask of pixels in cutouts of stars in which another source is visible."""
+    """Return masks of the pixels in square cutouts of stars in which another known source is visible.
+
+    `index` has the indices of the n stars in `sources`. The masks have the shape (n, side, side), and never include the
+    pixels within 3 pixels of the star.
+    """
     out = np.zeros((len(index), side, side), bool)
     if not len(index):
         return out
@@ -259,16 +283,21 @@ def _neighbour_mask(sources: Reference, index: Int, first_column: Int, first_row
     for n, (i, nearby) in enumerate(zip(index, neighbours, strict=True)):
         neighbour_indices = np.array([j for j in nearby if j != i], int)
         out[n] = wings.neighbour_mask(sources, neighbour_indices, first_column[n] + axis, first_row[n] + axis, noise)
-    # The core of a star is not masked, since light there cannot be assigned to a neighbour.
+    # Do not mask the core of a star: its light cannot be separated from the light of a neighbour.
     core = np.hypot(axis - side // 2, (axis - side // 2)[:, None]) < _CORE
     return out & ~core
 
 
 def _clipped_mean(values: Float, good: Bool, noise: float) -> Float:
-    """Mean of the good values of each row without outliers."""
+    """Return the mean of each row of `values` (pixels around a star) without outliers.
+
+    Values are used if `good` is True and if they are within 3 times `noise` (rms) of the median of their row.
+
+    If no value of a row is good, all are used.
+    """
     if not len(values):
         return np.zeros(0)
-    # All values are used if none is good.
+    # Treat all values of a row as good if none is.
     good = good | ~good.any(axis=1, keepdims=True)
     middle = np.nanmedian(np.where(good, values, np.nan), axis=1)
     used = good & (np.abs(values - middle[:, None]) < 3.0 * noise)
@@ -276,20 +305,26 @@ def _clipped_mean(values: Float, good: Bool, noise: float) -> Float:
 
 
 def _replace_contaminated(cuts: Float, neighbour_mask: Bool, flux: Float, noise: float) -> Float:
-    """Replace pixels with light of cosmic rays or neighbours by the typical profile of the stars."""
+    """Replace pixels with light of cosmic rays or neighbours by the median profile of all stars times the star's flux.
+
+    `cuts` are cutouts of stars in e- above the sky. With fewer than eight stars, they are returned unchanged.
+    """
     if len(cuts) < 8:
         return cuts
     typical = np.maximum(np.median(cuts / flux[:, None, None], axis=0), 0.0)
     expected = flux[:, None, None] * typical
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
-    # The core depends on the position within the pixel.
+    # Do not replace pixels of the core: their values depend on the star's position within the pixel.
     core = np.hypot(axis, axis[:, None]) < _CORE
     hit = (cuts > expected + _HIT * np.sqrt(noise**2 + expected) + 0.5 * expected) & ~core
     return np.where(hit | neighbour_mask, expected, cuts)
 
 
 def _growth(cuts: Float, x: Float, y: Float, radii: Float) -> Float:
-    """Light (e-) of each star within circles; light is evenly distributed within a pixel."""
+    """Return the light (e-) of each star within circles of the given radii (pixels), shape (stars, radii).
+
+    Pixels that are partly inside a circle contribute the fraction of their area.
+    """
     out = np.zeros((len(cuts), len(radii)))
     for i, cut in enumerate(cuts):
         out[i] = [sep.sum_circle(cut, [x[i]], [y[i]], r, subpix=0)[0][0] for r in radii]
@@ -297,17 +332,23 @@ def _growth(cuts: Float, x: Float, y: Float, radii: Float) -> Float:
 
 
 def _half_light(growth: Float, flux: Float, radii: Float) -> float:
-    """Half-light radius in pixels relative to the light within the widest aperture."""
+    """Return the radius (pixels) that contains half of the light within the widest aperture, from the median star.
+
+    Without stars, the fifth radius is returned.
+    """
     if not len(growth):
         return float(radii[4])
     mean = np.median(growth / flux[:, None], axis=0)
-    # For a Gaussian, the log of the fraction outside r, exp(-r^2 / 2 sigma^2), is linear in r^2.
+    # Interpolate the logarithm of the light outside r linearly in r^2, which is exact for a Gaussian.
     outside = np.minimum.accumulate(np.clip(1.0 - mean / mean[-1], 1e-6, 1.0))
     return float(np.sqrt(np.interp(np.log(2.0), np.append(0.0, -np.log(outside)), np.append(0.0, radii**2))))
 
 
 def _fwhm_with_error(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> tuple[float, float]:
-    """FWHM and its jackknife error over groups of stars."""
+    """Return the FWHM (pixels) of the brighter half of the stars, and its jackknife error over groups of stars.
+
+    The error is NaN if the FWHM of a subsample cannot be measured.
+    """
     bright = np.argsort(-flux, kind="stable")[: max(len(flux) // 2, 4)]
     fwhm = _fwhm(cuts[bright], x[bright], y[bright], flux[bright], window)
     parts = min(_PARTS, len(bright))
@@ -322,9 +363,10 @@ def _fwhm_with_error(cuts: Float, x: Float, y: Float, flux: Float, window: float
 
 
 def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
-    """FWHM (pixels) of the mean profile of stars, whose positions sample a pixel finely; NaN if there are too few.
+    """Return the FWHM (pixels) of the mean profile of stars, or NaN with fewer than three stars or a failed fit.
 
-    The logarithm of the light is fitted with r^2 and r^4 down to a third of the peak.
+    The logarithm of the light of all stars is fitted with a polynomial in r^2 and r^4, down to a third of the peak.
+    Stars at different positions within a pixel sample the profile finely. `window` is the first estimate of sigma.
     """
     if len(flux) < 3:
         return np.nan
@@ -341,7 +383,8 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
         residual = log_light - first - second * square - fourth * square**2
         used = np.abs(residual) < 4.0 * 1.4826 * np.median(np.abs(residual)) + 1e-9
         square, log_light = square[used], log_light[used]
-    # Half maximum is at u = r^2 with second u + fourth u^2 = -ln 2.
+    # `second` and `fourth` are the fitted coefficients of r^2 and r^4 in the logarithm of the profile. At half maximum,
+    # u = r^2 solves second u + fourth u^2 = -ln 2.
     root = second**2 - 4.0 * fourth * np.log(2.0)
     if second >= 0.0 or root <= 0.0:
         return np.nan
@@ -349,7 +392,11 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
 
 
 def _windowed_moments(cuts: Float, x: Float, y: Float, window: float) -> tuple[Float, ...]:
-    """Centroids (pixels of the cutout), second moments in the window, and the light in it, of each star."""
+    """Measure windowed centroids and second moments of stars in cutouts, with a Gaussian of sigma `window` (pixels).
+
+    Returns the centroids cx and cy in pixels of the cutout, the second moments xx, yy and xy in pixels^2, and twice the
+    weighted light, which for a Gaussian star of this width is its flux.
+    """
     axis = np.arange(cuts.shape[-1])
     cx, cy = x.copy(), y.copy()
     for _ in range(12):

@@ -1,10 +1,10 @@
-"""Measure the wings of a frame's point source, a power law, from rings around its brightest stars.
+"""Measure the wings of the PSF in a frame (its light at large distances, a power law) from its brightest stars.
 
 Notes
 -----
-The noise of single pixels hides the wings, so rings are averaged. If the rings contain little information, typical
-wings of telescopes are used, with an error of a half. A frame without bright stars or with an uneven sky therefore has
-a large error.
+Single pixels are too noisy, so pixels are averaged in rings around the stars. The result is combined with typical wings
+of space or ground telescopes. A frame without bright stars or with an uneven sky therefore has wings with a large error
+(a fifth in space, a half on the ground).
 """
 
 from __future__ import annotations
@@ -19,42 +19,69 @@ from truesky.validation.lake.measure import masks
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.references import Reference
 
-# Far wings fall as r^-3 (obscured aperture) or r^-11/3 (turbulence); nearer wings with diffraction rings are shallower.
+# Slopes (negative exponents of the power law) that are tried in the fit. Far wings fall as r^-3 (diffraction by an
+# obscured aperture) or r^-11/3 (turbulence); nearer wings with diffraction rings are shallower.
 _SLOPES = np.arange(2.4, 4.01, 0.05)
-_TYPICAL_SLOPE, _SLOPE_SPREAD = 3.0, 0.03
-# All light of a star in ground images is that within this radius (arcsec), since zero points use standard stars in
-# apertures.
+# Typical slope of the wings: their light per pixel falls with radius as r^-slope.
+_TYPICAL_SLOPE = 3.0
+# Standard deviation of the slope from the typical slope, which constrains the fit.
+_SLOPE_SPREAD = 0.03
+# The total light of a star in ground images is defined as the light within this radius (arcsec), because zero points
+# are calibrated with standard stars in apertures.
 _GROUND_EXTENT = 25.0
-# Inner and outer edge of the rings in units of the reach of the stars' apertures; largest radius, pixels; number of
-# rings, and smallest number of usable rings.
-_FROM, _TO, _MAX_RADIUS, _RINGS, _MIN_RINGS = 0.5, 4.0, 120, 14, 6
-# Light per arcsec2 at 1" relative to all light. Space: diffraction by the edges of Euclid's pupil, by filter. Ground:
-# turbulence and an aureole, which together fall this way from 5" to 25". Relative errors of both.
+# Inner radius of the smallest ring, as a fraction of half the side of the stars' cutouts.
+_FROM = 0.5
+# Outer radius of the largest ring, as a multiple of half the side of the stars' cutouts.
+_TO = 4.0
+# Largest outer radius of the rings around stars in which the light of the wings is averaged, pixels.
+_MAX_RADIUS = 120
+# Number of rings around each star in which the light of the wings is averaged.
+_RINGS = 14
+# A star is not used if it has fewer usable rings than this number.
+_MIN_RINGS = 6
+# Typical wings of Euclid by filter: fraction of the total light per arcsec^2 at 1" (diffraction by edges of the pupil).
 _SPACE = {"euclid_vis": 9.3e-3, "euclid_y": 1.4e-2, "euclid_j": 1.8e-2, "euclid_h": 2.3e-2}
-_GROUND, _UNSURE_SPACE, _UNSURE_GROUND = 1.5e-2, 0.2, 0.5
-# Largest and smallest number of stars, and largest flux of a nearby source relative to the star.
-_MAX_STARS, _MIN_STARS, _MAX_NEIGHBOUR = 24, 2, 1.0
-# Wings of neighbours are this fraction of their light times r^-3; they are visible above this fraction of the noise, at
-# least within this radius (pixels).
-_WING, _SHOWS, _CORE = 0.1, 0.1, 6.0
-# Standard deviations above a ring from which a pixel is hit; factor by which diffraction spikes may exceed the ring.
-_HIT, _SPIKE = 4.0, 8.0
+# Typical wings of ground telescopes: fraction of the total light per arcsec^2 at 1". Turbulence and an aureole together
+# fall as r^-3 from 5" to 25".
+_GROUND = 1.5e-2
+# Relative error of the typical wings in space.
+_UNSURE_SPACE = 0.2
+# Relative error of the typical wings on the ground.
+_UNSURE_GROUND = 0.5
+# Largest number of stars around which wings are measured.
+_MAX_STARS = 24
+# With fewer stars than this number, typical wings are used.
+_MIN_STARS = 2
+# A star is not used if a nearby source has more than this multiple of the star's flux.
+_MAX_NEIGHBOUR = 1.0
+# Rough wings of any source, for masks and noise: fraction of its light in a pixel at 1 pixel; they fall as r^-3.
+_WING = 0.1
+# A neighbour is visible in a pixel if its light is more than this fraction of the noise.
+_SHOWS = 0.1
+# Smallest radius of the masked disc around a visible neighbour of a star, pixels.
+_CORE = 6.0
+# A pixel is hit by a cosmic ray if it exceeds the median of its ring by more than this number of standard deviations
+# plus the allowance for spikes.
+_HIT = 4.0
+# Allowance for diffraction spikes when cosmic rays are searched, as a multiple of the rough wings (light of a source
+# that falls as r^-3).
+_SPIKE = 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class Wings:
-    """Power-law wings: strength * r^-slope is the fraction of a point source's light in a pixel at r pixels.
+    """Wings of a PSF: strength * r^-slope is the fraction of a point source's total light in a pixel at r pixels.
 
     Attributes
     ----------
     strength : float
-        Fraction of the light in a pixel at 1 pixel.
+        Fraction of the total light in a pixel at a distance of 1 pixel (extrapolated).
     slope : float
-        Negative exponent of the power law.
+        Negative exponent of the power law, larger than 2.
     outer_radius : float
-        Radius that contains all light, pixels.
+        Radius at which the wings end, pixels; infinite in space.
     error : float
-        Error of the strength.
+        Standard error of the strength.
     """
 
     strength: float
@@ -63,22 +90,22 @@ class Wings:
     error: float = 0.0
 
     def profile(self, radius: Float) -> Float:
-        """Return the fraction of all light per pixel at a radius in pixels."""
+        """Return the fraction of the total light in a pixel at each radius (pixels, above 0)."""
         return np.asarray(self.strength * radius**-self.slope)
 
     def fraction_beyond(self, radius: float) -> float:
-        """Return the fraction of all light beyond a radius in pixels."""
+        """Return the fraction of the total light beyond a radius in pixels; 0 beyond the end of the wings."""
         power = 2.0 - self.slope
         return float(2.0 * np.pi * self.strength * (radius**power - max(self.outer_radius, radius) ** power) / -power)
 
 
 def typical(frame: Frame) -> Wings:
-    """Return typical wings of a telescope of this kind.
+    """Return typical wings of a ground telescope, or of Euclid in the filter of the frame, with their error.
 
     Notes
     -----
-    Edges of length P around a pupil of area A diffract the fraction lambda P / (4 pi^3 A theta^3) of the light into a
-    solid angle, averaged over all directions.
+    A pupil of area A, whose edges have the total length P, diffracts the fraction lambda P / (4 pi^3 A theta^3) of the
+    light per steradian to the angle theta from the source, averaged over position angles.
 
     References
     ----------
@@ -92,25 +119,25 @@ def typical(frame: Frame) -> Wings:
 
 
 def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: int) -> Wings:
-    """Measure the wings from the brightest stars, and combine them with typical wings weighted by their errors.
+    """Measure the wings of the PSF around bright stars, and average them with typical wings, weighted by the errors.
 
     Parameters
     ----------
     frame : Frame
-        A frame.
+        Raw frame in electrons.
     sources : Reference
         Known sources of the frame.
     index : int array, shape (n,)
-        Indices of unsaturated stars, brightest first.
+        Indices, in `sources`, of the unsaturated stars, brightest first.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
     reach : int
-        Reach of the stars' apertures, pixels.
+        Half of the side of the stars' cutouts, pixels. Rings extend from 0.5 to 4 times `reach`, at most to 120 pixels.
 
     Returns
     -------
     Wings
-        Measured wings, or typical ones if there are too few stars.
+        Wings of a point source; typical wings if fewer than two stars can be used.
     """
     outer_radius = min(round(_TO * reach), _MAX_RADIUS)
     edges = np.geomspace(_FROM * reach, outer_radius, _RINGS + 1)
@@ -132,7 +159,7 @@ def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: i
     if len(means) < _MIN_STARS:
         return expected
     fit = _fit_wings(np.array(means), np.array(weights), np.array(fluxes), np.sqrt(edges[1:] * edges[:-1]))
-    # The strengths at the reach of the aperture are compared, so the typical strength is scaled to the fitted slope.
+    # Average the strengths at the radius `reach`: convert the typical strength to the fitted slope at this radius.
     as_steep = float(reach) ** (fit.slope - expected.slope)
     first, second = fit.error**-2, (expected.error * as_steep) ** -2
     strength = (first * fit.strength + second * expected.strength * as_steep) / (first + second)
@@ -142,7 +169,11 @@ def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: i
 def _rings(
     frame: Frame, sources: Reference, i: int, neighbours: Int, edges: Float, noise: float
 ) -> tuple[Float, Float]:
-    """Mean e- per pixel of each ring around a source and its weight (e-^-2), 0 if too little of the ring is usable."""
+    """Return the mean e- per pixel of each ring around source number `i`, and its weight (inverse variance, e-^-2).
+
+    `edges` are the radii of the rings in pixels. Pixels of neighbours and of cosmic rays are left out. The weight is 0
+    if less than a fifth of the ring's pixels, or fewer than eight, can be used.
+    """
     ny, nx = frame.electrons.shape
     outer_radius = int(np.ceil(edges[-1]))
     column, row = round(float(sources.x[i])), round(float(sources.y[i]))
@@ -157,7 +188,7 @@ def _rings(
         values = cut[inside & good]
         if values.size < 0.2 * inside.sum() or values.size < 8:
             continue
-        # Diffraction spikes also count as light; only pixels above them are attributed to cosmic rays.
+        # Remove cosmic rays, but keep diffraction spikes, whose light belongs to the wings.
         middle = float(np.median(values))
         wing_signal = sources.expected[i] * _WING * edges[k] ** -_TYPICAL_SLOPE
         values = values[np.abs(values - middle) < _HIT * np.hypot(noise, np.sqrt(wing_signal)) + _SPIKE * wing_signal]
@@ -166,23 +197,23 @@ def _rings(
 
 
 def neighbour_mask(sources: Reference, neighbours: Int, across: Int, up: Int, noise: float) -> Bool:
-    """Return a mask of pixels of a cutout in which another source is visible.
+    """Return a mask of the pixels of a cutout in which one of the given sources is visible above the noise.
 
     Parameters
     ----------
     sources : Reference
         Known sources of the frame.
     neighbours : int array, shape (n,)
-        Indices of the sources to mask.
+        Indices, in `sources`, of the sources to mask.
     across, up : int array, shape (nx,) and (ny,)
-        Columns and rows of the cutout.
+        Column numbers and row numbers of the cutout's pixels in the frame, consecutive.
     noise : float
-        rms of a pixel of blank sky, e-.
+        rms noise of a pixel of blank sky, e-.
 
     Returns
     -------
     bool array, shape (ny, nx)
-        Mask.
+        True for pixels to which a source may contribute more than a tenth of the noise.
     """
     out = np.zeros((len(up), len(across)), bool)
     reach = np.cbrt(_WING * sources.expected[neighbours] / (_SHOWS * noise))
@@ -192,12 +223,13 @@ def neighbour_mask(sources: Reference, neighbours: Int, across: Int, up: Int, no
 
 
 def _fit_wings(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings:
-    """Fit mean = sky of each star + flux strength r^-slope to all stars together.
+    """Fit the means of rings around n stars with a sky level for each star plus flux x strength x r^-slope.
 
-    `mean` and `weight` have the shape (n, rings); `flux` is in e-, `radius` in pixels.
+    `mean` (e- per pixel) and `weight` (inverse variance) have the shape (n, rings); `flux` is in e-, `radius` in
+    pixels. Strength and slope are the same for all stars; the slope is constrained to be near the typical one.
     """
     total = weight.sum(axis=1, keepdims=True)
-    # The sky of each star is removed with weighted means.
+    # Subtract the weighted mean over the rings of each star from data and model: this eliminates the sky level.
     offset = mean - (weight * mean).sum(axis=1, keepdims=True) / total
     fits, residuals = [], []
     for slope in _SLOPES:
@@ -208,7 +240,7 @@ def _fit_wings(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings:
         residuals.append(float((weight * (offset - strength * bent) ** 2).sum()))
         fits.append(Wings(strength, float(slope), error=power**-0.5))
     freedom = max(int((weight > 0.0).sum()) - len(flux) - 2, 1)
-    # Scatter of the rings beyond their noise lowers their weight relative to the typical slope.
+    # If the rings scatter more than their noise, reduce their weight compared with the constraint on the slope.
     scale = max(min(residuals) / freedom, 1.0)
     best = fits[int(np.argmin(np.array(residuals) / scale + ((_SLOPES - _TYPICAL_SLOPE) / _SLOPE_SPREAD) ** 2))]
     return replace(best, error=best.error * scale**0.5)

@@ -1,4 +1,7 @@
-"""Plot catalogue results for the report: counts, redshifts, colours, clustering and shear with their expectations."""
+"""Plot measurements of galaxy catalogues for the report: counts, redshifts, colours, clustering and shear.
+
+The plots also show observations or theory for comparison.
+"""
 
 from __future__ import annotations
 
@@ -13,27 +16,32 @@ from matplotlib.figure import Figure
 from lake_schema.arrays import Float
 from truesky.validation.lake.measure.rows import Row
 
-_INK, _PALETTE = "#1f4e79", ("#1f4e79", "#b8541a", "#2e7d4f")
+# Colour of most points and lines.
+_INK = "#1f4e79"
+# Colours of points and lines if a plot shows several samples of galaxies.
+_PALETTE = ("#1f4e79", "#b8541a", "#2e7d4f")
+# Names of measured number counts; the number in the name is the i magnitude.
 _COUNT = re.compile(r"log_i_([0-9.]+)")
+# Sentence about error bars in the captions of plots.
 _ERROR_NOTE = "Errors are jackknife errors over patches of the field"
 
 
 def draw_all(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Yield a caption and a figure for every catalogue result that has data.
+    """Yield a caption and a plot for every result of catalogue checks for which there are data.
 
     Parameters
     ----------
     rows : sequence of Row
-        Rows of all checks of catalogues.
+        Rows (measured values with expected values) of all checks; only number counts of galaxies are plotted from them.
     series : mapping of str to array
-        Series of all checks of catalogues by name.
+        Arrays for plots that the checks of catalogues return, by name.
 
     Yields
     ------
     caption : str
-        Caption of the figure.
+        Caption of the plot.
     figure : Figure
-        The figure.
+        The plot. Nothing is yielded without data.
     """
     counts = [row for row in rows if row.check == "observed" and _COUNT.fullmatch(row.quantity)]
     counts = [row for row in counts if np.isfinite(row.value)]
@@ -86,7 +94,7 @@ def _plot_redshifts(series: Mapping[str, Any]) -> Figure:
     middle = 0.5 * (low + high)
     left_axes.stairs(number, np.append(low, high[-1]), color=_INK, label="this lake")
     left_axes.errorbar(middle, number, np.nan_to_num(error), fmt="none", ecolor=_INK, capsize=2, lw=1)
-    # Redshift distribution of Euclid forecasts, with a median of 0.9.
+    # Plot the redshift distribution that Euclid forecasts assume, with a median of 0.9.
     z = np.linspace(0.0, float(high[-1]), 200)
     shape = z**2 * np.exp(-((z * 1.412 / 0.9) ** 1.5))
     total = float(np.sum(number * (high - low)))
@@ -161,12 +169,12 @@ def _plot_shear(series: Mapping[str, Any]) -> Figure:
 
 
 def _plot_points(axis: Any, x: Float, y: Float, error: Float, color: str, label: str) -> None:
-    """Plot points on logarithmic axes; negative values are open symbols at their absolute value."""
+    """Plot points with error bars on logarithmic axes; negative values are open symbols at their absolute value."""
     for sign, fill in ((1.0, color), (-1.0, "none")):
         has_sign = sign * y > 0.0
         if has_sign.any():
             bar = np.nan_to_num(error[has_sign])
-            # A bar that would reach below 0 ends near the axis.
+            # Shorten error bars that would reach below 0, which a logarithmic axis cannot show.
             bars = np.stack([np.minimum(bar, 0.9 * np.abs(y[has_sign])), bar])
             axis.errorbar(x[has_sign], sign * y[has_sign], bars, fmt="o", ms=4, color=color, mfc=fill, capsize=2,
                           label=label if sign > 0 else f"-{label}")  # fmt: skip
@@ -180,5 +188,5 @@ def _format_ratio_axes(axis: Any, label: str, tolerance: float) -> None:
 
 
 def _plain_ticks(axis: Any) -> None:
-    """Label ticks 1 and 10 instead of 10^0 and 10^1."""
+    """Label the ticks of a logarithmic x axis as 1 and 10 instead of 10^0 and 10^1."""
     axis.xaxis.set_major_formatter("{x:g}")

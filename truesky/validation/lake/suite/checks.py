@@ -1,4 +1,4 @@
-"""List of all checks of a lake."""
+"""List of all checks of a lake: of single frames, of several frames together, and of catalogues."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ from truesky.validation.lake.measure.rows import Place, Row
 
 @dataclass(frozen=True, slots=True)
 class CatalogueCheck:
-    """A check of catalogues.
+    """A check that is applied to tables of a lake, such as the clustering of galaxies.
 
     Attributes
     ----------
     name : str
         Name of the check.
     tables : tuple of str
-        Tables that `measure` requires, in the order of its arguments.
+        Names of the tables that the check requires, in the order of the arguments of `measure`.
     measure : callable
-        Function of the versions of these tables that returns a Result.
+        Function of these published tables (Version objects) that returns a Result: rows with verdicts, and arrays for
+        plots.
     source : str
-        Source of the expectations.
+        Publication or file from which the expected values are taken.
     """
 
     name: str
@@ -54,11 +55,14 @@ class CatalogueCheck:
 
 
 def _without_series(rows: Callable[..., list[Row]]) -> Callable[..., Result]:
-    """Wrap a check that returns rows alone, without series for figures."""
+    """Convert a function that returns only rows (measured values with verdicts) to one that returns a Result.
+
+    The Result has no arrays for plots.
+    """
     return lambda *versions: Result(Place(), rows(*versions), {})
 
 
-# Checks of single frames.
+# Checks of single frames (one detector of an exposure).
 FRAME_CHECKS = (
     ASTROMETRY,
     PHOTOMETRY,
@@ -73,9 +77,9 @@ FRAME_CHECKS = (
     COMPLETENESS,
     SPECTRA,
 )
-# Checks of all frames together.
+# Checks that combine the results of all frames: between exposures, and averaged over detectors.
 EXPOSURE_CHECKS = (REPEATABILITY, COMMON_BIAS)
-# Checks of the tables of a lake.
+# Checks of the catalogues (tables) of a lake.
 CATALOGUE_CHECKS = (
     CatalogueCheck(observed_sky.NAME, ("galaxies",), observed_sky.measure, "observed.csv"),
     CatalogueCheck(angular_clustering.NAME, ("galaxies",), angular_clustering.measure, angular_clustering.SOURCE),

@@ -1,4 +1,4 @@
-"""Plot the results of a lake for the report, as base64-encoded PNG."""
+"""Plot the measurements of a lake's images and catalogues for the HTML report, as base64-encoded PNG images."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.suite import catalogue_figures
 from truesky.validation.lake.suite.running import LakeResults
 
+# Width of every plot in the report, inches.
 _WIDTH = 10.0
 
 
 def draw_all(lake_results: LakeResults) -> Iterator[tuple[str, str]]:
-    """Yield the caption and the PNG (base64) of every figure for which there are data."""
+    """Yield the caption and the PNG image (base64) of every plot for which there are data.
+
+    Plots of image checks come first, separately for each channel (VIS, NISP-P, NISP-S, EXT), then plots of catalogues.
+    """
     channels = dict.fromkeys(str(result.place.channel) for result in lake_results.frame_results)
     for channel in channels:
         channel_results = [result for result in lake_results.frame_results if result.place.channel == channel]
@@ -47,10 +51,10 @@ def _concatenate_series(results: list[Result], name: str) -> Any:
 
 
 def _plot_astrometry(figure: Figure, results: list[Result]) -> None:
-    """Plot residuals as vectors over the detector, and their scatter."""
+    """Plot the position residuals of stars (mas) as vectors over the detector, and as points in x and y."""
     u, v, x, y = (_concatenate_series(results, name) for name in ("u", "v", "off_x", "off_y"))
     left_axes, right_axes = figure.subplots(1, 2)
-    # Cosmic rays and unknown neighbours cause outliers that are not astrometric residuals.
+    # Do not plot outliers, which are due to cosmic rays and unknown neighbours.
     is_typical = np.hypot(x - np.median(x), y - np.median(y)) < 6.0 * np.median(np.hypot(x, y))
     u, v, x, y = u[is_typical], v[is_typical], x[is_typical], y[is_typical]
     sampled = np.linspace(0, len(u) - 1, min(len(u), 500)).astype(int)
@@ -87,7 +91,7 @@ def _plot_noise(figure: Figure, results: list[Result]) -> None:
     predicted, measured = _concatenate_series(results, "noise").T
     axis.loglog(predicted, measured, ".", color="#1f4e79")
     for ticks in (axis.xaxis, axis.yaxis):
-        # Labels are 14 instead of 1.4 x 10^1.
+        # Label ticks as 14 instead of 1.4 x 10^1.
         ticks.set_major_formatter(LogFormatter())
         ticks.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     ends = np.array([predicted.min() * 0.95, predicted.max() * 1.05])
@@ -130,7 +134,7 @@ def _plot_quality(figure: Figure, results: list[Result]) -> None:
 
 
 def _plot_whiskers(figure: Figure, results: list[Result]) -> None:
-    """Plot ellipticities over the detector as whiskers along the long axis."""
+    """Plot the ellipticities of stars over the detector as lines along their long axis, without outliers."""
     u, v, e1, e2 = (
         _concatenate_series([r for r in results if "u" in r.series], name) for name in ("u", "v", "e1", "e2")
     )

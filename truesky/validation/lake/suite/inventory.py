@@ -1,4 +1,4 @@
-"""Find the contents of a lake that can be validated: tables, science files, and what is known about their frames."""
+"""Find the contents of a lake that can be validated: tables, raw images, known sources and properties of cameras."""
 
 from __future__ import annotations
 
@@ -21,28 +21,29 @@ from truesky.validation.lake.measure.frames import Instrument, NonlinearityCurve
 from truesky.validation.lake.measure.references import Catalogue
 from truesky.validation.lake.measure.rows import Place
 
-# Input tables of the checks; the key of the table `validation` depends on their versions.
+# Names of the tables that the checks read. If one changes, the table `validation` must be made again.
 TABLES = (
     "galaxies", "stars", "mission", "galaxy_fluxes", "star_fluxes", "exposures", "products", "rendered_truth",
     "rendered_spectra",
 )  # fmt: skip
 
 
+# Mission parameters of the nonlinearity of amplifiers, in the order of the fields of NonlinearityCurve.
 _CURVE = ("nonlinearity.high", "nonlinearity.low", "nonlinearity.low_scale")
 
 
 @dataclass(frozen=True, slots=True)
 class ScienceFile:
-    """A science file.
+    """A raw image of one detector in a lake (content "science", in contrast to truth maps).
 
     Attributes
     ----------
     path : str
-        Path in the version of table `products`.
+        Path of the FITS file relative to the folder of the table `products`.
     place : Place
-        Channel, band, exposure and detector.
+        Channel, band, exposure number and detector.
     exposure : mapping of str to object
-        Row of table `exposures`.
+        Row of the table `exposures` for this exposure, by column.
     """
 
     path: str
@@ -59,11 +60,11 @@ class LakeContents:
     root : Path
         Folder of the lake.
     tables : mapping of str to Version
-        Versions of the tables by name.
+        Published tables by name; missing tables are left out.
     science_files : tuple of ScienceFile
-        Science files, by exposure and detector.
+        Raw images to validate, sorted by exposure number and detector.
     paths : mapping of (int, str, str) to str
-        Paths in table `products` by exposure, detector and content.
+        Paths of all image files by exposure number, detector and content (such as "science").
     """
 
     root: Path
@@ -73,31 +74,32 @@ class LakeContents:
 
     @property
     def version_keys(self) -> dict[str, str]:
-        """Keys of the table versions by table name."""
+        """Return, by table name, the key of each table's version: a hash of everything on which its content depends."""
         return {name: version.key for name, version in self.tables.items()}
 
 
 def read_contents(root: Path, request: str | None = None, exposures: Sequence[int] = ()) -> LakeContents:
-    """Find the tables and science files of a lake.
+    """Find the tables and raw images of a lake that can be validated.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     request : str, optional
-        Name of the request whose tables are read, if the lake contains several.
+        Name of the request (simulation job) whose tables are read. It is required if requests have different tables.
     exposures : sequence of int
-        Exposures to validate; () for all.
+        Numbers of the exposures to validate; () for all.
 
     Returns
     -------
     LakeContents
-        Tables and science files.
+        Tables and raw images. A lake without the table `products` has no images.
 
     Raises
     ------
     BadInput
-        If the lake contains no table to validate, or has no images of a requested exposure.
+        If the lake contains no table to validate, if its table `products` has no image of one of the given exposures,
+        or if no request is given although requests have different tables.
     """
     names = layout.table_names(root)
     versions = {name: _open_version(root, name, request) for name in TABLES if name in names}
@@ -120,10 +122,11 @@ def read_contents(root: Path, request: str | None = None, exposures: Sequence[in
 
 
 def gain_partners(science_files: Sequence[ScienceFile]) -> dict[str, ScienceFile]:
-    """Return the partner frame for a gain measurement, by the path of the other frame of the pair.
+    """Select pairs of frames of the same detector, from whose difference the gain is measured.
 
-    Partners show the same detector. Two flats of one lamp are a pair. For ground cameras, two sky frames are also a
-    pair: one per detector, if possible with the same band and similar levels.
+    For each detector, band, lamp and exposure time, the first two flats are a pair. For each detector of a ground
+    camera, two frames of the sky are also a pair, if possible of the same band and with similar levels. The result has
+    the first frame of each pair by the path of the second frame.
     """
     flats: dict[tuple[Any, ...], list[ScienceFile]] = {}
     skies: dict[tuple[Any, ...], list[ScienceFile]] = {}
@@ -149,12 +152,12 @@ def gain_partners(science_files: Sequence[ScienceFile]) -> dict[str, ScienceFile
 
 
 def _sky_level(file: ScienceFile) -> float:
-    """Sky level in electrons per pixel."""
+    """Return the planned sky level of an exposure in electrons per pixel."""
     return float(file.exposure["sky"] * file.exposure["exposure_time_s"])
 
 
 def _level_difference(pair: tuple[ScienceFile, ScienceFile]) -> float:
-    """Absolute difference of the logarithms of two sky levels."""
+    """Return the absolute difference of the natural logarithms of the sky levels of two frames."""
     return abs(float(np.log(max(_sky_level(pair[0]), 1e-9) / max(_sky_level(pair[1]), 1e-9))))
 
 
@@ -163,14 +166,18 @@ def _open_version(root: Path, name: str, request: str | None) -> read.Version:
 
 
 def _exposure_rows(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]:
-    """Rows of the exposures of the images, by exposure."""
+    """Return the rows of the table `exposures` for the exposures of all images, by exposure number."""
     condition = pc.field("exposure_id").isin(products.rows(["exposure_id"])["exposure_id"].unique())
     rows = read.version(root, "exposures", products.manifest["facts"]["inputs"]["exposures"]).rows(where=condition)
     return {row["exposure_id"]: row for row in rows.to_pylist()}
 
 
 def instruments(contents: LakeContents) -> dict[str, Instrument]:
-    """Return the instrument of each camera from the mission database; amplifiers and pixels share mean values."""
+    """Return the known properties of each camera of the images: nonlinearity, vignetting and pixel response.
+
+    They are read from the mission database of the lake, with one mean value for all amplifiers or pixels of a camera.
+    Effects that the request switched off, or that the database does not contain, are assumed to be absent.
+    """
     curves = _mission_values(contents, (*_CURVE, "adc_max"), "nonlinearity")
     bowls, responses = (
         _mission_values(contents, ("illumination",), "illumination"),
@@ -186,7 +193,11 @@ def instruments(contents: LakeContents) -> dict[str, Instrument]:
 
 
 def _mission_values(contents: LakeContents, names: Sequence[str], effect: str) -> dict[str, list[float]]:
-    """Values of parameters in the mission database by camera; empty if `effect` is switched off in the request."""
+    """Return the values of mission parameters by camera, in the order of `names`.
+
+    Cameras without all parameters are left out. The result is empty if the request switched `effect` off, or if the
+    lake has no mission database or no images.
+    """
     if "mission" not in contents.tables or "products" not in contents.tables:
         return {}
     facts = contents.tables["products"].manifest["facts"]
@@ -204,12 +215,18 @@ def _mission_values(contents: LakeContents, names: Sequence[str], effect: str) -
 
 
 def truth(contents: LakeContents) -> dict[tuple[int, str], pa.Table]:
-    """Return the rows of `rendered_truth` by exposure and detector, with the columns that references require."""
+    """Return the rows of the table `rendered_truth` (true positions of sources) by exposure number and detector.
+
+    Only the columns that `references.build_reference` requires are read. The result is empty without this table.
+    """
     return _by_frame(contents, "rendered_truth", references.TRUTH)
 
 
 def spectra(contents: LakeContents) -> dict[tuple[int, str], pa.Table]:
-    """Return the rows of `rendered_spectra` by exposure and detector; only first orders are measured."""
+    """Return the rows of the table `rendered_spectra` by exposure number and detector, for the first order only.
+
+    The result is empty without this table.
+    """
     return _by_frame(contents, "rendered_spectra", where=pc.field("order") == 1)
 
 
@@ -227,14 +244,18 @@ def _by_frame(
     if not len(rows):
         return {}
     groups = rows.select(["exposure_id", "detector"]).to_pandas().groupby(["exposure_id", "detector"]).indices
-    # A slice would be pickled with the whole table, so rows are copied. Taking rows from a single chunk is fast.
+    # Copy the rows of each frame: pickling a slice for another process would copy the whole table. Combine the chunks
+    # first, because copying rows from a single chunk is faster.
     rows = rows.combine_chunks()
     by_frame = {key: rows.take(pa.array(index)) for key, index in groups.items() if key in frames}
     return by_frame
 
 
 def star_catalogue(contents: LakeContents, rows: Mapping[tuple[int, str], pa.Table]) -> Catalogue:
-    """Read the stars that the frames show from the catalogue of the lake."""
+    """Read positions and fluxes of the point sources in the images from the tables of stars.
+
+    `rows` are the rows of `rendered_truth` by exposure number and detector.
+    """
     points = [
         part["id"].to_numpy()[part["method"].to_numpy() == references.POINT] for part in rows.values() if len(part)
     ]

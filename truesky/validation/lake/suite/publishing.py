@@ -1,4 +1,4 @@
-"""Validate a lake and publish the table `validation` with a report."""
+"""Validate a lake, and publish the results as the table `validation` of the lake with an HTML report."""
 
 from __future__ import annotations
 
@@ -17,34 +17,42 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.suite import inventory, report, running
 from truesky.validation.lake.suite.inventory import LakeContents
 
+# Name of the HTML report in the folder of the table `validation`.
 REPORT = "report.html"
+# Name of the only Parquet file of the table `validation`.
 _PART = "all.parquet"
 
 
 def plan(contents: LakeContents, exposures: Sequence[int] = ()) -> Plan:
-    """Return the plan of table `validation` for the contents of a lake; `exposures` selects some, () means all."""
+    """Return the plan of the table `validation`: everything on which its content depends, and its only file.
+
+    The content depends on the versions of the input tables, the selected exposures (() for all) and the code.
+    """
     facts = {"inputs": contents.version_keys, "exposures": sorted(exposures), "code": code_version()}
     return Plan(VALIDATION, facts, (Task(_PART, {}),))
 
 
 def publish(root: Path, request: str | None = None, exposures: Sequence[int] = (), processes: int = 2) -> read.Version:
-    """Return the table `validation` of a lake; it is made if it does not exist.
+    """Run all checks of a lake, and publish the table `validation` with a report.
+
+    If the table already exists for the same input tables, exposures and code, it is returned without new checks.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     request : str, optional
-        Name of the request whose tables are read, if the lake contains several.
+        Name of the request (simulation job) whose tables are read. It is required if requests have different tables.
     exposures : sequence of int
-        Exposures to validate; () for all.
+        Numbers of the exposures to validate; () for all.
     processes : int
-        Number of processes that check frames and catalogues.
+        Number of parallel processes for the checks.
 
     Returns
     -------
     Version
-        Published version of the table. `inventory.read_contents` raises BadInput if there is nothing to validate.
+        The published table. BadInput is raised if the lake has nothing to validate, or if its table `products` has no
+        image of one of the given exposures.
     """
     contents = inventory.read_contents(root, request, exposures)
     table_plan = plan(contents, exposures)
@@ -63,7 +71,10 @@ def publish(root: Path, request: str | None = None, exposures: Sequence[int] = (
 
 
 def build_table(rows: Sequence[Row]) -> pa.Table:
-    """Return the table `validation` of rows."""
+    """Convert rows (measured values with expected values and verdicts) to the table `validation`.
+
+    Numbers that are not finite are stored as null.
+    """
     numbers = {
         name: np.ma.masked_invalid(np.array([getattr(row, name) for row in rows], float))
         for name in ("value", "error", "expected", "tolerance")

@@ -1,4 +1,4 @@
-"""Write the report: one HTML file that contains its figures, so that a browser can open it without a network."""
+"""Write the report of a validation: one HTML file with verdicts and plots, which a browser opens without a network."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from truesky.validation.lake.suite import figures
 from truesky.validation.lake.suite.running import LakeResults
 from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
 
+# Order of the verdicts in the report.
 _ORDER = (FAIL, UNDECIDED, PASS, NOT_APPLICABLE)
+# Style sheet of the report.
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 1150px; padding: 0 1em; color: #1a1a1a; }
 table { border-collapse: collapse; margin: .6em 0 1.6em; } th, td { padding: .2em .7em; text-align: left; }
@@ -24,7 +26,7 @@ details { margin-bottom: 1em; } summary { cursor: pointer; }
 
 
 def page(name: str, results: LakeResults) -> str:
-    """Return the HTML report of the lake `name`."""
+    """Return the HTML text of the report for the results of a lake; `name` is the name of the lake in the title."""
     verdict_counts = Counter(row.verdict for row in results.rows)
     summary = ", ".join(f'<span class="{v}">{verdict_counts[v]} {v.replace("_", " ")}</span>' for v in _ORDER)
     parts = [
@@ -49,7 +51,7 @@ def page(name: str, results: LakeResults) -> str:
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """HTML table of the numbers of verdicts by check and channel."""
+    """Return an HTML table with the number of passed, failed and other rows for each check, channel and band."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.check, " ".join(filter(None, (row.place.channel, row.place.band)))), []).append(row)
@@ -96,7 +98,10 @@ def _note_text(row: Row) -> str:
 
 
 def format_value(row: Row) -> str:
-    """Return a value with its error and unit, "" if it was not measured."""
+    """Return the measured value of a row as text with its standard error and unit, "" if it was not measured.
+
+    The error is left out if it is NaN or 0.
+    """
     if row.value != row.value:
         return ""
     error = f" ± {row.error:.2g}" if row.error == row.error and row.error > 0.0 else ""
@@ -104,7 +109,7 @@ def format_value(row: Row) -> str:
 
 
 def format_expected(row: Row) -> str:
-    """Return the expected value and its tolerance, "" if the check does not apply."""
+    """Return the expected value of a row as text with its tolerance, "" if there was nothing to measure."""
     if not row.applies:
         return ""
     sign = {"around": "±", "least": "at least, −", "most": "at most, +"}[row.kind]

@@ -1,4 +1,4 @@
-"""Run all checks of a lake: catalogues and single frames in several processes, then checks of all frames together."""
+"""Run all checks of a lake: catalogues and single frames in parallel processes, then all frames together."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from truesky.validation.lake.suite.inventory import LakeContents, ScienceFile
 
 @dataclass(frozen=True, slots=True)
 class FrameTask:
-    """Inputs for the checks of one frame.
+    """Inputs for the checks of one frame (one detector of an exposure), which are sent to another process.
 
     Attributes
     ----------
     products : Version
-        Version of table `products`.
+        Published table `products`, in whose folder the image files are.
     path : str
-        Path of the science file in this version.
+        Path of the raw FITS file relative to this folder.
     place : Place
-        Channel, band, exposure and detector.
+        Channel, band, exposure number and detector.
     sources : Reference
         Known sources of the frame.
     spectra : Table, optional
-        Rows of `rendered_spectra` of the frame.
+        Rows of the table `rendered_spectra` for the frame; None without spectra.
     instrument : Instrument, optional
-        Camera of the frame.
+        Nonlinearity, vignetting and pixel response of the camera; None for a linear detector without vignetting.
     partner : (str, int, Reference), optional
-        Path, exposure and sources of another frame, with which the gain is measured.
+        Path, exposure number and known sources of a second frame of the detector, with which the gain is measured.
     """
 
     products: read.Version
@@ -60,9 +60,9 @@ class LakeResults:
     Attributes
     ----------
     rows : list of Row
-        Rows of all checks.
+        Measured values with expected values and verdicts, of all checks.
     frame_results, catalogue_results : list of Result
-        Results of frames and of catalogues, with the series for figures.
+        Results of each frame, and of each check of catalogues, with arrays for plots.
     """
 
     rows: list[Row]
@@ -71,7 +71,11 @@ class LakeResults:
 
 
 def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
-    """Run all checks for which a lake has data, in `processes` parallel processes."""
+    """Run all checks of a lake in parallel processes, or in this process if `processes` is 1 or less.
+
+    A check of catalogues without the required tables, and a check that cannot be applied to a frame, return a row with
+    the verdict "not_applicable". Without images there are no rows of the checks of images.
+    """
     if processes <= 1:
         catalogues, results = (
             [*map(run_catalogue_check, _catalogue_tasks(contents))],
@@ -80,14 +84,15 @@ def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
     else:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("forkserver")) as pool:
             try:
-                # These few tasks take long, so they start while the sources of the frames are looked up.
+                # Start the checks of catalogues first: they are few but long, and can run while `_frame_tasks` reads
+                # the sources of the frames.
                 futures = [
                     pool.submit(run_catalogue_check, catalogue_task) for catalogue_task in _catalogue_tasks(contents)
                 ]
                 results = [*_with_progress_bar(pool.map(check_frame, _frame_tasks(contents)), contents)]
                 catalogues = [future.result() for future in futures]
             except BaseException:
-                # Tasks that have not started are cancelled.
+                # Cancel the checks that have not started, so that the error is reported at once.
                 pool.shutdown(cancel_futures=True)
                 raise
     rows = [row for result in results for row in result.rows]
@@ -98,17 +103,24 @@ def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
 
 
 def _with_progress_bar(results: Iterator[Result], contents: LakeContents) -> Iterator[Result]:
-    """Pass on the results of frames and show a progress bar."""
+    """Return an iterator over `results` that shows a progress bar with one step per image in `contents`."""
     return iter(tqdm(results, total=len(contents.science_files), unit="detector", desc="validation", disable=None))
 
 
 def _catalogue_tasks(contents: LakeContents) -> list[tuple[int, tuple[read.Version | None, ...]]]:
-    """Number of each check of catalogues, and versions of the tables that it requires (None if missing)."""
+    """Return the arguments of `run_catalogue_check` for each check of catalogues.
+
+    The arguments are the index of the check in CATALOGUE_CHECKS, and the tables that the check requires (None for a
+    table that the lake does not have).
+    """
     return [(n, tuple(map(contents.tables.get, check.tables))) for n, check in enumerate(checks.CATALOGUE_CHECKS)]
 
 
 def run_catalogue_check(catalogue_task: tuple[int, tuple[read.Version | None, ...]]) -> Result:
-    """Run a check of catalogues; return a row that names the missing tables if there are any."""
+    """Run one check of catalogues, given as (index in CATALOGUE_CHECKS, required tables).
+
+    If a table is None, the result is a row with the verdict "not_applicable" that names the missing tables.
+    """
     number, versions = catalogue_task
     check = checks.CATALOGUE_CHECKS[number]
     missing = [name for name, version in zip(check.tables, versions, strict=True) if version is None]
@@ -146,7 +158,7 @@ def _frame_tasks(contents: LakeContents) -> Sequence[FrameTask]:
 
 
 def check_frame(task: FrameTask) -> Result:
-    """Run all checks of one frame."""
+    """Open a frame, run all checks of single frames, and return their rows with verdicts and arrays for plots."""
     path: Path = task.products.sidecar_path(task.path)
     context = frame_context.measure_frame(path, task.place, task.sources, task.spectra, task.instrument)
     if task.partner is not None:
