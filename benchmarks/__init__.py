@@ -1,2 +1,3 @@
-# Limits numpy to the common instruction set, before any benchmark imports it.
+# Importing lake_schema restricts numpy to instructions that all common CPUs have. This must happen before a benchmark
+# imports numpy.
 import lake_schema  # noqa: F401

@@ -1,6 +1,7 @@
-"""Approximations that other programs use to be fast (Serrano et al. 2024, sections 4 and 6.2), in our drawing code.
+"""Approximations with which other programs draw galaxies faster, built into the drawing code of truesky.
 
-Each approximation is applied only to the galaxies that it was made for.
+Serrano et al. 2024 describe them in sections 4 and 6.2. Each is applied only to the galaxies for which it is meant, so
+that its error and its gain of time can be measured.
 """
 
 from __future__ import annotations
@@ -22,10 +23,16 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# Values of the paper: folding threshold; half-light radii (arcsec) below which galaxies are exponential and above which
-# they are drawn at lower resolution. Fainter galaxies than FAINT have one component: in the paper this is the limit of
-# VIS; here half of the scene is fainter.
-FOLDING, TINY, HUGE, FAINT = 5e-3, 0.01, 10.0, 24.5
+# Fraction of a galaxy's light that may lie outside its stamp, called folding threshold in galsim. Serrano et al. 2024
+# use this value and the next three.
+FOLDING = 5e-3
+# Galaxies with a smaller half-light radius (arcsec) are drawn as exponential discs.
+TINY = 0.01
+# Galaxies with a larger half-light radius (arcsec) are drawn at lower resolution.
+HUGE = 10.0
+# Fainter galaxies (mag) have one component in place of bulge and disc. In the paper this is the magnitude limit of VIS;
+# in these benchmarks about two thirds of the galaxies on a detector are fainter.
+FAINT = 24.5
 
 
 Value = TypeVar("Anything")
@@ -41,26 +48,28 @@ def _stamp_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Setti
 
 @dataclass(frozen=True)
 class Approximation:
-    """An approximation: the galaxies that it applies to, and its changes of galaxies, PSF, stamp sizes and image.
+    """An approximation of drawing galaxies, given by functions; by default they change nothing.
 
     Attributes
     ----------
     name : str
-        Name of the approximation.
+        Name of the approximation in tables.
     select_galaxies : callable
-        Function that draws a sample of the galaxies: (scene, seed, number) -> Sources.
+        Function (detector, seed, number) -> Sources that draws a sample of the galaxies for which it is meant.
     simplify : callable
-        Function that simplifies galaxies.
+        Function that simplifies the profiles of galaxies.
     simplify_psf : callable
         Function that simplifies the PSF.
     sizes : callable
-        Function that returns the sizes of the stamps.
+        Function that returns the sides of the stamps (small images of single galaxies) in pixels.
     process_image : callable
-        Function that changes the image.
+        Function that changes the drawn image.
     sample_sizes : tuple of int
-        Numbers of galaxies to measure errors, of pairs for shear, and of galaxies to time (0 for the whole scene).
+        Number of galaxies to measure errors, number of galaxies to measure the bias of shear, and number of galaxies to
+        measure the time (0 for all galaxies of a detector).
     timed_as : Approximation or None
-        Approximation that is timed instead, if drawing does not take the time that the approximation would.
+        Approximation whose time is measured in place of this one, if the drawing code would not become faster by this
+        one; None to measure this one.
     """
 
     name: str
@@ -75,25 +84,25 @@ class Approximation:
     def draw(
         self, sources: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
     ) -> Float:
-        """Draw simplified sources with a simplified PSF.
+        """Draw sources with the sizes of stamps and the change of the image that this approximation defines.
 
         Parameters
         ----------
         sources : Sources
-            The simplified sources.
+            Sources, to which `simplify` has been applied.
         psf : Psf
-            The simplified PSF.
+            PSF, to which `simplify_psf` has been applied.
         scene : Scene
-            The scene.
+            Detector with pixel scale, exposure time and noise.
         settings : Settings
-            Settings of drawing.
+            Parameters of the drawing code, such as limits for the sizes of stamps.
         side : int, optional
-            Side of the image in pixels. The default is the frame of the scene.
+            Width and height of the image in pixels. The default is the size of the detector.
 
         Returns
         -------
         float array, shape (ny, nx)
-            Expected electrons.
+            Expected electrons per pixel.
         """
         neglected = stamp_sizes.neglected_flux(sources.electrons, scene.noise, settings)
         nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
@@ -102,7 +111,7 @@ class Approximation:
 
 
 def _folding_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
-    """Sizes of stamps that contain all light but the folding threshold, as in galsim."""
+    """Return sides of stamps (pixels) that contain all light except the fraction FOLDING, as galsim chooses them."""
     shapes = sources.shapes.take(sources.shape)
     stretch = np.sqrt(shapes.magnification)
     radius = np.zeros(len(shapes))
@@ -125,7 +134,11 @@ def _round_index(sources: Sources) -> Sources:
 
 
 def _to_exponential(sources: Sources) -> Sources:
-    """Replace galaxies by discs of the same half-light radius; a pure bulge keeps its axis ratio."""
+    """Replace galaxies by single exponential discs with a half-light radius between those of bulge and disc.
+
+    The radius is the mean of both radii, weighted with their light. A galaxy without a disc keeps the axis ratio of its
+    bulge.
+    """
     shapes = sources.shapes
     fraction = shapes.bulge_fraction
     radius = fraction * shapes.bulge_radius + (1 - fraction) * shapes.disk_radius
@@ -138,7 +151,7 @@ def _to_exponential(sources: Sources) -> Sources:
 
 
 def _faint_galaxies(scene: Scene, seed: int, n: int) -> Sources:
-    """Galaxies with bulge and disc that are fainter than FAINT."""
+    """Draw at most `n` galaxies that have a bulge and a disc and are fainter than FAINT (mag)."""
     sources = scenes.sources(scene, seed, galaxies=40 * n, stars=0)
     fraction = sources.shapes.bulge_fraction
     is_faint_composite = (fraction > 0) & (fraction < 1) & (scenes.magnitudes(sources, scene) > FAINT)
@@ -159,7 +172,10 @@ def _tiny_galaxies(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def _huge_galaxies(scene: Scene, seed: int, n: int) -> Sources:
-    """Large galaxies with steep profiles, for which the code of the paper had not enough memory."""
+    """Draw `n` galaxies with large half-light radii and steep profiles (Sersic indices 2.5 to 6).
+
+    Serrano et al. 2024 had not enough memory to draw such galaxies at full resolution.
+    """
     sources = _galaxies_of_size(scene, seed, n, 1.2 * HUGE, 17.0)
     index, radius = np.linspace(2.5, 6.0, n), np.full(n, 1.2 * HUGE)
     shapes = replace(sources.shapes, bulge_radius=radius, sersic_index=index, bulge_fraction=np.ones(n))
@@ -167,7 +183,7 @@ def _huge_galaxies(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def _resample(image: Float) -> Float:
-    """Rebin to pixels of twice the side, and interpolate back by biquadratic splines."""
+    """Sum 2 x 2 pixels of an image, and interpolate the result back to the original pixels by biquadratic splines."""
     ny, nx = image.shape
     coarse = image.reshape(ny // 2, 2, nx // 2, 2).sum(axis=(1, 3))
     return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
@@ -179,9 +195,10 @@ def _half_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settin
 
 
 def _upsample_copy(image: Float) -> Float:
-    """Spend the time of the interpolation in `_resample`, and return the image unchanged.
+    """Interpolate a quarter of the image as `_resample` does, only to spend the time, and return the image unchanged.
 
-    The image is drawn with stamps of half the side, so that the sum is the time of drawing at lower resolution.
+    The image has been drawn with stamps of half the side. The total time is therefore that of drawing at half the
+    resolution and interpolating.
     """
     zoom(image[: len(image) // 2, : len(image) // 2], 2, order=2, mode="nearest", grid_mode=True)
     return image
@@ -192,7 +209,7 @@ def _remove_colours(sources: Sources) -> Sources:
 
 
 def _mean_colour_psf(psf: model.Psf) -> model.Psf:
-    """Replace the planes of all wavelengths by their mean; the variation across the detector stays."""
+    """Replace the images of the PSF at all wavelengths by their mean; the PSF still varies across the detector."""
     planes = psf.planes
     assert planes is not None
     achromatic = [i for i, power in enumerate(planes.powers) if power[2] == 0]
@@ -203,7 +220,7 @@ def _mean_colour_psf(psf: model.Psf) -> model.Psf:
 
 
 def _central_psf(psf: model.Psf) -> model.Psf:
-    """Use the PSF at the centre of the detector everywhere."""
+    """Return a PSF that is at all positions equal to the PSF at the centre of the detector."""
     planes = psf.planes
     assert planes is not None
     return replace(psf, planes=replace(planes, drift=planes.drift[:0], powers=()))

@@ -1,4 +1,7 @@
-"""Time the page in a browser: the first sky map, and moves of a brush."""
+"""Measure times of the web page in a browser: until the first sky map is shown, and until charts follow a brush.
+
+A brush is a range on the axis of a chart that selects rows in all other charts.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,12 @@ from statistics import median, quantiles
 from typing import Any
 
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
-_TIMEOUT, _PAUSE = 120.0, 3.0
-# Move the brush of the first chart; return ms until the other charts show other numbers, and until the next frame.
+# Longest time in seconds to wait for the page.
+_TIMEOUT = 120.0
+# Seconds after which the server has certainly counted all positions of a brush.
+_PAUSE = 3.0
+# JavaScript that moves the brush of the first chart with a key or the pointer. It returns the times in ms until the
+# other charts show other numbers, and until the browser has drawn them.
 _MOVE = """async ([kind, facts]) => {
   const [canvas] = document.querySelectorAll('#plot-grid canvas'), box = canvas.getBoundingClientRect();
   const text = () => [...document.querySelectorAll('#plot-grid .range')].slice(1).map((one) => one.textContent).join();
@@ -30,7 +37,7 @@ _MOVE = """async ([kind, facts]) => {
 
 
 def missing_requirement() -> str:
-    """Return a message about the missing software, or "" if a browser can be used."""
+    """Return a message if Playwright or Chromium is missing, or "" if a browser can be used."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
     return "" if CHROMIUM else "there is no chromium (Debian: apt install chromium)"
@@ -55,7 +62,10 @@ def _wait_until(tab: Any, expression: str) -> None:
 
 
 def time_first_sky(command: Sequence[str]) -> float:
-    """Return the time (s) from the start of a server to the legend of its sky map."""
+    """Start a server of the page with a command, and return the time (s) until a browser shows the first sky map.
+
+    The browser is started before. TimeoutError is raised after 120 s.
+    """
     with _open_tab() as tab:
         started = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -69,19 +79,20 @@ def time_first_sky(command: Sequence[str]) -> float:
 
 
 def time_brushes(address: str, times: int) -> dict[str, float]:
-    """Time moves of a brush over four histograms and a map: while it is held, and with requests to the server.
+    """Measure how long charts take to follow the movements of a brush.
 
     Parameters
     ----------
     address : str
-        Address of a page over a lake whose table `trial` has columns x_0 to x_3.
+        Address of the page of a lake whose table `trial` has columns x_0 to x_3.
     times : int
-        Number of moves.
+        Number of movements with keys, and number of movements with the pointer.
 
     Returns
     -------
     dict of str to float
-        Times in milliseconds.
+        Times in milliseconds: `cube_ms` (median while the brush is held with the pointer, for which the page has all
+        counts), `brush_1m_ms` and `brush_1m_95_ms` (median and 95 % quantile for keys, each with an HTTP request).
     """
     with _open_tab() as tab:
         tab.goto(address)
@@ -91,14 +102,14 @@ def time_brushes(address: str, times: int) -> dict[str, float]:
         tab.press("#plot-source", "Enter")
         tab.evaluate("() => document.getElementById('plot-source').dispatchEvent(new Event('change'))")
         _wait_until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
-        # Move back and forth, because a brush at the end of an axis cannot move.
+        # Move the brush right and left in turn, because it cannot move beyond the end of the axis.
         keys = ["ArrowRight" if k % 16 < 8 else "ArrowLeft" for k in range(times)]
         key_times = [tab.evaluate(_MOVE, ["key", {"key": key}]) for key in keys][1:]
         box = tab.locator("#plot-grid canvas").first.bounding_box()
         tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
         tab.mouse.down()
         tab.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.5 * box["height"])
-        # Wait for the counts of all positions of the brush.
+        # When the pointer is pressed, the page requests the counts for all positions of the brush. Wait for them.
         time.sleep(_PAUSE)
         drag_times = [tab.evaluate(_MOVE, ["drag", {"place": 0.4 + 0.5 * k / times}]) for k in range(times)]
         tab.mouse.up()

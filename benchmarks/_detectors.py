@@ -1,4 +1,8 @@
-"""Functions for benchmarks of single detectors: make a lake, plan a detector, measure its rendering, time a job."""
+"""Functions for benchmarks that render images of single detectors.
+
+They make a lake (folder with catalogues of sources and their fluxes), plan the image of a detector, measure the CPU
+time and memory of its rendering, and time a whole Spark job.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +27,15 @@ from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
-# Radius (deg) around the centre of an exposure that contains all sources on its detectors.
+# Radius (deg) around the centre of an exposure of Euclid that contains all sources on its detectors.
 FIELD_RADIUS = 0.62
 
 
 def make_lake(folder: Path, request: Request) -> Path:
-    """Make a lake with the catalogues and fluxes of a request, and return its folder."""
+    """Compute the catalogues of galaxies and stars and their fluxes for a request, and return the folder of the lake.
+
+    The lake is the new folder `lake` in `folder`.
+    """
     root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes):
         for step in module.steps(root, request):
@@ -37,7 +44,10 @@ def make_lake(folder: Path, request: Request) -> Path:
 
 
 def request_head(quick: bool) -> str:
-    """Return the demo request up to its first pointing, as text; `quick` selects only bright sources."""
+    """Return the beginning of requests/demo.toml, up to its first pointing, as TOML text.
+
+    If `quick` is True, the magnitude limits are lowered to 19 (galaxies) and 14 (stars).
+    """
     text = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[0]
     if quick:
         text = text.replace("galaxy_limit = 26.0", "galaxy_limit = 19.0").replace(
@@ -47,21 +57,21 @@ def request_head(quick: bool) -> str:
 
 
 def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
-    """Plan a request and select one detector.
+    """Plan the exposures of a request, and return the description of one rendering task (the image of a detector).
 
     Parameters
     ----------
     root : Path
-        Folder of the lake.
+        Folder of a lake with the catalogues and fluxes of the request.
     request : Request
-        The request.
+        Request with at least one exposure.
     number : int, optional
-        Index of the detector in the plan of images.
+        Index of the detector image in the plan; negative values count from the end.
 
     Returns
     -------
     dict
-        Facts of the task that renders the detector.
+        Description of the rendering task, an argument of `render_exposures.render_task`.
     """
     for step in plan_exposures.steps(root, request):
         publish.make_version(root, step.plan, step.run_task)
@@ -70,23 +80,23 @@ def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
 
 
 def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
-    """Render a detector, from reading the sources to writing the files.
+    """Measure the rendering of a detector image, from reading the catalogues to writing the files.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     facts : dict
-        Facts of the task.
+        Description of the rendering task, as `plan_detector` returns it.
     folder : Path
-        Folder for the files.
+        Folder in which the image files are written; existing files are replaced.
 
     Returns
     -------
     seconds : float
         CPU time in seconds.
     peak : float
-        Peak memory in GB.
+        Peak memory of this process during the rendering, in GB.
     """
     reset_peak_memory()
     started = time.process_time()
@@ -99,18 +109,18 @@ def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]
 
 
 def time_cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repeats: int) -> dict[str, float]:
-    """Time the rendering of a detector without and with the planes of the PSF in the cache.
+    """Time the rendering of a detector image without ("cold") and with ("warm") the images of the PSF in the cache.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     facts : dict
-        Facts of the task.
+        Description of the rendering task, as `plan_detector` returns it.
     folder : Path
-        Folder for the files.
+        Folder in which the image files are written.
     planes : str
-        Pattern of the folders of the planes in the cache.
+        Pattern (glob) of the names of the cache folders that contain PSF images, for example "vis_psf-*".
     repeats : int
         Number of repeats; the shortest time counts.
 
@@ -133,7 +143,7 @@ def time_cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repea
 
 
 def remove_planes(pattern: str) -> None:
-    """Delete the PSF planes in the cache whose folders match a pattern."""
+    """Delete the folders with PSF images in the cache whose names match a pattern (glob)."""
     for folder in cache.cache_dir().glob(pattern):
         for file in folder.iterdir():
             file.unlink()
@@ -141,16 +151,16 @@ def remove_planes(pattern: str) -> None:
 
 
 def add_cpu_time(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    """Wrap a function so that it adds its CPU time.
+    """Wrap a function, so that the CPU time of each call is added to an entry of a dictionary.
 
     Parameters
     ----------
     function : callable
         The function.
     name : str
-        Key of the sum.
+        Key of the entry, which must exist, or `seconds` must be a defaultdict.
     seconds : dict of str to float
-        CPU times in seconds, to which the wrapper adds.
+        Sums of CPU times in seconds by name; it is changed in place.
 
     Returns
     -------
@@ -171,21 +181,22 @@ def add_cpu_time(function: Callable[..., Any], name: str, seconds: dict[str, flo
 def effect_seconds(
     effects: Mapping[str, tuple[Effect, ...]], untimed_effects: tuple[object, ...], render: Callable[[], object]
 ) -> dict[str, float]:
-    """Measure the CPU time of each effect of a science image in one rendering.
+    """Measure the CPU time of each instrumental effect (such as cosmic rays) in one rendering of a science image.
 
     Parameters
     ----------
     effects : mapping of str to tuple of Effect
-        Effects of a channel by image type.
+        Effects of a channel (such as VIS) by image type. The entry "science" is replaced during the measurement.
     untimed_effects : tuple of object
-        Effects that are not measured, because the channel identifies them by their object.
+        Effects that are not measured: the channel compares them by identity, so they cannot be replaced by timed
+        copies.
     render : callable
-        Function that renders the image.
+        Function without arguments that renders the image.
 
     Returns
     -------
     dict of str to float
-        CPU time in seconds by `effect_<name>_s`.
+        CPU time in seconds of each effect, by `effect_<name>_s`.
     """
     seconds: dict[str, float] = defaultdict(float)
     science_effects = effects["science"]
@@ -202,7 +213,11 @@ def effect_seconds(
 
 
 def time_job(folder: Path, text: str) -> float:
-    """Return the wall time (s) of the Spark job that renders a request, given as text, on 2 cores."""
+    """Return the wall time (s) of the Spark job that renders all images of a request on 2 cores.
+
+    `text` is the request as TOML. The catalogues and the plan are made before the clock starts, in the folder
+    `exposure` in `folder`. CalledProcessError is raised if the job fails.
+    """
     file = folder / "exposure.toml"
     file.write_text(text, encoding="utf-8")
     request = parse(file)

@@ -1,8 +1,8 @@
-"""Measure time and errors of the settings for drawing spectra, for the sample used to choose them and for another one.
+"""Measure the CPU time and the errors of drawing slitless spectra, for several settings (parameters of the code).
 
-Galaxies and stars are drawn one by one in an order of the red grism, with continuum and one line. The truth is a slow
-method: each sample of the trace has separate rows and a separate PSF, on large and finely sampled stamps, with a PSF of
-more wavelengths.
+Errors are measured on the sources with which the settings were chosen, and on other sources. Galaxies and stars are
+drawn one by one in the first order of the red grism, with a continuum and one emission line. They are compared with a
+slow method: it uses large and finely sampled stamps, and a separate PSF at each step along the trace.
 """
 
 from __future__ import annotations
@@ -28,18 +28,35 @@ from truesky.render.sources.source_list import Sources
 
 # Noise of the sky in an exposure with the red grism, electrons per pixel.
 NOISE = 28.0
-# Kinds of errors; the table contains the largest of each.
+# Names of the measured errors: error of a pixel, error of the flux of a line, and error of the position of a line.
 ERROR_NAMES = ("background", "flux", "position")
-# Number of sources to choose the settings and to test them, with seeds; number of sources to time, with seed.
-NUM_CHOSEN, NUM_TEST, _SEEDS, _NUM_TIMED, _TIMED_SEED = 18, 36, (41, 42), 400, 43
-# Tilts of the grism (deg) of the sources in turn. All light of a source is in the first order.
+# Number of sources in the sample with which the settings of the drawing code are chosen.
+NUM_CHOSEN = 18
+# Number of sources in the sample with which the chosen settings are tested.
+NUM_TEST = 36
+# Seed of the sources with which settings are chosen, and seed of the sources with which they are tested.
+_SEEDS = (41, 42)
+# Number of sources with which the time of drawing is measured.
+_NUM_TIMED = 400
+# Seed of the sources with which the time of drawing is measured.
+_TIMED_SEED = 43
+# Tilts of the grism (deg), which are used in turn for the sources. All light of a source is in the first order.
 _TILTS = (0.0, 4.0, -4.0)
-# Brightest and faintest H_E, and electrons of magnitude 0 for a zero point of 25.3 and 549.6 s.
-_BRIGHT, _FAINT, _ZERO = 17.0, 23.0, 549.6 * 10 ** (0.4 * 25.3)
+# Brightest and faintest H_E magnitude of the sources.
+_BRIGHT, _FAINT = 17.0, 23.0
+# Electrons of a source of magnitude 0, for a zero point of 25.3 mag (1 electron per s) and 549.6 s.
+_ZERO = 549.6 * 10 ** (0.4 * 25.3)
+# Parameters of the slow method to which the drawn spectra are compared.
 _TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=5, positions=9)
-# Shape of the frame and position of the undispersed image; half sides of the box around a line; sigma of the weight of
-# its centroid. All in pixels.
-_SHAPE, _PLACE, _BOX, _SIGMA = (128, 720), (270.0, 60.0), (8, 4), 2.0
+# Shape (ny, nx) of the image of one spectrum, pixels.
+_SHAPE = (128, 720)
+# Column and row at which the source of a spectrum would lie on the image without the grism. A random fraction of a
+# pixel is added to both.
+_PLACE = (270.0, 60.0)
+# Half width and half height of the box in which the flux of a line is measured, pixels.
+_BOX = (8, 4)
+# Sigma of the Gaussian weight for the centroid of a line, pixels.
+_SIGMA = 2.0
 _TABLE_HEADER = """\
 # Settings of drawing spectra. allowed: the error of a pixel, of its noise, that they are for.
 #
@@ -55,7 +72,12 @@ _TABLE_HEADER = """\
 
 @dataclass(frozen=True)
 class SampleSource:
-    """A single source, the tilt of the grism (deg), its continuum and line, and the position of the line (pixels)."""
+    """A source with a spectrum, for which the errors of drawing are measured.
+
+    `source` is a list of one source, and `tilt` the tilt of the grism (deg). `continuum` and `line` are spectra,
+    float32 [1, n]: multiplied by the response of the spectral order, they are the fraction of the source's electrons at
+    each wavelength. `place` is the expected column and row of the line.
+    """
 
     source: Sources
     tilt: float
@@ -65,7 +87,7 @@ class SampleSource:
 
 
 def first_orders(tilt: float) -> tuple[Order, ...]:
-    """Return the first order of the red grism for a tilt in degrees."""
+    """Return the first order of the red grism on detector DET22, as a tuple of one order, for a tilt in degrees."""
     mission, band = resolve(), passbands.load("nisp_red")
     first = next(t for t in traces.traces("RGS000", tilt, _detector(), mission) if t.order == 1)
     return (Order(first, int(band.wavelength[0]), band.response * band.wavelength),)
@@ -76,14 +98,14 @@ def _detector() -> detectors.Detector:
 
 
 def settings_psf(settings: Settings) -> Psf:
-    """Return the PSF at the wavelengths and positions of the settings."""
+    """Return the PSF on detector DET22, at the numbers of wavelengths and positions that the settings contain."""
     trace = first_orders(0.0)[0].trace
     nodes = images.nodes(trace.first, trace.last, settings.nodes)
     return euclid.nisp_psf_at(_detector(), nodes, resolve(), settings.positions)
 
 
 def sample_sources(seed: int, count: int) -> list[SampleSource]:
-    """Draw a sample of two galaxies per star, uniform in magnitude."""
+    """Return `count` random sources with spectra: two galaxies per star, uniform in H_E from 17 to 23."""
     rng = np.random.default_rng(seed)
     stars = count // 3
     sources = scenes.sources(NISP, seed, galaxies=count - stars, stars=stars)
@@ -108,21 +130,21 @@ def sample_sources(seed: int, count: int) -> list[SampleSource]:
 
 
 def draw_images(sample_source: SampleSource, settings: Settings, psf: Psf) -> tuple[Float, Float]:
-    """Draw a source.
+    """Draw the dispersed image of a source, and of its emission line alone.
 
     Parameters
     ----------
     sample_source : SampleSource
-        The source.
+        The source with its spectrum.
     settings : Settings
         Settings of drawing spectra.
     psf : Psf
-        PSF at the wavelengths and positions of the settings.
+        PSF for these settings, from `settings_psf`.
 
     Returns
     -------
-    total, line : float array
-        Expected electrons of the whole spectrum, and of its line alone.
+    total, line : float array, shape (128, 720)
+        Expected electrons per pixel of the whole spectrum, and of its line alone.
     """
     spectra = sample_source.continuum + sample_source.line, sample_source.line
     dispersions = (
@@ -136,12 +158,12 @@ def draw_images(sample_source: SampleSource, settings: Settings, psf: Psf) -> tu
 def errors(
     drawn: tuple[Float, Float], truth: tuple[Float, Float], sample_source: SampleSource
 ) -> tuple[float, float, float]:
-    """Return the errors of a drawn source.
+    """Return the errors of the drawn spectrum of a source.
 
     Parameters
     ----------
     drawn, truth : tuple of float array
-        Images of `draw_images`.
+        Images to test and true images, each as returned by `draw_images` (whole spectrum, line).
     sample_source : SampleSource
         The source.
 
@@ -164,7 +186,10 @@ def errors(
 
 
 def _flux_and_centroid(image: Float, column: float, row: float) -> tuple[float, float, float]:
-    """Flux in a box around a line, and its centroid with a Gaussian weight."""
+    """Return the flux in a box around an emission line, and the centroid of the line with a Gaussian weight.
+
+    `column` and `row` are the expected position of the line in pixels. The centroid (x, y) is relative to it.
+    """
     first_column, first_row = round(column) - _BOX[0], round(row) - _BOX[1]
     box = image[first_row : first_row + 2 * _BOX[1] + 1, first_column : first_column + 2 * _BOX[0] + 1]
     y, x = np.indices(box.shape)
@@ -175,7 +200,10 @@ def _flux_and_centroid(image: Float, column: float, row: float) -> tuple[float, 
 
 
 def seconds(settings: Settings, repeats: int) -> float:
-    """Return the CPU time (s) to draw the first orders of 7,400 sources on a detector, 10 % of them stars."""
+    """Return the CPU time (s) to draw the first orders of 7,400 sources on a detector, 10 % of them stars.
+
+    The time is extrapolated from 400 sources. It is the shortest of `repeats` measurements.
+    """
     rng, psf = np.random.default_rng(_TIMED_SEED), settings_psf(settings)
     sources = scenes.sources(NISP, _TIMED_SEED, galaxies=_NUM_TIMED - _NUM_TIMED // 10, stars=_NUM_TIMED // 10)
     low, high = 10 ** (0.3 * _BRIGHT), 10 ** (0.3 * _FAINT)
@@ -192,7 +220,8 @@ def seconds(settings: Settings, repeats: int) -> float:
         half = time.process_time()
         draw.draw(sources, dispersed, psf, (NISP.ny, NISP.nx), NOISE)
         half_seconds, all_seconds = min(half_seconds, half - started), min(all_seconds, time.process_time() - half)
-    # Extrapolate by the time per source; the time that does not depend on the number of sources counts once.
+    # Extrapolate with the time per source, which follows from the times of half and of all sources. Time that does not
+    # depend on the number of sources counts once.
     each = (all_seconds - half_seconds) / (len(sources) - len(sources) // 2)
     return all_seconds + each * (7400 - len(sources))
 
@@ -200,22 +229,22 @@ def seconds(settings: Settings, repeats: int) -> float:
 def measure_settings(
     tiers: Iterable[Settings], repeats: int, num_chosen: int = NUM_CHOSEN, num_test: int = NUM_TEST
 ) -> list[dict[str, float]]:
-    """Measure errors and time of several settings.
+    """Measure the errors and the CPU time of drawing spectra with several settings.
 
     Parameters
     ----------
     tiers : iterable of Settings
-        The settings.
+        Settings to measure.
     repeats : int
-        Number of repeats of each time.
+        Number of repeats of each measurement of time.
     num_chosen, num_test : int, optional
-        Number of sources of the sample used to choose the settings, and of the test sample.
+        Number of sources with which settings are chosen, and number of other sources with which they are tested.
 
     Returns
     -------
     list of dict
-        For each of the settings the largest errors for the first sample, for the test sample (keys that end in
-        `_held`), and `seconds`.
+        One dictionary per setting: the largest errors for the first sample (`background`, `flux`, `position`) and for
+        the test sample (the same names with `_held`), and `seconds` (CPU time of 7,400 sources).
     """
     samples = {
         end: sample_sources(seed, n) for end, seed, n in zip(("", "_held"), _SEEDS, (num_chosen, num_test), strict=True)
@@ -239,7 +268,10 @@ def measure_settings(
 
 
 def settings_table(repeats: int = 2) -> str:
-    """Return the table of the current settings with newly measured errors and times, as text."""
+    """Measure again the errors and times of the settings with which truesky draws slitless spectra.
+
+    The settings are read from the present CSV table of the drawing code. Return the new table as text.
+    """
     current_rows = draw.read_settings()
     setting_names = [name for name in current_rows[0] if name == "allowed" or name in Settings.__slots__]
     names = [*setting_names, *(f"{name}{end}" for end in ("", "_held") for name in ERROR_NAMES), "seconds"]

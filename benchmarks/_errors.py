@@ -1,4 +1,4 @@
-"""Errors of drawn galaxies compared with galsim at its tightest parameters, and errors of their response to shear."""
+"""Measure errors of drawn galaxies: against galsim with its tightest parameters, and of their response to shear."""
 
 from __future__ import annotations
 
@@ -22,21 +22,28 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
 Result = TypeVar("Found")
-# Limit of the address space in bytes. Without it galsim would use all memory of the machine for steep bulges.
+# Limit of the address space of a process in bytes. Without it galsim would use all memory of the machine for steep
+# bulges.
 MEMORY = 4 << 30
-# Sigma of the Gaussian weight for moments, and radius of the aperture, in arcsec.
-WEIGHT_SIGMA, APERTURE_RADIUS = 0.75, 1.0
-# Shear that is applied to 90-degree pairs to measure their response.
+# Sigma of the Gaussian weight for moments, arcsec.
+WEIGHT_SIGMA = 0.75
+# Radius of the aperture for fluxes, arcsec.
+APERTURE_RADIUS = 1.0
+# Shear that is applied, with both signs, to pairs of galaxies rotated by 90 degrees.
 SHEAR = 0.02
-# Side of the frames that are compared, pixels.
+# Width and height of the images that are compared, pixels.
 COMPARED_SIDE = 256
 NAMES = ("aperture_mag", "centroid_mas", "r2", "ellipticity", "pixel_sigma")
-# The only approximation is a finite stamp, of the largest size.
+# Settings of the most accurate drawing by truesky. Its only approximation is a finite stamp, at least 51.2 arcsec wide.
 FULL_SETTINGS = Settings(edge=1e-7, aliased=1e-9, floor=0.0, min_size_arcsec=51.2, positions=9)
 
 
 def run_with_memory_limit(work: Callable[..., Result], *args: Any) -> Result:
-    """Run work(*args) in a forked process with limited memory and return its result; arguments are not copied."""
+    """Run work(*args) in a forked process with at most 4 GiB of memory, and return its result.
+
+    The process inherits the arguments, so they need not be copied. RuntimeError is raised if the process ends without a
+    result. This works on Unix only.
+    """
     context = get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_send_result, args=(theirs, work, args))
@@ -60,21 +67,21 @@ def _limit_memory() -> None:
 
 
 def measure_image(image: Float, scale: float, x: float, y: float) -> Float:
-    """Measure aperture flux and weighted moments of an image.
+    """Measure the aperture flux and the weighted moments of a source on an image.
 
     Parameters
     ----------
     image : float array, shape (ny, nx)
-        The image.
+        Image of one source without background.
     scale : float
         Pixel scale in arcsec.
     x, y : float
-        True position in pixels, the centre of the Gaussian weight.
+        True column and row of the source, the centre of the aperture and of the Gaussian weight.
 
     Returns
     -------
     float array, shape (6,)
-        Aperture flux, centroid (x, y) in arcsec, R2 in arcsec2, e1, e2.
+        Aperture flux, centroid (x, y) relative to the true position in arcsec, R2 in arcsec2, e1, e2.
     """
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     dx, dy = (columns - x) * scale, (rows - y) * scale
@@ -93,16 +100,17 @@ def errors(image: Float, truth: Float, scene: Scene, source: Sources) -> Float:
     Parameters
     ----------
     image, truth : float array, shape (ny, nx)
-        The image and the true image.
+        Image to test, and true image.
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     source : Sources
-        The source.
+        List of one source, with its true position.
 
     Returns
     -------
     float array, shape (5,)
-        By NAMES: aperture magnitude, centroid (mas), dR2 / R2, ellipticity, largest error of a pixel in sigma.
+        Absolute errors in the order of NAMES: aperture magnitude, centroid (mas), dR2 / R2, ellipticity, and largest
+        error of a pixel in units of the noise.
     """
     position = float(source.column[0]), float(source.row[0])
     ours, theirs = measure_image(image, scene.scale, *position), measure_image(truth, scene.scale, *position)
@@ -118,27 +126,28 @@ def errors(image: Float, truth: Float, scene: Scene, source: Sources) -> Float:
 
 
 def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int) -> tuple[dict[str, Float], Int, int]:
-    """Compare galaxies drawn with several settings with galsim.
+    """Measure the errors of galaxies drawn with several settings, against galsim with its tightest parameters.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     tiers : mapping of str to Settings
-        Settings by name.
+        Settings (parameters of the drawing code) by name.
     seed : int
-        Seed of the sample.
+        Seed of the sample of galaxies.
     n : int
-        Number of galaxies.
+        Number of galaxies, rounded up to a multiple of the number of magnitude bins.
 
     Returns
     -------
     errors : dict of str to float array, shape (m, 5)
-        Errors by name of the settings.
+        Errors of each galaxy, by name of the settings: aperture magnitude, centroid (mas), dR2 / R2, ellipticity, and
+        largest error of a pixel in units of the noise.
     bins : int array, shape (m,)
-        Magnitude bins.
+        Index of the magnitude bin of each galaxy.
     refused : int
-        Number of galaxies that galsim cannot draw.
+        Number of galaxies that were left out, because galsim could not draw them.
     """
     sources, full_psf = scenes.sample(scene, seed, n), scenes.scene_psf(scene)
     out: dict[str, list[Float]] = {name: [] for name in tiers}
@@ -163,32 +172,32 @@ def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: in
 def shear_response(
     scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int, g: float = SHEAR
 ) -> tuple[dict[str, Float], Sources]:
-    """Measure the bias of the response to shear by noise-free 90-degree pairs.
+    """Measure the bias of shear that errors of drawing cause, with noise-free pairs rotated by 90 degrees.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     tiers : mapping of str to Settings
-        Settings by name.
+        Settings (parameters of the drawing code) by name.
     seed : int
-        Seed of the sample.
+        Seed of the sample of galaxies.
     n : int
-        Number of galaxies.
+        Number of galaxies, rounded up to a multiple of the number of magnitude bins.
     g : float, optional
         Shear, applied with both signs.
 
     Returns
     -------
     biases : dict of str to float array, shape (n, 2)
-        Bias (m, c) by name of the settings.
+        Bias (m, c) of each galaxy, by name of the settings.
     sources : Sources
         The galaxies.
 
     Notes
     -----
-    The truth is the same galaxy with the same PSF on the largest stamp (FULL_SETTINGS). Compared with galsim this
-    truth has |m| <= 1e-5.
+    The bias is relative to the same galaxy with the same PSF, drawn by truesky on a very large stamp (FULL_SETTINGS).
+    Relative to galsim, such a drawing has |m| <= 1e-5.
     """
     sources, full_psf = scenes.sample(scene, seed, n), scenes.scene_psf(scene)
     out: dict[str, list[tuple[float, float]]] = {name: [] for name in tiers}
@@ -204,34 +213,34 @@ def shear_response(
 
 
 def make_drawer(psf: model.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
-    """Return a function that draws a galaxy.
+    """Return a function that draws a single galaxy.
 
     Parameters
     ----------
     psf : Psf
-        PSF of the galaxy.
+        PSF of the galaxy, the same at all positions and wavelengths.
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     settings : Settings
-        Settings of drawing.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
 
     Returns
     -------
     callable
-        Function of a source that returns its image, on a frame of side 2 COMPARED_SIDE.
+        Function of a list of one galaxy that returns its image (expected electrons) of 512 x 512 pixels.
     """
     return lambda source: scenes.draw_sources(source, psf, scene, settings, 2 * COMPARED_SIDE)
 
 
 def response(draw: Callable[[Sources], Float], source: Sources, scale: float, g: float = SHEAR) -> Float:
-    """Measure the response to shear of a galaxy and the same galaxy rotated by 90 degrees.
+    """Measure the mean response to shear of a galaxy and of the same galaxy rotated by 90 degrees.
 
     Parameters
     ----------
     draw : callable
-        Function that draws a galaxy without noise.
+        Function of a list of one galaxy that returns its image without noise.
     source : Sources
-        The galaxy with its position on the image. Its shear is replaced.
+        List of one galaxy with its position on the image. Its shear is replaced.
     scale : float
         Pixel scale in arcsec.
     g : float, optional
@@ -257,27 +266,31 @@ def response(draw: Callable[[Sources], Float], source: Sources, scale: float, g:
 
 
 def bias(measured: Float, truth: Float) -> tuple[float, float]:
-    """Return the bias (m, c) of a response relative to the true one: the larger of two components, with its sign."""
+    """Return the multiplicative and the additive bias of shear (m, c) from a measured and a true response.
+
+    Both arguments are results of `response`. Each bias is the one of the two shear components with the larger absolute
+    value, with its sign.
+    """
     m, c = measured[:2] / truth[:2] - 1, measured[2:] - truth[2:]
     return float(m[np.argmax(np.abs(m))]), float(c[np.argmax(np.abs(c))])
 
 
 def worst_by_group(biases: Float, sources: Sources, scene: Scene) -> dict[str, tuple[int, float, float]]:
-    """Return the largest biases in bins of magnitude, size and index of the bulge.
+    """Return the largest biases of shear in bins of magnitude, half-light radius, and Sersic index of the bulge.
 
     Parameters
     ----------
     biases : float array, shape (n, 2)
-        Bias (m, c) of each galaxy.
+        Bias of shear (m, c) of each galaxy.
     sources : Sources
         The galaxies.
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
 
     Returns
     -------
     dict of str to (int, float, float)
-        Number of galaxies, largest |m| and largest |c| by name of the bin.
+        Number of galaxies, largest |m| and largest |c| by name of the bin, such as "m 20-22". Empty bins are left out.
     """
     shapes = sources.shapes.take(sources.shape)
     size, index = galaxy_shapes.half_light(shapes), np.where(shapes.bulge_fraction > 0, shapes.sersic_index, 1.0)
@@ -297,14 +310,22 @@ def worst_by_group(biases: Float, sources: Sources, scene: Scene) -> dict[str, t
 
 
 def figures(error_values: Float) -> dict[str, float]:
-    """Return the rms and the largest of errors [n, 5] by name."""
+    """Return the rms and the largest value of each of five errors, by name such as `r2_rms` and `r2_worst`.
+
+    `error_values` has one row per galaxy. Its columns are the errors of aperture magnitude, centroid (mas), R2,
+    ellipticity, and of a pixel in units of the noise.
+    """
     rms, worst = np.sqrt((error_values**2).mean(axis=0)), error_values.max(axis=0)
     named = zip(NAMES, rms, worst, strict=True)
     return {key: float(value) for name, a, b in named for key, value in ((f"{name}_rms", a), (f"{name}_worst", b))}
 
 
 def figures_by_bin(error_values: Float, bins: Int) -> dict[str, float]:
-    """Return `figures` of each magnitude bin; the keys end in the bright edge of the bin."""
+    """Return the rms and the largest value of five errors in each magnitude bin, by names such as `r2_rms_m20`.
+
+    The number at the end of a name is the bright edge of the bin (mag). `error_values` has one row per galaxy and the
+    columns that `figures` requires. `bins` contains the index of each galaxy's bin.
+    """
     return {
         f"{key}_m{BINS[b]:.0f}": value
         for b in np.unique(bins)
@@ -313,16 +334,17 @@ def figures_by_bin(error_values: Float, bins: Int) -> dict[str, float]:
 
 
 def print_table(title: str, error_values: Float, bins: Int) -> None:
-    """Print rms and largest errors by magnitude bin.
+    """Print a table of the rms and the largest errors of galaxies, in each magnitude bin and in total.
 
     Parameters
     ----------
     title : str
         Title of the table.
     error_values : float array, shape (n, 5)
-        The errors.
+        Errors of each galaxy: aperture magnitude, centroid (mas), dR2 / R2, ellipticity, and largest error of a pixel
+        in units of the noise.
     bins : int array, shape (n,)
-        Magnitude bins.
+        Index of the magnitude bin of each galaxy.
     """
     print(f"{title:24}" + "".join(f"{name:>20}" for name in NAMES))
     rows = [(f"m {BINS[b]:.0f}-{BINS[b + 1]:.0f}", error_values[bins == b]) for b in range(len(BINS) - 1)]

@@ -1,4 +1,7 @@
-"""Measure overheads: CPU time of a task outside its rendering, and the serial CPU time of a run."""
+"""Measure overheads of rendering jobs: CPU time of a task outside its rendering, and CPU time that is not parallel.
+
+A task renders one detector image in a worker process of Spark.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,26 @@ from truesky.request.schema import Request
 from truesky.running import submitted_job
 from truesky.running.session import get_session
 
-# A machine of two cores is idle if the load average is below this value.
+# A machine of two cores counts as idle if its load average is below this value.
 QUIET_LOAD = 0.5
 
 
 def task_ms(root: Path, request: Request) -> float:
-    """Return the CPU time (ms) of a task in a worker without rendering and reading sources (largest value)."""
+    """Return the CPU time (ms) of a rendering task without reading the sources and without rendering the image.
+
+    It is measured for one task of each detector of the request in another process; the largest value is returned.
+    """
     facts = _first_task_per_detector(root, request)
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return 1e3 * max(pool.map(_time_outside_render, [root] * len(facts), facts))
 
 
 def compile_all(root: Path, request: Request) -> None:
-    """Render all tasks once in another process, so that everything compiled or computed once per machine is cached."""
+    """Render all images of a request once in another process.
+
+    Compiled functions and other data that are made only once per machine are then in the cache, and later measurements
+    do not include the time to make them.
+    """
     _warm_up(root, _task_facts(root, request))
 
 
@@ -46,12 +56,16 @@ def _task_facts(root: Path, request: Request) -> list[Json]:
 
 
 def _first_task_per_detector(root: Path, request: Request) -> Sequence[Json]:
-    """Facts of one task of each detector."""
+    """Return the description of one rendering task for each detector of the request."""
     return list({facts["detector"]: facts for facts in _task_facts(root, request)}.values())
 
 
 def _time_outside_render(root: Path, facts: Json) -> float:
-    """CPU time (s) of a task, with rendering and reading of sources replaced by results in memory."""
+    """Return the CPU time (s) of a rendering task without reading the sources and without rendering the image.
+
+    The sources and the rendered image of an earlier call are kept in memory and used again. The shortest of 15 times is
+    returned.
+    """
     renders: list[rendered_detector.RenderedDetector] = []
     original_render = render.render
     _run_with_render(lambda *a, **k: renders.append(original_render(*a, **k)) or renders[0], root, facts)  # type: ignore[func-returns-value]
@@ -87,10 +101,12 @@ def _time_task(root: Path, facts: Json) -> float:
 
 
 def cpu_shares(root: Path, request: Request) -> dict[str, float]:
-    """Return the share of the driver (Python and Java, after its start) in the CPU time of a render job.
+    """Return the share of Spark's driver in the CPU time of a rendering job, and the speed-up that follows from it.
 
-    The speed-up by two cores follows from this share. The time of Java within tasks counts as time of the driver. If
-    the machine is idle, the speed-up is also measured by wall time.
+    The driver is a Python and a Java process; their start does not count. CPU time that tasks use in this Java process
+    counts as the driver's. The result contains `serial_share` (the driver's share), `speedup_2_cores` (the speed-up by
+    two cores if only the rest is parallel) and `job_cpu_s` (the CPU time of the job in s). If the machine is idle, the
+    results of `wall_clock_speedup` are added.
     """
     _warm_up(root, _first_task_per_detector(root, request))
     spark = get_session("benchmark of production")
@@ -113,22 +129,22 @@ def cpu_shares(root: Path, request: Request) -> dict[str, float]:
 
 
 def _cpu(pid: int) -> float:
-    """CPU time (s) of a process until now."""
+    """Return the CPU time (s) that a process has used until now, from /proc."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def wall_clock_speedup(root: Path, request: Request, tasks: int = 16) -> dict[str, float]:
-    """Measure the speed-up by two cores in warm workers.
+    """Measure the wall time of rendering on one and on two cores, in processes that have rendered before.
 
     Parameters
     ----------
     root : Path
-        Folder of the lake.
+        Folder of a lake with the catalogues and the plan of the request.
     request : Request
         The request.
     tasks : int, optional
-        Number of detectors to render.
+        Number of times that the same detector image is rendered.
 
     Returns
     -------

@@ -1,4 +1,7 @@
-"""Time other programs on the same galaxies: galsim (object by object), UFig (photons), and SkyPy (catalogues)."""
+"""Measure the speed of other programs with the galaxies of the benchmarks.
+
+galsim draws images object by object, UFig draws images photon by photon, and SkyPy draws catalogues.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +21,17 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# Side of the image of a PSF for galsim, in samples (10").
+# Width and height of the PSF image for galsim in samples; it covers 10 arcsec for VIS and 30 arcsec for LSST.
 _SIDE = 301
 
 
 def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float]:
-    """Return the CPU time of galsim with its default parameters for the galaxies of a detector.
+    """Return the CPU time that galsim with its default parameters needs to draw all galaxies of a detector.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     each : int
         Number of galaxies per magnitude bin that are drawn; the times are scaled to all galaxies.
     seed : int, optional
@@ -39,7 +42,8 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
     default : float
         Time in seconds if each galaxy has a separate PSF for its colour and position.
     cached : float
-        Time in seconds with one PSF for all galaxies, Sersic indices rounded to 0.1, and every index drawn before.
+        Time in seconds with one PSF for all galaxies and Sersic indices rounded to 0.1. Each galaxy is drawn once
+        before the clock starts, so galsim has its profile in its cache.
     """
     sources, full_psf = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.scene_psf(scene)
     bins = scenes.magnitude_bins(sources, scene)
@@ -65,7 +69,7 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
 
 
 def _psf_image(psf: model.Psf, weights: Float) -> galsim.GSObject:
-    """Weighted sum of the planes of a PSF as a galsim object, in pixels."""
+    """Return the weighted sum of the images of a PSF (by wavelength and position) as a galsim object, in pixels."""
     assert psf.planes is not None
     image = transfer.image_of(psf.planes, weights)
     middle = slice((len(image) - _SIDE) // 2, (len(image) + _SIDE) // 2)
@@ -81,21 +85,21 @@ def _draw(sources: Sources, i: int, psf: galsim.GSObject, index: float) -> None:
 
 
 def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
-    """Draw a single source by galsim with default parameters, on a stamp whose size galsim chooses.
+    """Draw a single galaxy with galsim at its default parameters, on a stamp whose size galsim chooses.
 
     Parameters
     ----------
     source : Sources
-        The source.
+        List of one galaxy.
     psf : Psf
-        PSF of this source.
+        PSF of this galaxy, the same at all positions and wavelengths.
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels.
 
     Returns
     -------
     float array, shape (side, side)
-        Expected electrons.
+        Expected electrons per pixel; 0 outside the stamp.
     """
     assert psf.planes is not None
     body = galsim.JacobianWCS(*source.jacobian[0].ravel()).toImage(
@@ -110,9 +114,10 @@ def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
 
 
 def ufig_seconds(scene: Scene) -> float:
-    """Return the CPU time (s) of UFig to draw the photons of all galaxies, or NaN if it is not installed.
+    """Return the CPU time (s) that UFig needs to draw the photons of all galaxies, or NaN if it is not installed.
 
-    Bulge and disc are separate entries, and the PSF is a grey Moffat profile.
+    Bulge and disc of a galaxy are drawn as two objects. The PSF is a Moffat profile for all wavelengths. The shorter of
+    two times counts.
     """
     try:
         from ufig import rendering_util
@@ -134,7 +139,7 @@ def ufig_seconds(scene: Scene) -> float:
     m = int(has_photons.sum())
     fwhm, beta = (0.16 / scene.scale, 3.5) if scene.name == "vis" else (scenes.SEEING / scene.scale, scenes.BETA)
     zeros, ones = np.zeros((m, 1)), np.ones((m, 1))
-    np.random.seed(1)  # noqa: NPY002  (UFig draws from it)
+    np.random.seed(1)  # noqa: NPY002  (UFig draws from this global generator)
     arguments = [
         13,
         4,
@@ -164,28 +169,32 @@ def ufig_seconds(scene: Scene) -> float:
     return best
 
 
-# Blue galaxies (Herbel et al. 2017): coefficients of the five templates of k-correct at z = 0 and 1, and their weights.
+# Parameters of SkyPy for the spectra of blue galaxies (Herbel et al. 2017): coefficients of the five templates of
+# k-correct at z = 0, at z = 1, and weights of the templates.
 _TEMPLATE_MIX = (
     [2.079, 3.524, 1.917, 1.992, 2.536], [2.265, 3.862, 1.921, 1.685, 2.480], [3.47e9, 3.31e6, 2.13e9, 1.64e10, 1.01e9],
 )  # fmt: skip
-# At higher redshifts the templates do not cover I_E.
+# Largest redshift of galaxies drawn by SkyPy. At higher redshifts the templates of k-correct do not cover the passband
+# I_E.
 _MAX_REDSHIFT = 3.9
 
 
 def skypy_photometry(area: float, seed: int) -> float:
-    """Return the galaxies per CPU second of SkyPy, with positions and magnitudes in I_E, Y and H, at z < 3.9.
+    """Return the number of galaxies per CPU second that SkyPy draws, with positions and magnitudes in I_E, Y and H.
+
+    The galaxies are brighter than magnitude 26 in the reference band of the luminosity function and have z < 3.9.
 
     Parameters
     ----------
     area : float
-        Area in deg2.
+        Area of the sky in deg2.
     seed : int
         Seed of the legacy random generator of NumPy, which SkyPy uses.
 
     Returns
     -------
     float
-        Galaxies to magnitude 26 in the reference band per second.
+        Galaxies per CPU second.
 
     Raises
     ------

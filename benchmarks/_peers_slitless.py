@@ -1,4 +1,4 @@
-"""Compare slitlessutils with truesky for the same sources and grism: light along the traces, and CPU time."""
+"""Compare dispersed images by the program slitlessutils with images by truesky: light along spectra, and CPU time."""
 
 from __future__ import annotations
 
@@ -24,35 +24,48 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import SURVEY
 
-# Environment variable with the path of a Python that has slitlessutils, which requires an older NumPy.
+# Environment variable with the path of a Python interpreter that has slitlessutils. A separate one is necessary,
+# because slitlessutils requires an older NumPy.
 PYTHON_VARIABLE = "TRUESKY_SLITLESSUTILS"
 _INSTALL_HINT = "python3.11 -m venv PEERS; PEERS/bin/pip install slitlessutils==1.0.0 'numpy<2.4'"
 _PEER_SCRIPT = Path(__file__).with_name("_slitlessutils.py")
-# Wavelengths per pixel (default of slitlessutils), length of the intervals for fluxes (pixels), and noise (electrons).
-_SUBSAMPLES, _INTERVAL, _NOISE = 5, 64, 28.0
-_SHAPE, _SIDE = (2040, 2040), 40
-# Number of copies of the sources to time, so that the fixed cost of a detector is shared.
+# Number of wavelengths per pixel that slitlessutils uses (its default).
+_SUBSAMPLES = 5
+# Length along the spectrum of the intervals in which the light is compared, pixels.
+_INTERVAL = 64
+# Noise of a sky pixel, electrons.
+_NOISE = 28.0
+# Shape of the detector, pixels.
+_SHAPE = (2040, 2040)
+# Width and height of the stamps of single sources, pixels.
+_SIDE = 40
+# The time of truesky is measured for this number of copies of the sources, so that the fixed time per detector is
+# divided among many sources.
 _NUM_COPIES = 25
 
 
 def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
-    """Compare CPU time per spectrum, and light in intervals of the first order.
+    """Compare spectra drawn by slitlessutils and by truesky: CPU time, and light along the spectra.
+
+    The spectra are first orders of the red grism on detector DET23.
 
     Parameters
     ----------
     count : int, optional
-        Number of sources, half of them stars and half galaxies, on DET23 in the red grism.
+        Number of sources, half of them stars and half galaxies.
     seed : int, optional
         Seed of the sources.
 
     Returns
     -------
     dict of str to float
-        Times in seconds, their ratio, and the largest relative difference of light.
+        `spectrum_s` and `slitlessutils_spectrum_s` (CPU time per spectrum, s), `against_slitlessutils` (time of
+        slitlessutils / time of truesky), and `slitlessutils_flux` (largest relative difference of light in intervals of
+        64 pixels).
 
     Notes
     -----
-    Raises SystemExit if slitlessutils is not available.
+    SystemExit is raised if slitlessutils is not available.
     """
     python = _python()
     order, psf = _grism()
@@ -80,21 +93,22 @@ def _python() -> str:
 
 
 def _grism() -> tuple[Order, Psf]:
-    """Return the first order of the red grism, and the PSF in it."""
+    """Return the first order of the red grism on detector DET23, and the PSF at its wavelengths."""
     mission, band = resolve(), passbands.load("nisp_red")
     nisp_detector = detector("nisp", "DET23", mission)
     trace = next(
         candidate for candidate in traces.traces("RGS000", 0.0, nisp_detector, mission) if candidate.order == 1
     )
     part = (band.wavelength >= trace.first) & (band.wavelength <= trace.last)
-    # Electrons per erg s-1 cm-2 A-1, scaled to be large compared with the limit of sensitivity of slitlessutils, 1e10.
+    # Sensitivity in electrons per erg s-1 cm-2 A-1. It is scaled to values far above 1e10, the lower limit of
+    # sensitivities in slitlessutils.
     response = (band.response * band.wavelength)[part] * 1e12
     nodes = images.nodes(trace.first, trace.last, 3)
     return Order(trace, int(band.wavelength[part][0]), response), euclid.nisp_psf_at(nisp_detector, nodes, mission, 4)
 
 
 def _sources(count: int, seed: int) -> Sources:
-    """Return sources that do not overlap and whose first orders lie on the detector."""
+    """Return faint galaxies and stars whose first orders do not overlap and lie completely on the detector."""
     sources = scenes.sources(scenes.NISP, seed, galaxies=40, stars=count - count // 2)
     small = np.flatnonzero(scenes.magnitudes(sources, scenes.NISP)[:40] > 21.0)[: count // 2]
     sources = sources.take(np.concatenate([small, 40 + np.arange(count - count // 2)]))
@@ -104,7 +118,7 @@ def _sources(count: int, seed: int) -> Sources:
 
 
 def _spectrum(order: Order) -> Float:
-    """Return f_lambda with two lines, normalised to 20,000 electrons in the order."""
+    """Return f_lambda at the wavelengths of an order: a power law with two lines, scaled to 20,000 electrons."""
     waves = order.wavelength
     flux = (waves / 15000.0) ** -1.5
     for centre in (13500.0, 16600.0):
@@ -113,13 +127,13 @@ def _spectrum(order: Order) -> Float:
 
 
 def _time_drawing(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, float]:
-    """Draw the sources and return the frame and its CPU time (s).
+    """Draw the dispersed image of the sources with truesky, and return it with its CPU time (s).
 
-    Many copies are timed, as on a full detector, so that the transform of the PSF and the frame are shared. The shorter
-    of two times counts.
+    The time is measured for 25 copies of the sources and divided by 25. The fixed times of a detector, such as the
+    transform of the PSF, are then divided among many sources, as on a full detector. The shorter of two times counts.
     """
     source_spectrum, best = spectrum.astype(np.float32), np.inf
-    # Use stamps of the same size as the images for slitlessutils.
+    # Use stamps of 40 pixels, because the images for slitlessutils have this size, too.
     settings = replace(draw.settings_for(SURVEY), min_size=_SIDE)
     dispersed = DispersedSources(lambda which: np.tile(source_spectrum, (len(which), 1)), (order,), settings)
     frame = draw.draw(sources, dispersed, psf, _SHAPE, _NOISE)
@@ -132,13 +146,18 @@ def _time_drawing(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> 
 
 
 def _peer_inputs(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, Float, Float, Float]:
-    """Return the inputs of slitlessutils: images with PSF [n, side, side], corners, wavelengths, f_lambda [n, v]."""
+    """Return the inputs with which slitlessutils draws the sources that truesky draws.
+
+    They are images of the sources with PSF but without dispersion [n, side, side], the (column, row) of their first
+    pixels on the detector [n, 2], wavelengths (A) [v], and f_lambda at these wavelengths [n, v].
+    """
     constant_trace = replace(order.trace, x=np.zeros((2, 3)), y=np.zeros((2, 3)))
     undispersed_order = Order(constant_trace, order.first, order.response / float((spectrum * order.response).sum()))
     source_spectrum, stamps, corners = spectrum.astype(np.float32), [], []
     for i in range(len(sources)):
         source = sources.take(np.array([i]))
-        # A small frame is sufficient: its PSF equals the PSF at the position of the source to 0.1 %.
+        # Draw the source on a small frame. Its PSF is then that of another position on the detector, but the difference
+        # is only 0.1 %.
         corner = np.floor([source.column[0], source.row[0]]).astype(int) - _SIDE // 2
         shifted = replace(source, column=source.column - corner[0], row=source.row - corner[1])
         settings = replace(draw.settings_for(SURVEY), min_size=_SIDE, edge=1e-9, faint=0.0)
@@ -149,7 +168,7 @@ def _peer_inputs(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> t
         corners.append(corner)
     step = (order.trace.last - order.trace.first) / 512.0 / _SUBSAMPLES
     waves = np.arange(order.trace.first + 0.5 * step, order.trace.last, step)
-    # Average f_lambda over each step, so that the lines keep their flux.
+    # Average f_lambda over the interval around each wavelength, so that the flux of narrow lines does not change.
     edges = np.concatenate([[0.0], np.cumsum(spectrum)])
     at = [np.interp(waves + side * step - order.first + 0.5, np.arange(len(edges)), edges) for side in (-0.5, 0.5)]
     flux = (at[1] - at[0]) / step
@@ -175,7 +194,10 @@ def _run_peer(
 
 
 def _differences(sources: Sources, order: Order, ours: Float, theirs: Float) -> Float:
-    """Return the relative differences of light [n, intervals] within half a stamp of each trace."""
+    """Return the relative differences of the light of two images along the spectrum of each source [n, intervals].
+
+    Light is summed in intervals of 64 columns, within 20 rows on each side of the spectrum.
+    """
     differences = []
     for column, row in zip(sources.column.tolist(), sources.row.tolist(), strict=True):
         x, y = order.trace.offsets(column, row, np.array([order.trace.first, order.trace.last]))

@@ -1,7 +1,7 @@
-"""Measure time and errors of the PSF by the number of its positions on a detector of VIS or NISP.
+"""Measure the errors of interpolating the PSF across a VIS or NISP detector, and the CPU time to compute it.
 
-Two methods are compared: polynomials through a few positions, which the renderer uses, and the nearest position of a
-grid, which other programs use.
+The PSF is computed at some positions on the detector. Two methods give it at other positions: polynomials through a few
+positions, which truesky uses, and the PSF of the nearest position of a grid, which other programs use.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ from truesky.numerics import cache
 from truesky.render.camera import detectors
 from truesky.render.psf import euclid, model, sub_bands
 
-# Number of stars to measure the errors, with a separate seed.
-NUM_STARS, _SEED = 24, 5
-# Number of stars of the test sample in benchmarks/trade.py.
+# Number of stars whose errors are measured.
+NUM_STARS = 24
+# Seed of the random positions and colours of the stars whose errors are measured.
+_SEED = 5
+# Number of stars with which benchmarks/trade.py tests the PSF.
 NUM_TEST_STARS = 48
-# R2 of a point source / R2 of the smallest galaxies whose shear is measured, which are larger by 1.25. A relative
-# error of the PSF's R2, multiplied by this ratio, is the relative error of the response to shear (Paulin-Henriksson et
+# R2 of the PSF / R2 of the smallest galaxies whose shear is measured; their size is 1.25 times that of the PSF. A
+# relative error of the PSF's R2, multiplied by this ratio, is the multiplicative bias of shear (Paulin-Henriksson et
 # al. 2008; Laureijs et al. 2011).
 R2_RATIO = 1.25**-2
-# Numbers of positions along a side of the grids for the nearest position.
+# Numbers of positions along each side of the square grids for the method of the nearest position, for VIS.
 _NEAREST = (1, 2, 3, 4, 6, 10, 15, 20, 30, 40)
-# The same for NISP, and the file of its table.
+# Numbers of positions along each side of the square grids for the method of the nearest position, for NISP.
 _NISP_NEAREST = (1, 2, 3, 4, 6, 10)
+# CSV file to which the results of `measure_positions` for NISP are written.
 _FILE = Path(model.__file__).parents[1] / "drawing" / "psf_positions_nisp.csv"
 _COLUMNS = (
     "positions,nearest,flux_rms,flux_error,position_rms,position_error,"
@@ -50,7 +53,11 @@ colours the
 
 @dataclass(frozen=True)
 class Star:
-    """A star: position (in half sides from the centre), fractions of its light by wavelength, true PSF."""
+    """A star with its true PSF.
+
+    `place` is its position (x, y) on the detector: 0 is the centre, and -1 and 1 are the edges. `shares` contains the
+    fraction of its photons in each sub-band, and `truth` its PSF in each sub-band [sub-bands, t, t].
+    """
 
     place: tuple[float, float]
     shares: Float
@@ -58,10 +65,10 @@ class Star:
 
 
 def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
-    """Return a function that computes the PSF at a position.
+    """Return a function that computes the PSF at a position on a detector.
 
-    Its argument is (x, y) in half sides from the centre of the detector. It returns an array [wavelengths, t, t] along
-    the axes of the detector.
+    The argument of the function is a position (x, y): 0 is the centre of the detector, and -1 and 1 are its edges. The
+    function returns the sampled PSF [wavelengths, t, t], with its rows parallel to the rows of the detector.
     """
     mission, sampled = resolve(), _SAMPLINGS[scene.name]
     detector = detectors.detector(scene.name, scenes.SPACE[scene.name][0], mission)
@@ -85,16 +92,18 @@ def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
 def measure_positions(
     num_stars: int, nearest: tuple[int, ...] = _NEAREST, scene: Scene = VIS
 ) -> list[dict[str, float]]:
-    """Measure the errors for both methods and all numbers of positions.
+    """Measure errors and CPU time of the PSF for two methods of interpolation and several numbers of positions.
+
+    The methods are polynomials through a few positions, and the nearest position of a square grid.
 
     Parameters
     ----------
     num_stars : int
-        Number of stars.
+        Number of random stars whose errors are measured.
     nearest : tuple of int, optional
-        Numbers of positions along a side of the grids.
+        Numbers of positions along each side of the grids.
     scene : Scene, optional
-        The scene, of VIS or NISP.
+        Detector to test, VIS or NISP.
 
     Returns
     -------
@@ -122,7 +131,8 @@ def measure_positions(
                 for sample_star in star_sample
             ]
         )
-        # Each position stores only the core of the PSF, because the wings of the centre are used everywhere.
+        # The memory for a grid of positions is that of the core of the PSF at each position, and of one whole PSF. The
+        # wings are needed only once, because they are the same at all positions.
         planes = side**2 * len(psf.wavelength)
         megabytes = (planes * centre[0].size * psf.images.itemsize + psf.images.nbytes) / 1e6
         out.append(_table_row(side**2, True, error_values, out[0]["seconds"] + planes * plane_s, megabytes))
@@ -130,7 +140,7 @@ def measure_positions(
 
 
 def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
-    """Return the table of positions as text."""
+    """Return the results of `measure_positions` as the text of a CSV file with a header."""
     header = _TABLE_HEADER.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
     lines = [
         ",".join(f"{row[name]:.2g}" if name not in _INTEGER_COLUMNS else f"{row[name]:.0f}" for name in row)
@@ -139,37 +149,40 @@ def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
     return "\n".join([header + _COLUMNS, *lines]) + "\n"
 
 
-# Sampling of the PSF of each camera, and the command that writes its table.
+# Sizes and sampling of the PSF images of each camera.
 _SAMPLINGS = {"vis": euclid.VIS, "nisp": euclid.NISP}
+# Command that writes the table of each camera, for the header of the table.
 _WRITERS = {"vis": "python -m benchmarks.trade\n# --positions", "nisp": "python -m benchmarks._positions"}
 _INTEGER_COLUMNS = ("positions", "nearest", "megabytes")
 
 
 def draw_star(psf_at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
-    """Draw a star at a random position with random colours."""
+    """Draw a star at a random position on the detector with a random spectrum; `psf_at` computes its true PSF."""
     place = rng.uniform(-1, 1, 2).tolist()
     photons = scenes.colours(1, rng)[0]
     return Star((place[0], place[1]), photons / photons.sum(), psf_at((place[0], place[1])))
 
 
 def star_errors(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, float, float, float]:
-    """Return the errors of a star.
+    """Return the errors of the image of a star if an approximate PSF is used.
 
     Parameters
     ----------
     planes : float array, shape (wavelengths, t, t)
-        PSF to test.
+        PSF to test. The number of wavelengths must divide the number of sub-bands.
     star : Star
         The star with its true PSF.
     scene : Scene, optional
-        The scene.
+        Detector, of which the pixel scale is used.
 
     Returns
     -------
     tuple of float
-        |dF / F| in 1", error of the position in pixels, |dR2 / R2|, and error of the ellipticity.
+        Relative error of the flux within 1 arcsec, error of the position in pixels, relative error of R2, and error of
+        the ellipticity.
     """
-    # Neighbouring sub-bands may share a plane.
+    # The PSF may have fewer wavelengths than sub-bands. Then neighbouring sub-bands have the same PSF, and the light of
+    # the star in them is added.
     shares = star.shares.reshape(len(planes), -1).sum(axis=1)
     measured = _moments(np.tensordot(shares, planes, 1), scene)
     truth = _moments(np.tensordot(star.shares, star.truth, 1), scene)
@@ -185,7 +198,7 @@ def star_errors(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, f
 def largest_errors(
     seed: int, n: int, psf_variants: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], dict[str, float]]:
-    """Return the largest errors of several variants of the PSF.
+    """Return the largest errors of stars on a VIS detector for different numbers of PSF positions and wavelengths.
 
     Parameters
     ----------
@@ -194,12 +207,12 @@ def largest_errors(
     n : int
         Number of stars.
     psf_variants : sequence of (int, int)
-        Numbers of positions and of colours of each variant.
+        Numbers of positions and of wavelengths of each PSF.
 
     Returns
     -------
     dict of (int, int) to dict
-        Largest errors `flux`, `shape` and `position` (in the units of an accuracy) by variant.
+        For each PSF the largest errors `flux` (relative), `shape` (bias of shear) and `position` (pixels).
     """
     psf_at, rng = make_optics(), np.random.default_rng(seed)
     centre, star_sample = psf_at((0.0, 0.0)), [draw_star(psf_at, rng) for _ in range(n)]
@@ -221,7 +234,10 @@ def _moments(image: Float, scene: Scene) -> Float:
 
 
 def drift(psf: model.Planes, star: Star) -> Float:
-    """Return the sum of polynomials that is added to the planes of the centre at a star: [wavelengths, t, t]."""
+    """Return the difference between the PSF at a star's position and at the centre of the detector [wavelengths, t, t].
+
+    It is the sum of the polynomials in position and wavelength with which truesky interpolates the PSF.
+    """
     out = []
     for wavelength in psf.wavelength:
         redder = wavelength - psf.wavelength.mean()
@@ -236,7 +252,7 @@ def _nearest_position(grid_centres: Float, place: tuple[float, float]) -> tuple[
 
 
 def _compute_planes(positions: int, scene: Scene) -> tuple[float, model.Planes]:
-    """Return the CPU time (s) to compute the planes, and the planes."""
+    """Compute the PSF at `positions` positions of a detector without the cache; return the CPU time (s) and the PSF."""
     with cache.use_temporary_dir():
         start = time.process_time()
         planes = scenes.scene_psf(scene, positions).planes

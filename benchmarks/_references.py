@@ -1,4 +1,7 @@
-"""Reference images drawn by galsim with its tightest thresholds. They are slow to make and are stored in the cache."""
+"""Accurate reference images of single sources, drawn with galsim at its tightest parameters.
+
+They take long to draw, and are therefore stored in the disc cache.
+"""
 
 from __future__ import annotations
 
@@ -14,32 +17,33 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# Thresholds of folding and of the largest frequency (folding_threshold and maxk_threshold of galsim).
+# Value of galsim's parameters folding_threshold (light that may be aliased because an image is periodic) and
+# maxk_threshold (amplitude at the largest frequency, relative to frequency 0).
 ACCURACY = 1e-4
 
 
 def reference_image(
     source: Sources, psf: model.Psf, side: int, maxk_threshold: float = ACCURACY, folding_threshold: float = ACCURACY
 ) -> Float | None:
-    """Draw a single source by galsim.
+    """Draw a single source with galsim, or return the image from the cache.
 
     Parameters
     ----------
     source : Sources
-        The source.
+        List of one source, a star or a galaxy.
     psf : Psf
-        PSF of this source.
+        PSF of this source, the same at all positions and wavelengths.
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels.
     maxk_threshold, folding_threshold : float, optional
-        Thresholds of galsim for the largest frequency and for folding.
+        Parameters of galsim for the accuracy: amplitude at the largest frequency, and light that may be aliased.
 
     Returns
     -------
     float array, shape (side, side), or None
-        Expected electrons; None if the memory is not sufficient.
+        Expected electrons per pixel; None if galsim fails or has not enough memory.
     """
-    # A point source has no shape.
+    # The index `source.shape` is -1 for a star, which has no entry in `source.shapes`.
     shapes = source.shapes.take(source.shape[source.shape >= 0])
     source_values = [
         source.column,
@@ -71,28 +75,31 @@ def reference_image(
 
 
 def image_by_series(source: Sources, psf: model.Psf, side: int) -> Float:
-    """Draw a single source by the Fourier series of its PSF: shifted, averaged over pixels and sampled.
+    """Draw a single source with the Fourier series of its sampled PSF, which is exact for stars.
+
+    The transform of the PSF is multiplied by the transforms of the galaxy (from galsim) and of a square pixel. The
+    product is shifted to the position of the source and transformed back.
 
     Parameters
     ----------
     source : Sources
-        The source.
+        List of one source, a star or a galaxy.
     psf : Psf
-        PSF of this source, with planes.
+        PSF of this source as an image (`psf.planes`), the same at all positions and wavelengths.
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels.
 
     Returns
     -------
     float array, shape (side, side)
-        Expected electrons.
+        Expected electrons per pixel.
 
     Notes
     -----
-    galsim gives the transform of a galaxy, with its tightest thresholds. `reference_image` uses galsim also for the
-    PSF, which it interpolates between samples by a Lanczos kernel of 31 samples. Ten pixels from a star this leaves an
-    error of 6e-7 of its flux, which is 1 sigma for a star of 15 mag and 4e-5 of its R2. A galaxy that is not small
-    compared with the frame folds here; `reference_image` is better for such galaxies.
+    `reference_image` uses galsim also for the PSF, which it interpolates between samples by a Lanczos kernel of 31
+    samples. Ten pixels from a star this leaves an error of 6e-7 of its flux, which is 1 sigma of the noise for a star
+    of 15 mag, and changes its R2 by 4e-5. The image here is periodic, so a galaxy that is not small compared with it is
+    aliased; `reference_image` is better for such galaxies.
     """
     assert psf.planes is not None
     plane, samples = psf.planes.images[0].astype(float), psf.planes.samples

@@ -1,7 +1,8 @@
-"""Scenes to measure drawing: galaxies and stars on a VIS, NISP or LSST detector.
+"""Random galaxies and stars on a VIS, NISP or LSST detector, with which the drawing of sources is measured.
 
-The VIS scene has 4,701 galaxies (magnitudes 17 to 26, dN/dm ~ 10^(0.3 m)) and 300 stars, each with its own colour and
-position. The LSST scene has 18,223 galaxies and 1,160 stars.
+A scene is a detector with its exposure time, noise and numbers of sources. The VIS and NISP scenes have 4,701 galaxies
+(magnitudes 17 to 26, dN/dm ~ 10^(0.3 m)) and 300 stars, each with a separate colour and position. The LSST scene has
+18,223 galaxies and 1,160 stars.
 """
 
 from __future__ import annotations
@@ -20,26 +21,28 @@ from truesky.render.psf import euclid, ground, model, sub_bands
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Edges of the magnitude bins of errors.
+# Edges of the magnitude bins in which errors are reported.
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
-# Edges of the layers of magnitude of a stratified sample.
+# Edges of the ranges of magnitude (layers) that have equal numbers of sources in `stratified_sample`.
 LAYERS = (14.5, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0)
-# FWHM of the seeing of the LSST scene in arcsec, and exponent of the Moffat profile for programs that require one.
-SEEING, BETA = 0.7, 3.0
-# Atmosphere of the LSST scene at an airmass of 1.2.
+# FWHM of the seeing on the LSST detector, arcsec.
+SEEING = 0.7
+# Exponent of the Moffat profile that represents the seeing on the LSST detector in other programs.
+BETA = 3.0
+# Atmosphere above the LSST telescope at an airmass of 1.2.
 _AIR = ground.Air(SEEING, (0.01, 0.005), slope=-0.3, tan_zenith_distance=0.66, zenith=0.5, height=2663.0)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A detector with its number of sources.
+    """A detector with the properties of an exposure, and the numbers of sources on it.
 
     Attributes
     ----------
     name : str
-        Name of the scene.
+        Name of the camera: "vis", "nisp" or "lsst".
     nx, ny : int
-        Number of pixels.
+        Numbers of columns and rows.
     scale : float
         Pixel scale in arcsec.
     exposure : float
@@ -49,7 +52,7 @@ class Scene:
     noise : float
         Noise of a sky pixel in electrons.
     galaxies, stars : int
-        Numbers of sources.
+        Numbers of galaxies and of stars.
     """
 
     name: str
@@ -64,20 +67,20 @@ class Scene:
 
 
 VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
-# One signal frame of a photometric ramp in Y.
+# A detector of NISP in the passband Y, with the exposure time (s) of one photometric exposure.
 NISP = Scene("nisp", 2040, 2040, 0.3, 87.24, 25.0, 12.0, 4701, 300)
-# Detector, passband and function of the PSF of cameras in space.
+# For each camera in space: name of the detector, passband, and function that computes the PSF.
 SPACE = {"vis": ("3-4", "euclid_vis", euclid.vis_psf), "nisp": ("DET23", "euclid_y", euclid.nisp_psf)}
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
 def scene_psf(scene: Scene, positions: int = 9, colours: int = sub_bands.N_SUB_BANDS) -> model.Psf:
-    """Return the PSF of a scene.
+    """Return the PSF on the detector of a scene.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     positions : int, optional
         Number of positions on the detector at which the PSF is computed.
     colours : int, optional
@@ -100,21 +103,21 @@ def scene_psf(scene: Scene, positions: int = 9, colours: int = sub_bands.N_SUB_B
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
-    """Draw galaxies and then stars from the counts of a scene.
+    """Return random galaxies, followed by random stars, on the detector of a scene.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     seed : int
         Seed of the random numbers.
     galaxies, stars : int, optional
-        Numbers of sources. The default is the numbers of the scene.
+        Numbers of galaxies and of stars. The default is the numbers of the scene.
 
     Returns
     -------
     Sources
-        The sources.
+        The sources: positions are uniform on the detector, and magnitudes follow power laws.
     """
     rng = np.random.default_rng(seed)
     n, m = galaxies if galaxies is not None else scene.galaxies, stars if stars is not None else scene.stars
@@ -150,7 +153,10 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
 
 
 def colours(n: int, rng: np.random.Generator) -> Float:
-    """Return the relative numbers of photons of n sources in the sub-bands of the PSF, by power laws."""
+    """Return the relative numbers of photons of `n` sources in the sub-bands of the PSF [n, sub-bands].
+
+    They are exponentials in wavelength with random slopes, and are not normalised.
+    """
     waves = np.linspace(-0.25, 0.25, sub_bands.N_SUB_BANDS)
     return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
 
@@ -161,31 +167,34 @@ def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: fl
 
 
 def magnitudes(source_list: Sources, scene: Scene) -> Float:
-    """Return the AB magnitudes of sources."""
+    """Return the AB magnitudes of sources from their electrons, the exposure time and the zero point of the scene."""
     return np.asarray(scene.zero_point - 2.5 * np.log10(source_list.electrons / scene.exposure))
 
 
 def magnitude_bins(source_list: Sources, scene: Scene) -> Int:
-    """Return the index of the magnitude bin of each source."""
+    """Return the index of the bin of BINS in which the magnitude of each source lies.
+
+    Sources outside all bins belong to the first or to the last bin.
+    """
     return np.clip(np.searchsorted(BINS, magnitudes(source_list, scene)) - 1, 0, len(BINS) - 2)
 
 
 def sample(scene: Scene, seed: int, n: int) -> Sources:
-    """Draw a sample of n galaxies, with equal numbers in all magnitude bins.
+    """Return a random sample of galaxies, with equal numbers in all magnitude bins of BINS.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     seed : int
         Seed of the random numbers.
     n : int
-        Number of galaxies, rounded up to a multiple of the number of bins.
+        Number of galaxies, rounded up to a multiple of the number of bins, 6.
 
     Returns
     -------
     Sources
-        The galaxies.
+        The galaxies in random order, that is, not sorted by magnitude.
     """
     candidates = sources(scene, seed, galaxies=max(60 * n, 3000), stars=0)
     bins, rng = magnitude_bins(candidates, scene), np.random.default_rng(seed)
@@ -195,28 +204,28 @@ def sample(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def stratified_sample(scene: Scene, seed: int, each: int) -> Sources:
-    """Draw a sample with equal numbers of galaxies and stars in each layer of magnitude, from bright to faint.
+    """Return a random sample with equal numbers of galaxies and of stars in each range of magnitude of LAYERS.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     seed : int
         Seed of the random numbers.
     each : int
-        Number of galaxies, and of stars, per layer.
+        Number of galaxies, and number of stars, per range of magnitude.
 
     Returns
     -------
     Sources
-        The sources.
+        The galaxies, followed by the stars.
     """
     layers, n = len(LAYERS) - 1, each * (len(LAYERS) - 1)
     candidates, rng = sources(scene, seed, galaxies=n, stars=n), np.random.default_rng([seed, 1])
     low, high = np.array(LAYERS[:-1]), np.array(LAYERS[1:])
     layer = np.tile(np.arange(layers), 2 * each)
     mag = low[layer] + (high - low)[layer] * rng.random(2 * n)
-    # Scale the sizes by the change of magnitude, because fainter galaxies are smaller.
+    # The magnitudes of the galaxies are replaced, so scale their sizes: fainter galaxies are smaller.
     size = 10 ** (-0.14 * (mag - magnitudes(candidates, scene)))[:n]
     shapes = candidates.shapes
     shapes = replace(shapes, bulge_radius=shapes.bulge_radius * size, disk_radius=shapes.disk_radius * size)
@@ -226,25 +235,25 @@ def stratified_sample(scene: Scene, seed: int, each: int) -> Sources:
 def draw_sources(
     source_list: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
 ) -> Float:
-    """Draw sources as in an exposure.
+    """Draw an image of sources without noise, in the way in which an exposure is simulated.
 
     Parameters
     ----------
     source_list : Sources
-        The sources.
+        The sources with their positions on the image.
     psf : Psf
-        The PSF.
+        PSF on the detector.
     scene : Scene
-        The scene.
+        Detector, of which the size and the noise are used.
     settings : Settings
-        Settings of drawing.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
     side : int, optional
-        Side of the image in pixels. The default is the frame of the scene.
+        Width and height of the image in pixels. The default is the size of the detector.
 
     Returns
     -------
     float array, shape (ny, nx)
-        Expected electrons.
+        Expected electrons per pixel.
     """
     sizes = stamp_sizes.stamp_sizes(
         source_list.electrons, source_list.shape, source_list.shapes, psf, scene.noise, settings
@@ -255,21 +264,23 @@ def draw_sources(
 
 
 def psf_of_source(psf: model.Psf, source_list: Sources, i: int) -> model.Psf:
-    """Return a PSF that is the same everywhere, equal to the PSF of source i and limited to its planes.
+    """Return a PSF that is the same at all positions and wavelengths, equal to the PSF of one source.
+
+    The wings of the PSF beyond its sampled image are left out.
 
     Parameters
     ----------
     psf : Psf
-        PSF of the detector.
+        PSF on the detector, which depends on position and wavelength.
     source_list : Sources
-        The sources.
+        Sources with their positions and colours.
     i : int
-        Index of the source.
+        Index of the source in the list.
 
     Returns
     -------
     Psf
-        PSF of this source.
+        PSF of source `i`. If `psf` has no sampled images (`planes` is None), it is returned unchanged.
     """
     planes = psf.planes
     if planes is None:
@@ -283,21 +294,21 @@ def psf_of_source(psf: model.Psf, source_list: Sources, i: int) -> model.Psf:
 
 
 def centred_source(source_list: Sources, i: int, side: int) -> Sources:
-    """Return source i, shifted by whole pixels to the middle of a frame, without colours.
+    """Return one source of a list, shifted by whole pixels to the middle of a square image.
 
     Parameters
     ----------
     source_list : Sources
         The sources.
     i : int
-        Index of the source.
+        Index of the source in the list.
     side : int
-        Side of the frame in pixels.
+        Width and height of the image in pixels.
 
     Returns
     -------
     Sources
-        The source, to be drawn with the PSF of `psf_of_source`.
+        List of this source without its colour, because it is drawn with the PSF from `psf_of_source`.
     """
     source = source_list.take(np.array([i]))
     shift = [side // 2 - np.rint(position) for position in (source.column, source.row)]

@@ -1,10 +1,11 @@
-"""Disperse images by slitlessutils. `_peers_slitless` runs this script with a Python that has slitlessutils.
+"""Disperse images of sources with the program slitlessutils, and measure its CPU time.
 
 Usage: python benchmarks/_slitlessutils.py CONFIGURATION INPUT OUTPUT
 
-Classes of slitlessutils read the files of grismconf, invert the trace, clip each pixel of an image (convolved with the
-PSF) at each wavelength against the pixels of the detector, and multiply by the sensitivity. This is the loop of its
-modules `tabulate` and `simulate`, without the instrument files that these would download.
+The benchmark `_peers_slitless` runs this script with a Python interpreter that has slitlessutils. Classes of
+slitlessutils read the configuration of the grism (grismconf) and invert the trace. They clip each pixel of a source
+image at each wavelength against the pixels of the detector, and multiply by the sensitivity. The loop is the same as in
+its modules `tabulate` and `simulate`, but without the instrument files that these would download.
 """
 
 from __future__ import annotations
@@ -35,21 +36,24 @@ def _detector(configuration: Path, shape: tuple[int, int]) -> object:
 
 
 def main(configuration: Path, input_file: Path, output_file: Path) -> None:
-    """Disperse the images of a file.
+    """Disperse the source images in a file and write the image of the detector.
 
     Parameters
     ----------
     configuration : Path
         Configuration of the grism in the format of grismconf.
     input_file : Path
-        File with images, their corners, wavelengths, f_lambda, and the shape of the frame.
+        File of numpy (.npz) with the arrays `images` [n, side, side], `corners` (column and row of their first pixels
+        on the detector) [n, 2], `waves` (wavelengths, A) [v], `spectra` (f_lambda) [n, v], and `shape` (ny, nx) of the
+        detector.
     output_file : Path
-        File for the frame and the CPU time (s).
+        File of numpy (.npz) to write, with the arrays `frame` (image of the detector) and `seconds` (CPU time).
     """
     urllib.request.urlopen = _no_network  # type: ignore[assignment]
     with np.load(input_file) as read:
         images, corners, waves, spectra, shape = (read[n] for n in ("images", "corners", "waves", "spectra", "shape"))
-    # Provide an empty set of reference files, because no instrument files are needed.
+    # slitlessutils looks for reference files of instruments and would download them. They are not needed here, so
+    # create an empty set of reference files.
     fixture = Path.home() / ".slitlessutils" / "1.0.0"
     fixture.mkdir(parents=True, exist_ok=True)
     (fixture / "version.json").write_text('{"version": "1.0.0", "date": "1970-01-01"}')
@@ -59,7 +63,7 @@ def main(configuration: Path, input_file: Path, output_file: Path) -> None:
     for image, (first_column, first_row), spectrum in zip(images, corners, spectra, strict=True):
         detected = order.sensitivity(waves) * spectrum * step
         for row, column in np.argwhere(image > 1e-6 * image.sum()).tolist():
-            # Corners of a pixel; slitlessutils counts positions from 1.
+            # Coordinates of the four corners of the pixel; slitlessutils counts pixels from 1.
             x = first_column + column + 1 + np.array([-0.5, -0.5, 0.5, 0.5])
             y = first_row + row + 1 + np.array([-0.5, 0.5, 0.5, -0.5])
             to_x, to_y, wave, area = detector.drizzle(x, y, "+1", waves)  # type: ignore[attr-defined]

@@ -1,10 +1,12 @@
 """Measure the speed of the galaxy catalogue: python -m benchmarks.catalogue [--quick] [--json FILE].
 
-The halos and galaxies of one order-5 cell (3.4 deg2) to I_E < 26 are drawn with default settings and written as
-Parquet, as in the job. Times are CPU seconds of one core, with the box and its lensing in the cache. The job itself is
-timed with Spark on one and two cores, for a circle where four cells meet. The comparison with SkyPy uses positions and
-magnitudes in three bands of galaxies to the same limit: SkyPy draws a Schechter function at random positions, truesky
-uses halos and satellites in the box. Without SkyPy the benchmark ends with an error.
+The halos and galaxies of one HEALPix cell of order 5 (3.4 deg2) to I_E < 26 are drawn with default settings and written
+as Parquet, as in the Spark job. Times are CPU seconds of one core, with the box of the density field and its lensing
+maps in the cache. The job itself is timed with Spark on one and two cores, for a circle where four cells meet.
+
+Both truesky and SkyPy draw positions and magnitudes in three passbands of galaxies to magnitude 26. SkyPy draws a
+Schechter function at random positions, and truesky central and satellite galaxies in halos of the box. Without SkyPy
+the benchmark ends with an error.
 """
 
 from __future__ import annotations
@@ -43,8 +45,10 @@ SEED = 7
 CELL = 9000
 # Number of galaxies in the simulated survey of Serrano et al. 2024.
 SURVEY_GALAXIES = 922e6
-# Centre (deg) and radii (deg) of a circle where four order-5 cells meet, so that they share it evenly.
-CENTRE, RADIUS, QUICK_RADIUS = (53.4375, -27.279613), 0.75, 0.05
+# Position (RA, Dec in deg) where four HEALPix cells of order 5 meet, so that a circle around it has a quarter in each.
+CENTRE = (53.4375, -27.279613)
+# Radius (deg) of the circle in which the Spark job draws galaxies, and its radius with --quick.
+RADIUS, QUICK_RADIUS = 0.75, 0.05
 NOTES = {
     "cell_rows": "galaxies of an order-5 cell to I_E < 26",
     "cell_s": "CPU, both tables, drawn and written (target 45)",
@@ -61,27 +65,30 @@ NOTES = {
 
 
 def universe_settings(quick: bool) -> dict[str, object]:
-    """Return the default settings of the universe in a request; `quick` makes box and lensing maps smaller."""
+    """Return the default settings of the simulated universe by name, with a seed.
+
+    If `quick` is True, the box of the density field and the lensing maps are smaller.
+    """
     small = {"box_cells": 192, "lensing_nside": 64} if quick else {}
     return {"seed": SEED, **asdict(Universe()), **small}
 
 
 def make_cell(cell: int, count: int, settings: dict[str, object]) -> dict[str, float]:
-    """Draw and write halos and galaxies as a task does.
+    """Draw the halos and galaxies of a HEALPix cell and write them to temporary files, as a task of the job does.
 
     Parameters
     ----------
     cell : int
-        Number of the order-5 cell.
+        Nested index of the cell of order 5.
     count : int
-        Number of its generation cells to draw.
+        Number of cells of order 8 in it that are drawn, 1 to 64.
     settings : dict
-        Settings of the universe.
+        Settings of the simulated universe, from `universe_settings`.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     task_facts = {**settings, "generation_cells": list(range(cell << 6, (cell << 6) + count))}
     build_galaxies._universe(task_facts, None)
@@ -106,9 +113,10 @@ def make_cell(cell: int, count: int, settings: dict[str, object]) -> dict[str, f
 
 
 def time_job(cores: int, quick: bool) -> tuple[float, float]:
-    """Return the wall time (s) of the table `galaxies` with Spark on this number of cores, and the sum of its tasks.
+    """Run the job that makes the table `galaxies` with Spark on this number of cores.
 
-    The start of Java and of the workers is not included.
+    Return the wall time (s) without the start of Java and of the worker processes, and the sum of the wall times of all
+    tasks (s). CalledProcessError is raised if the job fails.
     """
     ra, dec = CENTRE
     settings = universe_settings(quick)
@@ -124,7 +132,8 @@ def time_job(cores: int, quick: bool) -> tuple[float, float]:
         lake = Path(folder) / "lake"
         command = [spark, "--master", f"local[{cores}]", job, "--lake", lake, "--request", request]
         subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
-        # The same workers have made the halos before, so they are warm.
+        # Only the log of the table `galaxies` is read. The same worker processes have made the halos before, so their
+        # start and the compilation of functions are not part of the time.
         (log,) = layout.runs_folder(layout.resolve_lake(lake)).glob("*-galaxies-*.jsonl")
         lines = [json.loads(line) for line in log.read_text().splitlines()]
     tasks = sum(line["seconds"] for line in lines if "part" in line)
@@ -132,7 +141,11 @@ def time_job(cores: int, quick: bool) -> tuple[float, float]:
 
 
 def two_core_speedup(quick: bool, repeats: int) -> dict[str, float]:
-    """Compare the job on one and on two cores; each time is the shortest of several alternating runs."""
+    """Compare the wall times of the job that makes galaxies on one and on two cores.
+
+    Each time is the shortest of `repeats` runs, which alternate. The result contains the measured speed-up, the
+    fraction of the one-core time that is spent outside tasks, and the speed-up that follows from this fraction.
+    """
     turns = [(time_job(1, quick), time_job(2, quick)) for _ in range(repeats)]
     single_core_s, tasks = min(single_core for single_core, _ in turns)
     double_core_s = min(double_core for _, double_core in turns)[0]
@@ -145,7 +158,11 @@ def two_core_speedup(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def photometry(count: int, settings: dict[str, object]) -> float:
-    """Return galaxies per CPU second with halo, position, velocity, redshift, spectrum and magnitudes in 3 bands."""
+    """Return the galaxies per CPU second that truesky draws, with positions and magnitudes in three passbands.
+
+    Halos, velocities, redshifts and spectra are drawn, too, because the magnitudes depend on them. `count` is the
+    number of HEALPix cells of order 8, and `settings` are from `universe_settings`.
+    """
     universe = build_galaxies._universe(settings, None)
     drawn = population.CellCache(universe.population)
     library, dustiest = templates.galaxy_library(), float(universe.selection.ebv[-1])
@@ -163,7 +180,7 @@ def photometry(count: int, settings: dict[str, object]) -> float:
 
 
 def run(quick: bool, repeats: int) -> dict[str, float]:
-    """Return all figures."""
+    """Measure the speed of the galaxy catalogue, and return all results by name; `quick` draws a small area."""
     settings, count = universe_settings(quick), 4 if quick else 64
     turns = [make_cell(CELL, count, settings) for _ in range(repeats)]
     figures = {"generation_cells": count, **min(turns, key=lambda turn: turn["cell_s"])}
@@ -180,7 +197,7 @@ def run(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("catalogue", __doc__ or "", argv)
     report.print_and_write("catalogue", 1, run(options.quick, 1), NOTES, options.json)
     return 0

@@ -1,11 +1,11 @@
-"""Make reference images of charge transfer inefficiency by arCTIc for the tests.
+"""Make reference images of charge transfer inefficiency (CTI) with the program arCTIc, for the tests of truesky.
 
 Usage: python benchmarks/cti_reference.py [FILE]
 
-The script requires a separate environment: arcticpy 2.6 needs NumPy < 2 and the GNU Scientific Library. Every transfer
-is simulated (express = 0), and the traps are empty at the first packet. The images have galaxies on a sky of 130
-electrons, without and with cosmic rays, and 2086 rows, 2066 of them pixels. Losses are stored in units of 0.001
-electrons.
+The script requires a separate Python environment: arcticpy 2.6 needs NumPy < 2 and the GNU Scientific Library. Every
+transfer is simulated (express = 0), and the traps are empty at the first transfer. The images show galaxies on a sky of
+130 electrons, without and with cosmic rays. They have 2086 rows, of which the last 20 are overscan. The changes by CTI
+are stored as integers in units of 0.001 electrons.
 """
 
 from __future__ import annotations
@@ -19,13 +19,21 @@ FILE = (
     Path(__file__).resolve().parents[1] / "tests" / "truesky" / "render" / "effects" / "readout" / "cti_reference.npz"
 )
 ROWS, OVERSCAN, COLUMNS, SKY = 2086, 20, 32, 130.0
-# Traps at the end of the mission (Israel et al. 2015); full well and its power from the arCTIc examples for Euclid.
-DENSITY, RELEASE, FULL_WELL, POWER = (0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.58
+# Density (traps per pixel) and release time (pixel transfers) of three species of traps at the end of the mission
+# (Israel et al. 2015).
+DENSITY, RELEASE = (0.02, 0.03, 0.95), (0.8, 3.5, 20.0)
+# Full well (electrons), and exponent of the volume of a charge cloud as a function of its charge, from the examples of
+# arCTIc for Euclid.
+FULL_WELL, POWER = 2e5, 0.58
+# Unit of the stored changes, electrons.
 UNIT = 0.001
 
 
 def galaxies(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image [ROWS, COLUMNS] in whole electrons, and row, column, electrons and scale length of galaxies."""
+    """Return an image [ROWS, COLUMNS] of galaxies with Poisson noise in whole electrons, and a table of the galaxies.
+
+    The columns of the table are row, column, electrons and scale length (pixels). The overscan rows are 0.
+    """
     pixels = ROWS - OVERSCAN
     y, x = np.mgrid[:ROWS, :COLUMNS].astype(float)
     expected = np.full((ROWS, COLUMNS), SKY)
@@ -46,7 +54,7 @@ def galaxies(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
-    """Return an image [ROWS, COLUMNS] of short tracks, which cover 2 % of the pixels."""
+    """Return an image [ROWS, COLUMNS] of short cosmic-ray tracks in whole electrons, which cover 2 % of the pixels."""
     pixels = ROWS - OVERSCAN
     hits = np.zeros((ROWS, COLUMNS), np.int32)
     while (hits > 0).mean() < 0.02:
@@ -64,7 +72,10 @@ def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
 
 
 def main(file: Path) -> None:
-    """Write the reference images to a file, if arcticpy is installed."""
+    """Write the reference images to a compressed file of numpy (.npz), or only print a message without arcticpy.
+
+    SystemExit is raised if a change does not fit into 32 bits.
+    """
     try:
         import arcticpy
     except ImportError:

@@ -1,7 +1,8 @@
-"""Measure the effects of VIS: time, margin and change of pixels, and the change of magnitude, size and ellipticity.
+"""Measure the instrumental effects of VIS (such as cosmic rays): CPU time, changes of pixels, and changes of sources.
 
-The scene is a full detector with an artificial sky of points and squares. Each effect acts on the result of the
-effects before it. Magnitude, size and ellipticity are measured on a standard set of stars and galaxies.
+The time and the changes of pixels are measured on a full detector with an artificial sky of points and squares. Each
+effect acts on the result of the effects before it. Changes of magnitude, size and ellipticity are measured on a
+standard set of stars and galaxies.
 """
 
 from __future__ import annotations
@@ -31,19 +32,32 @@ from truesky.render.psf import euclid, model, sub_bands
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Numbers of squares and of points in the scene, and electrons of the brightest source.
-_SOURCES, _STARS, _LIGHT = 30_000, 200, 1e9
-_EXPOSURE, _SKY, _ZERO_POINT = 560.53, 0.25, 25.93
-# Standard set: magnitudes of stars and galaxies, half-light radius of the exponential disc (arcsec); spacing and
-# side of a stamp (pixels).
+# Number of squares of 7 x 7 pixels (galaxies) on a full detector.
+_SOURCES = 30_000
+# Number of points (stars) on a full detector.
+_STARS = 200
+# Electrons of the bright star whose ghost falls on the detector.
+_LIGHT = 1e9
+# Exposure time, s.
+_EXPOSURE = 560.53
+# Sky background, electrons per s and pixel.
+_SKY = 0.25
+# Magnitude of a source of 1 electron per s.
+_ZERO_POINT = 25.93
+# Standard set of sources: magnitude of the stars, magnitude of the galaxies, and half-light radius of the galaxies'
+# exponential disc (arcsec).
 _STAR, _GALAXY, _RADIUS = 19.0, 22.5, 0.3
+# Distance between the sources of the standard set, and width and height of their stamps, pixels.
 _SPACING, _STAMP = 64, 64
-# Radius of the aperture in arcsec.
+# Radius of the aperture in which fluxes are measured, arcsec.
 APERTURE = 1.3
 
 
 def draw_light(ny: int, nx: int) -> Frame:
-    """Return a frame of expected electrons with points and squares of 7 x 7 pixels."""
+    """Return an image [ny, nx] of expected electrons with random points and squares of 7 x 7 pixels.
+
+    Their number is proportional to the area of the image.
+    """
     rng = np.random.default_rng(1)
     frame = np.zeros((ny, nx))
     share = ny * nx / (_scenes.VIS.nx * _scenes.VIS.ny)
@@ -56,9 +70,11 @@ def draw_light(ny: int, nx: int) -> Frame:
 
 
 def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
-    """Measure each effect: CPU time (s) per detector, margin, rms and largest change of a pixel in units of its noise.
+    """Measure each effect of VIS: CPU time per detector, and rms and largest change of a pixel in units of its noise.
 
-    `side` is the side of the detector in pixels (None for its real size); the shortest time of `repeats` counts.
+    The result also contains the margin of each effect: its estimated size divided by the size below which an image is
+    rendered without it. `side` is the width and height of the detector in pixels; None means its real size. The
+    shortest time of `repeats` measurements counts.
     """
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
@@ -66,7 +82,7 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
         detector = type(detector)("3-4", "vis", side, side, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = draw_light(detector.ny, detector.nx)
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector)
-    # Place the bright source so that its ghost falls into the middle of the detector.
+    # Place the bright star so that its ghost falls into the middle of the detector.
     _, _, across, *_ = ghosts.parameters(scene)
     place = (0.5 * n - shift for n, shift in zip((detector.nx, detector.ny), across, strict=True))
     lights = Lights(*(np.array([at]) for at in (*place, _LIGHT)))
@@ -77,7 +93,8 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
     assembled = quadrants.assemble(frame, *quadrants.overscan_sizes(scene))
     out["all_s"] = sum(value for key, value in out.items() if key.endswith("_s"))
     out["mean_adu"] = float(assembled.mean())
-    # Effects of other image types: effects of flats act on the light, effects of pumping images on an empty frame.
+    # Measure also the effects that science images do not have. Effects on flats act on the image without other
+    # effects. Effects on trap-pumping images act on an empty image, one after another.
     light_alone = draw_light(detector.ny, detector.nx)
     for effect in vis.FLAT:
         if effect not in vis.SKY:
@@ -90,7 +107,10 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
 
 
 def _measure_effect(effect: Effect, frame: Frame, scene: Scene, repeats: int, out: dict[str, float]) -> Frame:
-    """Apply an effect, add its figures to `out`, and return the new frame."""
+    """Apply an effect, add its CPU time, margin and changes of pixels to `out`, and return the new image.
+
+    The margin is the estimated size of the effect divided by the size below which an image is rendered without it.
+    """
     parameters = effect.parameters(scene)
     result = effect.apply(frame, *parameters, rng=stream(1, effect.name))
     apply_effect = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
@@ -102,13 +122,16 @@ def _measure_effect(effect: Effect, frame: Frame, scene: Scene, repeats: int, ou
 
 
 def _add_change(name: str, change: Frame, scene: Scene, out: dict[str, float]) -> None:
-    """Add the rms and largest change of a pixel, in units of its noise, to `out`."""
+    """Add the rms and the largest change of a pixel, in units of its noise, to `out`; `name` is the effect's name."""
     out[f"{name}_rms_sigma"] = float(np.sqrt(np.mean(change**2))) / scene.pixel_noise
     out[f"{name}_largest_sigma"] = float(np.abs(change).max()) / scene.pixel_noise
 
 
 def standard_sources(detector: Detector, spacing: int) -> Sources:
-    """Return the standard set on a lattice with this spacing (pixels): stars and round exponential galaxies in turn."""
+    """Return the standard set of sources: stars and round exponential galaxies in turn, on a square lattice.
+
+    The distance between neighbours is `spacing` pixels, plus random fractions of a pixel.
+    """
     rng = np.random.default_rng(2)
     middle = [np.arange(spacing / 2, n - spacing / 2 + 1, spacing) for n in (detector.nx, detector.ny)]
     column, row = (axis.ravel() for axis in np.meshgrid(*middle))
@@ -125,12 +148,12 @@ def standard_sources(detector: Detector, spacing: int) -> Sources:
 
 
 def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, scale: float = 0.1) -> Frame:
-    """Measure flux, size and ellipticity of each source.
+    """Measure the flux, size and ellipticity of each source on an image.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
-        The image.
+        Image in any unit.
     sources : Sources
         The sources.
     radius : float, optional
@@ -141,7 +164,8 @@ def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, sca
     Returns
     -------
     float array, shape (n, 4)
-        Flux in the aperture above the surroundings, and R^2 (arcsec2), e1 and e2 with a Gaussian weight of 0.75".
+        Flux in the aperture (the mean of the surroundings is subtracted), R^2 (arcsec2), e1 and e2. R^2 and the
+        ellipticity have a Gaussian weight with a sigma of 0.75 arcsec.
     """
     half, out = round(2.0 * radius / scale), []
     for x, y in zip(sources.column, sources.row, strict=True):
@@ -150,7 +174,7 @@ def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, sca
         rows, columns = np.mgrid[: cutout.shape[0], : cutout.shape[1]]
         dx, dy = (columns - (x - x0)) * scale, (rows - (y - y0)) * scale
         distance = np.hypot(dx, dy)
-        # Use the mean for the surroundings, because a median of counts is a whole number.
+        # Subtract the mean of the surroundings and not the median, because a median of counts is a whole number.
         cutout = cutout - cutout[distance > 1.5 * radius].mean()
         weighted = cutout * np.exp(-0.5 * (distance / 0.75) ** 2)
         xx, yy, xy = ((weighted * a).sum() / weighted.sum() for a in (dx * dx, dy * dy, dx * dy))
@@ -159,25 +183,25 @@ def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, sca
 
 
 def effect_changes(scene: Scene, sources: Sources, frame: Frame, radius: float = APERTURE) -> dict[str, Frame]:
-    """Measure the change of each source by each effect that leaves a frame of electrons.
+    """Measure how each effect of VIS changes the magnitude, size and ellipticity of each source.
 
-    Cosmic rays are omitted, because they hit only some sources.
+    The conversion to digital units is left out, and so are cosmic rays, because they hit only some sources.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Description of the exposure from which the effects take their parameters.
     sources : Sources
         The sources.
     frame : float array, shape (ny, nx)
-        Expected electrons of the sources.
+        Expected electrons of the sources per pixel.
     radius : float, optional
         Radius of the aperture, in arcsec.
 
     Returns
     -------
     dict of str to float array, shape (n, 4)
-        Changes of magnitude, dR^2 / R^2, de1 and de2 by name of the effect.
+        Change of magnitude, dR^2 / R^2, de1 and de2 of each source, by name of the effect.
     """
     out: dict[str, Frame] = {}
     sizes = quadrants.overscan_sizes(scene)
@@ -193,7 +217,11 @@ def effect_changes(scene: Scene, sources: Sources, frame: Frame, radius: float =
 
 
 def median_changes(side: int | None, repeats: int) -> dict[str, float]:
-    """Return the median changes of the standard set by each effect; shear is half of the change of ellipticity."""
+    """Return the median changes of stars and of galaxies of the standard set by each effect of VIS.
+
+    For each effect the result contains the changes of magnitude, of size (dR^2 / R^2), and of shear (half of the change
+    of ellipticity). `side` is the width and height of the detector in pixels; None means its real size.
+    """
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
     detector = detector if side is None else replace(detector, nx=side, ny=side)
@@ -215,7 +243,12 @@ def median_changes(side: int | None, repeats: int) -> dict[str, float]:
 def _measure_drawing(
     sources: Sources, psf: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
 ) -> Frame:  # fmt: skip
-    """Measure the effect that is part of drawing: add its extra time and changes to `out`; return changes [n, 4]."""
+    """Measure the one effect of VIS (varying sensitivity within a pixel) that is applied while sources are drawn.
+
+    Its additional CPU time, margin and changes of pixels are added to `out`. The margin is the estimated size of the
+    effect divided by the size below which an image is rendered without it. Return the changes of magnitude, size and
+    ellipticity of each source [n, 4]. `light` is the image without this effect.
+    """
     (strength,) = vis.TRANSFER_EFFECT.parameters(scene)
     sizes, (ny, nx) = np.full(len(sources), _STAMP), light.shape
     draw_with, draw_without = (
@@ -225,7 +258,7 @@ def _measure_drawing(
     extra_s = report.best_time(draw_with, repeats, time.process_time) - report.best_time(
         draw_without, repeats, time.process_time
     )
-    # The difference may be negative if it is smaller than the scatter of the times.
+    # The difference of the two times can be negative if it is smaller than their scatter.
     out[f"{vis.TRANSFER_EFFECT.name}_s"] = max(extra_s, 0.0)
     out[f"{vis.TRANSFER_EFFECT.name}_margin"] = vis.TRANSFER_EFFECT.margin(scene)
     drawn = draw_with()
@@ -234,13 +267,13 @@ def _measure_drawing(
 
 
 def _shape_differences(previous_shapes: Frame, new_shapes: Frame) -> Frame:
-    """Differences of results of `measure_shapes`: magnitude, dR^2 / R^2, de1, de2."""
+    """Return the differences between two results of `measure_shapes`: magnitude, dR^2 / R^2, de1, de2 [n, 4]."""
     ratio = new_shapes[:, :2] / previous_shapes[:, :2]
     return np.column_stack([-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, new_shapes[:, 2:] - previous_shapes[:, 2:]])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("effects", __doc__ or "", argv)
     side = 512 if options.quick else None
     repeats = 1 if options.quick else 3

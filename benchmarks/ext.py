@@ -1,8 +1,8 @@
-"""Measure a detector of each ground camera with all effects: CPU time from catalogue to file, memory, and forecast.
+"""Measure the rendering of a detector of each ground camera with all effects: CPU time, memory, errors of forecasts.
 
-The benchmark uses one process and one thread, and a field without the Moon. The process has rendered before, like a
-worker. All effects of a science image are forced on. The forecast is compared with the measurements. An option also
-times an exposure of LSSTCam by Spark.
+The time is from the catalogue to the file, in one process with one thread, which has rendered before. The field is
+observed without the Moon. All optional effects of a science image are switched on. The forecast of time and memory is
+compared with the measurements. An option also times an exposure of LSSTCam by Spark.
 """
 
 from __future__ import annotations
@@ -28,15 +28,24 @@ from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "ext.json"
-# Radii (deg) of areas that contain all sources on a detector of JPCam and on all of LSSTCam; radius for --quick.
-_FIELD_RADIUS, _LSST_RADIUS, _QUICK_RADIUS = 0.47, 2.1, 0.2
-# Magnitude limits of galaxies and stars; the same for --quick.
-_DEEP, _BRIGHT = (26.0, 26.0), (20.0, 16.0)
+# Radius (deg) of the simulated area that contains all sources on one detector of JPCam, the largest detector.
+_FIELD_RADIUS = 0.47
+# Radius (deg) of the area that contains all sources on all detectors of LSSTCam.
+_LSST_RADIUS = 2.1
+# Radius (deg) of the area with --quick.
+_QUICK_RADIUS = 0.2
+# Magnitude limits of galaxies and of stars.
+_DEEP = (26.0, 26.0)
+# Magnitude limits of galaxies and of stars with --quick.
+_BRIGHT = (20.0, 16.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera with a passband, a detector near the axis, and a date (MJD) when the field is high in a dark night."""
+    """A ground camera with a passband, a detector near its optical axis, and a date.
+
+    At the date `mjd` the field of the benchmark is high above the horizon in a night without the Moon.
+    """
 
     name: str
     band: str
@@ -45,7 +54,8 @@ class Camera:
 
 
 LSST = Camera("lsstcam", "lsst_r", "R22_S11", 61088.2)
-# Cameras by the prefix of their figures. JPCam has the largest detector. The bands of HSC and Pan-STARRS have fringes.
+# Cameras by the beginning of the names of their results. JPCam has the largest detector. The passbands of HSC and
+# Pan-STARRS (gpc1) have fringes.
 CAMERAS = {
     "lsst": LSST,
     "decam": Camera("decam", "des_r", "S4", 61088.2),
@@ -71,18 +81,18 @@ _NOTES = {
 def request_text(
     cameras: Sequence[Camera], radius: float, limits: tuple[float, float] = _DEEP, whole_cameras: bool = False
 ) -> str:
-    """Return a request for a field that all sites see, with a detector of each camera.
+    """Return a request for one exposure per camera of a field that is visible from all sites.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        The cameras.
+        Cameras, each with its passband, detector and date.
     radius : float
-        Radius of the area in degrees.
+        Radius of the simulated area in degrees.
     limits : tuple of float, optional
         Magnitude limits of galaxies and stars.
     whole_cameras : bool, optional
-        Render all detectors, at draft accuracy.
+        If True, render all detectors at draft accuracy; by default one detector per camera at survey accuracy.
 
     Returns
     -------
@@ -119,26 +129,28 @@ mjd = {camera.mjd!r}
 
 
 def with_all_effects(request: Request) -> Request:
-    """Force all effects of a science image on."""
+    """Return a copy of a request that switches on all optional effects of science images of ground cameras."""
     return replace(request, effects=Effects(on=tuple(effect.name for effect in ground.SKY if effect.optional)))
 
 
 def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """Return all figures of single detectors; each camera runs in a new process, so that memory is measured correctly.
+    """Measure the rendering of one detector of each ground camera.
+
+    Each camera is measured in a new process, because the peak memory of a process includes that of earlier work.
 
     Parameters
     ----------
     folder : Path
-        Folder for the lake and the files.
+        Existing folder in which the lake and the image files are written.
     quick : bool
-        Use a small field with bright sources, without JPCam.
+        If True, simulate a small field with bright sources only, without JPCam.
     repeats : int
-        Number of repeats.
+        Number of repeats of each measurement; the shortest time counts.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     file, out = folder / "detectors.toml", dict[str, float]()
     cameras = {name: camera for name, camera in CAMERAS.items() if not (quick and name == _LARGEST)}
@@ -156,9 +168,12 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
 
 
 def _camera_figures(name: str, root: Path, camera_request: Request, repeats: int) -> dict[str, float]:
-    """Return the figures of one camera; `camera_request` contains only its pointing."""
+    """Measure the rendering of one detector of a camera, and the errors of the forecast; return the results by name.
+
+    `name` is the key of the camera in CAMERAS. `camera_request` contains only the exposure of this camera.
+    """
     folder, full_task = root.parent, plan_detector(root, with_all_effects(camera_request))
-    # Compile, and fill the caches.
+    # The first rendering is not timed: it compiles functions and fills the caches.
     sources = render_exposures.render_task(root, full_task).rows["sources"][0].as_py()
     measurements = [measure_render(root, full_task, folder) for _ in range(repeats)]
     (forecast,) = read.version(root, "tasks").rows().to_pylist()
@@ -178,14 +193,17 @@ def _camera_figures(name: str, root: Path, camera_request: Request, repeats: int
 
 
 def time_exposure(folder: Path, limits: tuple[float, float]) -> Mapping[str, float]:
-    """Return the wall time (s) of the Spark job for all 189 detectors of LSSTCam; `limits` as in `request_text`."""
+    """Return the wall time (s) of the Spark job that renders all 189 detectors of LSSTCam, as `lsst_exposure_s`.
+
+    `limits` are the magnitude limits of galaxies and of stars. The lake is made in `folder` before the clock starts.
+    """
     return {
         "lsst_exposure_s": one_detector.time_job(folder, request_text([LSST], _LSST_RADIUS, limits, whole_cameras=True))
     }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
     extra_parser.add_argument("--repeats", type=int, default=2, help="repeats; the shortest time counts")

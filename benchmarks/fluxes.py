@@ -1,9 +1,10 @@
 """Measure speed and accuracy of band fluxes: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
 
-The sample consists of galaxies of two components with emission lines over the whole parameter space of the tables, in
-the 22 bands of Serrano et al. 2024. The truth is direct integration in steps of 1 A in the same run. Times are CPU
-seconds of one core. Option --measure writes the errors of all settings in all bands
-(truesky/fluxes/tables/flux_errors.csv), from which the job chooses its settings.
+The job that computes fluxes interpolates tables. Here its fluxes are compared with direct integration in steps of 1 A,
+in the 22 passbands of Serrano et al. 2024. The sample consists of galaxies with two spectral templates and emission
+lines, over the whole parameter space of the tables. Times are CPU seconds of one core. Option --measure writes the
+errors for all settings (resolutions of the tables) in all passbands to a file such as
+truesky/fluxes/tables/flux_errors.csv, from which the job chooses its settings.
 """
 
 from __future__ import annotations
@@ -42,17 +43,28 @@ BANDS = (
     "hsc_z",
 )  # fmt: skip
 
-# Different samples are used to choose the settings, to test them, and to measure the speed.
-_SEED_CHOICE, _SEED_TEST, _SEED_SPEED = 1, 2, 3
-_SAMPLE, _SPEED_SAMPLE = 20_000, 200_000
+# Seed of the galaxies that are used to choose the resolutions of the tables.
+_SEED_CHOICE = 1
+# Seed of the galaxies with which the accuracy is tested.
+_SEED_TEST = 2
+# Seed of the galaxies with which the speed is measured.
+_SEED_SPEED = 3
+# Number of galaxies with which the accuracy is measured.
+_SAMPLE = 20_000
+# Number of galaxies with which the speed is measured.
+_SPEED_SAMPLE = 200_000
+# Number of galaxies of each sample with --quick.
 _QUICK = 500
 _MAG = 2.5 / np.log(10.0)
-# Zero point of the maggies of speclite: 3631 Jy in microjansky.
+# Flux density in microjansky of 1 maggie (AB magnitude 0), the unit of speclite.
 _AB_UJY = 3631e6
 
 
 def sample(n: int, seed: int) -> pa.Table:
-    """Return n random rows of the table `galaxies`, uniform over the parameter space of the flux tables."""
+    """Return `n` random galaxies with the columns of the table `galaxies` that determine fluxes.
+
+    Redshift, templates, reddening and extinction are uniform over the ranges that the flux tables cover.
+    """
     rng = np.random.default_rng(seed)
     frac = rng.uniform(0.0, 1.0, n)
     z = rng.uniform(build_tables.Z_FIRST + 0.001, build_tables.Z_LAST - 0.01, n)
@@ -83,14 +95,16 @@ def sample(n: int, seed: int) -> pa.Table:
 
 
 def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
-    """Write the error of every candidate setting in every passband.
+    """Write the rms and the largest relative error of fluxes for every candidate setting in every passband.
+
+    A setting is the resolution of a flux table in wavelength, E(B-V) and A_V.
 
     Parameters
     ----------
     file : Path
-        CSV file to write.
+        CSV file to write; an existing file is replaced.
     n : int, optional
-        Number of galaxies.
+        Number of galaxies whose fluxes are compared with direct integration.
     bands : sequence of str, optional
         Names of the passbands. The default is all passbands.
     """
@@ -112,14 +126,14 @@ def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
 
 
 def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accuracy) -> Float:
-    """Return the errors of the settings that the job chooses for an accuracy.
+    """Return the errors of the fluxes that the job computes for a requested accuracy.
 
     Parameters
     ----------
     rows : Galaxies
         The galaxies.
     truth : float array, shape (n, 22)
-        True fluxes.
+        Fluxes from direct integration in the passbands BANDS, microjansky.
     library : Library
         Library of galaxy spectra.
     accuracy : Accuracy
@@ -128,7 +142,11 @@ def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accura
     Returns
     -------
     float array, shape (n, 22)
-        Errors in magnitudes.
+        Errors in magnitudes; negative if the flux is too high.
+
+    Notes
+    -----
+    SystemExit is raised if no table reaches the accuracy in a passband.
     """
     f_nu, _ = _interpolate(rows, library, accuracy)
     return np.asarray(-_MAG * np.log(f_nu / truth))
@@ -144,7 +162,10 @@ def _interpolate(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[
 
 
 def speclite_difference(n: int, library: Library) -> float:
-    """Return the largest difference (mag) between the fluxes of truesky and of speclite for the same spectra."""
+    """Return the largest difference (mag) between the fluxes of truesky and of speclite for the same `n` spectra.
+
+    Only the passbands whose curves truesky takes from speclite are compared.
+    """
     import astropy.units as u
     from speclite.filters import load_filter
 
@@ -168,7 +189,10 @@ def speclite_difference(n: int, library: Library) -> float:
 
 
 def job_speed(n: int) -> float:
-    """Return the galaxies per CPU second of the job for 22 bands, from file to published file, without Spark."""
+    """Return the galaxies per CPU second for which the job computes fluxes in 22 passbands, without Spark.
+
+    The time includes reading the catalogue of `n` galaxies and writing and publishing the table of fluxes.
+    """
     from lake_schema import ids, sky
     from lake_schema.store import layout, plan, publish
     from lake_schema.tables.galaxies import GALAXIES
@@ -204,12 +228,12 @@ def job_speed(n: int) -> float:
 
 
 def stars(n: int) -> dict[str, float]:
-    """Return speed and error of the fluxes of n stars."""
+    """Return the speed (stars per CPU second) and the largest error (mag) of fluxes of `n` stars in 22 passbands."""
     from truesky.fluxes.sources import Stars
 
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)
-    # Most stars are mixtures of four templates.
+    # Each star is a mixture of four spectral templates, as most stars of the catalogue are.
     rows = Stars(
         rng.integers(0, len(library), (4, n)), rng.dirichlet(np.ones(4), n).T, rng.uniform(5.0, 26.0, n),
         rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
@@ -221,21 +245,24 @@ def stars(n: int) -> dict[str, float]:
 
 
 def error_curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[float]]:
-    """Return error and time of each setting, used for all bands, for the figure in the notebook.
+    """Return the error and the CPU time for each setting (resolution of flux tables), for a figure in a notebook.
+
+    Each setting is used for all 22 passbands.
 
     Parameters
     ----------
     rows : Galaxies
         The galaxies.
     truth : float array, shape (n, 22)
-        True fluxes.
+        Fluxes from direct integration in the passbands BANDS, microjansky.
     library : Library
         Library of galaxy spectra.
 
     Returns
     -------
     dict of str to list of float
-        One value per setting: CPU time per galaxy (us), rms and largest error (mag), and size of a table (MB).
+        Lists with one value per setting: `curve_us` (CPU time per galaxy, us), `curve_rms_mag` and `curve_max_mag` (rms
+        and largest error, mag), and `curve_mb` (size of the table of one passband, MB).
     """
     curves = [passbands.load(name) for name in BANDS]
     names = ("curve_us", "curve_rms_mag", "curve_max_mag", "curve_mb")
@@ -253,13 +280,13 @@ def error_curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, lis
 
 
 def run(quick: bool) -> dict[str, Any]:
-    """Return all figures."""
+    """Measure speed and accuracy of fluxes, and return all results by name; `quick` uses few galaxies."""
     library = templates.galaxy_library()
     n = _QUICK if quick else _SAMPLE
     curves = [passbands.load(name) for name in BANDS]
     rows = galaxies_from_table(sample(n, _SEED_TEST), library)
     integrated: list[Float] = []
-    # Load the compiled code before the clock starts.
+    # Integrate two galaxies before the clock starts, so that the compiled code is loaded.
     integration.galaxy_fluxes(rows.select(np.arange(2)), curves, library)
     integration_s = _best_cpu_time(lambda: integrated.append(integration.galaxy_fluxes(rows, curves, library)), 1)
     truth = integrated[0]
@@ -294,7 +321,7 @@ def run(quick: bool) -> dict[str, Any]:
 
 
 def _build_seconds(library: Library, quick: bool) -> float:
-    """CPU time (s) to make the tables of the 22 bands (2 bands if `quick`) with an empty cache."""
+    """Return the CPU time (s) to compute the flux tables of the 22 passbands (2 if `quick`) with an empty cache."""
     bands = BANDS[:2] if quick else BANDS
     curves = [passbands.load(name) for name in bands]
     settings = [setting for choice in choose(bands, SURVEY) if (setting := choice.setting) is not None]
@@ -310,7 +337,10 @@ def _build_seconds(library: Library, quick: bool) -> float:
 
 
 def _full_spectrum_seconds(n: int, library: Library) -> float:
-    """CPU time (s) per galaxy to integrate its whole spectrum, 600 to 24000 A, in vacuum and in air."""
+    """Return the CPU time (s) per galaxy to compute 22 fluxes from its whole spectrum, 600 to 24000 A, without tables.
+
+    The spectrum is computed twice, with wavelengths in vacuum and in air. `n` is the number of galaxies.
+    """
     table, curves = sample(n, _SEED_TEST), [passbands.load(name) for name in BANDS]
 
     def work() -> None:
@@ -327,12 +357,12 @@ def _rms(error: Float) -> float:
 
 
 def _best_cpu_time(work: Callable[[], object], repeats: int) -> float:
-    """Shortest CPU time (s) of several repeats."""
+    """Return the shortest CPU time (s) of several calls of a function."""
     return best_time(work, repeats, time.process_time)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     parser = argparse.ArgumentParser(prog="benchmarks.fluxes", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few objects, for tests")
     parser.add_argument("--json", type=Path, metavar="FILE")

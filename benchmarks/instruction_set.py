@@ -1,8 +1,8 @@
-"""Compare the CPU time with the common instruction set and with all instructions of this CPU.
+"""Compare the CPU time with instructions that all common CPUs have, and with all instructions of this CPU.
 
-Two processes per subject, one with TRUESKY_CPU=portable and one with TRUESKY_CPU=native, do the same work in turn, so
-that a change of the machine's speed affects both. Each does the work once before it is measured. On a CPU without
-AVX-512 the ratios are 1.
+For each kind of work there are two processes, one with TRUESKY_CPU=portable and one with TRUESKY_CPU=native. They do
+the same work in turn, so that a change of the machine's speed affects both. Each does the work once before the first
+measurement. On a CPU without AVX-512 the ratios are about 1.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-# Set this before NumPy is imported.
+# The number of threads must be set before NumPy is imported, because NumPy reads OMP_NUM_THREADS only then.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import lake_schema  # noqa: F401
@@ -36,7 +36,8 @@ _NOTES = {
 }
 
 
-# Each subject imports its modules itself, because loading the modules of all subjects would take seconds.
+# Each function below prepares one kind of work and returns a function that does it. They import what they need
+# themselves, because loading the modules of all kinds of work would take seconds.
 def _vis(folder: Path, quick: bool) -> Callable[[], Any]:
     from benchmarks import _detectors, vis
 
@@ -80,7 +81,10 @@ SUBJECTS = {"vis": _vis, "nisp_s": _nisp_s, "fluxes": _fluxes, "catalogue": _cat
 
 
 def serve(subject: str, quick: bool) -> None:
-    """Do a subject's work once for each line on stdin and answer with its CPU seconds."""
+    """Do one kind of work once for each line on stdin, and print the CPU time in s after each.
+
+    `subject` is a key of SUBJECTS. The work is also done once before the first line, without a measurement.
+    """
     with tempfile.TemporaryDirectory() as folder:
         run_subject = SUBJECTS[subject](Path(folder), quick)
         run_subject()
@@ -91,22 +95,27 @@ def serve(subject: str, quick: bool) -> None:
 
 
 def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
-    """Return the ratio of the CPU times, and the median time with each setting in seconds.
+    """Compare the CPU times of one kind of work with the common instructions and with all instructions of this CPU.
 
     Parameters
     ----------
     subject : str
-        A key of `SUBJECTS`.
+        Kind of work, a key of `SUBJECTS`.
     repeats : int
-        Number of measurements of each setting.
+        Number of measurements with each set of instructions.
     quick : bool
-        Do little work, for tests.
+        If True, do little work, for tests.
 
     Returns
     -------
     dict of str to float
-        `<subject>_ratio`, the median of the ratios of neighbouring measurements; its smallest and largest value; and
-        `<subject>_portable_s`, `<subject>_native_s`.
+        `<subject>_ratio` (median of time with common instructions / time with all instructions, each from two
+        measurements one after the other), `<subject>_ratio_min` and `<subject>_ratio_max` (smallest and largest ratio),
+        and `<subject>_portable_s` and `<subject>_native_s` (median CPU times in s).
+
+    Notes
+    -----
+    SystemExit is raised if a process ends early.
     """
     command = [sys.executable, "-m", "benchmarks.instruction_set", "--serve", subject, *["--quick"] * quick]
     environment = {
@@ -151,7 +160,7 @@ def _ask(child: subprocess.Popen[str]) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure the subjects and print the ratios."""
+    """Run the benchmark with the options `argv` (default: the command line), print the ratios, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
     extra_parser.add_argument("--repeats", type=int, default=7, help="repeats of each measurement")

@@ -1,7 +1,8 @@
-"""Measure the speed of the lake and compare with other programs: python -m benchmarks.lake [--quick] [--json FILE].
+"""Measure the speed of the lake (the folder of tables): python -m benchmarks.lake [--quick] [--json FILE].
 
-The catalogue has 50 random columns in 20 cells of 250,000 rows. It is compared with the Parquet writers of Spark and
-pyarrow, with lsdb, with a scan of all rows, and with the same query on files that are not verified.
+Writing, searching and reading are measured with a catalogue of 50 columns of random values, in 20 HEALPix cells of
+250,000 rows. They are compared with the Parquet writers of Spark and pyarrow, with cone searches by lsdb, with a full
+scan, and with queries that do not verify the checksums of files.
 """
 
 from __future__ import annotations
@@ -32,8 +33,11 @@ from lake_schema.store.stage import write_partition
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
 from truesky.explore.explorer import Explorer
 
-# Consecutive nested cells of order 5, around the Chandra Deep Field South.
-FIRST_CELL, CELLS, ROWS = 8976, 20, 250_000
+# First of the consecutive nested HEALPix cells of order 5, around the Chandra Deep Field South.
+FIRST_CELL = 8976
+# Number of HEALPix cells of the catalogue, and number of rows in each cell.
+CELLS, ROWS = 20, 250_000
+# Number of HEALPix cells, and number of rows in each, with the option --quick.
 QUICK_CELLS, QUICK_ROWS = 3, 20_000
 CONE_ARCSEC, CONE_COLUMNS = 60.0, ("id", "ra", "dec", "x_0", "x_1")
 
@@ -77,7 +81,7 @@ NOTES = {
 
 
 def random_rows(cell: int, n: int) -> pa.Table:
-    """Return n random rows in a cell of order 5."""
+    """Return `n` rows of random values for the table TRIAL, with positions in a nested HEALPix cell of order 5."""
     rng = np.random.default_rng([1, cell])
     index, ra, dec = sky.random_in_cell(5, cell, n, rng)
     ids = np.int64(cell) << 46 | np.arange(n)
@@ -89,12 +93,19 @@ def random_rows(cell: int, n: int) -> pa.Table:
 
 
 def make_cell(root: Path, facts: Json) -> Output:
-    """Make the rows of one cell; the task function of the catalogue."""
+    """Make the rows of one HEALPix cell of the catalogue.
+
+    `facts` contains `cell` (nested index of order 5) and `rows` (number of rows). `root` is not used, but the functions
+    that compute a file of a table must have it.
+    """
     return Output(random_rows(facts["cell"], facts["rows"]))
 
 
 def catalogue_plan(cells: int, rows: int) -> Plan:
-    """Return the plan of a catalogue of this number of cells, with this number of rows in each."""
+    """Return the list of tasks that make the catalogue, one per HEALPix cell.
+
+    `cells` is the number of cells, and `rows` the number of rows in each.
+    """
     numbers = range(FIRST_CELL, FIRST_CELL + cells)
     return Plan(
         TRIAL, {}, tuple(Task(layout.cell_file(5, cell), {"cell": cell, "rows": rows}, rows) for cell in numbers)
@@ -102,21 +113,21 @@ def catalogue_plan(cells: int, rows: int) -> Plan:
 
 
 def time_writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
-    """Time the writing of one cell by truesky, pyarrow and Spark, each on one core.
+    """Measure the speed of writing the rows of one cell by truesky, pyarrow and Spark, each on one core.
 
     Parameters
     ----------
     folder : Path
-        Folder for the files.
+        Existing folder in which the files are written.
     rows : pyarrow.Table
-        Rows of the cell.
+        Rows of one cell.
     repeats : int
         Number of repeats; the shortest time counts.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     part = Task(layout.cell_file(5, FIRST_CELL), {})
     ours, plain = folder / "ours.parquet", folder / "plain.parquet"
@@ -137,7 +148,7 @@ def time_writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]
 
 
 def _time_spark_writer(folder: Path, file: Path, repeats: int) -> float:
-    """Wall time (s) of Spark's writer for the same rows, which are in its memory, in one task."""
+    """Return the wall time (s) in which Spark writes the rows of a Parquet file, read before, in one task."""
     from truesky.running.session import get_session
 
     frame = get_session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
@@ -146,7 +157,11 @@ def _time_spark_writer(folder: Path, file: Path, repeats: int) -> float:
 
 
 def time_cones(version: read.Version, repeats: int) -> dict[str, float]:
-    """Time searches in small circles at random positions of the catalogue."""
+    """Time searches in circles of 60 arcsec by truesky, by lsdb, and by a scan of all rows.
+
+    `version` is the catalogue, and `repeats` the number of random positions. SystemExit is raised if the three methods
+    do not find the same number of rows.
+    """
     import lsdb
 
     centres = np.random.default_rng(2).permutation(version.rows(["ra", "dec"], version.partitions[:2]).to_pandas())[
@@ -187,7 +202,10 @@ def _scan_cone(version: read.Version, ra: float, dec: float, radius: float, colu
 
 
 def time_heatmap(version: read.Version, repeats: int) -> dict[str, float]:
-    """Time a heat map of all rows."""
+    """Measure the wall time of a two-dimensional histogram of all rows of a catalogue.
+
+    The result contains the time in s, and its ratio to the time of DuckDB for files whose checksums are not verified.
+    """
     import duckdb
 
     files = [str(version.partition_path(part)) for part in version.partitions]
@@ -205,7 +223,10 @@ def time_heatmap(version: read.Version, repeats: int) -> dict[str, float]:
 
 
 def time_verification(version: read.Version, repeats: int) -> dict[str, float]:
-    """Measure the speed of verification and of verified reading."""
+    """Measure the speed (MB/s) of verifying all files of a table, and of reading one file with verified checksums.
+
+    The reading is also compared with pyarrow, which verifies no checksums.
+    """
     size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
     deep = report.best_time(lambda: read.find_faults(version, deep=True), repeats)
     part = version.partitions[0]
@@ -225,14 +246,14 @@ _SESSION = (
 
 
 def time_session_start(repeats: int) -> dict[str, float]:
-    """Time the start of a Spark session in a new process."""
+    """Return the shortest wall time (s) of the start of a Spark session in a new process, of at most three starts."""
     command = [sys.executable, "-c", _SESSION]
     done = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(min(repeats, 3))]
     return {"session_start_s": min(float(text) for text in done)}
 
 
 def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
-    """Return the number of repeats and all figures."""
+    """Make the catalogue in `folder`, and measure everything; return the number of repeats and all results by name."""
     cells, rows, repeats = (QUICK_CELLS, QUICK_ROWS, 1) if quick else (CELLS, ROWS, 5)
     figures = time_writing(folder, random_rows(FIRST_CELL, rows), repeats)
     pa.set_cpu_count(os.cpu_count() or 1)
@@ -254,7 +275,7 @@ def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     chosen = report.options("lake", __doc__ or "", argv)
     folder = Path(tempfile.mkdtemp(prefix="truesky-benchmark-"))
     try:

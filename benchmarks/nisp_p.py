@@ -1,8 +1,8 @@
-"""Measure a NISP-P detector with all effects: CPU time from catalogue to file, and memory.
+"""Measure the rendering of a NISP-P detector (near-infrared images) with all effects: CPU time and memory.
 
-The benchmark uses one process and one thread, and the field of the demo in H. The process has rendered before, like a
-worker. "cold" is without the planes of the PSF in the cache, "warm" with them. An option also times an exposure of 16
-detectors by Spark.
+The time is from the catalogue to the file, in one process with one thread, which has rendered before. The image shows
+the field of requests/demo.toml in H. "cold" times are without images of the PSF in the cache, "warm" times with them.
+An option also times an exposure of 16 detectors by Spark.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "nisp_p.json"
-# Folders of the PSF's planes in the cache.
+# Pattern of the names of the cache folders that contain PSF images.
 _PLANES = "nisp*_psf-*"
 _RAMP = nisp_p.SKY[nisp_p.SKY.index(nisp_p.persistence.EFFECT) + 1 :]
 _NOTES = {
@@ -38,16 +38,16 @@ _NOTES = {
 
 
 def request_text(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
-    """Return a request for the field of the demo with NISP.
+    """Return a request for NISP exposures of the field of requests/demo.toml.
 
     Parameters
     ----------
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     detectors : str, optional
-        Line of the request that selects detectors; empty for all detectors.
+        Line of TOML that selects detectors; "" for all detectors.
     exposures : int, optional
-        Number of exposures, 134 s apart. The last one is in H.
+        Number of exposures, 1 to 3, which begin 134 s apart. The last one is in H, and earlier ones in J and Y.
 
     Returns
     -------
@@ -71,27 +71,30 @@ mjd = {60905.0 + number * 134.0 / 86400.0!r}
 
 
 def with_all_effects(request: Request) -> Request:
-    """Force all effects of a science image on, with the non-linearity of the ramp in place of that of the signal."""
+    """Return a copy of a request that switches on all optional effects of NISP-P science images.
+
+    Of two models of non-linearity, the one of the ramp (all readouts) is on, and not the one of the final signal.
+    """
     names = [effect.name for effect in nisp_p.SKY if effect.optional and effect.name != "signal_nonlinearity"]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """Return all figures of a detector.
+    """Measure the rendering of one NISP-P detector, also as the third exposure of a sequence with persistence.
 
     Parameters
     ----------
     folder : Path
-        Folder for the lake and the files.
+        Existing folder in which the lake and the image files are written.
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     repeats : int
-        Number of repeats.
+        Number of repeats of each measurement; the shortest time counts.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     file = folder / "three.toml"
     file.write_text(request_text(quick, exposures=3), encoding="utf-8")
@@ -99,10 +102,10 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
     last_exposure = replace(three_exposures, pointings=three_exposures.pointings[-1:])
     root = one_detector.make_lake(folder, three_exposures)
     full_task = plan_detector(root, with_all_effects(last_exposure))
-    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
+    measure_render(root, full_task, folder)  # Untimed: compiles functions and fills the caches.
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
-    # The channel identifies these effects by their object, so they must not be replaced.
+    # The renderer recognises these two effects by identity, so they must not be replaced by timed copies.
     channel_effects = nisp_p.CHANNEL.persistence_effect, nisp_p.CHANNEL.chromatic_effect
     effects = one_detector.effect_seconds(
         nisp_p.EFFECTS, channel_effects, lambda: measure_render(root, full_task, folder)
@@ -116,13 +119,16 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
 
 
 def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
-    """Return the wall time (s) of the Spark job for all 16 detectors of an exposure, or for two if `quick`."""
+    """Return the wall time (s) of the Spark job that renders all 16 detectors of an exposure, or two if `quick`.
+
+    The result has one entry, `exposure_s`. The lake is made in `folder` before the clock starts.
+    """
     text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
     return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
     extra_parser.add_argument("--repeats", type=int, default=2, help="repeats; the shortest time counts")

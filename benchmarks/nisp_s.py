@@ -1,8 +1,9 @@
-"""Measure a NISP-S detector with all effects: CPU time from catalogue to file, and memory; and exposures by Spark.
+"""Measure the rendering of a NISP-S detector (slitless spectra) with all effects: CPU time and memory.
 
-The benchmark uses one process and one thread. The image is the field of the demo with grism RGS000: all sources to
-H_E = 23 or with an H alpha flux of 1e-16, in all orders. The process has rendered before, like a worker. "cold" is
-without the planes of the PSF in the cache, "warm" with them.
+The time is from the catalogue to the file, in one process with one thread, which has rendered before. The image shows
+the field of requests/demo.toml through grism RGS000. It contains all spectral orders of all sources with H_E < 23 or an
+H alpha flux above 1e-16 erg s-1 cm-2. "cold" times are without images of the PSF in the cache, "warm" times with them.
+An option also times a whole exposure by Spark.
 """
 
 from __future__ import annotations
@@ -34,13 +35,15 @@ from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "nisp_s.json"
-# Folders of the PSF's planes in the cache.
+# Pattern of the names of the cache folders that contain PSF images.
 _PLANES = "nisp*_psf-*"
-# Pointing (deg) for which DET22 lies in the middle of the area of the demo.
+# Pointing (ICRS, deg) for which detector DET22 lies in the middle of the area of requests/demo.toml.
 _RA, _DEC = 53.0135, -27.907
 _RAMP = nisp_s.SKY[nisp_s.SKY.index(nisp_s.persistence.EFFECT) + 1 :]
-# Number of sources that galsim draws, and side of its stamps in pixels.
-_NUM_GALSIM, _STAMP = 8, 32
+# Number of sources that galsim draws for comparison.
+_NUM_GALSIM = 8
+# Width and height of the stamps that galsim draws, pixels.
+_STAMP = 32
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed",
     "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
@@ -64,14 +67,16 @@ _NOTES = {
 def request_text(
     quick: bool, detectors: str = 'detectors = ["DET22"]', place: tuple[float, float] = (_RA, _DEC)
 ) -> str:
-    """Return a request for the field of the demo with the red grism; spectra are selected as in Serrano et al. 2024.
+    """Return a request for an exposure of the field of requests/demo.toml with the red grism.
+
+    Sources whose spectra are drawn are selected as in Serrano et al. 2024.
 
     Parameters
     ----------
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     detectors : str, optional
-        Line of the request that selects detectors.
+        Line of TOML that selects detectors; "" for all detectors.
     place : tuple of float, optional
         RA and Dec of the pointing in degrees.
 
@@ -99,16 +104,22 @@ mjd = 60905.0
 
 
 def with_all_effects(request: Request) -> Request:
-    """Force all effects of a science image on, with the non-linearity of the ramp in place of that of the signal."""
+    """Return a copy of a request that switches on all optional effects of NISP-S science images.
+
+    Of two models of non-linearity, the one of the ramp (all readouts) is on, and not the one of the final signal.
+    """
     names = [effect.name for effect in nisp_s.SKY if effect.optional and effect.name != "signal_nonlinearity"]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 @contextmanager
 def record_drawing(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
-    """Add the CPU time of drawing and of spectra to `seconds`, and the arguments of drawing to `drawn`.
+    """Record the drawing of spectra in renderings during a `with` block.
 
-    A rendering draws all sources first, and then some of them again for their colours.
+    The CPU time of drawing (`draw_s`, `colours_s`) and of computing spectra (`spectra_s`) is added to `seconds`, which
+    must be a defaultdict. The arguments of each call of the drawing function are appended to `drawn`. The first call of
+    a rendering draws all sources; later calls draw bright sources again, because the response of pixels depends on
+    colour.
     """
     original_draw, original_of_rows = draw.draw, spectra.spectrum_function
 
@@ -129,7 +140,11 @@ def record_drawing(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> I
 
 
 def galsim_seconds(drawn: tuple[Any, ...]) -> float:
-    """Return the mean CPU time (s) of galsim for a first order: one stamp per pixel of the trace, and one PSF."""
+    """Return the mean CPU time (s) that galsim needs for the first order of a source.
+
+    galsim draws one stamp per pixel along the trace, with the same PSF at all wavelengths. `drawn` contains the
+    arguments of the drawing function of truesky: sources, dispersion, PSF. The mean is over 8 of the sources.
+    """
     sources, dispersed, psf = drawn[:3]
     (first,) = (order.trace for order in dispersed.orders if order.trace.order == 1)
     indices = np.linspace(0, len(sources) - 1, _NUM_GALSIM).astype(int)
@@ -156,21 +171,21 @@ def galsim_seconds(drawn: tuple[Any, ...]) -> float:
 
 
 def measure_stages(root: Path, full_task: Json, folder: Path) -> dict[str, float]:
-    """Measure the stages of one rendering, and compare with galsim for the same number of sources.
+    """Measure the CPU time of the stages of one rendering, and compare the drawing of spectra with galsim.
 
     Parameters
     ----------
     root : Path
         Folder of the lake.
     full_task : dict
-        Facts of the task.
+        Description of the rendering task, as `plan_detector` returns it.
     folder : Path
-        Folder for the files.
+        Folder in which the image files are written.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     seconds: dict[str, float] = defaultdict(float)
     drawn: list[tuple[Any, ...]] = []
@@ -191,28 +206,28 @@ def measure_stages(root: Path, full_task: Json, folder: Path) -> dict[str, float
 
 
 def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """Return all figures of a detector.
+    """Measure the rendering of one NISP-S detector at several accuracies.
 
     Parameters
     ----------
     folder : Path
-        Folder for the lake and the files.
+        Existing folder in which the lake and the image files are written.
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     repeats : int
-        Number of repeats.
+        Number of repeats of each measurement; the shortest time counts.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     file = folder / "one.toml"
     file.write_text(request_text(quick), encoding="utf-8")
     request = parse(file)
     root = one_detector.make_lake(folder, request)
     full_task = plan_detector(root, with_all_effects(request))
-    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
+    measure_render(root, full_task, folder)  # Untimed: compiles functions and fills the caches.
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
     out |= measure_stages(root, full_task, folder)
@@ -223,13 +238,16 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
 
 
 def time_exposure(folder: Path, quick: bool) -> dict[str, float]:
-    """Return the wall time (s) of the Spark job for all 16 detectors of an exposure, or for two if `quick`."""
+    """Return the wall time (s) of the Spark job that renders all 16 detectors of an exposure, or two if `quick`.
+
+    The result has one entry, `exposure_s`. The lake is made in `folder` before the clock starts.
+    """
     text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
     return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
     extra_parser.add_argument(

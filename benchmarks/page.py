@@ -1,8 +1,9 @@
-"""Measure the response times of the page: python -m benchmarks.page [--quick] [--json FILE].
+"""Measure the response times of the web page of a lake: python -m benchmarks.page [--quick] [--json FILE].
 
-Charts are counted over random columns in the cache. Requests over HTTP go to a server with an artificial lake of 1 M
-rows and an image, and to one with 10 M rows and an empty cache. If a browser is installed (extra `test`, and chromium),
-it moves brushes over the first lake.
+Histograms (charts) are counted over random columns. HTTP requests go to a server of a lake (folder of tables) with a
+table of 1 million random rows and an image, and to one with 10 million rows and an empty cache. If a browser is
+installed (extra `test`, and chromium), it moves a brush over the charts of the first lake. A brush is a range on the
+axis of a chart that selects rows in all other charts.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ TOKEN = "a-token-of-the-benchmark"
 SPAN = (-3.0, 3.0)
 CHARTS = [*(Chart((k,), (SPAN,), (120,)) for k in range(4)), Chart((0, 1), (SPAN, SPAN), (96, 96))]
 LIMITS = {0: (-1.0, 1.0), 1: (-0.5, 2.0), 2: (-2.0, 0.5)}
-# The same charts as a request of the page.
+# Body of the HTTP request with which the page asks for the charts CHARTS, for rows within LIMITS.
 QUESTION: dict[str, Any] = {
     "charts": [{"axes": c.columns, "bins": c.bins, "spans": c.spans} for c in CHARTS],
     "limits": [[axis, *limit] for axis, limit in LIMITS.items()],
@@ -90,13 +91,13 @@ NOTES = {
 
 
 def random_columns(rows: int) -> list[np.ndarray]:
-    """Return four columns of normally distributed random numbers."""
+    """Return four float32 columns of normally distributed random numbers with this number of rows."""
     rng = np.random.default_rng(1)
     return [rng.standard_normal(rows, np.float32) for _ in range(4)]
 
 
 def count_with_duckdb(columns: Sequence[np.ndarray]) -> None:
-    """Count the same charts by DuckDB, one query per chart."""
+    """Count the rows in the bins of CHARTS with DuckDB, one query per chart, for comparison."""
     with duckdb.connect() as session:
         session.register("t", pa.table({f"c{k}": column for k, column in enumerate(columns)}))
         lo, hi = SPAN
@@ -113,19 +114,19 @@ def count_with_duckdb(columns: Sequence[np.ndarray]) -> None:
 
 
 def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dict[str, float]:
-    """Measure the counting of charts over cached columns.
+    """Measure how long it takes to count rows in the bins of charts, for columns in memory.
 
     Parameters
     ----------
     rows, many_rows, max_rows : int
-        Numbers of rows of the three sizes of tables, in ascending order.
+        Numbers of rows of the small, the large and the largest table; `many_rows` must not exceed `max_rows`.
     repeats : int
-        Number of repeats.
+        Number of repeats of each measurement.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     few_columns = random_columns(rows)
     count_rows(few_columns, CHARTS, LIMITS)
@@ -147,7 +148,7 @@ def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dic
     figures["brush_50m_cpu_ms"] = 1e3 * report.best_time(
         make_answer(inspect_columns(many_columns)), repeats, time.process_time
     )
-    # The page caches the sample that it shows first as separate columns.
+    # In a large table the page first counts a sample of the rows, which it keeps as separate, contiguous columns.
     sample = inspect_columns([column[::SUBSAMPLING].copy() for column in all_columns])
     figures["first_100m_ms"] = 1e3 * median_seconds(make_answer(sample, SUBSAMPLING), 5 * repeats)
     figures["whole_100m_cpu_s"] = report.best_time(
@@ -159,7 +160,7 @@ def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dic
 
 
 def median_seconds(ask: Callable[[], Any], times: int) -> float:
-    """Return the median wall time (s) of several calls."""
+    """Return the median wall time (s) of `times` calls of the function `ask`."""
     seconds = []
     for _ in range(times):
         started = time.perf_counter()
@@ -169,20 +170,20 @@ def median_seconds(ask: Callable[[], Any], times: int) -> float:
 
 
 class PageClient:
-    """HTTP connection to the page with its cookie."""
+    """HTTP connection to the server of the page on a port of this machine, with the cookie that gives access."""
 
     def __init__(self, port: int) -> None:
         self.connection, self.cookie = http.client.HTTPConnection("127.0.0.1", port), f"truesky-{port}={TOKEN}"
 
     def send(self, method: str, path: str, body: str | None = None) -> http.client.HTTPResponse:
-        """Send a request.
+        """Send an HTTP request, and return the response, whose body must be read before the next request.
 
         Parameters
         ----------
         method, path : str
-            Method and path of the request.
+            Method (such as GET) and path of the request.
         body : str, optional
-            Body of the request.
+            Body of the request; by default it is empty.
 
         Returns
         -------
@@ -193,36 +194,37 @@ class PageClient:
         return self.connection.getresponse()
 
     def milliseconds(self, times: int, method: str, path: str, body: str | None = None) -> float:
-        """Return the median time of several equal requests.
+        """Return the median wall time of several equal HTTP requests, until the response has been read.
 
         Parameters
         ----------
         times : int
             Number of requests.
         method, path : str
-            Method and path of the request.
+            Method (such as GET) and path of the request.
         body : str, optional
-            Body of the request.
+            Body of the request; by default it is empty.
 
         Returns
         -------
         float
-            Time in milliseconds.
+            Median time in milliseconds.
         """
         return 1e3 * median_seconds(lambda: self.send(method, path, body).read(), times)
 
 
 def make_lake(lake: Path, rows: int, side: int) -> None:
-    """Make a lake with a catalogue in cells of at most 1 M rows, and an image.
+    """Make a lake with a catalogue of random values (table `trial`) and an image of noise.
 
     Parameters
     ----------
     lake : Path
-        Folder of the lake.
+        Folder of the lake, which must not exist.
     rows : int
-        Number of rows of the catalogue.
+        Approximate number of rows of the catalogue. They are divided among at least two HEALPix cells of order 5, with
+        about a million rows each in large catalogues.
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels.
     """
     lake.mkdir()
     cells = max(CELLS, rows // ROWS)
@@ -244,23 +246,23 @@ def make_lake(lake: Path, rows: int, side: int) -> None:
 
 
 def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> dict[str, float]:
-    """Measure a server over HTTP and in a browser.
+    """Measure the response times of a server of the page over HTTP and, if one is installed, in a browser.
 
     Parameters
     ----------
     lake : Path
-        Folder of the lake to make.
+        Folder of the lake to make, which must not exist.
     rows, downloaded : int
-        Numbers of rows of the catalogue and of the downloads.
+        Number of rows of the catalogue, and number of rows to download.
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels.
     repeats : int
-        Number of repeats.
+        Factor of the numbers of repeats: most HTTP requests are sent 20 times as often.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     make_lake(lake, rows, side)
     started = time.perf_counter()
@@ -281,7 +283,8 @@ def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: i
                 print(f"page: the browser is not measured: {missing}")
             else:
                 figures |= _browser.time_brushes(address, 20 * repeats)
-            # Use a new connection, because the server has closed the first one, which was idle.
+            # Use a new connection: the server has closed the first one, because it was idle during the measurements
+            # in the browser.
             figures |= measure_downloads(PageClient(port), f"/api/{key}", server.pid, downloaded)
         finally:
             server.terminate()
@@ -291,16 +294,16 @@ def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: i
 
 
 def first_answer_seconds(client: PageClient, lake: str, part: int) -> float:
-    """Return the wall time of the first request for four columns, with an empty cache.
+    """Return the wall time of a request for charts of four columns that the server must first read from the table.
 
     Parameters
     ----------
     client : PageClient
-        Connection to the page.
+        Connection to the server.
     lake : str
-        Path of the lake's addresses on the server.
+        Beginning of the HTTP paths of the lake, "/api/<key>".
     part : int
-        1 for all rows, or SUBSAMPLING for a sample.
+        1 to count all rows, or 64 (SUBSAMPLING) to count one row in 64.
 
     Returns
     -------
@@ -317,21 +320,21 @@ def first_answer_seconds(client: PageClient, lake: str, part: int) -> float:
 
 
 def measure_large_lake(lake: Path, rows: int, repeats: int) -> dict[str, float]:
-    """Measure a lake of many rows: the first request for a sample, and searches in a circle.
+    """Measure response times for a large table: the first charts of a sample, and searches in a circle on the sky.
 
     Parameters
     ----------
     lake : Path
-        Folder of the lake to make.
+        Folder of the lake to make, which must not exist.
     rows : int
-        Number of rows.
+        Number of rows of the table.
     repeats : int
-        Number of repeats.
+        A third of the number of searches.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     make_lake(lake, rows, QUICK_SIDE)
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
@@ -363,23 +366,23 @@ def measure_large_lake(lake: Path, rows: int, repeats: int) -> dict[str, float]:
 
 
 def time_requests(client: PageClient, lake: str, side: int, times: int) -> dict[str, float]:
-    """Time the frequent requests of the page.
+    """Time the frequent HTTP requests of the page: a small SQL query, the first sky map, and tiles of an image.
 
     Parameters
     ----------
     client : PageClient
-        Connection to the page.
+        Connection to the server.
     lake : str
-        Path of the lake's addresses on the server.
+        Beginning of the HTTP paths of the lake, "/api/<key>".
     side : int
-        Side of the image in pixels.
+        Width and height of the image in pixels, at least 512.
     times : int
-        Number of requests of each kind.
+        Number of requests for the query and for the map. Each tile is requested once.
 
     Returns
     -------
     dict of str to float
-        Median times in milliseconds.
+        Median times in milliseconds, and the time of the first tile.
     """
     client.send("POST", f"{lake}/sql", '{"sql": "SELECT 1"}').read()
     clock = time.perf_counter()
@@ -395,23 +398,23 @@ def time_requests(client: PageClient, lake: str, side: int, times: int) -> dict[
 
 
 def measure_downloads(client: PageClient, lake: str, server: int, rows: int) -> dict[str, float]:
-    """Measure the speed of large downloads, and the additional memory of the server and its processes.
+    """Measure the speed of large downloads, and the additional memory of the server and its query processes.
 
     Parameters
     ----------
     client : PageClient
-        Connection to the page.
+        Connection to the server.
     lake : str
-        Path of the lake's addresses on the server.
+        Beginning of the HTTP paths of the lake, "/api/<key>".
     server : int
-        Identifier of the process of the server.
+        Process identifier of the server.
     rows : int
         Number of rows to download.
 
     Returns
     -------
     dict of str to float
-        Speeds in MB/s by format, and memory in MB.
+        Speed in MB/s for each file format, and `download_mb`, the largest additional memory in MB.
     """
     sql = quote(f"SELECT range AS id, range * 1.5 AS x, (range % 1000)::FLOAT AS y FROM range({rows})")
     figures, added_mb = {}, 0.0
@@ -426,13 +429,13 @@ def measure_downloads(client: PageClient, lake: str, server: int, rows: int) -> 
 
 
 def process_memory(pid: int) -> int:
-    """Return the memory (bytes) of a process and all its descendants."""
+    """Return the resident memory (bytes) of a process and all its descendants together."""
     process = psutil.Process(pid)
     return sum(family_member.memory_info().rss for family_member in (process, *process.children(recursive=True)))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("page", __doc__ or "", argv)
     rows, many_rows, max_rows = (
         (QUICK_ROWS, QUICK_MANY_ROWS, QUICK_MAX_ROWS) if options.quick else (ROWS, MANY_ROWS, MAX_ROWS)
@@ -441,7 +444,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     repeats = 1 if options.quick else 3
     figures = time_counting(rows, many_rows, max_rows, repeats)
     with tempfile.TemporaryDirectory() as folder:
-        # Start with an empty cache.
+        # Use an empty cache folder of truesky, so that first requests are not answered from it.
         os.environ["TRUESKY_CACHE"] = f"{folder}/cache"
         figures |= measure_server(Path(folder) / "lake", rows, downloaded, side, repeats)
         figures |= measure_large_lake(

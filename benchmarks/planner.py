@@ -1,7 +1,8 @@
-"""Measure the time of planning and the errors of the forecast.
+"""Measure the time to plan exposures, and the errors of the forecast of the costs of rendering them.
 
-Detectors of VIS and LSST are rendered as in a job, for three skies: the sky of the demo, one with few sources and one
-with many stars. The costs in truesky/render/channels come from this benchmark.
+Costs are CPU time, memory and disc space. Detector images of VIS and LSST are rendered as in a job for three skies: the
+sky of requests/demo.toml, one with few sources, and one with many stars. The constants in truesky/render/channels, from
+which costs are forecast, come from this benchmark.
 """
 
 from __future__ import annotations
@@ -34,9 +35,12 @@ from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
-# Number of rows of a crowded cell, and number of columns that a detector reads.
-CELL_ROWS, CELL_COLUMNS = 1_200_000, len(visible_sources.GALAXY_COLUMNS)
-# Changes of the demo request, whose sky is far from the Galactic plane and has sources to I_E = 26.
+# Number of rows of a crowded HEALPix cell of a catalogue.
+CELL_ROWS = 1_200_000
+# Number of columns of the galaxy catalogue that the rendering of a detector reads.
+CELL_COLUMNS = len(visible_sources.GALAXY_COLUMNS)
+# For each sky, the changes of requests/demo.toml, whose field is far from the Galactic plane and has sources to
+# I_E = 26.
 SKIES: dict[str, dict[str, Any]] = {
     "field": {},
     "sparse": {
@@ -49,7 +53,7 @@ SKIES: dict[str, dict[str, Any]] = {
         "products": {"truth": []},
     },
 }
-# Types of VIS calibration frames: without a sky, and with a lamp.
+# Types of VIS calibration frames that are rendered, too: without light (bias, dark), and with a lamp (flat).
 CALIBRATIONS = ("bias", "dark", "flat")
 _NOTES = {
     "plan_s": "wall, 331 fields x 4 dithers, all detectors of VIS and NISP (target 60)",
@@ -62,7 +66,10 @@ _NOTES = {
 
 
 def sky_request(sky_name: str, quick: bool) -> Request:
-    """Return the request of the demo with one of the SKIES; `quick` selects only bright sources."""
+    """Return the request of requests/demo.toml for one of the three skies in SKIES.
+
+    If `quick` is True, only bright sources and fewer images are simulated.
+    """
     table, change = tomllib.loads((ROOT / "requests" / "demo.toml").read_text()), SKIES[sky_name]
     table["pointing"] = [{**pointing, **change.get("pointing", {})} for pointing in table["pointing"][quick:]]
     table |= {key: value for key, value in change.items() if key in ("area", "products")}
@@ -76,25 +83,25 @@ def sky_request(sky_name: str, quick: bool) -> Request:
 
 
 def make_lake(folder: Path, sky_name: str, quick: bool, given_request: Request | None = None) -> tuple[Path, Request]:
-    """Make a lake with catalogues, fluxes and plan.
+    """Make a lake with catalogues, fluxes and the plan of exposures of a request.
 
     Parameters
     ----------
     folder : Path
-        Folder for the lake.
+        Existing folder; the lake is a new folder in it.
     sky_name : str
         Name of one of the SKIES.
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     given_request : Request, optional
-        Use this request instead of the request of the sky.
+        Request to use; by default the request for this sky.
 
     Returns
     -------
     root : Path
         Folder of the lake.
     lake_request : Request
-        The request.
+        Request from which the lake was made.
     """
     root, lake_request = layout.resolve_lake(folder / sky_name), given_request or sky_request(sky_name, quick)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
@@ -104,7 +111,10 @@ def make_lake(folder: Path, sky_name: str, quick: bool, given_request: Request |
 
 
 def time_planning(folder: Path, quick: bool) -> dict[str, float]:
-    """Time the plan of the fields of the wide survey."""
+    """Measure the wall and CPU time (s) to plan 331 fields of a wide survey with all detectors of VIS and NISP.
+
+    If `quick` is True, only 20 fields are planned. The numbers of exposures and detector images are returned, too.
+    """
     survey_request = parse(ROOT / "requests" / "sc8_main.toml")
     block = replace(survey_request.observations[0], fields=20 if quick else 331)
     survey_request = replace(survey_request, observations=(block,))
@@ -115,21 +125,22 @@ def time_planning(folder: Path, quick: bool) -> dict[str, float]:
 
 
 def measure_rendering(root: Path, lake_request: Request, name: str) -> dict[str, float]:
-    """Render all detectors of a lake, and compare their costs with the forecast.
+    """Render all planned detector images of a lake, and compare their costs with the forecast.
 
     Parameters
     ----------
     root : Path
-        Folder of the lake.
+        Folder of the lake, made by `make_lake`.
     lake_request : Request
-        Its request.
+        Request from which the lake was made.
     name : str
-        Prefix of the keys of the figures.
+        Beginning of the names of the results.
 
     Returns
     -------
     dict of str to float
-        CPU time (s), peak memory (GB) and size (MB) by channel and image type, and relative errors of the forecast.
+        For each channel and image type: CPU time (names end in `_s`), peak memory (`_gb`) and size of the images
+        (`_mb`), and the relative errors of their forecasts (`_s_error`, `_gb_error`, `_mb_error`).
     """
     step = render_exposures.steps(root, lake_request)[0]
     factor = speed.estimate_speed(root).factor
@@ -159,7 +170,10 @@ def measure_rendering(root: Path, lake_request: Request, name: str) -> dict[str,
 
 
 def _measure_task(function: Callable[[Task], Json], part: Task) -> tuple[Json, float, float]:
-    """Run a task in a worker and return its receipt, CPU time (s) and peak memory (GB)."""
+    """Run a rendering task in this process; return its receipt, the CPU time (s) and the peak memory (GB).
+
+    The receipt is the list of the task's files that the function `function` returns.
+    """
     reset_peak_memory()
     started = time.process_time()
     result = function(part)
@@ -167,14 +181,14 @@ def _measure_task(function: Callable[[Task], Json], part: Task) -> tuple[Json, f
 
 
 def time_reading(folder: Path, quick: bool) -> dict[str, float]:
-    """Return wall and CPU time (s) to read the generation cells of a detector from one file."""
+    """Return the wall and the CPU time (s) to read the sources near one detector from a crowded catalogue file."""
     rows = 100_000 if quick else CELL_ROWS
     root = layout.resolve_lake(folder / "crowded")
     publish.make_version(root, bulk.catalogue_plan(1, rows), bulk.make_cell)
     version = read.version(root, bulk.TRIAL.name)
     names = [name for name in version.schema.names if not name.startswith("_")][:CELL_COLUMNS]
     place = version.rows(["ra", "dec"]).slice(rows // 2, 1).to_pylist()[0]
-    # The circle contains a VIS detector and its margin.
+    # A circle of 0.1 deg contains a VIS detector and the sources outside it whose light reaches it.
     cells = sky.cells_in_cone(place["ra"], place["dec"], 0.1, GENERATION_ORDER).tolist()
     clocks = {"source_read_s": time.perf_counter, "source_read_cpu_s": time.process_time}
     return {
@@ -184,7 +198,7 @@ def time_reading(folder: Path, quick: bool) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("planner", __doc__ or "", argv)
     quick = options.quick
     with tempfile.TemporaryDirectory() as name:

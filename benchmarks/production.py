@@ -1,7 +1,7 @@
-"""Forecast a production for Euclid's eighth science challenge: core-hours by channel, per square degree, and overheads.
+"""Forecast the core-hours of simulating Euclid's eighth science challenge, and measure overheads of its jobs.
 
-The costs are the costs of the forecast, measured for each channel on an Intel Xeon of 2.5 GHz (truesky/render/channels,
-python -m benchmarks.planner). For each camera and band, the cost of all exposures follows from all detectors of a dozen
+The core-hours are computed with the constants in truesky/render/channels, which `python -m benchmarks.planner` measured
+on an Intel Xeon of 2.5 GHz. For each camera and passband, the cost of all exposures is extrapolated from a dozen
 exposures that are evenly spaced in the plan.
 """
 
@@ -25,8 +25,10 @@ from truesky.validation.lake.suite import inventory, running
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "production.json"
-# Number of exposures of each kind whose cost is computed; area of the main run in deg2 (Serrano et al. 2024).
-_SAMPLE, AREA = 12, 165.0
+# Number of exposures of each camera, image type and passband whose cost is computed.
+_SAMPLE = 12
+# Area of the main run in deg2 (Serrano et al. 2024).
+AREA = 165.0
 _EUCLID = ("VIS", "NISP-P", "NISP-S")
 _NOTES = {
     "core_hours_deg2": "main run, all channels, survey accuracy, all effects (target 6; the paper 2433)",
@@ -48,7 +50,11 @@ _NOTES = {
 
 
 def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict[str, int]]:
-    """Return core-hours and numbers of exposures of a request in requests/, by channel of Euclid or ground camera."""
+    """Return the forecast core-hours and the number of exposures of a request, by channel of Euclid or ground camera.
+
+    `name` is the name of the request's file in requests/ without its ending. `sample` is the number of exposures of
+    each camera, image type and passband whose cost is computed; the costs of the others are extrapolated.
+    """
     request = parse(ROOT / "requests" / f"{name}.toml")
     mission = mission_of(request.mission)
     exposures_by_kind, plan = defaultdict(list), survey.exposures(request, mission)
@@ -89,7 +95,10 @@ def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict
 
 
 def forecast_core_hours(quick: bool) -> dict[str, float]:
-    """Return the core-hours of the three productions, or only of the deep field if `quick`."""
+    """Return the core-hours of the pilot, deep and main runs of the science challenge, or only of deep if `quick`.
+
+    For the main run the core-hours per deg2 are returned, too.
+    """
     out: dict[str, float] = {}
     for run in ("deep",) if quick else ("pilot", "deep", "main"):
         hours, counts = core_hours(f"sc8_{run}", 2 if quick else _SAMPLE)
@@ -105,9 +114,13 @@ def forecast_core_hours(quick: bool) -> dict[str, float]:
 
 
 def overhead(quick: bool) -> dict[str, float]:
-    """Measure the overhead of tasks and runs outside rendering."""
+    """Measure the time that rendering jobs spend outside rendering, per task and per job.
+
+    The result contains `overhead_ms` (sum of the times per task in ms) and its parts. `quick` measures only some parts.
+    """
     with tempfile.TemporaryDirectory() as name:
-        # Use detectors with almost no sources to measure a task, and eight copies of the demo for shares of CPU time.
+        # Detectors with almost no sources are used to measure the time of a task outside rendering. The shares of CPU
+        # time below are measured with eight copies of each pointing of requests/demo.toml.
         empty_request = replace(
             planner.sky_request("field", quick), universe=planner.sky_request("field", True).universe, observations=()
         )
@@ -130,7 +143,10 @@ def overhead(quick: bool) -> dict[str, float]:
 
 
 def time_validation(lake: Path) -> dict[str, float]:
-    """Time the checks of a rendered field of Euclid."""
+    """Measure the wall time (s) of `truesky validate` for the Euclid science images of a lake, with two processes.
+
+    The result also contains the number of checked detector images.
+    """
     contents = inventory.read_contents(lake)
     shots = tuple(
         shot
@@ -143,7 +159,7 @@ def time_validation(lake: Path) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     lake_help = "also time the validation of this lake with a rendered field of Euclid, for example of `make pilot`"
     options = report.options("production", __doc__ or "", argv, lake=lake_help)
     figures = overhead(options.quick) | forecast_core_hours(options.quick)

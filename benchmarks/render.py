@@ -1,7 +1,7 @@
-"""Measure the drawing of sources: time per detector, comparison with other programs, and errors against galsim.
+"""Measure the drawing of sources: CPU time per detector, comparison with other programs, and errors against galsim.
 
-The errors are measured on galaxies that were not used to choose the settings. They are for accuracy "survey" unless the
-key of a figure names another accuracy.
+The errors are measured on galaxies that were not used to choose the parameters of the drawing code. A result is for the
+accuracy "survey", unless its name contains another accuracy ("quicklook", "draft" or "reference").
 """
 
 from __future__ import annotations
@@ -24,10 +24,15 @@ from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.psf import model
 from truesky.request import accuracy
 
-# Number of galaxies whose errors are measured, with a separate seed; fraction of them that is sheared in pairs; number
-# of galaxies per magnitude bin that galsim draws.
-NUM_TEST, PAIR_FRACTION, NUM_PEER = 204, 0.25, 8
+# Number of galaxies whose errors are measured.
+NUM_TEST = 204
+# Number of pairs rotated by 90 degrees for which the bias of shear is measured, divided by the number of galaxies for
+# which the other errors are measured.
+PAIR_FRACTION = 0.25
+# Number of galaxies per magnitude bin for which the speed of galsim is measured.
+NUM_PEER = 8
 REPEATS = 2
+# Seed of the galaxies whose errors are measured.
 _SEED = 16
 _NOTES = {
     "vis_survey_s": "CPU, all sources of a VIS detector, each with its own chromatic PSF (target 4.2)",
@@ -55,20 +60,20 @@ _NOTES = {
 
 
 def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, shared: bool = False) -> float:
-    """Return the CPU time to draw a scene.
+    """Return the CPU time to draw all sources of a detector.
 
     Parameters
     ----------
     scene : Scene
-        The scene.
+        Detector with pixel scale, exposure time, noise and numbers of sources.
     settings : Settings
-        Settings of drawing.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
     repeats : int
         Number of repeats; the shortest time counts.
     stars : bool, optional
-        Draw stars as well as galaxies.
+        If True (default), draw stars and galaxies, else only galaxies.
     shared : bool, optional
-        Use one PSF for all sources.
+        If True, use one PSF for all sources. By default each source has a PSF for its colour and position.
 
     Returns
     -------
@@ -79,7 +84,8 @@ def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, 
     if shared and psf.planes is not None:
         psf = scenes.psf_of_source(psf, sources, 0)
         sources = replace(sources, photons=None)
-    # Draw some of the brightest sources first: they use double precision, which is compiled separately.
+    # Draw a few sources before the clock starts, because functions are compiled at their first call. The brightest
+    # ones are among them, because they use separate functions in double precision.
     is_bright = sources.electrons >= np.sort(sources.electrons)[-3]
     scenes.draw_sources(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, scene, settings)
     return report.best_time(lambda: scenes.draw_sources(sources, psf, scene, settings), repeats, time.process_time)
@@ -90,7 +96,7 @@ def _psf(scene: Scene, settings: Settings) -> model.Psf:
 
 
 def psf_plane_seconds() -> tuple[float, float]:
-    """Return the CPU time (s) of the PSF of a detector: computed, and read from the cache."""
+    """Return the CPU time (s) to compute the PSF of a VIS detector, and the CPU time (s) to read it from the cache."""
     out = []
     with cache.use_temporary_dir():
         for _ in range(2):
@@ -101,7 +107,11 @@ def psf_plane_seconds() -> tuple[float, float]:
 
 
 def times(quick: bool, repeats: int) -> dict[str, float]:
-    """Return all times (s), and the ratios of times measured in the same run."""
+    """Measure the speed of drawing on a VIS and an LSST detector.
+
+    Return CPU times in s (names end in `_s`), and ratios: time of galsim or UFig / time of truesky. If `quick` is True,
+    the slowest accuracy and the time of the PSF are left out. `repeats` is the number of repeats of each measurement.
+    """
     tiers = {name: settings_for(target) for name, target in accuracy.PRESETS.items()}
     out = {}
     for scene in (VIS, LSST):
@@ -127,7 +137,12 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
-    """Return all errors: those at survey accuracy by their names, others with scene and accuracy as prefix."""
+    """Measure the errors of drawing against galsim, and print them.
+
+    `galaxies` is the number of galaxies; `quick` reduces it to 6 on VIS only. Errors on VIS at survey accuracy are
+    returned by their plain names, such as `r2_rms`. Other names begin with the detector and the accuracy, such as
+    `lsst_draft_r2_rms`.
+    """
     num_galaxies, pairs = (6, 2) if quick else (galaxies, max(round(PAIR_FRACTION * galaxies), 1))
     names = ("survey",) if quick else ("quicklook", "draft", "survey", "reference")
     tiers = {name: settings_for(accuracy.preset(name)) for name in names}
@@ -159,7 +174,7 @@ def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--galaxies", type=int, default=NUM_TEST, help="galaxies to compare with galsim")
     extra_parser.add_argument("--repeats", type=int, default=REPEATS, help="repeats; the shortest time counts")

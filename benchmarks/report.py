@@ -1,4 +1,4 @@
-"""Functions for all benchmarks: command-line options, a clock, and a report as table and as JSON."""
+"""Functions that all benchmarks use: command-line options, measurement of times, and a report as table and as JSON."""
 
 from __future__ import annotations
 
@@ -17,25 +17,29 @@ from lake_schema.store.provenance import git_commit
 def options(
     name: str, doc: str, argv: Sequence[str] | None = None, picture: bool = False, lake: str = ""
 ) -> argparse.Namespace:
-    """Parse the options of a benchmark.
+    """Parse the command-line options of a benchmark.
 
     Parameters
     ----------
     name : str
-        Name of the benchmark.
+        Name of the benchmark's module in the package `benchmarks`.
     doc : str
-        Its module docstring; the first line is the description.
+        Docstring of this module; its first line is the description of the command. It must not be empty.
     argv : sequence of str, optional
         Arguments. The default is the command line.
     picture : bool, optional
-        Add the option --picture.
+        If True, add the option --picture.
     lake : str, optional
-        Help text of the option --lake; without it there is no such option.
+        Help text of the option --lake. By default there is no such option.
 
     Returns
     -------
     argparse.Namespace
-        `quick`, `json`, and `picture` and `lake` if these options exist.
+        `quick` (bool), `json` (Path or None) and, if these options exist, `picture` and `lake` (Path or None).
+
+    Notes
+    -----
+    SystemExit is raised if an option is wrong, and for --help.
     """
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=doc.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="do little work and one repeat, for tests")
@@ -53,11 +57,11 @@ def best_time(work: Callable[[], Any], repeats: int, clock: Callable[[], float] 
     Parameters
     ----------
     work : callable
-        The function.
+        Function without arguments.
     repeats : int
-        Number of calls.
+        Number of calls, at least 1.
     clock : callable, optional
-        Clock in seconds. The default measures wall time.
+        Function that returns a time in seconds. The default measures wall time; `time.process_time` measures CPU time.
 
     Returns
     -------
@@ -73,7 +77,7 @@ def best_time(work: Callable[[], Any], repeats: int, clock: Callable[[], float] 
 
 
 def machine() -> str:
-    """Return the model of the processor and the number of cores."""
+    """Return the model of the processor and the number of cores as text, such as "Intel Xeon ..., 2 cores"."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -86,20 +90,20 @@ def machine() -> str:
 def print_and_write(
     name: str, repeats: int, figures: Mapping[str, float], notes: Mapping[str, str], file: Path | None
 ) -> None:
-    """Print the figures with notes, and write them as a flat JSON object if a file is given.
+    """Print the results of a benchmark as a table, and write them to a JSON file if one is given.
 
     Parameters
     ----------
     name : str
         Name of the benchmark.
     repeats : int
-        Number of repeats of each measurement.
+        Number of repeats of each measurement, for the heading.
     figures : mapping of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     notes : mapping of str to str
-        Descriptions of figures.
+        Descriptions of some of the values, by name.
     file : Path or None
-        JSON file to write.
+        JSON file to write, one object with the commit, the machine and the values; None to write nothing.
     """
     header = {"name": name, "commit": git_commit(), "machine": machine(), "repeats": repeats}
     load = round(os.getloadavg()[0], 2)

@@ -1,8 +1,9 @@
-"""Simulate the main run of Euclid's eighth science challenge on 100 to 10,000 cores: makespan and bottlenecks.
+"""Simulate how long a large rendering job takes on 100 to 10,000 cores, and what limits it.
 
-The tasks and their forecast times follow from requests/sc8_main.toml. The benchmark measures the rate at which Spark
-dispatches tasks, the memory of the driver per task, and the time to publish tiny partitions. A discrete-event
-simulation then distributes the tasks to cores, some of which are slow or fail.
+The job is the main run of Euclid's eighth science challenge. Its tasks (one per detector image) and their forecast
+times follow from requests/sc8_main.toml. The benchmark first measures the rate at which Spark starts tasks, the memory
+of Spark's driver per task, and the time to publish the results of tasks. A discrete-event simulation then distributes
+the tasks to cores, some of which are slow or fail.
 """
 
 from __future__ import annotations
@@ -36,12 +37,23 @@ from truesky.running.submitted_job import _collect
 
 ROOT = Path(__file__).resolve().parents[1]
 CORES = (100, 300, 1000, 3000, 10_000)
-# Cores per machine; fraction of slow machines (at least one machine), and their slowdown; mean time between failures of
-# a machine and its repair time, in hours. These values are more pessimistic than computing sites report.
-CORES_PER_MACHINE, SLOW_FRACTION, SLOWDOWN, MEAN_LIFE_H, REPAIR_H = 32, 0.02, 2.0, 1000.0, 0.2
-# Scatter of the actual time of a task around its forecast (natural logarithm), and overhead of a task in seconds.
-SCATTER, OVERHEAD_S = 0.25, 0.03
-# Number of files that a task creates, renames and syncs: rows, image, header, truth and receipt.
+# Number of cores of each machine of the simulated computing site. The values of slow machines and failures below are
+# more pessimistic than real sites report.
+CORES_PER_MACHINE = 32
+# Fraction of machines that are slow; at least one machine is slow.
+SLOW_FRACTION = 0.02
+# Factor by which tasks take longer on a slow machine.
+SLOWDOWN = 2.0
+# Mean time between failures of a machine, hours.
+MEAN_LIFE_H = 1000.0
+# Time after a failure until the machine works again, hours.
+REPAIR_H = 0.2
+# Standard deviation of ln(actual time of a task / forecast time).
+SCATTER = 0.25
+# Time that a task takes in addition to its forecast, s.
+OVERHEAD_S = 0.03
+# Number of files that a task creates, renames and syncs: table rows, image, header, true sources, and the receipt (the
+# JSON file that lists the others).
 FILES_PER_TASK = 5
 _NOTES = {
     "tasks": "planned detectors of the main run",
@@ -60,19 +72,16 @@ _NOTES = {
 }
 
 
-# ------------------------------------------------------------------------------------------------ simulation
-
-
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A computing site.
+    """Properties of a simulated computing site.
 
     Attributes
     ----------
     cores : int
         Number of cores.
     handed_out_per_s : float
-        Number of tasks that the driver dispatches per second.
+        Largest number of tasks that Spark's driver can start per second.
     slow_fraction : float
         Fraction of machines that are slow.
     mean_life_h : float
@@ -87,18 +96,18 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of a simulation.
+    """Result of a simulated run.
 
     Attributes
     ----------
     makespan : float
         Time from the first start to the last end of a task, in seconds.
     busy : float
-        Core-seconds of completed tasks.
+        Core-seconds spent on completed tasks.
     lost : float
-        Core-seconds of tasks that failures interrupted.
+        Core-seconds spent on tasks until a failure interrupted them.
     repeated : int
-        Number of interrupted tasks.
+        Number of times that a task was interrupted.
     """
 
     makespan: float
@@ -107,32 +116,38 @@ class Outcome:
     repeated: int
 
     def efficiency(self, cores: int, seconds: float) -> float:
-        """Return core-seconds of all tasks (on machines of normal speed) / core-seconds of the site during the run."""
+        """Return the fraction of the available core-seconds that the tasks would need on machines of normal speed.
+
+        `seconds` is the sum of the times of all tasks. The available core-seconds are `cores` times the makespan.
+        """
         return seconds / (cores * self.makespan)
 
 
 def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
-    """Simulate a run: each task runs on the core that is free first; tasks on a failing machine start again.
+    """Simulate a run on a computing site with slow machines and failures.
+
+    Each task runs on the core that is free first. If a machine fails, its tasks start again on other cores. One failure
+    always happens in the middle of the run, unless `site.mean_life_h` is infinite.
 
     Parameters
     ----------
     seconds : float array, shape (n,)
         Times of the tasks on one core in seconds, in the order in which they are dispatched.
     site : Site
-        The computing site.
+        Properties of the computing site.
     rng : Generator
-        Random numbers for slow machines and failures.
+        Generator of random numbers, which selects slow machines and times of failures.
 
     Returns
     -------
     Outcome
-        Makespan and losses.
+        Makespan, and core-seconds that were used and lost.
     """
     machines = -(-site.cores // CORES_PER_MACHINE)
     slow = np.isin(np.arange(machines), rng.permutation(machines)[: math.ceil(site.slow_fraction * machines)])
     death_time = rng.exponential(site.mean_life_h * 3600.0, machines)
     if np.isfinite(site.mean_life_h):
-        # Let one machine fail in the middle of the run, however short the run is.
+        # Let one machine fail in the middle of the run, so that even a short run has a failure.
         death_time[rng.integers(machines)] = 0.5 * seconds.sum() / site.cores
     free = [(0.0, core) for core in range(site.cores)]
     waiting = iter(range(len(seconds)))
@@ -152,7 +167,7 @@ def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
         machine = core // CORES_PER_MACHINE
         duration = seconds[task] * (SLOWDOWN if slow[machine] else 1.0)
         while death_time[machine] < driver:
-            # The machine failed while it was idle.
+            # The machine failed and was repaired while it was idle, so no task was lost. Draw its next failure.
             death_time[machine] += rng.exponential(site.mean_life_h * 3600.0)
         if death_time[machine] < driver + duration:
             repeated += 1
@@ -167,7 +182,11 @@ def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
 
 
 def task_orders(seconds: Float, exposures: Int) -> dict[str, Int]:
-    """Return orders of tasks by name: longest first (as the jobs run), as observed, shortest first."""
+    """Return three orders in which tasks can be started, as arrays of indices, by name.
+
+    "longest": longest task first, which truesky uses. "observed": by number of the exposure. "shortest": shortest task
+    first. `seconds` contains the forecast times of the tasks, and `exposures` the numbers of their exposures.
+    """
     return {
         "longest": np.argsort(-seconds, kind="stable"),
         "observed": np.argsort(exposures, kind="stable"),
@@ -176,24 +195,25 @@ def task_orders(seconds: Float, exposures: Int) -> dict[str, Int]:
 
 
 def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int]) -> dict[str, float]:
-    """Simulate all numbers of cores and all orders of tasks.
+    """Simulate runs with several numbers of cores, each with three orders of the tasks.
 
     Parameters
     ----------
     seconds : float array, shape (n,)
         Forecast times of the tasks in seconds.
     exposures : int array, shape (n,)
-        Numbers of their exposures.
+        Numbers of the exposures of the tasks.
     rate : float
-        Number of tasks that the driver dispatches per second.
+        Largest number of tasks that Spark's driver can start per second.
     cores : sequence of int
-        Numbers of cores.
+        Numbers of cores to simulate.
 
     Returns
     -------
     dict of str to float
-        Hours and efficiency by number of cores and order. The order of the jobs is also simulated on a site without
-        slow machines and failures.
+        `hours_<cores>_<order>` (makespan) and `efficiency_<cores>_<order>` for the orders "longest", "observed" and
+        "shortest", `again_<cores>` (number of interrupted tasks), and for a site without slow machines and failures
+        `hours_<cores>_sound`, `tasks_per_s_<cores>` and `creates_per_s_<cores>` (created files per second).
     """
     actual_seconds = seconds * np.random.default_rng(1).lognormal(-0.5 * SCATTER**2, SCATTER, len(seconds)) + OVERHEAD_S
     figures = {}
@@ -215,11 +235,12 @@ def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int])
     return figures
 
 
-# ------------------------------------------------------------------------------------------------ measurements
-
-
 def planned_tasks(quick: bool) -> tuple[Float, Int, dict[str, float]]:
-    """Return forecast times (s) and exposures of the tasks of the main run, and figures of the plan."""
+    """Plan the main run of Euclid's eighth science challenge, or a small part of it if `quick`.
+
+    Return the forecast times (s) of its tasks, the numbers of their exposures, and numbers about the plan by name, such
+    as `tasks` and `core_hours`.
+    """
     request = parse(ROOT / "requests" / "sc8_main.toml")
     if quick:
         short_observations = tuple(
@@ -256,7 +277,11 @@ def _make_part(task: Json) -> Task:
 
 
 def time_dispatch(num_tasks: int) -> dict[str, float]:
-    """Measure the rate of empty tasks in local mode, and the memory that they leave in the driver's Java."""
+    """Measure the rate at which Spark runs empty tasks on this machine, and the memory that they leave in its driver.
+
+    `num_tasks` is the number of tasks. The result contains tasks per second with and without Python, and the memory of
+    the Java process in kB per task.
+    """
     spark = get_session("benchmark of the scheduler")
     java = spark.sparkContext._jvm
     task_list = [
@@ -287,7 +312,12 @@ def time_dispatch(num_tasks: int) -> dict[str, float]:
 
 
 def time_publishing(folder: Path, num_partitions: int) -> dict[str, float]:
-    """Measure the publication of `num_partitions` partitions whose tiny files and receipts exist already."""
+    """Measure the time and memory to publish a table whose files have been written by many tasks.
+
+    The files are tiny, and each of the `num_partitions` tasks has left a receipt (a JSON file that lists its files).
+    Publishing reads the receipts, writes the manifest (the list of all files), and removes the receipts. The lake is
+    made in `folder`.
+    """
     root = layout.resolve_lake(folder / f"lake-{num_partitions}")
     partitions = tuple(_make_part({"exposure_id": i // 36, "detector": f"{i % 36}"}) for i in range(num_partitions))
     plan = Plan(PRODUCTS, {"request": {"name": "tiny"}}, partitions)
@@ -338,7 +368,10 @@ _SHA256_OF_X = "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881
 
 
 def draw_picture(figures: Json, file: Path) -> None:
-    """Plot hours and efficiency against the number of cores for each order into a PNG or JPEG file."""
+    """Plot makespan and efficiency against the number of cores, for each order of the tasks, into a PNG or JPEG file.
+
+    `figures` contains the results of `makespans` for all numbers in CORES, and `core_hours`.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -373,7 +406,7 @@ def draw_picture(figures: Json, file: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run measurements and simulations, and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("scheduler", __doc__ or "", argv, picture=True)
     seconds, exposures, figures = planned_tasks(options.quick)
     figures |= time_dispatch(200 if options.quick else 4000)

@@ -1,10 +1,13 @@
 """Measure speed and accuracy of the star catalogue: python -m benchmarks.stars [--quick] [--json FILE].
 
-stars_per_s_core   stars per CPU second of one core, from the plan to the published table
-with_fluxes_...    the same with fluxes in ten bands
-cell_peak_gb       peak memory of a separate process that draws the most crowded cell outside the plane and the bulge
-counts_*           largest difference of star counts from sums of the same laws by independent code
-against_*          ratio to published counts of the real sky in the same band
+The report has these lines:
+
+stars_per_s_core   stars per CPU second of one core, until the table of stars is published in the lake (folder)
+with_fluxes_...    stars per CPU second of one core, until stars and their fluxes in ten passbands are published
+cell_peak_gb       peak memory of a process that draws the most crowded HEALPix cell outside the plane and the bulge
+counts_*           largest relative difference of drawn star counts from counts that independent code expects from the
+                   same density laws
+against_*          ratio of drawn star counts to published counts of the real sky in the same passband
 """
 
 from __future__ import annotations
@@ -37,16 +40,16 @@ from truesky.request.from_toml import from_table
 from truesky.validation.model import star_counts
 
 BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
-# Number of stars with H < 26 at |b| > 20 deg by the same laws.
+# Published number of stars with H < 26 at |b| > 20 deg from the same density laws as in truesky.
 SKY_20 = 2.65e9
 
 
 def pole_counts(v: float) -> float:
-    """Return the published number of stars per deg2 at the Galactic pole brighter than V.
+    """Return the published number of stars per deg2 at the Galactic pole that are brighter than magnitude `v` in V.
 
     Notes
     -----
-    The error is 15 % according to the authors. At V = 11 the formula is a factor of 2 too low.
+    The error is 15 % according to the authors. At V = 11 the formula gives only half of the real number.
 
     References
     ----------
@@ -58,22 +61,32 @@ def pole_counts(v: float) -> float:
 
 
 def count_far_from_plane(step: int) -> float:
-    """Return the expected number of stars with H < 26 at |b| > 20 deg, from every `step`-th cell."""
+    """Return the number of stars with H < 26 at |b| > 20 deg that the density laws of truesky predict.
+
+    Only every `step`-th HEALPix cell of order 8 is computed, and the sum is multiplied by `step`.
+    """
     cells = np.arange(0, 12 << 2 * GENERATION_ORDER, step)
     _, b = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
     universe = stars.model()
-    # The published number counts systems, not components.
+    # The published number counts a binary as one star, so companions are switched off.
     single_stars = replace(universe.galaxy, companions=0.0 * universe.galaxy.companions)
     return float(stars.expected_counts(cells[np.abs(b) > 20.0], replace(universe, galaxy=single_stars)).sum() * step)
 
 
 def brighter_than_11(step: int, dust: Float32) -> float:
-    """Return the expected number of stars with V < 11 on the sky, with dust, from every `step`-th cell of order 4."""
+    """Return the number of stars with V < 11 on the whole sky that the density laws of truesky predict, with dust.
+
+    `dust` is the map of Galactic dust from `dust_map.load`. Only every `step`-th HEALPix cell of order 4 is computed.
+    """
     return star_counts.count_whole_sky(stars.model(), 11.0, dust, step)
 
 
 def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
-    """Count stars at both Galactic poles to V = 20 and G = 20 by their fluxes, and compare with published counts."""
+    """Count simulated stars at both Galactic poles with V < 20 and with G < 20, and compare with published counts.
+
+    `cells` is the number of positions near the poles whose HEALPix cells are drawn, and `dust` the map of Galactic
+    dust. The result contains the stars per deg2 and their ratios to the published counts.
+    """
     universe, library = stars.model(24.0), templates.stellar_library()
     zero_points = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
     drawn = star_counts.cells_at_latitude(90.0, cells, south=True)
@@ -85,7 +98,8 @@ def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
             magnitudes[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
     v, g = (np.concatenate(magnitudes[band]) for band in zero_points)
     area = len(drawn) * star_counts.AREA
-    # Convert the published counts to G: weight bins of V by the fraction of our stars that is brighter than G = 20.
+    # Convert the published counts from V to G: multiply the count in each bin of V by the fraction of simulated stars
+    # in this bin that is brighter than G = 20.
     edges = np.arange(8.0, 24.1, 0.5)
     bright_counts, _ = np.histogram(v[g < 20.0], edges)
     all_counts, _ = np.histogram(v, edges)
@@ -99,11 +113,16 @@ def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
 
 
 def speed(radius: float) -> dict[str, float]:
-    """Measure the two jobs for a circle of this radius (deg) at b = 30 deg, without Spark."""
+    """Measure the speed of drawing stars and of computing their fluxes, in this process without Spark.
+
+    The stars lie in a circle of this radius (deg) at Galactic latitude 30 deg. The result contains the number of rows,
+    stars per CPU second without and with fluxes, and the size of a row in bytes.
+    """
     ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
     table = {"name": "benchmark", "seed": star_counts.SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
     request = from_table({**table, "fluxes": {"bands": BANDS}})
-    # Make libraries and machine code before the clock starts, because they are made only once.
+    # Make the libraries of spectra, the tables of fluxes and compiled code before the clock starts, because they are
+    # made only once per machine.
     curves = [passbands.load(band) for band in BANDS]
     libraries = templates.galaxy_library(), templates.stellar_library()
     band_fluxes.prepare(curves, [None] * len(curves), *libraries, request.accuracy)
@@ -138,9 +157,10 @@ print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
 
 
 def draw_crowded_cell(limit: float) -> int:
-    """Draw and publish the most crowded cell outside the plane and the bulge, and return its number of rows.
+    """Draw and publish the stars of the most crowded HEALPix cell, and return their number.
 
-    The plane and the bulge have brighter limits.
+    `limit` is the faintest magnitude. Cells in the Galactic plane and in the bulge are not considered, because truesky
+    uses brighter limits there.
     """
     cells = np.arange(12 << 2 * GENERATION_ORDER)
     lon, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
@@ -160,7 +180,7 @@ def draw_crowded_cell(limit: float) -> int:
 
 
 def crowded_cell_memory(limit: float) -> tuple[float, float]:
-    """Return rows and peak memory (GB) of `draw_crowded_cell` in a separate process."""
+    """Return the number of stars and the peak memory (GB) of `draw_crowded_cell` in a new process."""
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
         [sys.executable, "-c", _CROWDED, str(limit)], capture_output=True, text=True, check=True, cwd=root
@@ -170,7 +190,7 @@ def crowded_cell_memory(limit: float) -> tuple[float, float]:
 
 
 def run(quick: bool) -> dict[str, float]:
-    """Return all figures."""
+    """Measure speed and accuracy of the star catalogue, and return all results by name; `quick` draws few stars."""
     dust = dust_map.load(star_counts.SEED)
     figures = speed(0.1 if quick else 1.0)
     figures["cell_rows"], figures["cell_peak_gb"] = crowded_cell_memory(16.0 if quick else 26.0)
@@ -202,7 +222,7 @@ NOTES = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("stars", __doc__ or "", argv)
     report.print_and_write("stars", 1, run(options.quick), NOTES, options.json)
     return 0

@@ -1,10 +1,13 @@
-"""Measure time against accuracy of drawing, for a sequence of settings and for approximations of other programs.
+"""Measure the CPU time and the errors of drawing sources on a VIS detector, for several settings and approximations.
 
-The settings are chosen on one sample of sources; the truth is a drawing on the largest stamps in double precision.
-Their errors are then measured on other sources, with equal numbers of galaxies and stars in each layer of magnitude;
-the truth is galsim with its tightest parameters. The benchmark also measures galsim with default parameters on these
-galaxies, and the change of galsim's images if one of the tight parameters is looser. Errors of approximations are
-relative to our most accurate drawing. The scene is a VIS detector. Each point is measured in a separate process.
+A setting is a set of parameters of the drawing code. The settings are chosen with one sample of sources, which are
+compared with a drawing on very large stamps in double precision. Their errors are then measured on a test sample, with
+equal numbers of galaxies and stars in each range of magnitude, against galsim with its tightest parameters.
+
+The benchmark also measures galsim with default parameters, and galsim with a relaxed value of one tight parameter. It
+measures approximations with which other programs save time, relative to the most accurate drawing of truesky. The
+errors of each setting, and each approximation, are measured in a separate process. The CPU times of all settings are
+measured in one process.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from truesky.render.psf import model
 from truesky.render.sources.source_list import Sources
 
 Row = dict[str, str | float]
-# Settings from quicklook to reference accuracy; then single changes of the settings for survey accuracy.
+# Settings of the drawing code from the least accurate ("quicklook") to the most accurate ("reference").
 _CHAIN = (
     Settings(0.5, 1e-2, 1e-1, 2.4, 1, 2),
     Settings(0.25, 4e-3, 3e-2, 4.0, 4, 4),
@@ -46,7 +49,9 @@ _CHAIN = (
     Settings(0.018, 2e-4, 1e-3, 6.5, 9),
     Settings(0.005, 5e-5, 1e-4, 8.0, 25),
 )
+# Index in _CHAIN of the settings for the accuracy "survey".
 _SURVEY = 4
+# Variants of the settings for survey accuracy: name of one parameter, and its changed value.
 _CHANGED = (
     ("edge", 0.1),
     ("aliased", 1e-2),
@@ -55,21 +60,30 @@ _CHANGED = (
     ("min_size_arcsec", 3.2),
     ("colours", 4),
 )
-# Numbers of galaxies and of stars per layer of magnitude, to choose the settings and to test them; number of galaxies
-# in each sample that are sheared in pairs. Number of galaxies to measure approximations, and of their pairs.
-_NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED, _NUM_QUOTED, _NUM_PAIRS = 3, 4, 12, 24, 18
+# Number of galaxies, and of stars, per range of magnitude in the sample with which settings are chosen.
+_NUM_CHOSEN = 3
+# Number of galaxies, and of stars, per range of magnitude in the sample with which the chosen settings are tested.
+_NUM_TEST = 4
+# Number of galaxies in each sample for which the bias of shear is measured.
+_NUM_SHEARED = 12
+# Number of galaxies with which approximations of other programs are measured.
+_NUM_QUOTED = 24
+# Number of galaxies with which the bias of shear by approximations of other programs is measured.
+_NUM_PAIRS = 18
 _CHOSEN_SEED, _TEST_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 34, 21, 1
-# Seeds of the stars that measure the error of the PSF.
+# Seeds of the stars with which the error of the PSF is measured: for the sample with which settings are chosen, and for
+# the test sample.
 _PSF_SEEDS = (5, 6)
-# Threshold of the largest frequency in galsim. With 1e-4 the centres of bright discs are wrong by 3e-3 of the noise.
+# Parameter maxk_threshold of galsim for the true images. With 1e-4 the centres of bright discs would be wrong by 3e-3
+# of the noise.
 _MAXK_THRESHOLD = 1e-5
-# Galaxies fainter than this are small compared with the frame.
+# Galaxies fainter than this magnitude are small compared with the width of the image on which they are drawn.
 _SMALL = 20.0
-# Names of cases with one looser parameter of galsim: threshold of folding, threshold of the largest frequency.
+# Variants of galsim with one relaxed parameter: name, folding_threshold, maxk_threshold.
 _LOOSER_THRESHOLDS = (("folding 1e-3", 1e-3, _MAXK_THRESHOLD), ("largest frequency 1e-4", references.ACCURACY, 1e-4))
-# The only approximation of the truth is a finite, large stamp. It is drawn in double precision.
+# Settings of the most accurate drawing. Its only approximation is a finite stamp, at least 25.6 arcsec wide.
 _TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, min_size_arcsec=25.6, positions=9)
-# Magnitudes per relative error of flux.
+# Factor from a small relative error of a flux to the error in magnitudes: 2.5 / ln(10).
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
 _SETTING_NAMES = ("edge", "aliased", "floor", "min_size_arcsec", "positions", "colours")
@@ -91,7 +105,11 @@ _SETTINGS = f"""\
 
 @dataclass(frozen=True)
 class Reference:
-    """A source of a sample in the middle of a frame, its PSF, its true image, and its response to shear if measured."""
+    """A source in the middle of an image, its PSF, its true image, and its true response to shear.
+
+    `sources` is a list of one source. `response` contains de1/dg1, de2/dg2 and the mean e1 and e2 of a pair rotated by
+    90 degrees; it is None if it is not measured.
+    """
 
     sources: Sources
     psf: model.Psf
@@ -105,21 +123,22 @@ class Reference:
 
 
 def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.0) -> list[Reference]:
-    """Draw the true images of sources.
+    """Draw the true images of sources on a VIS detector.
 
     Parameters
     ----------
     sources : Sources
         The sources.
     num_pairs : int
-        Number of galaxies whose response to shear is measured.
+        Number of galaxies whose response to shear is measured; the first ones in random order are used.
     maxk_threshold : float, optional
-        Threshold of galsim for the largest frequency. 0 uses our drawing on the largest stamps as truth.
+        Parameter of galsim, with which galaxies are drawn. With 0 (default), and if galsim fails, the true images are
+        drawn by truesky on very large stamps. Otherwise those of stars follow from the Fourier series of their PSF.
 
     Returns
     -------
     list of Reference
-        The sources in random order.
+        The sources with their true images, in random order.
     """
     full_psf, out = scenes.scene_psf(VIS), []
     order = np.random.default_rng(_CHOSEN_SEED).permutation(len(sources))
@@ -149,7 +168,10 @@ def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.
 
 
 def _truth(source: Sources, psf: model.Psf, maxk_threshold: float) -> Float | None:
-    """True image of a galaxy (by galsim) or of a star (by the Fourier series of its PSF)."""
+    """Return the true image of a galaxy (drawn by galsim) or of a star (from the Fourier series of its PSF).
+
+    None is returned if galsim fails or has not enough memory.
+    """
     if source.shape[0] < 0:
         return references.image_by_series(source, psf, errors.COMPARED_SIDE)
     return references.reference_image(source, psf, errors.COMPARED_SIDE, maxk_threshold)
@@ -167,25 +189,26 @@ def compare(
     simplified: list[Reference],
     approximation: Approximation = NO_APPROXIMATION,
 ) -> tuple[Float, Float]:
-    """Measure the errors of galaxies that are drawn with an approximation.
+    """Measure the errors of sources that are drawn with some settings and, optionally, with an approximation.
 
     Parameters
     ----------
     settings : Settings
-        Settings of drawing.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
     galaxies : list of Reference
-        The galaxies with their true images.
+        The sources with their true images.
     simplified : list of Reference
-        The galaxies to draw: the simplified ones, or the same.
+        The sources to draw, in the same order: `galaxies` again, or a simplified copy for an approximation.
     approximation : Approximation, optional
-        The approximation. By default there is no approximation.
+        Approximation of stamp sizes or of the image. By default nothing is approximated.
 
     Returns
     -------
     errors : float array, shape (n, 5)
-        Errors by the names in `_errors.NAMES`.
+        Aperture magnitude, centroid (mas), relative R2, ellipticity, and largest error of a pixel in units of the
+        noise.
     bias : float array, shape (pairs, 2)
-        Bias (m, c) of the response to shear.
+        Bias (m, c) of the response to shear, for the sources whose true response is known.
     """
     error_values, bias = [], []
     for galaxy, simplified_galaxy in zip(galaxies, simplified, strict=True):
@@ -215,22 +238,23 @@ def measure_settings(
     test_sample: list[Reference],
     psf_errors: Mapping[str, dict[str, float]],
 ) -> Row:
-    """Measure the errors of settings for the sample used to choose them, and for the test sample.
+    """Measure the errors of settings of the drawing code for two samples.
 
     Parameters
     ----------
     settings : Settings
-        The settings.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
     chosen_sample, test_sample : list of Reference
-        The two samples.
+        Sources with which settings are chosen, and other sources with which they are tested.
     psf_errors : mapping of str to dict
-        Largest errors from the finite numbers of positions and colours of the PSF, for "" (first sample) and "_held"
-        (test sample).
+        Largest errors that follow from the finite numbers of positions and wavelengths of the PSF, by name, for the
+        first sample (key "") and for the test sample (key "_held"). They are added in quadrature.
 
     Returns
     -------
     dict
-        Errors by name; keys of the test sample end in `_held`.
+        Largest errors by name: `flux` (relative), `shape`, `position` (pixels) and `background` (in units of the
+        noise). Names for the test sample end in `_held`.
     """
     row: Row = {}
     for kind, sample_part in (("", chosen_sample), ("_held", test_sample)):
@@ -246,7 +270,10 @@ def measure_settings(
 
 
 def _largest_errors(error_values: Float, bias: Float, is_star: Bool) -> dict[str, float]:
-    """Largest errors by the names of an accuracy, from the errors [n, 5] and bias [pairs, 2] of `compare`."""
+    """Return the largest errors by the names that a request uses for an accuracy: flux, shape, position, background.
+
+    `error_values` [n, 5] and `bias` [pairs, 2] are results of `compare`. `is_star` [n] is True for stars.
+    """
     worst = error_values.max(axis=0)
     return {
         "flux": float(np.expm1(worst[0] / _MAG)),
@@ -261,23 +288,25 @@ def _largest_errors(error_values: Float, bias: Float, is_star: Bool) -> dict[str
 def measure_approximation(
     approximation: Approximation, settings: Settings, repeats: int, quoted: list[Reference]
 ) -> Row:
-    """Measure the times with and without an approximation, and its errors.
+    """Measure the CPU time with and without an approximation, and its errors.
 
     Parameters
     ----------
     approximation : Approximation
-        The approximation.
+        Approximation to measure.
     settings : Settings
-        Settings of drawing.
+        Parameters of the drawing code, such as limits for the sizes of stamps.
     repeats : int
-        Number of repeats of each time.
+        Number of repeats of each measurement of time.
     quoted : list of Reference
-        Sample for approximations that apply to all galaxies.
+        Galaxies with true images, for approximations that apply to all galaxies. Other approximations draw a sample of
+        the galaxies for which they are meant.
 
     Returns
     -------
     dict
-        `seconds_before` and `seconds` (CPU time without and with the approximation), and errors.
+        `seconds_before` and `seconds` (CPU time without and with the approximation), `galaxies_timed` (number of
+        galaxies that were timed), and errors by name.
     """
     n, pairs, num_timed = approximation.sample_sizes
     sources, full_psf = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.scene_psf(VIS)
@@ -291,7 +320,8 @@ def measure_approximation(
         quoted if approximation.select_galaxies is NO_APPROXIMATION.select_galaxies else make_references(sources, pairs)
     )
     simplified = [_simplify_galaxy(galaxy, sources, simple_psf, approximation) for galaxy in galaxies]
-    # Use large stamps, so that the approximation is the only error, unless it approximates the sizes of stamps.
+    # Draw on large stamps, so that the approximation is the only source of error. An approximation of the sizes of
+    # stamps is measured with `settings`.
     settings_used = _TRUTH if approximation.sizes is NO_APPROXIMATION.sizes else settings
     return {**row, **_summary(*compare(settings_used, galaxies, simplified, approximation))}
 
@@ -299,7 +329,11 @@ def measure_approximation(
 def _simplify_galaxy(
     galaxy: Reference, sources: Sources, simple_psf: model.Psf, approximation: Approximation
 ) -> Reference:
-    """Simplify a galaxy of `sources`; `simple_psf` is the simplified PSF of the detector."""
+    """Return a galaxy to which an approximation of profiles and PSF has been applied.
+
+    `sources` is the list of sources from which the galaxy was taken, and `simple_psf` the simplified PSF of the
+    detector.
+    """
     source = replace(approximation.simplify(galaxy.sources), photons=None)
     if approximation.simplify_psf is NO_APPROXIMATION.simplify_psf:
         return replace(galaxy, sources=source)
@@ -312,17 +346,19 @@ def _simplify_galaxy(
 def _seconds(
     sources: Sources, psf: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NO_APPROXIMATION
 ) -> float:
-    """CPU time (s) to draw sources on the frame of the scene."""
-    # Draw some of the brightest sources first: they use double precision, which is compiled separately.
+    """Return the CPU time (s) to draw sources on a VIS detector, the shortest of `repeats` measurements."""
+    # Draw a few sources before the clock starts, because functions are compiled at their first call. The brightest
+    # ones are among them, because they use separate functions in double precision.
     is_bright = sources.electrons >= np.sort(sources.electrons)[-3:].min()
     approximation.draw(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, VIS, settings)
     return report.best_time(lambda: approximation.draw(sources, psf, VIS, settings), repeats, time.process_time)
 
 
 def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Settings, float]:
-    """Return the CPU time (s) of the scene by settings.
+    """Return the CPU time (s) to draw all sources of a VIS detector with each of several settings.
 
-    All settings are drawn in turn, so that other load on the machine affects them equally.
+    In each repeat all settings are timed one after another, so that other load on the machine affects them equally. The
+    shortest time of each counts.
     """
     scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(settings_list, np.inf)
     for _ in range(repeats):
@@ -333,7 +369,12 @@ def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Setti
 
 
 def measure_galsim(test_sample: list[Reference], num_per_bin: int) -> Row:
-    """Return time and errors of galsim with default parameters, for the galaxies and the truth that our errors use."""
+    """Return the CPU time and the errors of galsim with default parameters.
+
+    The errors are measured for the galaxies in `test_sample`, relative to their true images. `num_per_bin` is the
+    number of galaxies per bin of magnitude for which the time is measured; it is scaled to all galaxies of a VIS
+    detector.
+    """
     default, _ = peers.galsim_seconds(VIS, num_per_bin)
     galaxies = [reference for reference in test_sample if not reference.is_star]
     error_values = [
@@ -344,7 +385,11 @@ def measure_galsim(test_sample: list[Reference], num_per_bin: int) -> Row:
 
 
 def compare_oracles(test_sample: list[Reference]) -> Iterator[Row]:
-    """Yield the differences between galsim with its tightest parameters and methods that should be as accurate."""
+    """Yield the differences between galsim with its tightest parameters and other accurate methods.
+
+    The methods are truesky on very large stamps, galsim with one relaxed parameter, and the Fourier series of the PSF.
+    The last row compares truesky with the Fourier series, for small galaxies.
+    """
     galaxies = [reference for reference in test_sample if not reference.is_star]
     draw_functions: dict[str, Callable[[Reference], Float | None]] = {
         "ours, the largest stamps": lambda g: scenes.draw_sources(g.sources, g.psf, VIS, _TRUTH, errors.COMPARED_SIDE)
@@ -358,7 +403,7 @@ def compare_oracles(test_sample: list[Reference]) -> Iterator[Row]:
         images = [(draw_galaxy(reference), reference) for reference in galaxies]
         error_values = [errors.errors(image, g.image, VIS, g.sources) for image, g in images if image is not None]
         yield {"kind": "oracle", "name": name, **errors.figures(np.array(error_values)), "galaxies": len(error_values)}
-    # For galaxies that are small compared with the frame the Fourier series is the better truth.
+    # For galaxies that are small compared with the image, the Fourier series is more accurate than galsim.
     faint = [reference for reference in galaxies if float(scenes.magnitudes(reference.sources, VIS)[0]) > _SMALL]
     error_values = [
         errors.errors(draw_functions["ours, the largest stamps"](g), _draw_by_series(g), VIS, g.sources) for g in faint
@@ -377,7 +422,11 @@ def _draw_with_thresholds(reference: Reference, folding_threshold: float, maxk_t
 
 
 def measure_all(quick: bool, repeats: int) -> Iterator[Row]:
-    """Yield one row per point, each measured in a separate process."""
+    """Measure everything, and yield one row (values by name) per setting, approximation or other program.
+
+    `quick` measures only a few of them with few sources. Each row is measured in a separate process, but all
+    settings are timed in the same process.
+    """
     chain = [_CHAIN[0], _CHAIN[_SURVEY]] if quick else _CHAIN
     changed = [] if quick else [Settings(**{**asdict(_CHAIN[_SURVEY]), name: value}) for name, value in _CHANGED]
     num_chosen, num_test, pairs = (1, 1, 2) if quick else (_NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED)
@@ -427,7 +476,10 @@ def _format_row(row: Row) -> str:
 
 
 def write(rows: list[Row], file: Path) -> None:
-    """Write the rows as CSV, with a column for every key; a field is empty if a row does not have the key."""
+    """Write rows (dictionaries with values by name) to a CSV file, with one column for every name.
+
+    A field is empty if its row does not have the name.
+    """
     names = list(dict.fromkeys(key for row in rows for key in row))
     with file.open("w", newline="", encoding="utf-8") as out:
         writer = csv.DictWriter(out, names, lineterminator="\n")
@@ -436,7 +488,10 @@ def write(rows: list[Row], file: Path) -> None:
 
 
 def settings_table(rows: list[Row]) -> str:
-    """Return the table of settings that truesky.request.accuracy reads, from the rows of trade.csv."""
+    """Return the CSV table of settings, errors and times that truesky.request.accuracy reads, as text.
+
+    `rows` are the rows of `measure_all`; at least one must have the kind "settings".
+    """
     names = _SETTINGS.splitlines()[-1].split(",")
     setting_rows = [row for row in rows if row["kind"] == "settings"]
     lines = [",".join(f"{float(row[name]):.4g}" for name in names) for row in setting_rows]
@@ -444,7 +499,10 @@ def settings_table(rows: list[Row]) -> str:
 
 
 def draw_figure(rows: list[Row], file: Path) -> None:
-    """Plot time against the errors of flux, size, ellipticity and position."""
+    """Plot CPU time against the rms errors of flux, size, ellipticity and position into an image file.
+
+    `rows` are the rows of `measure_all`.
+    """
     from matplotlib.figure import Figure
 
     labels = {"aperture_mag_rms": 'flux in 1", mag', "r2_rms": "R², relative", "ellipticity_rms": "ellipticity"}
@@ -461,7 +519,10 @@ def draw_figure(rows: list[Row], file: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark, print the figures and write the requested files."""
+    """Run the benchmark with the options `argv` (default: the command line), and return 0.
+
+    The results are printed, and written to the files that options name.
+    """
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--csv", type=Path, metavar="FILE", help="write the points to this file")
     extra_parser.add_argument("--figure", type=Path, metavar="FILE", help="plot time against errors")
@@ -484,7 +545,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row in measure_all(options.quick, repeats):
         rows.append(row)
         print(_format_row(row), flush=True)
-        # Write after every point, because the benchmark takes long.
+        # Write the file after every row, because the benchmark takes long and might be interrupted.
         if extra_options.csv:
             write(rows, extra_options.csv)
     if extra_options.figure:

@@ -1,8 +1,8 @@
-"""Measure a VIS detector with all effects: CPU time from catalogue to file and of each stage, and memory.
+"""Measure the rendering of a VIS detector with all effects: CPU time, in total and of each stage, and memory.
 
-The benchmark uses one process and one thread, and the field of the demo. The process has rendered before, like a
-worker. "cold" is without the planes of the PSF in the cache, "warm" with them. All effects of a science image are
-forced on. An option also times an exposure of 36 detectors by Spark.
+The time is from the catalogue to the file, in one process with one thread, which has rendered before. The image shows
+the field of requests/demo.toml. "cold" times are without images of the PSF in the cache, "warm" times with them. All
+optional effects of a science image are switched on. An option also times an exposure of 36 detectors by Spark.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
 _PRESETS = ("draft", "survey", "quicklook", "reference")
-# Folders of the PSF's planes in the cache.
+# Pattern of the names of the cache folders that contain PSF images.
 _PLANES = "vis_psf-*"
-# Accuracies that are measured with the effects that they select, and also with all effects.
+# Accuracies that are measured twice: with the effects that are noticeable at this accuracy, and with all effects.
 _FAST_PRESETS = ("quicklook", "draft")
-# This accuracy takes as long as all others together, so it is measured once.
+# Accuracy that is measured only once, because it takes as long as all others together.
 _SLOW_PRESET = "reference"
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed (target 15)",
@@ -51,7 +51,7 @@ _NOTES = {
 
 
 def demo_request(quick: bool) -> Request:
-    """Return the request of the demo with its VIS detector; `quick` selects only bright sources."""
+    """Return the request of requests/demo.toml, reduced to its VIS detector; `quick` simulates only bright sources."""
     parsed = parse(ROOT / "requests" / "demo.toml")
     parsed = replace(parsed, pointings=parsed.pointings[:1], bands=parsed.bands[:1], truth=())
     if quick:
@@ -61,14 +61,18 @@ def demo_request(quick: bool) -> Request:
 
 
 def with_all_effects(request: Request) -> Request:
-    """Force all effects of a science image on."""
+    """Return a copy of a request that switches on all optional effects of VIS science images."""
     names = [effect.name for effect in (vis.TRANSFER_EFFECT, *vis.SKY) if effect.optional]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 @contextmanager
 def record_stages(seconds: dict[str, float]) -> Iterator[None]:
-    """Add the CPU time of stages and effects of renderings within the context to `seconds`."""
+    """Record the CPU time of the stages and effects of renderings during a `with` block.
+
+    Times in s are added to `seconds`, which must be a defaultdict, by names such as `stage_draw_s` and
+    `effect_cosmic_rays_s`.
+    """
     functions: tuple[tuple[Any, str, str], ...] = (
         (catalogue_rows, "read_sources", "read"),
         (visible_sources, "exposure_psf", "psf"),
@@ -90,26 +94,26 @@ def record_stages(seconds: dict[str, float]) -> Iterator[None]:
 
 
 def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """Return all figures of a detector.
+    """Measure the rendering of one VIS detector at several accuracies.
 
     Parameters
     ----------
     folder : Path
-        Folder for the lake and the files.
+        Existing folder in which the lake and the image files are written.
     quick : bool
-        Use a universe with bright sources only.
+        If True, simulate only bright sources, so that the benchmark is fast.
     repeats : int
-        Number of repeats.
+        Number of repeats of each measurement; the shortest time counts.
 
     Returns
     -------
     dict of str to float
-        The figures.
+        Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     request = demo_request(quick)
     root, out = make_lake(folder, request), {}
     full_task = plan_detector(root, with_all_effects(request))
-    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
+    measure_render(root, full_task, folder)  # Untimed: compiles functions and fills the caches.
     for name in _PRESETS[:2] if quick else _PRESETS:
         variant = replace(request, accuracy=preset(name))
         facts = plan_detector(root, variant if name in _FAST_PRESETS else with_all_effects(variant))
@@ -125,7 +129,7 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
         if name in _FAST_PRESETS:
             out[f"{name}_full_s"] = measure_render(root, plan_detector(root, with_all_effects(variant)), folder)[0]
         if name == "survey":
-            # The planes of the PSF are still in the cache.
+            # The time is "warm": the last repeat has left the images of the PSF in the cache.
             out["survey_needed_s"] = measure_render(root, plan_detector(root, request), folder)[0]
             stage_seconds: dict[str, float] = defaultdict(float)
             with record_stages(stage_seconds):
@@ -135,7 +139,10 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
 
 
 def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
-    """Return the wall time (s) of the Spark job for all 36 detectors of an exposure, or for two if `quick`."""
+    """Return the wall time (s) of the Spark job that renders all 36 detectors of an exposure, or two if `quick`.
+
+    The result has one entry, `exposure_s`. The lake is made in `folder` before the clock starts.
+    """
     block = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[1]
     pointing = "\n".join(line for line in block.splitlines() if not line.startswith(("centre_on", "detectors")))
     if quick:
@@ -145,7 +152,7 @@ def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
     extra_parser.add_argument("--only-exposure", action="store_true", help="time only the exposure")

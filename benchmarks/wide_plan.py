@@ -1,7 +1,7 @@
-"""Plan the whole wide survey with spark-submit, and measure the time and the peak memory of driver and workers.
+"""Plan the whole wide survey with spark-submit, and measure the time and the peak memory of Spark's driver and workers.
 
-The survey consists of two caps around the Galactic poles: 34,000 fields with all exposures of Euclid, 16 million
-detectors. The benchmark then measures the memory of functions that read the plan.
+The survey consists of two caps around the Galactic poles. It has 34,000 fields with all exposures of Euclid, which are
+16 million detector images. The benchmark then measures the memory of functions that read this plan.
 """
 
 from __future__ import annotations
@@ -49,21 +49,24 @@ _POLL_S = 0.5
 
 
 def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
-    """Run the planning job, and measure its wall time and the memory of its processes twice per second.
+    """Run the Spark job that plans a survey, and measure its wall time and the memory of its processes.
+
+    The memory is read from /proc twice per second, so this works on Linux only.
 
     Parameters
     ----------
     folder : Path
-        Folder for the request and the lake.
+        Existing folder in which the request (wide.toml) and the lake are written.
     fields : int
-        Number of fields.
+        Number of fields of the survey.
     cores : int
-        Number of cores.
+        Number of cores that Spark uses.
 
     Returns
     -------
     dict of str to float
-        `plan_s`, `tasks`, `parts` and peak memory in GB.
+        `plan_s` (wall time in s), `tasks` (number of detector images), `parts` (number of files of the plan), and peak
+        memory in GB: `driver_gb` (Python and Java), `driver_python_gb` and `worker_gb` (largest worker).
 
     Raises
     ------
@@ -94,7 +97,11 @@ def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
 
 
 def _process_memory(pid: int) -> dict[str, float]:
-    """Memory (GB) of the driver (Python and Java), of its Python process alone, and of the largest worker."""
+    """Return the present memory (GB) of the processes of a Spark job that the process `pid` has started.
+
+    The keys are `driver_gb` (Python and Java), `driver_python_gb` and `worker_gb` (largest Python worker). Processes
+    that end meanwhile are ignored.
+    """
     java = python = worker = 0.0
     for process_id in _process_tree(pid):
         try:
@@ -114,7 +121,7 @@ def _process_memory(pid: int) -> dict[str, float]:
 
 
 def _process_tree(pid: int) -> list[int]:
-    """Identifiers of a process and all its descendants."""
+    """Return the identifiers of a process and of all its descendants, from /proc."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -128,7 +135,10 @@ def _process_tree(pid: int) -> list[int]:
 
 
 def added_memory(reader: Callable[[Path], None], lake: Path) -> float:
-    """Return the memory (GB) that a reader adds to this process. Call it in a new process."""
+    """Return the memory (GB) by which a function that reads the lake increases the peak memory of this process.
+
+    Call this in a new process, because the peak memory of earlier work would hide the increase.
+    """
     reset_peak_memory()
     initial = peak_memory_gb()
     reader(lake)
@@ -136,13 +146,16 @@ def added_memory(reader: Callable[[Path], None], lake: Path) -> float:
 
 
 def sum_plan(lake: Path) -> None:
-    """Read the whole plan and sum its costs, as the forecast does."""
+    """Read the whole plan of a lake and print the sum of its forecast costs, as the planning job does at its end."""
     speed.estimate_speed(lake)
     plan_exposures._print_published(lake, read.version(lake, "tasks"))
 
 
 def choose_detectors(lake: Path) -> None:
-    """Select one detector of each of the last thousand exposures that have it."""
+    """Select the rendering tasks of detector 3-4 from the plan of a lake, as the rendering job does, at most 1000.
+
+    The request is read from wide.toml in the folder that contains the lake.
+    """
     versions = {name: read.version(lake, name) for name in ("exposures", "tasks")}
     request = parse(lake.parent / "wide.toml")
     last = versions["exposures"].num_rows
@@ -151,7 +164,7 @@ def choose_detectors(lake: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and print the figures."""
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
     options = report.options("wide_plan", __doc__ or "", argv)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

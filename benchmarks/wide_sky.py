@@ -1,7 +1,8 @@
-"""Compare the universe over hundreds of square degrees with its model, down to a bright limit.
+"""Compare halos and galaxies drawn over hundreds of square degrees, to a bright limit, with the model behind them.
 
-The mass function, the luminosity function and the angular correlation w(theta) of halos and volume-limited galaxies
-are measured in blocks of order-4 cells, because structure dominates the statistics of a few small cells.
+The mass function of halos, the luminosity function of galaxies, and the angular correlation w(theta) of halos and of
+volume-limited galaxies are measured. The area consists of HEALPix cells of order 4 (blocks) spread over the sky; in
+smaller areas the large-scale structure dominates the statistics.
 """
 
 from __future__ import annotations
@@ -33,16 +34,17 @@ _MAX_MULTIPOLE = 8000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkySample:
-    """Halos and galaxies of several blocks.
+    """Halos and galaxies drawn in several blocks (HEALPix cells of order 4) of the sky.
 
     Attributes
     ----------
     blocks : list of int
-        HEALPix cells of order BLOCK_ORDER.
-    halos : tuple of array
-        Redshift, log_mass and order-29 index of each halo.
-    galaxies : tuple of array
-        Redshift, M_r, log_mass of the host halo and order-29 index of each galaxy.
+        Nested indices of the blocks.
+    halos : tuple of array, shape (n,)
+        Redshift, log10 mass (Msun/h) and order-29 nested HEALPix index of each halo.
+    galaxies : tuple of array, shape (m,)
+        Redshift, absolute magnitude M_r, log10 mass (Msun/h) of the host halo, and order-29 nested HEALPix index of
+        each galaxy.
     """
 
     blocks: list[int]
@@ -51,12 +53,15 @@ class SkySample:
 
     @property
     def area(self) -> float:
-        """Area of the blocks in deg2."""
+        """Total area of the blocks in deg2."""
         return len(self.blocks) * sky.cell_area(BLOCK_ORDER)
 
 
 def draw_sky(universe: Population, count: int) -> SkySample:
-    """Draw the halos and galaxies of `count` blocks spread over the sky."""
+    """Draw the halos and galaxies of `count` blocks (HEALPix cells of order 4), which are spread over the sky.
+
+    Galaxies are kept if 0.4 < z < 0.8, z < 0.2, or M_r < -20.
+    """
     num_blocks = 12 << 2 * BLOCK_ORDER
     blocks = np.linspace(0.04 * num_blocks, 0.97 * num_blocks, count).astype(int).tolist()
     columns: list[list[npt.NDArray[np.generic]]] = [[] for _ in range(7)]
@@ -89,7 +94,11 @@ def draw_sky(universe: Population, count: int) -> SkySample:
 
 
 def mass_function(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """Return the ratio of drawn to expected halos in bins of redshift, above a complete mass."""
+    """Return the ratio of the number of drawn halos to the number that the model predicts.
+
+    There is one ratio per range of redshift and lowest log10 mass; the sample is complete above these masses. The names
+    are `halos_<log mass>_z<lowest redshift>`.
+    """
     model, figures = universe.halos, {}
     z, mass, _ = sky_sample.halos
     for z_min, z_max, min_log_mass in (
@@ -107,7 +116,10 @@ def mass_function(universe: Population, sky_sample: SkySample) -> dict[str, floa
 
 
 def luminosity_ratios(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """Return the ratio of drawn to expected galaxies, down to a magnitude where all colours are complete."""
+    """Return the ratio of the number of drawn galaxies to the integral of the luminosity function, at four redshifts.
+
+    Galaxies are counted to the faintest M_r at which the sample is complete; this magnitude is returned, too.
+    """
     law, figures = luminosity_function.schechter(), {}
     z, m, _, _ = sky_sample.galaxies
     for z_centre, half_width in ((0.1, 0.07), (0.5, 0.1), (0.8, 0.15), (1.0, 0.2)):
@@ -124,9 +136,11 @@ def luminosity_ratios(universe: Population, sky_sample: SkySample) -> dict[str, 
 
 
 def correlation(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """Compare w(theta) of halos and galaxies at 0.4 < z < 0.8 with Limber's equation and the linear bias of halos.
+    """Compare w(theta) of halos and of galaxies at 0.4 < z < 0.8 with the theory.
 
-    Densities are relative to the mean of the model, not of the blocks, so there is no integral constraint.
+    The theory is Limber's equation with linear power and the linear bias of halos. For each bin of angle the result
+    contains w, its ratio to the theory, and the error of this ratio. Overdensities are relative to the mean density of
+    the model and not of the observed area, so no correction by an integral constraint is necessary.
     """
     model, figures = universe.halos, {}
     z, mass, index = sky_sample.halos
@@ -147,7 +161,7 @@ def correlation(universe: Population, sky_sample: SkySample) -> dict[str, float]
     mean = float(np.sum(density * model.steps.volume[steps])) * np.radians(1.0) ** 2 * sky_sample.area
     column = np.clip(np.searchsorted(model.log_mass, host[selected]) - 1, 0, model.x.shape[1] - 1)
     step = np.clip(np.searchsorted(model.steps.z, z[selected]), 0, model.steps.z.size - 1)
-    # Fit a line to the bias of the galaxies, because it varies smoothly with z.
+    # Fit the bias of the galaxies' halos as a linear function of z, because the mean bias varies smoothly with z.
     slope, level = np.polyfit(z[selected], model.x[step, column], 1)
     bias_growth = level + slope * model.steps.z[steps]
     return figures | _compare_to_limber(
@@ -169,7 +183,11 @@ def _compare_to_limber(
 
 
 def _angular_correlation(blocks: Sequence[int], index: Int, mean: float) -> tuple[Float, Float]:
-    """Measure w in bins of EDGES from pairs of pixels, and its error from the scatter between blocks."""
+    """Measure w(theta) in the bins of EDGES (deg) and its standard error, from counts in HEALPix pixels of order 9.
+
+    `index` contains the order-29 nested index of each object, and `mean` the number of objects that the model predicts
+    in all blocks together. The error follows from the scatter between the blocks.
+    """
     pixels = 4 ** (PIXEL_ORDER - BLOCK_ORDER)
     pixel = index >> 2 * (sky.MAX_ORDER - PIXEL_ORDER)
     each = np.empty((2, len(blocks), EDGES.size - 1))
@@ -189,9 +207,10 @@ def _angular_correlation(blocks: Sequence[int], index: Int, mean: float) -> tupl
 
 
 def _limber_correlation(chi: Float, density: Float, bias_growth: Float) -> Float:
-    """Expected w of counts in pixels, averaged over each bin, by Limber's equation.
+    """Return w(theta) of counts in HEALPix pixels of order 9 from Limber's equation, averaged over each bin of EDGES.
 
-    `density` is the comoving density and `bias_growth` bias times growth, both at the distances `chi`.
+    `chi` contains comoving distances, `density` the comoving number density, and `bias_growth` the linear bias times
+    the growth factor at these distances.
     """
     weight = density * chi**2
     weight = weight / np.trapezoid(weight, chi)
@@ -216,7 +235,10 @@ def _select_bins(model: halos.HaloModel, z_min: float, z_max: float, min_log_mas
 
 
 def _faintest_magnitude(universe: Population, z_min: float, z_max: float) -> float:
-    """Magnitude M_r to which galaxies between two redshifts are complete, given the mass limit of halos."""
+    """Return the absolute magnitude M_r to which galaxies between two redshifts are complete.
+
+    It follows from the lowest halo mass that is drawn, and is rounded to 0.1 mag towards bright magnitudes.
+    """
     model = universe.halos
     steps = (model.steps.z > z_min) & (model.steps.z < z_max)
     limits = model.matching.magnitude(model.steps.z[steps], model.limit[steps])
@@ -224,5 +246,9 @@ def _faintest_magnitude(universe: Population, z_min: float, z_max: float) -> flo
 
 
 def drawn_from(seed: int, box_cells: int) -> Population:
-    """Return the population of halos and galaxies for a seed and a box of this number of cells."""
+    """Return the model from which halos and galaxies are drawn, to magnitude 22.
+
+    `seed` is the seed of the simulated universe, and `box_cells` the number of grid cells along a side of the box with
+    the density field.
+    """
     return galaxies.halos_and_galaxies(seed, Universe(galaxy_limit=LIMIT, box_cells=box_cells))

@@ -1,11 +1,11 @@
-"""Make truesky/catalogue/stars/isochrones.csv, a fit to a table of isochrones.
+"""Fit a table of stellar isochrones, and write the coefficients to truesky/catalogue/stars/isochrones.csv.
 
     python scripts/fit_isochrones.py ISOCHRONES [--test OTHER ...] [--out FILE]
 
 ISOCHRONES is a Parquet or CSV file with one row per point and the columns metallicity ([M/H]), log_age (log10 yr), eep
 (equivalent evolutionary point, numbered as in Dotter 2016), initial_mass (Msun), log_teff (K) and log_l (Lsun). The
-isochrones of MIST (https://waps.cfa.harvard.edu/MIST) have these columns under other names. OTHER has the same columns
-without eep; its hottest stars are compared with the fit.
+isochrones of MIST (https://waps.cfa.harvard.edu/MIST) have these columns under other names. OTHER is a table with the
+same columns, except eep; the hottest stars of its old isochrones are compared with the hottest stars of the fit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 
-import lake_schema  # noqa: F401  (limits numpy, which is imported below)
+import lake_schema  # noqa: F401  (restricts numpy, imported later, to common CPU instructions)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -30,31 +30,36 @@ SOURCE = """# Fit to MIST isochrones, v/v_crit = 0.4: Choi et al. 2016, ApJ 823,
 # A row is a point of evolution at a knot of log age; columns are coefficients of powers 0 .. 4 of [M/H]:
 # log10 L / Lsun, log10 Teff / K; mass: log10 of the mass that leaves the main sequence, Msun, then log10 of the
 # differences of initial mass between points, in units of it."""
-# Smallest difference of two initial masses, relative to the turn-off mass. Smaller ones are rounding errors of the
-# tables.
+# Smallest difference of the initial masses of two points, relative to the turn-off mass. Smaller differences are
+# rounding errors of the tables, and are replaced by this value.
 _MIN_MASS_DIFFERENCE = 1e-5
 
 
 def read(path: Path) -> dict[str, Float]:
-    """Return the columns of NAMES that the table has."""
+    """Return the columns of a Parquet or CSV file that NAMES lists, as float64 arrays; missing columns are left out."""
     table = pyarrow.parquet.read_table(path) if path.suffix == ".parquet" else pyarrow.csv.read_csv(path)
     return {name: table[name].to_numpy().astype(float) for name in NAMES if name in table.column_names}
 
 
 def sample_isochrones(table: dict[str, Float]) -> tuple[Float, Float, dict[str, Float]]:
-    """Sample the isochrones at the points of the fit.
+    """Interpolate each isochrone at the fixed points of evolution that the fit uses.
+
+    These points are fixed initial masses on the main sequence, then equivalent evolutionary points. Isochrones outside
+    the range of age and metallicity of the fit are left out.
 
     Parameters
     ----------
-    table : dict of str to float array
-        Columns of the table.
+    table : dict of str to float array, shape (n,)
+        Columns of the table by the names in NAMES.
 
     Returns
     -------
     age, metallicity : float array, shape (k,)
         log10 age in yr, and [M/H], of each isochrone.
     samples : dict of str to float array, shape (k, points)
-        log_l, log_teff, and mass in the form that `model.masses` reads.
+        `log_l` (log10 L / Lsun), `log_teff` (log10 K) and `mass`. `mass` is NaN on the main sequence, except at its
+        last point (log10 of the turn-off mass, Msun). At later points it is log10 of the difference of initial mass to
+        the point before, relative to the turn-off mass.
     """
     age = table["log_age"]
     inside = (age > model.AGES[0] - 1e-6) & (age < model.AGES[-1] + 1e-6)
@@ -84,19 +89,21 @@ def sample_isochrones(table: dict[str, Float]) -> tuple[Float, Float, dict[str, 
 
 
 def fit_coefficients(age: Float, metallicity: Float, values: Float) -> Float:
-    """Fit values at the points of the isochrones by least squares.
+    """Fit a property of isochrones by least squares, as a function of age and metallicity at each point of evolution.
+
+    The function is a polynomial in [M/H] at each knot (fixed value) of log age, and linear in log age between knots.
 
     Parameters
     ----------
     age, metallicity : float array, shape (k,)
         log10 age in yr, and [M/H], of each isochrone.
     values : float array, shape (k, points)
-        Values to fit.
+        Values to fit, such as log10 Teff.
 
     Returns
     -------
     float array, shape (points, knots, powers)
-        Coefficients of the powers of [M/H] at each knot of log age.
+        Coefficients of the powers 0, 1, ... of [M/H] at each knot of log age.
     """
     knot, weight = model.bracket_age(age)
     shares = np.zeros((age.size, len(model.AGES)))
@@ -109,14 +116,14 @@ def fit_coefficients(age: Float, metallicity: Float, values: Float) -> Float:
 
 
 def write(path: Path, coefficients: dict[str, Float], comments: list[str]) -> None:
-    """Write the table.
+    """Write the coefficients of the fit to a CSV file, with its sources as comments at the top.
 
     Parameters
     ----------
     path : Path
-        File to write.
+        File to write; an existing file is replaced.
     coefficients : dict of str to float array, shape (points, knots, powers)
-        Coefficients by column name.
+        Coefficients by name of the fitted property (log_l, log_teff, mass). Cells of NaN stay empty.
     comments : list of str
         Lines about the errors of the fit, written below the sources.
     """
@@ -136,19 +143,20 @@ def write(path: Path, coefficients: dict[str, Float], comments: list[str]) -> No
 
 
 def residuals(age: Float, metallicity: Float, samples: dict[str, Float]) -> list[str]:
-    """Describe the rms and the largest differences between the fit and the isochrones, by phase and age.
+    """Describe the differences between the fit in `model.TABLE` and the isochrones, as text.
 
     Parameters
     ----------
     age, metallicity : float array, shape (k,)
         log10 age in yr, and [M/H], of each isochrone.
     samples : dict of str to float array, shape (k, points)
-        Samples of the isochrones.
+        log_teff (log10 K) and log_l (log10 L / Lsun) at the points of the fit, from `sample_isochrones`.
 
     Returns
     -------
     list of str
-        One sentence per range of age and phase.
+        One line per range of age and phase of evolution, with the rms and the largest difference of Teff (%) and of the
+        bolometric magnitude.
     """
     fit = model.isochrones(10.0 ** (age - 9.0), metallicity)
     main, comments = fit.main_sequence, []
@@ -167,7 +175,10 @@ def residuals(age: Float, metallicity: Float, samples: dict[str, Float]) -> list
 
 
 def compare_hottest(path: Path) -> list[str]:
-    """Compare the hottest points of old isochrones in the fit and in another table; return one line per isochrone."""
+    """Compare the hottest stars of old isochrones in another table with the hottest stars of the fit.
+
+    Return one line of text for each of five pairs of age and metallicity that the table in `path` contains.
+    """
     table, comments = read(path), []
     for age, metals in ((12.5, -2.0), (12.5, -1.5), (10.0, -1.0), (10.0, -0.5), (5.0, 0.0)):
         ages = np.unique(table["log_age"])
@@ -185,7 +196,7 @@ def compare_hottest(path: Path) -> list[str]:
 
 
 def main() -> int:
-    """Run the command and return its exit status."""
+    """Run the command and return its exit status, 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("isochrones", type=Path)
     parser.add_argument("--test", type=Path, nargs="*", default=[])

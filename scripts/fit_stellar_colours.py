@@ -2,9 +2,10 @@
 
     python scripts/fit_stellar_colours.py GRID [--out FILE]
 
-GRID is a table of mean surface fluxes f_lambda (erg s-1 cm-2 um-1) of model atmospheres in the bands of TITLES, by
-Teff, log g and [Fe/H]. One such table is model_grid_CK04.dat of astroARIADNE (https://github.com/jvines/astroARIADNE,
-MIT licence). Logarithms of fluxes are interpolated linearly between the nodes of the grid.
+GRID is a text table of mean surface fluxes f_lambda (erg s-1 cm-2 um-1) of model atmospheres in the passbands of
+TITLES. Its first three columns are Teff, log g and [Fe/H]. One such table is model_grid_CK04.dat of astroARIADNE
+(https://github.com/jvines/astroARIADNE, MIT licence). Logarithms of fluxes are interpolated linearly in ln Teff, log g
+and [Fe/H].
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-import lake_schema  # noqa: F401  (limits numpy, which is imported below)
+import lake_schema  # noqa: F401  (restricts numpy, imported later, to common CPU instructions)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -25,7 +26,7 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import model_stars
 
-# Column title in the grid for each band of model_stars.BANDS.
+# Title of the column of GRID for each passband.
 TITLES = {
     "sdss_u": "SDSS_u", "sdss_g": "SDSS_g", "bessell_v": "GROUND_JOHNSON_V", "sdss_r": "SDSS_r", "sdss_i": "SDSS_i",
     "sdss_z": "SDSS_z", "twomass_j": "2MASS_J", "twomass_h": "2MASS_H", "twomass_ks": "2MASS_Ks",
@@ -35,14 +36,23 @@ SOURCE = """# Model atmospheres of Castelli & Kurucz 2003 (IAU Symp. 210, A20; C
 # https://github.com/jvines/astroARIADNE/blob/master/LICENSE.
 # Made by scripts/fit_stellar_colours.py.  Bands: AB magnitude less that in bessell_v; bolometric_h: M_bol - M_H
 # (AB)."""
-# Luminosity for M_bol = 0 (IAU 2015), erg/s; Stefan-Boltzmann constant, cgs; 10 pc, cm.
-_L0, _SIGMA, _TEN_PC = 3.0128e35, 5.670374419e-5, 3.0856775814913673e19
+# Luminosity of a star with absolute bolometric magnitude 0 (IAU 2015), erg/s.
+_L0 = 3.0128e35
+# Stefan-Boltzmann constant, erg s-1 cm-2 K-4.
+_SIGMA = 5.670374419e-5
+# Ten parsecs, cm.
+_TEN_PC = 3.0856775814913673e19
+# AB magnitude of f_nu = 1 erg s-1 cm-2 Hz-1, with the opposite sign.
 _AB = 48.6
 _ANGSTROM_PER_UM = 1e4
 
 
 def read(path: Path) -> tuple[tuple[Float, Float, Float], Float]:
-    """Return the axes (Teff, log g, [Fe/H]) and ln f_nu [teff, log_g, metallicity, band], with NaN in empty nodes."""
+    """Read a grid of model atmospheres.
+
+    Return its axes (Teff in K, log g, [Fe/H]; ascending) and ln f_nu (erg s-1 cm-2 Hz-1) with the axes [Teff, log g,
+    [Fe/H], passband of TITLES]. Combinations that the grid does not contain are NaN.
+    """
     with path.open(encoding="utf-8") as file:
         titles = file.readline().lstrip("#").split()
     table = np.loadtxt(path)
@@ -57,7 +67,11 @@ def read(path: Path) -> tuple[tuple[Float, Float, Float], Float]:
 
 
 def main() -> int:
-    """Run the command and return its exit status."""
+    """Run the command and return the exit status 0.
+
+    SystemExit is raised if GRID lacks models around a combination of Teff, log g and [M/H] of the result. ValueError is
+    raised if a combination lies outside the range of GRID.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("grid", type=Path)
     parser.add_argument("--out", type=Path, default=model_stars.TABLE)
@@ -77,7 +91,8 @@ def main() -> int:
                     raise SystemExit(f"{options.grid}: the grid has no model with {t:.0f} K, log g {g}, [M/H] {z}")
                 v = mags[bands.index("bessell_v")]
                 colors = [f"{m - v:.4f}" for b, m in zip(bands, mags, strict=True) if b != "bessell_v"]
-                # The result does not depend on the radius of the star.
+                # Both magnitudes are for a star with a radius of 10 pc, whose flux at 10 pc is its surface flux. The
+                # radius cancels in M_bol - M_H.
                 m_bol = -2.5 * np.log10(4.0 * np.pi * _TEN_PC**2 * _SIGMA * t**4 / _L0)
                 bolometric = m_bol - (mags[bands.index("twomass_h")] - _AB)
                 lines.append(",".join([f"{t:.2f}", f"{g:g}", f"{z:g}", f"{bolometric:.4f}", *colors]))

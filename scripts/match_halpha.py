@@ -2,9 +2,9 @@
 
     python scripts/match_halpha.py [--cells 120]
 
-A sample without clustering (every halo has the mean properties) is drawn once. At each redshift, its cumulative counts
-of uncorrected luminosities are matched to model 3 of Pozzetti et al. 2016. The table is monotone and the same for every
-seed.
+A sample of simulated galaxies without clustering is drawn once, in an area of --cells HEALPix cells of 0.052 deg2. In
+each bin of redshift, the cumulative counts of uncorrected luminosities are matched to model 3 of Pozzetti et al. 2016.
+The corrected luminosity never decreases with the uncorrected one. The table is the same for every seed of a simulation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-import lake_schema  # noqa: F401  (limits numpy, which is imported below)
+import lake_schema  # noqa: F401  (restricts numpy, imported later, to common CPU instructions)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -29,18 +29,23 @@ from truesky.fluxes import cosmology
 from truesky.request.schema import Universe
 from truesky.validation.model import mean_sky
 
-SEED, UNIVERSE = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
+SEED = 2016
+UNIVERSE = Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
+# Edges of the bins of redshift in which luminosities are corrected.
 EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1), [3.3, 3.7, 4.2, 5.0, 6.0]])
+# Uncorrected log10 L of H alpha (erg/s) at which corrections are tabulated.
 LOG_L = np.linspace(39.0, 43.6, 47)
-# Luminosities exceeded by fewer galaxies than this take the shift of the highest luminosity with enough of them.
+# If fewer galaxies than this are brighter than a luminosity, its correction is that of the highest luminosity with
+# enough brighter galaxies.
 ENOUGH = 15
 CM_PER_MPC = 3.0856775814913673e24
 
 
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return redshifts and uncorrected log L (erg/s) of galaxies brighter than the limit of UNIVERSE in some cells.
+    """Return the redshifts and the uncorrected log10 L of H alpha (erg/s) of simulated galaxies.
 
-    `cells` is the number of cells of the sample.
+    `cells` is the number of HEALPix cells of order 8 (0.052 deg2 each) that are drawn. The galaxies are brighter than
+    26 mag; galaxies without H alpha emission are left out.
     """
     lines = emission_lines.model_from_table(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
     universe = replace(mean_sky.without_clustering(galaxies.model(SEED, UNIVERSE)), lines=lines)
@@ -52,21 +57,26 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
-    """Return the correction of log L in dex.
+    """Return the corrections of log10 L of H alpha, with which the counts of galaxies agree with the published model.
 
     Parameters
     ----------
     z : float array, shape (n,)
-        Redshifts.
+        Redshifts of the galaxies of a sample.
     raw : float array, shape (n,)
-        Uncorrected log10 L in erg/s.
+        Uncorrected log10 L of H alpha of these galaxies, in erg/s.
     area : float
         Area of the sample in square degrees.
 
     Returns
     -------
-    float array, shape (redshift bins, nodes)
-        Corrections at the luminosities LOG_L.
+    float array, shape (redshift bins, luminosities)
+        Corrections to add to log10 L, in dex, in the bins between EDGES and at the luminosities LOG_L.
+
+    Notes
+    -----
+    Every bin of redshift must contain at least ENOUGH galaxies brighter than 10^39 erg/s; otherwise IndexError is
+    raised.
     """
     rows = []
     for z_low, z_high in pairwise(EDGES):
@@ -76,7 +86,8 @@ def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
         log_luminosity = np.linspace(38.0, 45.0, 281)
         counts = emission_lines.expected_counts(10.0**log_luminosity / (4 * np.pi * distance**2), z_low, z_high) * area
         above = luminosities.size - np.searchsorted(luminosities, LOG_L)
-        # Counts decrease with luminosity, so that their negative logarithms increase as interpolation requires.
+        # Counts decrease with luminosity. np.interp requires ascending values, so interpolate in their negative
+        # logarithms.
         matched = np.interp(-np.log(np.maximum(above, 1)), -np.log(np.maximum(counts, 1e-9)), log_luminosity)
         shift = matched - LOG_L
         last = int(np.flatnonzero(above >= ENOUGH)[-1])
@@ -88,7 +99,7 @@ def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
 
 
 def main() -> None:
-    """Run the command."""
+    """Run the command, which replaces the table in the package."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, default=120, help="generation cells to draw (0.052 deg2 each)")
     cells = parser.parse_args().cells

@@ -1,8 +1,9 @@
-"""Take pictures of the page over the lake of `make demo` for the documentation.
+"""Take screenshots of the web page of truesky for the documentation.
 
     python -m scripts.page_pictures FOLDER
 
-The system's Chromium takes the pictures, driven by Playwright (extra `test`). Both must be installed.
+The page shows the lake (folder of tables and images) that `make demo` has made. Playwright (extra `test`) controls the
+Chromium of the system, which takes the screenshots. Both must be installed.
 """
 
 from __future__ import annotations
@@ -21,11 +22,15 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 LAKE = ROOT / "out" / "demo" / "lake"
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
-_TOKEN, _SIZE, _LONGEST = "a-token-of-the-pictures", {"width": 1400, "height": 860}, 60.0
+_TOKEN = "a-token-of-the-pictures"
+# Size of the browser window, pixels.
+_SIZE = {"width": 1400, "height": 860}
+# Longest time that `wait_until` waits, s.
+_LONGEST = 60.0
 
 
 def missing_requirement() -> str:
-    """Return a message about a missing requirement, or "" if pictures can be taken."""
+    """Return a message if Playwright, Chromium or the lake of `make demo` is missing, or "" if nothing is missing."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
     if CHROMIUM is None:
@@ -35,7 +40,7 @@ def missing_requirement() -> str:
 
 @contextmanager
 def serve_page(lake: Path) -> Iterator[str]:
-    """Serve the page over a lake while the block runs, and yield its address."""
+    """Run the server of the web page for a lake during a `with` block, and yield the address of the page."""
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", _TOKEN]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
         try:
@@ -46,7 +51,11 @@ def serve_page(lake: Path) -> Iterator[str]:
 
 
 def wait_until(tab: Any, expression: str) -> Any:
-    """Wait until a JavaScript expression is true and return its value. It polls because the page forbids eval."""
+    """Wait until a JavaScript expression is true in a browser tab, and return its value.
+
+    The expression is evaluated every 50 ms, because the page forbids the eval that Playwright's wait needs.
+    TimeoutError is raised after 60 s.
+    """
     end = time.monotonic() + _LONGEST
     while not (value := tab.evaluate(expression)):
         if time.monotonic() > end:
@@ -80,7 +89,7 @@ def _images(tab: Any) -> None:
     tab.check("#image-truth")
     time.sleep(4.0)
     box = tab.locator("#image-canvas").bounding_box()
-    # A bright star with a galaxy next to it.
+    # Point at a bright star with a galaxy next to it, given as fractions of the width and height of the image.
     x, y = box["x"] + 0.755 * box["width"], box["y"] + 0.823 * box["height"]
     tab.mouse.move(x, y)
     for _ in range(8):
@@ -109,7 +118,10 @@ VIEWS: tuple[tuple[str, str, Callable[[Any], None]], ...] = (
 
 
 def pictures(into: Path) -> list[tuple[str, str]]:
-    """Take the pictures and return their file names and captions. Raises RuntimeError if the page has errors."""
+    """Take the screenshots, write them to the existing folder `into`, and return their file names and captions.
+
+    RuntimeError is raised if the page reports an error in the browser's console.
+    """
     from playwright.sync_api import sync_playwright
 
     files = []
@@ -138,7 +150,7 @@ def pictures(into: Path) -> list[tuple[str, str]]:
 
 
 def main() -> None:
-    """Run the command."""
+    """Run the command; SystemExit with a message is raised if a requirement is missing."""
     if why := missing_requirement():
         raise SystemExit(f"truesky: {why}")
     folder = Path(sys.argv[1])

@@ -5,9 +5,10 @@
     python -m scripts.plain_words --check                # exit status 1 above a limit or above the recorded counts
 
 The rules and limits are in plain_words.toml. plain_words.json records the places of each file. `--check` allows no file
-to have more places than recorded; `--record` writes lower counts. The texts are docstrings, comments, messages of
-`raise`, help texts of commands, comments in JavaScript, and Markdown. Code in backquotes is ignored, and so are lines
-with `plain-words: off`. The rules find unidiomatic forms, not obscurity: a sentence without a hit may still be unclear.
+to have more places than recorded; `--record` replaces the recorded counts by the present ones. The texts are
+docstrings, comments, messages of `raise`, help texts of commands, comments in JavaScript, and Markdown. Code in
+backquotes is ignored, and so are texts whose first line contains `plain-words: off`. The rules find unidiomatic forms,
+not obscurity: a sentence without a hit may still be unclear.
 """
 
 from __future__ import annotations
@@ -33,14 +34,17 @@ PATHS = (
     "truesky", "lake_schema", "jobs", "scripts", "benchmarks", "docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md",
     "SECURITY.md",
 )  # fmt: skip
-# Only files with at least this number of words have a rate.
+# Only files with at least this number of words have a rate (number of odd phrases per 1,000 words).
 LONG_FILE = 200
 MESSAGE = "message"
 HELP_ARGUMENTS = ("help", "description", "epilog")
 
 
 class Text(NamedTuple):
-    """A piece of prose: the line on which it begins, its kind, and its words."""
+    """A piece of prose in a file.
+
+    `line` is the line on which it begins. `kind` is "docstring", "comment", "message" or "markdown".
+    """
 
     line: int
     kind: str
@@ -48,7 +52,11 @@ class Text(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """A place that matches a rule."""
+    """A place in a file at which a rule finds an odd phrase, or a vague name.
+
+    `kind` is the kind of the text ("docstring", "comment", ...), or "functions" or "variables" for a name. `text` is
+    the phrase with its surroundings, or the name.
+    """
 
     path: str
     line: int
@@ -60,7 +68,7 @@ class Hit(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """A form to avoid, and the advice for it."""
+    """A form of phrase to avoid: a regular expression that finds it, and advice for a better form."""
 
     name: str
     problem: str
@@ -70,7 +78,11 @@ class Rule:
 
 @dataclass(frozen=True)
 class Settings:
-    """Rules, vague names and limits from plain_words.toml."""
+    """Content of plain_words.toml.
+
+    `vague` contains words that say too little as a name, `good` single-word participles that are allowed as names of
+    functions, and `limits` the largest allowed rates by name.
+    """
 
     rules: tuple[Rule, ...]
     vague: frozenset[str]
@@ -79,22 +91,22 @@ class Settings:
 
 
 def read_settings() -> Settings:
-    """Read rules, names and limits."""
+    """Read the rules, names and limits from plain_words.toml."""
     table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
     rules = []
     for rule in table["rule"]:
-        # A backslash at the end of a line joins it with the next.
+        # A pattern may have several lines: a backslash at the end of a line joins it with the next one.
         pattern = rule["pattern"].replace("\\\n", "").format(clause=table["clause"], end=table["end"])
         rules.append(Rule(rule["name"], rule["problem"], rule["advice"], re.compile(pattern, re.MULTILINE)))
     words = {key: frozenset(text.split()) for key, text in table["names"].items()}
     return Settings(tuple(rules), words["vague"], words["good"], table["limits"])
 
 
-# ---------------------------------------------------------------------------- prose
-
-
 def read_prose(path: Path) -> Iterator[Text]:
-    """Yield the pieces of prose in a Python, JavaScript or Markdown file."""
+    """Yield the pieces of prose in a Python (.py), JavaScript (.js) or Markdown file: docstrings, comments and so on.
+
+    SyntaxError is raised if a Python file cannot be parsed.
+    """
     source = path.read_text()
     if path.suffix == ".py":
         tree = ast.parse(source)
@@ -118,7 +130,7 @@ def _docstrings(tree: ast.AST) -> Iterator[Text]:
 
 
 def _messages(tree: ast.AST) -> Iterator[Text]:
-    """Yield texts that users see: arguments of exceptions, and help texts."""
+    """Yield the texts of a Python program that its users see: messages of `raise`, and help texts of commands."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             values = node.exc.args
@@ -133,7 +145,10 @@ def _messages(tree: ast.AST) -> Iterator[Text]:
 
 
 def constant_text(node: ast.AST) -> str:
-    """Return the text of a string expression, with {} for each value in it."""
+    """Return the text of a string, an f-string or a sum of them, with {} for each inserted value.
+
+    The result is "" for other expressions.
+    """
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else ""
     if isinstance(node, ast.JoinedStr):
@@ -144,7 +159,10 @@ def constant_text(node: ast.AST) -> str:
 
 
 def _comments(source: str) -> Iterator[Text]:
-    """Yield blocks of comments on consecutive lines, without instructions for tools."""
+    """Yield the comments of a Python program; comments on consecutive lines are one text.
+
+    Instructions for tools, such as "noqa" or "type:", are left out.
+    """
     block, first = list[str](), 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         text = token.string.lstrip("#").strip()
@@ -170,7 +188,7 @@ def _paragraphs(source: str) -> Iterator[Text]:
 
 
 def find_hits(path: Path, settings: Settings) -> tuple[list[Hit], Counter[str]]:
-    """Return the places of a file that match a rule, and its number of words by kind of text."""
+    """Return the odd phrases in the prose of a file, and its number of words by kind of text ("docstring", ...)."""
     lines, hits, words = path.read_text().splitlines(), [], Counter[str]()
     for line, kind, text in read_prose(path):
         words[kind] += len(re.findall(r"[A-Za-z][A-Za-z']+", text))
@@ -184,11 +202,11 @@ def find_hits(path: Path, settings: Settings) -> tuple[list[Hit], Counter[str]]:
     return hits, words
 
 
-# ---------------------------------------------------------------------------- names
-
-
 def find_vague_names(path: Path, settings: Settings) -> tuple[list[Hit], Counter[str]]:
-    """Return vague names in a Python file, and its numbers of functions and of variables (with parameters)."""
+    """Return the vague names in a Python file, and its numbers of names of "functions" and of "variables".
+
+    Parameters count as variables.
+    """
     hits, count = list[Hit](), Counter[str]()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -217,19 +235,24 @@ def _vague(path: Path, line: int, kind: str, name: str) -> Hit:
     return Hit(str(path), line, kind, "names", name, "name the thing it is, or the action it takes")
 
 
-# ---------------------------------------------------------------------------- report
-
-
 @dataclass
 class Report:
-    """Hits and sizes of all files: `words` by file and kind, `names` by kind."""
+    """Result for all files: places that were found, and sizes.
+
+    `words` contains the number of words by file and by kind of text. `names` contains the numbers of names of
+    "functions" and of "variables".
+    """
 
     hits: list[Hit]
     words: dict[str, Counter[str]]
     names: Counter[str]
 
     def rates(self) -> dict[str, float]:
-        """Return the rates that have a limit, by name."""
+        """Return the rates that have a limit, by name.
+
+        `words`, `messages` and `file` are odd phrases per 1,000 words: in all texts, in messages and help texts, and in
+        the worst file. `functions` and `variables` are percentages of vague names.
+        """
         in_prose = [hit for hit in self.hits if hit.rule != "names"]
         by_name = Counter(hit.kind for hit in self.hits if hit.rule == "names")
         words = sum((Counter(count) for count in self.words.values()), Counter[str]())
@@ -243,19 +266,19 @@ class Report:
         }
 
     def file_rates(self) -> dict[str, float]:
-        """Return places per 1,000 words of each long file."""
+        """Return the number of odd phrases per 1,000 words of each file with at least 200 words, by path."""
         hit_counts = Counter(hit.path for hit in self.hits if hit.rule != "names")
         totals = {path: words.total() for path, words in self.words.items()}
         return {path: 1000.0 * hit_counts[path] / total for path, total in totals.items() if total >= LONG_FILE}
 
     def counts(self) -> dict[str, int]:
-        """Return the number of places, vague names among them, of each file that has any."""
+        """Return the number of odd phrases and vague names in each file that has any, by path."""
         hit_counts = Counter(hit.path for hit in self.hits)
         return {path: hit_counts[path] for path in sorted(hit_counts)}
 
 
 def read_files(paths: list[Path], settings: Settings) -> Report:
-    """Read all files of some kinds below the paths, which are relative to the working directory."""
+    """Examine all Python, Markdown and JavaScript files at or below some paths, and return the result."""
     report = Report([], defaultdict(Counter), Counter())
     for top in paths:
         files = [top] if top.is_file() else sorted(top.rglob("*"))
@@ -272,7 +295,17 @@ def read_files(paths: list[Path], settings: Settings) -> Report:
 
 
 def print_report(report: Report, settings: Settings, rows: int = 10) -> None:
-    """Print the rates, the number of places of each rule, and the files with the highest rates."""
+    """Print the number of odd phrases by rule, the files with the highest rates, and the rates with their limits.
+
+    Parameters
+    ----------
+    report : Report
+        Counts and places of odd phrases and vague names.
+    settings : Settings
+        Rules and limits.
+    rows : int
+        Number of files to print.
+    """
     hit_counts, words = Counter(hit.rule for hit in report.hits), sum(c.total() for c in report.words.values())
     for rule in settings.rules:
         rate = 1000.0 * hit_counts[rule.name] / max(words, 1)
@@ -287,7 +320,22 @@ def print_report(report: Report, settings: Settings, rows: int = 10) -> None:
 
 
 def find_failures(report: Report, settings: Settings, recorded: dict[str, int]) -> list[str]:
-    """Return one line for each limit that is exceeded, and for each file that became worse."""
+    """Return one line for each rate above its limit, and for each file with more places than recorded.
+
+    Parameters
+    ----------
+    report : Report
+        Counts and places of odd phrases and vague names.
+    settings : Settings
+        Rules and limits.
+    recorded : mapping of str to int
+        Allowed number of places by file; 0 for a file that is not named.
+
+    Returns
+    -------
+    list of str
+        The lines. The places of a file follow its line. The list is empty if nothing is wrong.
+    """
     rates = report.rates()
     failures = [
         f"{name}: {rates[name]:.2f} > {limit:g}" for name, limit in settings.limits.items() if rates[name] > limit
@@ -301,7 +349,10 @@ def find_failures(report: Report, settings: Settings, recorded: dict[str, int]) 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit status."""
+    """Run the command and return its exit status: 1 if --check finds that the texts became worse, else 0.
+
+    `arguments` is the list of options; None means the command line.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m scripts.plain_words", description="Find odd phrases and vague names."
     )

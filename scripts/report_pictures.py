@@ -1,8 +1,9 @@
-"""Join figures of a report of `truesky validate` in one picture, for docs/pilot.md.
+"""Join eight figures of an HTML report of `truesky validate` in one picture, for docs/pilot.md.
 
     python -m scripts.report_pictures REPORT [FILE]
 
-The picture has figures of VIS, NISP-P and the galaxies. FILE is a JPEG, by default docs/pilot_validation.jpg.
+REPORT is the HTML file. The figures show VIS images, NISP-P images and galaxies. FILE is the JPEG to write, by default
+docs/pilot_validation.jpg.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from pathlib import Path
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
-# Beginnings of the captions, in rows of two; width of a figure and gap between rows, pixels.
+# Beginnings of the captions of the figures, in the order of the picture, which has two figures per row.
 CAPTIONS = (
     "VIS: positions", "VIS: magnitudes", "VIS: noise", "VIS: sources that are found",
     "NISP-P: positions", "NISP-P: magnitudes", "galaxies: counts", "galaxies: how they cluster",
 )  # fmt: skip
-_WIDE, _GAP = 760, 14
+# Width of a figure in the picture, pixels.
+_WIDE = 760
+# Gap between two rows of figures, pixels.
+_GAP = 14
 _FIGURE = re.compile(r"<img alt='[^']*' src='data:image/png;base64,([^']+)'><figcaption>(.*?)</figcaption>", re.DOTALL)
 
 
 def figures(report: str) -> dict[str, Image.Image]:
-    """Return the figures in the HTML of a report, by caption."""
+    """Return the figures that are embedded as PNG in the HTML text of a report, as RGB images by caption."""
     matches = _FIGURE.findall(report)
     return {unescape(text): Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB") for data, text in matches}
 
 
 def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
-    """Join figures in rows of two, scaled to the same width."""
+    """Return one image with the figures in rows of two, each scaled to a width of 760 pixels."""
     scaled = [
         picture.resize((_WIDE, round(picture.height * _WIDE / picture.width)), Image.Resampling.LANCZOS)
         for picture in pictures
@@ -50,7 +54,10 @@ def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command. The exit status is 0, or 2 if there is no report or it lacks one of the figures."""
+    """Run the command with the arguments REPORT [FILE], and return its exit status.
+
+    The status is 0 on success, and 2 if REPORT is not a file or lacks one of the figures.
+    """
     if not argv or not Path(argv[0]).is_file():
         print(f"{' '.join(argv) or 'report_pictures'}: not a report of truesky validate", file=sys.stderr)
         return 2

@@ -1,9 +1,8 @@
-"""Draw a picture of spiral galaxies, with smooth discs and with arms and knots.
+"""Draw a picture of four spiral galaxies, with smooth discs and with spiral arms and knots of star formation.
 
     python -m scripts.structure_picture [FILE]
 
-The galaxies are drawn with the PSF of VIS on a corner of a detector, without noise. FILE is a JPEG, by default
-docs/structure.jpg.
+The galaxies are drawn with the PSF of VIS and without noise. FILE is the JPEG to write, by default docs/structure.jpg.
 """
 
 from __future__ import annotations
@@ -31,9 +30,16 @@ from truesky.request.accuracy import SURVEY
 from truesky.request.structure import Arms
 
 ROOT = Path(__file__).resolve().parents[1]
-# Side of a panel, pixels; electrons per galaxy; noise per pixel, electrons; softening and white level of the grey
-# scale, electrons.
-_SIDE, _LIGHT, _NOISE, _SOFT, _WHITE = 160, 2e5, 12.0, 8.0, 1000.0
+# Width and height of the panel of one galaxy, pixels.
+_SIDE = 160
+# Electrons per galaxy.
+_LIGHT = 2e5
+# Noise per pixel (electrons) from which the size of the drawn stamps is chosen; no noise is added.
+_NOISE = 12.0
+# Electrons per pixel at which the grey scale, asinh(electrons / _SOFT), changes from linear to logarithmic.
+_SOFT = 8.0
+# Electrons per pixel that are drawn white.
+_WHITE = 1000.0
 _GALAXIES = {
     "bulge_half_light_radius": [0.5, 0.6, 0.3, 0.4], "disk_half_light_radius": [2.2, 2.4, 1.5, 2.6],
     "bulge_fraction": [0.1, 0.3, 0.05, 0.15], "bulge_sersic_index": [2.0, 3.0, 1.5, 2.0],
@@ -43,7 +49,10 @@ _GALAXIES = {
 
 
 def draw(discs: DiscStructure | None) -> Float:
-    """Return the four galaxies side by side in electrons; `discs` None means smooth discs."""
+    """Return an image (electrons) of the four galaxies side by side.
+
+    `discs` describes the spiral arms and knots; None means smooth discs.
+    """
     mission = resolve()
     detector = replace(detectors.detector("vis", "3-4", mission), nx=4 * _SIDE, ny=_SIDE)
     system = astrometry.wcs(detector, *boresight_for(detector, 53.1, -27.8, 0.0))
@@ -59,7 +68,7 @@ def draw(discs: DiscStructure | None) -> Float:
 
 
 def write(path: Path) -> None:
-    """Write the picture as JPEG."""
+    """Write the picture to a JPEG file: smooth discs in one row, discs with arms and knots in the other."""
     panels = np.concatenate([draw(None)[::-1], draw(DiscStructure(Arms(), 1))[::-1]])
     grey = np.arcsinh(np.maximum(panels, 0.0) / _SOFT) / np.arcsinh(_WHITE / _SOFT)
     enlarged = np.minimum(grey, 1.0).repeat(2, axis=0).repeat(2, axis=1)

@@ -1,10 +1,11 @@
 """Simulate the Euclid sky, from dark-matter haloes to raw detector images.
 
-`check` validates a request and returns a `Request`; `run` computes its catalogues, fluxes, plan and images and stores
-them in a lake. `open` opens a lake for reading and returns a `Lake`, whose method `image` returns an `Image`.
-`accuracies` lists the errors and costs of the named accuracies. The module `plots` draws the results of `Lake.hist`,
-`Lake.heatmap` and `Lake.skymap`. All errors derive from `LakeError`: `BadInput` for invalid input, `Damaged` for files
-whose content has changed.
+A request is a TOML file (or a dictionary) that defines a simulation, and a lake is the folder with its tables and
+images. `check` validates a request and returns a `Request`. `run` computes catalogues, fluxes, a plan of exposures and
+images, and stores them in a lake. `open` opens a lake for reading and returns a `Lake`, whose method `image` returns an
+`Image`. `accuracies` lists the errors and costs of the named settings of accuracy. The module `plots` draws the results
+of `Lake.hist`, `Lake.heatmap` and `Lake.skymap`. All errors derive from `LakeError`: `BadInput` for invalid input,
+`Damaged` for files whose content has changed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ __all__ = [
     "plots", "run",
 ]  # fmt: skip
 
-# Import these on first use, because together they take seconds.
+# Names of the package that are imported on first use, because all imports together take seconds: the module, and the
+# attribute in it (None for the module).
 _LAZY_IMPORTS: dict[str, tuple[str, str | None]] = {
     "Image": ("lake_schema.fits.images", "Image"),
     "Lake": ("truesky.api.lake", "Lake"),

@@ -1,4 +1,4 @@
-"""Build the table `gaia` from the stars of a lake.
+"""Build the table `gaia`: the simulated stars of a lake (folder of tables) as Gaia DR2 would list them.
 
 spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST
 """

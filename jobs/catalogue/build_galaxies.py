@@ -1,4 +1,6 @@
-"""Build the tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
+"""Build the catalogues of dark-matter halos and galaxies that a request (TOML file) asks for.
+
+The tables are `halos`, `halo_limits`, `galaxies` and `quarantine`.
 
 spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Build the table `stars` of a request.
+"""Build the catalogue of simulated stars, table `stars`, in the area of a request (TOML file).
 
 spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Build the table `strong_lenses` and the images of the arcs of a request.
+"""Build the table `strong_lenses`, and images of the lensed arcs, in the area of a request (TOML file).
 
 spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,6 @@
-"""Compute the band fluxes of all sources of a lake, and store the passbands and templates used.
+"""Compute the fluxes of all galaxies and stars of a request (TOML file) in its passbands.
+
+The passbands and the spectral templates that were used are stored, too.
 
 spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Plan the exposures of a request.
+"""Plan the exposures of a request (TOML file): pointings, and one rendering task per detector image.
 
 spark-submit jobs/render/plan_exposures.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Render the planned exposures.
+"""Render the raw detector images of all exposures that `plan_exposures.py` has planned for a request (TOML file).
 
 spark-submit jobs/render/render_exposures.py --lake LAKE --request REQUEST
 """

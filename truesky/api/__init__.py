@@ -1,1 +1,1 @@
-"""Python interface: open a lake, run and check requests."""
+"""Python interface: open a lake (folder with tables and images), and check and run requests for simulations."""

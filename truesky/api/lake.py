@@ -1,4 +1,4 @@
-"""Read the tables and images of a lake."""
+"""Read the tables and images of a lake (the folder with all results of simulations): class `Lake`."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from truesky.api.tables import LakeTables
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-# Numbers of exposures and sources are 64-bit integers.
+# Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
 
 
 class Lake(LakeTables):
-    """A lake, opened for reading.
+    """A lake (the folder with all tables and images of simulations), opened for reading.
 
-    All methods use the tables as they were when the lake was opened, even if newer versions are published later. Use a
-    `with` block, or call `close`, to end the process that answers queries.
+    All methods use the tables as they were when the lake was opened, even if newer versions are published later. SQL
+    queries run in a separate process. Use a `with` block, or call `close`, to end this process.
 
-    Several threads may use the same lake. One process answers its queries one after the other, so open the lake once
-    per thread to run queries at the same time. `close` also ends queries that other threads are waiting for; these
-    raise `BadInput`.
+    Several threads may use the same object, but its process answers one query after the other. Open the lake once per
+    thread to run queries at the same time. If a thread calls `close`, queries of other threads raise `BadInput`.
 
     Parameters
     ----------
     path : str or Path
         Folder of the lake, or its address on object storage, ``s3://BUCKET/PREFIX``.
     request : str, optional
-        Name of a request. The lake then shows the tables of this request only. Without it, a table that all requests
-        share is called by its name, and a table of one request by both names, for example ``demo.products``.
+        Name of a request (one of the simulations in the lake). The lake then shows the tables of this request only.
+        Without it, a table that all requests share is called by its name, and a table of one request by both names,
+        for example ``demo.products``.
     memory : float, optional
-        Bytes that a query and its result may take together.
+        Memory limit of a query and its result together, 1e7 to 1e15 bytes.
     timeout : float, optional
-        Seconds after which a query is stopped.
+        Time in seconds after which a query is stopped, 0 to 1e6.
 
     Raises
     ------
@@ -58,17 +58,25 @@ class Lake(LakeTables):
     """
 
     def images(self, content: str | None = "science") -> pd.DataFrame:
-        """List the image files.
+        """List the image files of the lake.
 
         Parameters
         ----------
         content : str or None, optional
-            What the files hold: ``science``, ``noise_free``, ``cosmic_rays`` and so on. None lists all files.
+            Content of the files to list: ``science`` (simulated raw images), ``noise_free``, ``cosmic_rays`` and so on.
+            None lists all files.
 
         Returns
         -------
         pandas.DataFrame
-            One row per file: the columns of the table ``products``, and ``file``, its path relative to the lake.
+            One row per file: the columns of the table ``products``, and ``file``, the path of the file relative to the
+            folder of the lake. There are no rows if no file has this content.
+
+        Raises
+        ------
+        BadInput
+            If the lake has no table ``products``, or if requests have different versions of it and no request was
+            chosen.
         """
         version = self._explorer._version("products")
         files = version.rows().to_pandas()
@@ -76,28 +84,28 @@ class Lake(LakeTables):
         return files if content is None else files[files["content"] == content].reset_index(drop=True)
 
     def image(self, path: str, electrons: bool = False) -> Image:
-        """Read one image as the pixels of its detector, without overscan and in one piece.
+        """Read an image file as one array with all pixels of the detector, without overscan.
 
         The checksum of the file is verified first.
 
         Parameters
         ----------
         path : str
-            The column ``path`` of `images`.
+            Path of the file, as in the column ``path`` of the result of `images`.
         electrons : bool, optional
-            Convert to electrons above the bias level, instead of the stored units.
+            If True, convert pixels to electrons above the bias level. By default they have the stored unit.
 
         Returns
         -------
         Image
-            `data`, an array [ny, nx], and `cards`, the FITS header as (keyword, value, comment).
+            `data`, an array of shape (ny, nx), and `cards`, the FITS header as (keyword, value, comment).
 
         Raises
         ------
         BadInput
-            If the lake has no such file, or its pixels are not electrons.
+            If the lake has no such file, or `electrons` is True and the pixels cannot be converted to electrons.
         Damaged
-            If the file is not as it was written.
+            If the checksum of the file is wrong.
         """
         from truesky.render.products import read_back
 
@@ -105,33 +113,48 @@ class Lake(LakeTables):
         return read_back.electrons(file) if electrons else read_back.frame(file)
 
     def extensions(self, path: str) -> list[Image]:
-        """Read all arrays of an image file as they are stored, with overscans and quality.
+        """Read all extensions of an image file as they are stored, with overscans and arrays of quality flags.
 
         Parameters
         ----------
         path : str
-            The column ``path`` of `images`.
+            Path of the file, as in the column ``path`` of the result of `images`.
 
         Returns
         -------
         list of Image
-            One per extension of the FITS file. The first has the header that applies to all. `data` is None if an
-            extension has no array.
+            One entry per extension of the FITS file. The first entry has the primary header, which applies to all.
+            `data` is None if an extension has no array.
+
+        Raises
+        ------
+        BadInput
+            If the lake has no such file.
+        Damaged
+            If the checksum of the file is wrong.
         """
         return images.read_images(self._explorer._version("products").sidecar_path(path))
 
     def wcs(self, path: str) -> WCS:
-        """Return the world coordinate system of an image's pixels.
+        """Return the world coordinate system of the pixels of an image.
 
         Parameters
         ----------
         path : str
-            The column ``path`` of `images`.
+            Path of the file, as in the column ``path`` of the result of `images`.
 
         Returns
         -------
         astropy.wcs.WCS
-            Converts between ICRS positions and pixels of the array that `image` returns, counted from 0.
+            Converts between ICRS positions and pixels of the array that `image` returns. The centre of its first pixel
+            is (0, 0) if methods with 0-based pixels are used.
+
+        Raises
+        ------
+        BadInput
+            If the lake has no such file.
+        Damaged
+            If the checksum of the file is wrong.
         """
         from astropy.wcs import WCS, FITSFixedWarning
 
@@ -140,39 +163,37 @@ class Lake(LakeTables):
         cards = read_back.header(self._explorer._version("products").sidecar_path(path))
         header = {keyword: value for keyword, value, _ in cards}
         with warnings.catch_warnings():
-            # astropy warns even if it only normalises the date.
+            # astropy would warn even if it only changes the format of the date.
             warnings.simplefilter("ignore", FITSFixedWarning)
             return WCS(header)
 
     def models(
         self, exposure_id: int, detector: str, sources: Sequence[int] | None = None
     ) -> Iterator[tuple[int, Float]]:
-        """Draw single sources of a published slitless image, each by itself and without noise.
+        """Draw each source of a slitless image that is in the lake on a separate frame, without noise.
 
-        The expected electrons of all sources add up to the truth image ``noise_free``.
+        The frames of all sources add up to the truth image ``noise_free`` (expected electrons of the sources alone).
 
         Parameters
         ----------
         exposure_id : int
-            Number of the exposure, one that a grism disperses.
+            Number of an exposure with a grism.
         detector : str
             Name of the detector.
         sources : sequence of int, optional
             Identifiers of the sources. The default is all sources whose spectra may reach the detector.
 
-        Yields
-        ------
-        source : int
-            Identifier.
-        electrons : ndarray of float64, shape (ny, nx)
-            Expected electrons of this source, in all orders of the grism. They are 0 if its spectrum misses the
-            detector by little.
+        Returns
+        -------
+        iterator of (int, ndarray of float64)
+            Identifier of each source, and its expected electrons per pixel in all orders of the grism, shape (ny, nx).
+            All are 0 if the spectrum just misses the detector.
 
         Raises
         ------
         BadInput
-            If there is no such image, it is not dispersed, or the spectrum of a source cannot reach the detector. The
-            error is raised by the call, before the first source is drawn.
+            If there is no such image, the exposure has no grism, or a source of `sources` is unknown or too far from
+            the detector. The error is raised by the call itself, before the first source is drawn.
         """
         from truesky.render import models
 
@@ -195,12 +216,13 @@ class Lake(LakeTables):
         Returns
         -------
         pandas.DataFrame
-            The rows of the table ``rendered_truth``: identifier, pixel position, electrons, magnitude and so on.
+            One row per source, from the table ``rendered_truth``: identifier, pixel position, electrons, magnitude and
+            so on. There are no rows if no source was drawn.
 
         Raises
         ------
         BadInput
-            If nothing was rendered for this detector.
+            If the lake has no image of this detector and exposure.
         """
         files = self.images(content=None)
         if not np.any((files["exposure_id"] == exposure_id) & (files["detector"] == detector)):

@@ -1,4 +1,4 @@
-"""Check and run simulation requests from Python."""
+"""Check and run requests (definitions of simulations, as TOML files or dictionaries) from Python."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ _MAX_DETECTORS = 2**63 - 1
 
 
 def check(request: str | Path | Mapping[str, Any]) -> Request:
-    """Check a request as completely as the jobs do, without writing anything.
+    """Check a request for a simulation as completely as the jobs do, without writing anything.
 
     Parameters
     ----------
     request : str, Path or mapping
-        A TOML file, or the same keys as a dictionary, whose numbers may be numpy's and whose lists may be tuples or
-        arrays. Relative file names in a dictionary start at the current folder.
+        Path of a TOML file, or a dictionary with the same keys. The numbers of a dictionary may be numpy numbers, and
+        its lists may be tuples or arrays. Relative file names in a dictionary start at the current folder.
 
     Returns
     -------
     Request
-        The parsed request.
+        The request with all defaults filled in.
 
     Raises
     ------
     BadInput
-        If any job would refuse the request. The message names the key and the allowed values.
+        If a job would refuse the request. The message names the key and the allowed values.
 
     Examples
     --------
@@ -68,25 +68,25 @@ def run(
     lenses: bool = False,
     gaia: bool = False,
 ) -> Lake:
-    """Run all jobs of a request: catalogues, fluxes, the plan of the exposures and images.
+    """Run all jobs of a request: compute its catalogues, fluxes, plan of exposures and images.
 
-    The jobs share one Spark session: the active one of this process, else a local session. Tables that the lake
-    already has are kept, so a second call continues where an interrupted one ended.
+    The jobs share one Spark session: the active one of this process, else a local session. Tables and images that the
+    lake already has are not computed again, so a second call continues where an interrupted one ended.
 
     Parameters
     ----------
     request : str, Path or mapping
-        A TOML file, or the same keys as a dictionary.
+        Path of a TOML file, or a dictionary with the same keys, see `check`.
     lake : str or Path
-        Folder of the lake. It is created if it does not exist.
+        Folder of the lake, in which all results are stored. It is created if it does not exist.
     detectors : str or sequence of str, optional
         Names of the detectors to render. The default is all planned detectors.
     limit : int, optional
-        Largest number of detectors to render.
+        Largest number of detector images to render, at least 1. The default is all.
     lenses : bool, optional
         Also compute the table of strong lenses.
     gaia : bool, optional
-        Also compute the stars as Gaia DR2 would list them.
+        Also compute the table `gaia`: the simulated stars as Gaia DR2 would list them.
 
     Returns
     -------
@@ -96,8 +96,8 @@ def run(
     Raises
     ------
     BadInput
-        If the request is wrong, the lake belongs to another universe, or the disc has too little room. Nothing is
-        computed then.
+        If the request is wrong, the lake was filled with other settings of the simulated universe, or the disc has too
+        little space. Nothing is computed in these cases.
     LakeError
         If a job fails.
     """
@@ -121,15 +121,17 @@ def run(
 
 
 def accuracies() -> pd.DataFrame:
-    """List the allowed errors, the measured errors and the cost of drawing sources for each named accuracy.
+    """List the errors and the CPU time of drawing sources for each named setting of accuracy.
+
+    The name of such a setting is the value of the key ``accuracy`` of a request.
 
     Returns
     -------
     pandas.DataFrame
-        One row per name, such as ``survey``. The columns are the largest allowed errors of a source's ``flux``
-        (relative), ``shape`` (reduced shear) and ``position`` (pixels), and of the ``background`` (in units of the
-        noise of a sky pixel); the measured errors, with the suffix ``_reached``; ``seconds`` of CPU time to draw all
-        sources of a VIS detector; and the settings that are used for drawing.
+        One row per name, such as ``survey``. Four columns are the largest allowed errors: ``flux`` (relative),
+        ``shape`` (reduced shear), ``position`` (pixels), and ``background`` (in units of the noise of a sky pixel).
+        Four columns with the suffix ``_reached`` are the measured errors. ``seconds`` is the CPU time to draw all
+        sources of a VIS detector. The other columns are parameters of the drawing code.
     """
     rows = {}
     for name, allowed in accuracy.PRESETS.items():
@@ -147,7 +149,7 @@ def _parse_request(request: str | Path | Mapping[str, Any]) -> Request:
 
 
 def _to_toml_value(value: Any) -> Any:
-    """Convert a value of a dictionary to the type that a TOML file would give."""
+    """Convert numpy numbers, tuples and arrays in a value of a dictionary to the types that a TOML file would give."""
     if isinstance(value, Mapping):
         return {key: _to_toml_value(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

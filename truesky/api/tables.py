@@ -1,4 +1,4 @@
-"""Read the tables of a lake."""
+"""Read the tables of a lake (the folder with all results of simulations): rows, SQL, histograms and maps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,19 @@ from truesky.explore.process import MEMORY, TIMEOUT
 
 
 class LakeTables:
-    """Tables of a lake that is opened for reading: queries, rows, counts and files. See `truesky.open`."""
+    """Tables of a lake that is opened for reading: base class of `truesky.Lake`, which also reads images.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of the lake, or its address on object storage, ``s3://BUCKET/PREFIX``.
+    request : str, optional
+        Name of a request (one of the simulations in the lake), to which the lake is then restricted.
+    memory : float, optional
+        Memory limit of a query and its result together, 1e7 to 1e15 bytes.
+    timeout : float, optional
+        Time in seconds after which a query is stopped, 0 to 1e6.
+    """
 
     def __init__(
         self, path: str | Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
@@ -35,18 +47,18 @@ class LakeTables:
         self.close()
 
     def close(self) -> None:
-        """End the process that answers queries. A later query starts another."""
+        """End the process that answers queries; a later query starts a new one."""
         self._explorer.close()
 
-    # ------------------------------------------------------------------------------------------------ tables
-
     def tables(self) -> pd.DataFrame:
-        """List the tables.
+        """List the tables of the lake.
 
         Returns
         -------
         pandas.DataFrame
-            One row per table, indexed by name: rows, MB, files, version and meaning.
+            One row per table, indexed by name. The columns are `rows`, `MB` (10^6 bytes), `files` (number of files),
+            `version` (key of the version: a hash that identifies it) and `meaning`. If a table cannot be opened,
+            `version` is "damaged" or "unreadable version", `meaning` is the error, and the numbers are missing.
         """
         return self._explorer.tables()
 
@@ -61,12 +73,17 @@ class LakeTables:
         Returns
         -------
         pandas.DataFrame
-            One row per column, indexed by name: type, unit, range, whether it can be null, UCD and meaning.
+            One row per column of the table, indexed by name: `type`, `unit`, `range` (allowed values), `null` (True if
+            values may be missing), `ucd` and `meaning`.
+
+        Notes
+        -----
+        BadInput is raised if the lake has no such table.
         """
         return self._explorer.describe(table)
 
     def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "pandas") -> Any:
-        """Read a table.
+        """Read all rows of a table into memory.
 
         Parameters
         ----------
@@ -75,11 +92,16 @@ class LakeTables:
         columns : str or sequence of str, optional
             Names of the columns to read. The default is all columns.
         into : {"pandas", "arrow", "astropy"}, optional
-            Kind of the result. An astropy table has units.
+            Type of the result. An astropy table has units.
 
         Returns
         -------
         pandas.DataFrame, pyarrow.Table or astropy.table.Table
+            All rows of the table.
+
+        Notes
+        -----
+        BadInput is raised if the lake has no such table or column, or if `into` is another text.
         """
         from truesky.explore import results
 
@@ -91,21 +113,24 @@ class LakeTables:
         Parameters
         ----------
         query : str
-            SQL in the dialect of DuckDB. Two functions are added: ``separation(ra1, dec1, ra2, dec2)`` in degrees and
-            ``mag_ab(f_nu)`` for flux densities in microjansky. ``$name`` stands for a parameter.
+            SQL in the dialect of DuckDB. Two functions are added: ``separation(ra1, dec1, ra2, dec2)`` is the angle
+            between two positions in degrees, and ``mag_ab(f_nu)`` is the AB magnitude of a flux density in microjansky.
+            ``$name`` stands for a parameter.
         into : {"pandas", "arrow", "astropy"}, optional
-            Kind of the result.
+            Type of the result. An astropy table has units.
         **parameters
-            Values of the parameters: numbers, strings, booleans, or lists, tuples and arrays of them.
+            Values of the parameters by name: numbers, strings, booleans, or lists, tuples and arrays of them.
 
         Returns
         -------
         pandas.DataFrame, pyarrow.Table or astropy.table.Table
+            Rows of the result.
 
         Raises
         ------
         BadInput
-            If the query is not a single SELECT over tables of the lake, or exceeds the limits of time or memory.
+            If the query is not a single SELECT over tables of the lake, exceeds the limits of time or memory, or `into`
+            is another text.
         Damaged
             If the content of a file that the query reads has changed since it was written.
         """
@@ -121,7 +146,7 @@ class LakeTables:
         on: str = "observed",
         into: str = "pandas",
     ) -> Any:
-        """Read the rows of a catalogue within a circle on the sky.
+        """Read the rows of a catalogue within a circle on the sky, including its edge.
 
         Parameters
         ----------
@@ -134,37 +159,44 @@ class LakeTables:
         columns : str or sequence of str, optional
             Names of the columns to read. The default is all columns.
         on : {"observed", "true"}, optional
-            Select by observed positions, or by the true ones without gravitational lensing.
+            Positions that are compared with the circle: observed ones, or true ones without gravitational lensing.
         into : {"pandas", "arrow", "astropy"}, optional
-            Kind of the result.
+            Type of the result. An astropy table has units.
 
         Returns
         -------
         pandas.DataFrame, pyarrow.Table or astropy.table.Table
+            Rows inside the circle; there are none if it is empty.
+
+        Notes
+        -----
+        BadInput is raised if the table or a column does not exist, or an argument is outside its bounds.
         """
         return self._explorer.cone(table, ra, dec, radius, _names(columns), on, into)
 
     def export(self, query: str, path: str | Path, /, **parameters: object) -> Path:
-        """Write the result of a query to a file.
+        """Write the result of an SQL query to a file.
 
         Parameters
         ----------
         query : str
-            One SELECT, as for `sql`.
+            One SELECT over tables of the lake, as for the method `sql`.
         path : str or Path
             File to write; ``~`` is the home folder. Its ending selects the format: ``.csv``, ``.parquet``, ``.fits``
-            or ``.vot``. Units and UCDs are written if the format supports them.
+            or ``.vot``. Units and UCDs are written if the format supports them. An existing file is replaced.
         **parameters
-            Values of the parameters of the query.
+            Values of the parameters of the query by name.
 
         Returns
         -------
         Path
-            The file.
+            Path of the file.
+
+        Notes
+        -----
+        BadInput is raised if the query fails, the path has another ending, or the format cannot hold the result.
         """
         return self._explorer.export(query, path, **parameters)
-
-    # ------------------------------------------------------------------------------------------------ distributions
 
     def hist(
         self,
@@ -175,28 +207,35 @@ class LakeTables:
         where: str = "true",
         weight: str | None = None,
     ) -> tuple[Float, Float]:
-        """Count rows in equal bins of an expression, without reading the rows into this process.
+        """Return a histogram of an SQL expression, without reading the rows into this process.
 
         Parameters
         ----------
         table : str
             Name of a table, or the text of a FROM clause, such as ``galaxies JOIN galaxy_fluxes USING (id)``.
         x : str
-            SQL expression of the table's columns.
+            SQL expression of the table's columns. Rows for which it is NULL or outside `span` are not counted.
         bins : int, optional
-            Number of bins.
+            Number of bins of equal width, 1 to 10,000.
         span : tuple of float, optional
-            Lower edge of the first bin and upper edge of the last. The default is the range of the values.
+            Lower edge of the first bin and upper edge of the last bin, both included. The default is the smallest and
+            the largest value, or 0.5 below and above them if they are equal.
         where : str, optional
-            SQL condition that selects rows.
+            SQL condition that selects rows. The default is all rows.
         weight : str, optional
-            SQL expression that is summed instead of 1. Rows without a value count as 0.
+            SQL expression that is summed in each bin; rows for which it is NULL add 0. By default rows are counted.
 
         Returns
         -------
         counts : ndarray of float64, shape (bins,)
+            Number of rows, or sum of weights, in each bin.
         edges : ndarray of float64, shape (bins + 1,)
-            Arguments for ``truesky.plots.hist``.
+            Edges of the bins, ascending. ``truesky.plots.hist(counts, edges)`` draws the result.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or if `span` is missing and an expression has no values or not
+        only finite ones.
         """
         return self._explorer.hist(table, x, bins, span, where, weight)
 
@@ -210,54 +249,67 @@ class LakeTables:
         where: str = "true",
         weight: str | None = None,
     ) -> tuple[Float, Float, Float]:
-        """Count rows in a grid of equal bins of two expressions.
+        """Return a two-dimensional histogram of two SQL expressions, without reading the rows into this process.
 
         Parameters
         ----------
         table : str
-            Name of a table, or the text of a FROM clause.
+            Name of a table, or the text of a FROM clause, such as ``galaxies JOIN galaxy_fluxes USING (id)``.
         x, y : str
-            SQL expressions of the table's columns.
+            SQL expressions of the table's columns. Rows for which one is NULL or outside its range are not counted.
         bins : tuple of int, optional
-            Numbers of bins of x and y.
+            Numbers of bins of equal width in x and in y, 1 to 10,000 each.
         span : tuple of tuple of float, optional
-            Ranges of x and y. The default is the ranges of the values.
+            Range of x and range of y, each (lowest, highest), both included. The default is the smallest and the
+            largest value of each expression, or 0.5 below and above them if they are equal.
         where : str, optional
-            SQL condition that selects rows.
+            SQL condition that selects rows. The default is all rows.
         weight : str, optional
-            SQL expression that is summed instead of 1. Rows without a value count as 0.
+            SQL expression that is summed in each bin; rows for which it is NULL add 0. By default rows are counted.
 
         Returns
         -------
         counts : ndarray of float64, shape (y bins, x bins)
+            Number of rows, or sum of weights, in each bin.
         x_edges : ndarray of float64, shape (x bins + 1,)
+            Edges of the bins in x, ascending.
         y_edges : ndarray of float64, shape (y bins + 1,)
-            Arguments for ``truesky.plots.heatmap``.
+            Edges of the bins in y, ascending. ``truesky.plots.heatmap(counts, x_edges, y_edges)`` draws the result.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or if `span` is missing and an expression has no values or not
+        only finite ones.
         """
         return self._explorer.heatmap(table, x, y, bins, span, where, weight)
 
     def skymap(
         self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
     ) -> tuple[Int, Float]:
-        """Count the rows of a catalogue in nested HEALPix cells.
+        """Count the rows of a catalogue in HEALPix cells of the sky.
 
         Parameters
         ----------
         table : str
-            Name of a catalogue.
+            Name of a catalogue, or the text of a FROM clause with the column ``_healpix_29``.
         order : int, optional
-            Order of the cells; nside is 2**order.
+            HEALPix order of the cells, 0 to 29; nside is 2**order.
         where : str, optional
-            SQL condition that selects rows.
+            SQL condition that selects rows. The default is all rows.
         weight : str, optional
-            SQL expression that is summed instead of 1. Rows without a value count as 0.
+            SQL expression that is summed in each cell; rows for which it is NULL add 0. By default rows are counted.
 
         Returns
         -------
         cells : ndarray of int64, shape (n,)
-            Cells that contain rows, ascending.
+            Nested indices of the cells that contain rows, ascending.
         counts : ndarray of float64, shape (n,)
-            Arguments for ``truesky.plots.skymap``, together with the order if it is not 8.
+            Number of rows, or sum of weights, in each cell. ``truesky.plots.skymap(cells, counts, order)`` draws the
+            result.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or the table has no positions.
         """
         return self._explorer.skymap(table, order, where, weight)
 

@@ -2,8 +2,9 @@
 
 Notes
 -----
-A lake can contain the tables of several requests. Name a request, or write demo.galaxies for the galaxies of request
-demo.
+A lake is the folder with all tables and images of the simulator; a request is the TOML file of a user that defines a
+simulation. A lake can contain the tables of several requests. Give the name of a request to `Explorer`, or write
+`demo.galaxies` in SQL for the table `galaxies` of the request `demo`.
 
 Examples
 --------

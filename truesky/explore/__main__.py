@@ -1,6 +1,7 @@
-"""Query a lake: python -m truesky.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE].
+"""Query the tables of a lake (a folder of the simulator) with SQL on the command line.
 
-FILE is .csv, .parquet, .fits or .vot.
+Usage: python -m truesky.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE]. The name of FILE ends in .csv,
+.parquet, .fits or .vot. Without --out the rows are printed, at most 40 of them. Without SQL the tables are listed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ _MAX_ROWS_SHOWN = 40
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Return the exit status: 0 on success, 1 if the lake is damaged, 2 if the call or the query is wrong."""
+    """Run the command and return its exit status: 0 on success, 1 if the lake is damaged, 2 for wrong input.
+
+    The status is also 1 if a file cannot be written.
+
+    `argv` contains the command-line arguments without the name of the program; None means those of this process.
+    """
     options = _options(argv)
     return command.run("explore", lambda: _answer(options))
 

@@ -1,11 +1,12 @@
 """Translate ADQL, the query language of the Virtual Observatory, to DuckDB's SQL.
 
-The translation changes TOP, which becomes LIMIT at the end of its SELECT; names of functions; and geometry: POINT,
-CIRCLE, POLYGON, CONTAINS, INTERSECTS, DISTANCE, COORD1, COORD2, and columns of STC-S polygons. Other geometry raises an
-error with its name. Quoted text does not change. The guard decides if the resulting query may run.
+Three things change: TOP becomes LIMIT at the end of its SELECT, some functions get another name, and geometry becomes
+SQL. The geometry is POINT, CIRCLE, POLYGON, CONTAINS, INTERSECTS, DISTANCE, COORD1, COORD2, and columns that contain
+polygons as STC-S text. Other geometry, such as BOX, raises BadInput. Quoted text does not change. The translation does
+not decide if the query is allowed; `truesky.explore.guard` checks the resulting SQL.
 
-If a query selects the rows of a catalogue in a circle, the translation also selects the HEALPix cells that the circle
-touches. Files and row groups without these cells are then not read.
+If a query selects the rows of a catalogue in a circle, the translation adds a condition on the HEALPix cells that the
+circle touches. DuckDB then skips Parquet files and row groups without these cells.
 
 References
 ----------
@@ -22,7 +23,9 @@ import numpy as np
 from lake_schema import sky
 from lake_schema.errors import BadInput
 
-# Vertices are lists of ra, dec, ra, dec ... in deg. A side is positive if the position lies to its left.
+# Macros of DuckDB for geometry on the sphere; all angles are in deg unless a comment says otherwise. The argument v is
+# the list of a polygon's vertices: ra, dec, ra, dec, ... The macro adql_side is positive if the position (a, d) lies to
+# the left of the great circle from (a1, d1) to (a2, d2).
 MACROS = (
     """CREATE MACRO adql_side(a1, d1, a2, d2, a, d) AS
        cos(radians(d1)) * cos(radians(a1)) * (cos(radians(d2)) * sin(radians(a2)) * sin(radians(d))
@@ -36,18 +39,22 @@ MACROS = (
         for i in range(1, len(v), 2)]""",
     """CREATE MACRO adql_cosine(a1, d1, a2, d2) AS
        sin(radians(d1)) * sin(radians(d2)) + cos(radians(d1)) * cos(radians(d2)) * cos(radians(a1 - a2))""",
-    # Winding angle of the sides around a position, in radians: for concave polygons the signs of sides are not enough.
+    # adql_turn: angle in radians under which a side of the polygon is seen from the position (a, d), signed. The sum of
+    # these angles is +-2 pi if the position is inside, also for concave polygons, where the signs of adql_side are not
+    # enough.
     """CREATE MACRO adql_turn(a1, d1, a2, d2, a, d) AS
        atan2(adql_side(a1, d1, a2, d2, a, d),
              adql_cosine(a1, d1, a2, d2) - adql_cosine(a1, d1, a, d) * adql_cosine(a2, d2, a, d))""",
     """CREATE MACRO adql_turns(ra, dec, v) AS
        list_sum([adql_turn(v[i], v[i + 1], v[(i + 1) % len(v) + 1], v[(i + 2) % len(v) + 1], ra, dec)
                  for i in range(1, len(v), 2)])""",
-    # Positions on a side of a convex polygon are inside.
+    # adql_in_polygon: true if the position is inside the polygon. Positions on a side of a convex polygon are inside.
+    # The first vertex must be less than 90 deg from the position.
     """CREATE MACRO adql_in_polygon(ra, dec, v) AS (separation(ra, dec, v[1], v[2]) < 90
        AND (list_min(adql_sides(ra, dec, v)) >= 0 OR list_max(adql_sides(ra, dec, v)) <= 0
             OR abs(adql_turns(ra, dec, v)) > pi()))""",
-    # Distance in deg from a position to an arc: to its great circle, or to an end if this is nearest.
+    # adql_from_arc: distance in deg from the position (a, d) to the arc between two vertices. It is the distance to the
+    # great circle through the arc if the nearest point lies on the arc, else the distance to the nearer end.
     """CREATE MACRO adql_from_arc(a1, d1, a2, d2, a, d) AS
        CASE WHEN adql_cosine(a2, d2, a, d) > adql_cosine(a1, d1, a, d) * adql_cosine(a1, d1, a2, d2)
              AND adql_cosine(a1, d1, a, d) > adql_cosine(a2, d2, a, d) * adql_cosine(a1, d1, a2, d2)
@@ -67,7 +74,7 @@ _TOKEN = re.compile(
     r"""|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|<>|!=|<=|>=|\|\||.""",
     re.DOTALL,
 )
-# LOG is the natural logarithm in ADQL, but the logarithm to base 10 in DuckDB.
+# DuckDB's names of ADQL functions. LOG is the natural logarithm in ADQL, but the logarithm to base 10 in DuckDB.
 _RENAMED = {"LOG": "ln", "RAND": "random", "TRUNCATE": "trunc"}
 _REGIONS = {"CIRCLE", "POLYGON"}
 _GEOMETRY = {"CONTAINS", "INTERSECTS", "DISTANCE", "COORD1", "COORD2"}
@@ -75,26 +82,37 @@ _REFUSED = {"AREA", "BOX", "CENTROID", "COORDSYS", "REGION"}
 _SET = {"UNION", "INTERSECT", "EXCEPT"}
 _MAX_LENGTH = 50_000
 _CLAUSES = {"SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "ON"}
-# A comparison between these tokens is a complete condition.
+# A comparison is a complete condition, not a part of a longer expression, if the token before it is in
+# _CONDITION_STARTS and the token after it is in _CONDITION_ENDS ("" is the end of the query).
 _CONDITION_STARTS, _CONDITION_ENDS = (
     {"WHERE", "ON", "AND", "OR", "NOT", "("},
     {"AND", "OR", ")", "GROUP", "ORDER", "LIMIT", "OFFSET", ""},
 )
-# Tokens after the name of a table that are not an alias.
+# Keywords that can follow the name of a table in FROM, so they are not its alias.
 _NO_NAMES = {*_CLAUSES, *_SET, "JOIN", "INNER", "LEFT", "RIGHT", "FULL", "CROSS", "NATURAL", "USING", "LIMIT", "OFFSET"}
-# Cells per radius of a circle, largest number of cell ranges, largest radius, and margin for rounding.
-_CELLS_A_RADIUS, _MAX_RANGES, _MAX_RADIUS_DEG, _ROUNDING_DEG = 4, 24, 60.0, 1e-7
+# The HEALPix cells that cover a circle are at least this many times smaller than its radius. Their order is at most
+# 20, so this does not hold for radii below 0.8 arcsec.
+_CELLS_A_RADIUS = 4
+# Largest number of ranges of cells in a condition for a circle.
+_MAX_RANGES = 24
+# Circles with a larger radius (deg) get no condition on HEALPix cells.
+_MAX_RADIUS_DEG = 60.0
+# The radius is increased by this angle (deg), so that rounding errors do not exclude a cell.
+_ROUNDING_DEG = 1e-7
 
 
 def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
-    """Translate a query from ADQL to DuckDB's SQL with the macros of MACROS.
+    """Translate a query from ADQL to DuckDB's SQL.
+
+    The result uses the macros MACROS of this module, which the DuckDB session must have created.
 
     Parameters
     ----------
     text : str
         The query in ADQL.
-    catalogues : collection of str
-        Tables, in lower case, whose column `_healpix_29` is the index of ra and dec.
+    catalogues : collection of str, optional
+        Names, in lower case, of the tables whose column `_healpix_29` is the order-29 nested HEALPix index of the
+        columns `ra` and `dec`. Searches in circles are faster in these tables.
 
     Returns
     -------
@@ -104,7 +122,8 @@ def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
     Raises
     ------
     BadInput
-        If the query is too long or uses ADQL that cannot be translated; the message names it.
+        If the query has more than 50,000 characters, or contains a construct that cannot be translated. The message
+        names the construct.
     """
     if len(text) > _MAX_LENGTH:
         raise BadInput(f"ADQL: a query has at most {_MAX_LENGTH} characters")
@@ -115,39 +134,39 @@ def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
 
 
 def cone_condition(column: str, ra: float, dec: float, radius: float) -> str:
-    """Return the SQL condition that an order-29 index lies in cells that a circle touches, as a few ranges.
+    """Return an SQL condition that selects the HEALPix cells that a circle touches, as at most 24 ranges of the index.
 
     Parameters
     ----------
     column : str
-        Column of the index.
+        Name of the column with the order-29 nested HEALPix index.
     ra, dec, radius : float
-        Centre and radius of the circle, deg.
+        Centre and radius of the circle, deg. The radius is 0 to 180.
 
     Returns
     -------
     str
-        Condition in SQL; it can also be true for cells outside the circle.
+        Condition in SQL. It is true for all positions in the circle, and for some positions outside it.
     """
     order = int(np.clip(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) * _CELLS_A_RADIUS / max(radius, 1e-6))), 0, 20))
     cells = sky.cells_in_cone(ra, dec, min(radius + _ROUNDING_DEG, 180.0), order)
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
     if len(cuts) >= _MAX_RANGES:
-        # Only the widest gaps are kept, so narrow gaps between cells are included in the ranges.
+        # There would be too many ranges of cells. Split them only at the widest gaps in the index; cells in narrower
+        # gaps are then selected, too, although they do not touch the circle.
         cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MAX_RANGES + 1 :]])
     firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
     ranges = [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
     return f"({' OR '.join(f'({column} >= {first} AND {column} < {last})' for first, last in ranges)})"
 
 
-# ------------------------------------------------------------------------------------------------ places
-
-
 def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str, str]:
-    """Index column for each table prefix ("" or "name.") of `ra` and `dec` in a query.
+    """Return the HEALPix column of each catalogue in a query, by the prefix with which the query can name its columns.
 
-    Names that may refer to something other than a catalogue are left out.
+    For example {"": "_healpix_29", "g.": "g._healpix_29"} for "SELECT ... FROM galaxies AS g": both `ra` and `g.ra`
+    refer to the catalogue. A prefix that may also refer to another table or subquery is left out. The result is empty
+    if the query has a WITH clause.
     """
     words = [token for token in tokens if not token.isspace()]
     upper = [word.upper() for word in words]
@@ -155,7 +174,8 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
         return {}
     named_tables: list[tuple[str, bool]] = []
     for k, word in enumerate(upper):
-        # A comma also joins tables: a name counts as a catalogue only if no comma follows.
+        # Only names after FROM and JOIN are found here. A comma after a table means that more tables follow, which are
+        # not found, so such a table does not count as a catalogue.
         if word in ("FROM", "JOIN"):
             name, at = "", k + 1
             while at < len(words) and not (upper[at] in _NO_NAMES or words[at] in ("(", ")", ",")):
@@ -169,7 +189,8 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
             named_tables.append(
                 (alias.lower() or name.rpartition(".")[2], name in catalogues and next_word not in ("(", ","))
             )
-    # Aliases of subqueries follow a bracket.
+    # A word after a closing bracket may be the alias of a subquery. A table with the same name is then not returned,
+    # because its prefix could mean the subquery.
     behind_brackets = " ".join(upper).replace(") AS ", ") ").split(") ")[1:]
     hidden = {text.partition(" ")[0].lower() for text in behind_brackets}
     names = [name for name, _ in named_tables]
@@ -180,13 +201,14 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
     return unqualified | {f"{name}.": f"{name}._healpix_29" for name in catalogue_names if name.isidentifier()}
 
 
-# ------------------------------------------------------------------------------------------------ TOP
-
-
 def _top_to_limit(tokens: Sequence[str]) -> list[str]:
-    """Move TOP n of every SELECT to LIMIT n at the end of this SELECT: at its bracket, at OFFSET, or at the end."""
+    """Replace TOP n of every SELECT by LIMIT n at the end of the same SELECT, and return all tokens.
+
+    A SELECT ends before its OFFSET, at the closing bracket of its subquery, or at the end of the query. BadInput is
+    raised if a SELECT with TOP is followed by UNION, INTERSECT or EXCEPT, because LIMIT would apply to the whole union.
+    """
     out: list[str] = []
-    # Bracket depth and limit of each open SELECT, innermost last.
+    # Bracket depth and n of each SELECT with TOP n whose end has not been reached, innermost last.
     open_selects: list[tuple[int, str]] = []
     depth, at = 0, 0
     while at < len(tokens):
@@ -212,7 +234,11 @@ def _top_to_limit(tokens: Sequence[str]) -> list[str]:
 
 
 def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | None]:
-    """Skip [DISTINCT | ALL] TOP n after a SELECT; append the rest to `out`. Return the next index and n."""
+    """Read the optional DISTINCT, ALL and TOP n after a SELECT.
+
+    `at` is the index of the token after SELECT. DISTINCT or ALL is appended to `out`, and TOP n is not. Return the
+    index of the next token, and n as text, or None if there is no TOP.
+    """
     ahead = [k for k in range(at, min(at + 8, len(tokens))) if not tokens[k].isspace()]
     if ahead and tokens[ahead[0]].upper() in ("DISTINCT", "ALL"):
         out += tokens[at : ahead[0] + 1]
@@ -222,11 +248,12 @@ def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | Non
     return at, None
 
 
-# ------------------------------------------------------------------------------------------------ functions
-
-
 def _translate_functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
-    """Translate calls of functions that have another name or form in SQL; `indices` come from `_indices`."""
+    """Translate calls of functions that have another name or form in SQL, and return all tokens.
+
+    `indices` contains the HEALPix column of each catalogue by the prefix of its columns ("" or "name."). BadInput is
+    raised for geometry that cannot be translated.
+    """
     out: list[str] = []
     at, clauses = 0, [""]
     while at < len(tokens):
@@ -253,9 +280,11 @@ def _translate_functions(tokens: Sequence[str], indices: Mapping[str, str]) -> l
 
 
 def _cone_cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) -> str:
-    """Condition on the cells of a circle if a call tests that catalogue positions lie in a circle, else "".
+    """Return an SQL condition on HEALPix cells for a test that a catalogue's positions lie in a circle.
 
-    This requires a position given as columns and a circle given as numbers.
+    `word` is the name of the called function. The result is "" unless the function is CONTAINS or INTERSECTS, the
+    position is given by the columns `ra` and `dec` of a catalogue, and the circle by numbers with a radius of at most
+    60 deg. `indices` contains the HEALPix column of each catalogue by the prefix of its columns ("" or "name.").
     """
     if word not in ("CONTAINS", "INTERSECTS") or len(arguments) != 2:
         return ""
@@ -274,9 +303,11 @@ def _cone_cells(word: str, arguments: list[list[str]], indices: Mapping[str, str
 
 
 def _condition_end(tokens: Sequence[str], call_end: int, out: list[str]) -> int | None:
-    """Index after the comparison of a call with 1; None if the comparison is not a complete condition.
+    """Return the index of the token after a comparison such as CONTAINS(...) = 1 or 1 = CONTAINS(...).
 
-    `out` contains the tokens before the call; a "1 =" is removed from it.
+    None is returned if the call is not compared with 1, or if the comparison is only a part of a longer expression.
+    `call_end` is the index of the token after the call. `out` contains the tokens before the call; a "1 =" at its end
+    is removed.
     """
     following = [k for k in range(call_end, len(tokens)) if not tokens[k].isspace()][:3]
     preceding = [k for k in range(len(out)) if not out[k].isspace()][-3:]
@@ -293,7 +324,10 @@ def _condition_end(tokens: Sequence[str], call_end: int, out: list[str]) -> int 
 
 
 def _arguments(tokens: Sequence[str], bracket: int) -> tuple[list[list[str]], int]:
-    """Arguments of a call, and the index after its closing bracket."""
+    """Return the arguments of a call as lists of tokens, and the index of the token after its closing bracket.
+
+    `bracket` is the index of the opening bracket. BadInput is raised if the bracket is not closed.
+    """
     arguments: list[list[str]] = [[]]
     depth = 0
     for at in range(bracket, len(tokens)):
@@ -332,7 +366,11 @@ def _geometry(word: str, arguments: list[list[str]]) -> str:
 
 
 def _inside(ra: str, dec: str, region: list[str]) -> str:
-    """Condition that a position lies in a region: a circle, a polygon, or a column of STC-S polygons."""
+    """Return the SQL condition that a position lies in a region.
+
+    `ra` and `dec` are SQL expressions in deg. `region` contains the tokens of a CIRCLE, a POLYGON, or an expression
+    for polygons as STC-S text. BadInput is raised for a POINT.
+    """
     kind = _kind(region)
     if kind == "CIRCLE":
         ra0, dec0, radius = _circle(region)
@@ -343,7 +381,11 @@ def _inside(ra: str, dec: str, region: list[str]) -> str:
 
 
 def _vertices(region: list[str]) -> str:
-    """Vertices of a polygon, or of a column of STC-S polygons."""
+    """Return SQL for the list of a polygon's vertices: ra, dec, ra, dec, ... in deg.
+
+    `region` contains the tokens of a POLYGON, or of an expression for polygons as STC-S text. BadInput is raised if a
+    POLYGON has fewer than three corners, or an odd number of coordinates.
+    """
     if _kind(region) != "POLYGON":
         return f"adql_vertices({_sql(region)})"
     corners = [part for argument in _numbers(region) for part in argument]
@@ -353,7 +395,10 @@ def _vertices(region: list[str]) -> str:
 
 
 def _kind(tokens: list[str]) -> str:
-    """Name of the geometry function that an argument calls, "" for other arguments such as columns."""
+    """Return CIRCLE, POLYGON or POINT if an argument is a call of this function, else "" (for example for a column).
+
+    BadInput is raised for geometry that cannot be translated, such as BOX.
+    """
     words = [token for token in tokens if not token.isspace()]
     word = words[0].upper() if len(words) > 1 and words[1] == "(" else ""
     if word in _REFUSED:
@@ -362,7 +407,11 @@ def _kind(tokens: list[str]) -> str:
 
 
 def _numbers(tokens: list[str]) -> list[list[str]]:
-    """Arguments of a geometry call without the coordinate frame of ADQL 2.0; points are pairs of numbers."""
+    """Return the arguments of a call of POINT, CIRCLE or POLYGON as SQL, one list per argument.
+
+    A list contains two expressions (ra, dec) if the argument is a POINT, else one. The coordinate frame, with which the
+    arguments begin in ADQL 2.0 ('ICRS'), is left out.
+    """
     arguments, _ = _arguments(tokens, tokens.index("("))
     numbers = []
     for number, argument in enumerate(arguments):
@@ -398,5 +447,5 @@ def _sql(tokens: list[str]) -> str:
     text = "".join(_translate_functions(tokens, {})).strip()
     if not text:
         raise BadInput("ADQL: an argument is missing")
-    # Columns, numbers and texts need no brackets.
+    # Single columns, numbers and texts need no brackets; other expressions are put in brackets.
     return text if re.fullmatch(r"'(?:[^']|'')*'|-?[\w.]+", text) else f"({text})"

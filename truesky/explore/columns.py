@@ -1,8 +1,10 @@
-"""Store columns or expressions of a lake as float32 files in the cache, from which charts are counted.
+"""Store the values of SQL expressions as float32 files in the disc cache, so that histograms of them need no query.
 
-A join returns its rows in a different order each time, so one query fills all its columns. Columns of a table are
-filled one by one. Each is stored with a sum over the keys of its rows that depends on their order; columns whose sums
-differ are not combined.
+A histogram (chart) can combine several columns, so all columns must have their rows in the same order. Columns of a
+single table are queried and stored one by one. Each is stored with a checksum of the order of its rows, computed from
+the primary keys. If the checksums of columns differ, one query computes all these columns again together. A join
+returns its rows in a different order each time, and its columns have no checksum. They are therefore always queried
+together.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from lake_schema.arrays import Array, Float32
 from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
-# Function of a query and of texts that must each be an expression; it returns the rows.
+# Type of a function that runs a query. Its arguments are the SQL of the query, and the parts of this SQL that a user
+# wrote, each of which must be exactly one SQL expression. It returns the rows in batches.
 Ask = Callable[[str, Sequence[str]], Iterable[pa.RecordBatch]]
 _NAME = "columns"
 _ORDER = "order"
@@ -31,20 +34,21 @@ MAX_BYTES = 4e9
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Rows of a lake.
+    """Selection of rows from the tables of a lake.
 
     Attributes
     ----------
     lake : str
-        Key of the versions of its tables.
+        Digest that identifies the lake and the versions of its tables; it changes if their content changes.
     source : str
-        SQL after FROM.
+        Name of a table, or other SQL after FROM such as a join.
     where : str
-        SQL condition of the rows.
+        SQL condition that the rows must meet.
     keys : tuple of str
-        Columns that identify the rows of a table; () if the source is not a table or has no keys.
+        Columns that identify a row of the table; () if the source is not a single table, or has no such columns.
     part : int
-        One row in this number is selected, by its keys.
+        Sampling factor: about one row in `part` is selected, by a hash of its keys; 1 selects all rows. Larger values
+        require `keys`.
     """
 
     lake: str
@@ -54,27 +58,31 @@ class Selection:
     part: int = 1
 
     def condition(self) -> str:
-        """Return the SQL condition of the selected rows."""
+        """Return the SQL condition that the selected rows meet: `where`, and the sampling if `part` is above 1."""
         sampled = f" AND hash({', '.join(self.keys)}) % {self.part} = 0" if self.part > 1 else ""
         return f"({self.where}\n){sampled}"
 
 
 def load(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Float32]:
-    """Load columns, or query and store them if they are not in the cache.
+    """Return the values of SQL expressions for selected rows, from the cache if they are in it.
+
+    Missing values are computed with a query and stored in the cache.
 
     Parameters
     ----------
     selection : Selection
-        Rows.
+        Rows to select.
     expressions : sequence of str
-        SQL expressions.
+        SQL expressions, one per column.
     ask : callable
-        Function that runs a query; it raises BadInput if a text is not an expression.
+        Function that runs a query. Its arguments are the SQL, and the parts of it that a user wrote. It must raise
+        BadInput if one of these parts is not exactly one SQL expression.
 
     Returns
     -------
     list of float32 arrays, shape (n,)
-        Values of each expression for the same rows, NaN if missing; memory-mapped files.
+        Values of each expression as memory-mapped files. The order of rows is the same in all arrays. Values are NaN if
+        they are NULL or cannot be converted to a number.
     """
     if selection.keys:
         loaded = [_cached_columns(selection, [text], ask) for text in expressions]
@@ -101,14 +109,19 @@ def _compute_columns(selection: Selection, expressions: Sequence[str], ask: Ask)
     order = f"hash({', '.join(selection.keys)})" if selection.keys else "0::UBIGINT"
     query = f"SELECT {', '.join(select_list)}, {order} AS row_key FROM {selection.source} WHERE {selection.condition()}"
     cache.cache_dir().mkdir(parents=True, exist_ok=True)
-    # Columns of large tables can have gigabytes, so they go to disc and not to memory.
+    # Columns of large tables can have gigabytes, so they are written to temporary files and not held in memory.
     with ExitStack() as open_files:
         files = [open_files.enter_context(tempfile.TemporaryFile(dir=cache.cache_dir())) for _ in expressions]
         return _collect_batches(ask(query, [*expressions, selection.where]), files)
 
 
 def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) -> dict[str, Array]:
-    """Write columns to files, and sum the keys in the last column in a way that depends on the order of rows."""
+    """Write each column but the last to its file as float32, and return the columns with a checksum of the row order.
+
+    The last column contains a uint64 hash of each row's key. The checksum is the sum of row number times hash, modulo
+    2^64, so it depends on the order of the rows. It is stored under "order" with the number of rows. The columns are
+    memory-mapped, and their names in the result are "0", "1", ...
+    """
     total, rows = np.zeros(1, np.uint64), 0
     for batch in batches:
         for number, file in enumerate(files):
@@ -124,9 +137,10 @@ def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes
 
 
 def trim(max_bytes: float = MAX_BYTES, folder: Path | None = None) -> int:
-    """Remove stored columns, the oldest first, until at most `max_bytes` bytes remain; return their number.
+    """Remove stored columns (values of SQL expressions) from the disc cache until at most `max_bytes` bytes remain.
 
-    `folder` is the cache folder; None is the cache of the project.
+    The oldest columns are removed first. Return the number of removed entries (folders of one or several columns).
+    `folder` is the cache folder; None means the cache folder of truesky.
     """
     folders = [path for path in (folder or cache.cache_dir()).glob(f"{_NAME}-*") if path.is_dir()]
     sizes = {path: sum(file.stat().st_size for file in path.iterdir()) for path in folders}

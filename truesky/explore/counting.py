@@ -1,7 +1,8 @@
-"""Count many rows for several linked charts at once; limits set in one chart apply to the others.
+"""Count rows for several linked histograms (charts) in one pass; limits set in one chart select rows in the others.
 
-A row counts in a chart if it lies within the limits of every column, except those on the chart's axes, and within
-the spans of the chart. Missing values (NaN) are in no bin and within no limits.
+A chart is a grid of bins in one to three columns. A row counts in a chart if it lies in the ranges of the chart's axes
+and within the limits of all other columns. Limits of the columns on the axes are ignored, unless the chart declares
+otherwise. Missing values (NaN) are in no bin and within no limits.
 """
 
 from __future__ import annotations
@@ -18,22 +19,30 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from truesky.numerics.compiling import exact_jit
 
-# Number of rows per block; a few columns of a block fit into the cache of a processor.
+# Number of rows that are counted at a time. A few columns of this length fit into the cache of a processor.
 _BLOCK = 32768
-_MAX_COLUMNS, MAX_CELLS = 30, 8_000_000
+# Largest number of columns that can be counted together: each column needs a bit of an int32.
+_MAX_COLUMNS = 30
+# Largest number of bins of all charts (histograms) together.
+MAX_CELLS = 8_000_000
 _MAX_AXES = 3
-# Largest number of counts of all threads together: 128 MB.
+# Largest number of bins in all threads together (128 MB). Each thread counts in its own copy of the bins of all charts.
 _MAX_COUNTS = 2 * MAX_CELLS
-# A grid with more cells per row of a block than this is counted in directly.
+# Rows of a block are usually counted in separate bins, which are then added to those of the chart. If a chart has more
+# than this number of bins per row of the block, rows are counted in its own bins, because adding would take longer.
 _SPARSE = 4
-# Number of rows from which a span is estimated, and the fraction that may lie outside on each side.
-_SPAN_SAMPLE, _OUTSIDE = 200_000, 2e-3
-# Initial number of rows that are examined per point.
+# The default range of an axis is estimated from every n-th value. n is the largest integer that leaves this number of
+# values or more.
+_SPAN_SAMPLE = 200_000
+# Fraction of the values that the default range of an axis cuts off at each end.
+_OUTSIDE = 2e-3
+# `points` first examines this number of rows per requested point.
 _ROWS_PER_POINT = 8
 
-# Number of values that are checked for missing ones at a time.
+# Number of values that `_missing` examines at a time, so that it needs little memory.
 _PIECE = 1 << 22
-# Bit of a row that has values on all axes but lies outside of the spans; lower bits are for the columns.
+# Each row has a bit field: bit c is set if the row violates the limits of column c. The bit _OUTSIDE_BIT is set if a
+# finite value of the row lies outside the range of an axis of the chart.
 _OUTSIDE_BIT = 1 << _MAX_COLUMNS
 
 Limits = Mapping[int, tuple[float, float]]
@@ -41,18 +50,21 @@ Limits = Mapping[int, tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Counts in a grid of equal bins.
+    """Definition of a histogram with one to three axes and bins of equal width.
+
+    BadInput is raised if there are no axes or more than three, a range is empty or not finite, or the number of bins is
+    below 1 or above 8 million.
 
     Attributes
     ----------
     columns : tuple of int
-        Numbers of the columns along its axes, one to three.
+        Index of the column on each axis.
     spans : tuple of (float, float)
-        Lowest and highest value of each axis.
+        Range of each axis: lowest and highest value, both included.
     bins : tuple of int
         Number of bins of each axis.
     ignored_limits : frozenset of int, optional
-        Columns whose limits do not apply to this chart; by default those of its axes.
+        Indices of the columns whose limits do not apply to this chart; by default the columns on its axes.
     """
 
     columns: tuple[int, ...]
@@ -70,29 +82,35 @@ class Chart:
 
     @property
     def cells(self) -> int:
-        """Total number of bins."""
-        # Python integers have any size; a 64-bit product could wrap around to a small number.
+        """Total number of bins: the product of the numbers of bins of the axes."""
+        # Convert to Python integers, which have any size; a product of 64-bit integers could overflow to a small one.
         return math.prod(int(bins) for bins in self.bins)
 
 
 def count_rows(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
-    """Count rows for several charts in one pass.
+    """Count the rows in each bin of several charts (histograms) in one pass.
 
     Parameters
     ----------
     columns : sequence of float32 arrays, shape (n,)
-        Columns.
+        Values of 1 to 30 columns for the same rows.
     charts : sequence of Chart
-        Charts to count.
+        Histograms to compute.
     limits : mapping of int to (float, float)
-        Lowest and highest value, both included, by number of the column.
-    threads : int
-        Number of threads; fewer are used if their counts would need much memory.
+        Lowest and highest value, both included, that select rows, by index of the column. A chart ignores the limits of
+        the columns on its axes by default.
+    threads : int, optional
+        Number of threads; fewer are used if their counts would need more than 128 MB.
 
     Returns
     -------
     list of int arrays, shape (bins of the first axis, bins of the second axis, ...)
-        Counts of each chart.
+        Number of rows in each bin, one array per chart.
+
+    Notes
+    -----
+    BadInput is raised if there are no columns, more than 30, or columns of different lengths; if a chart or a limit
+    refers to a column that does not exist; or if the charts have more than 8 million bins together.
     """
     return count_with_outside(columns, charts, limits, threads)[0]
 
@@ -100,30 +118,33 @@ def count_rows(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limi
 def count_with_outside(
     columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1
 ) -> tuple[list[Int], list[int]]:
-    """Count rows for several charts, and rows outside of their spans, in one pass.
+    """Count the rows in each bin of several charts (histograms), and the rows outside their axes, in one pass.
 
     Parameters
     ----------
     columns : sequence of float32 arrays, shape (n,)
-        Columns.
+        Values of 1 to 30 columns for the same rows.
     charts : sequence of Chart
-        Charts to count.
+        Histograms to compute.
     limits : mapping of int to (float, float)
-        Lowest and highest value, both included, by number of the column.
-    threads : int
-        Number of threads; fewer are used if their counts would need much memory.
+        Lowest and highest value, both included, that select rows, by index of the column. A chart ignores the limits of
+        the columns on its axes by default.
+    threads : int, optional
+        Number of threads; fewer are used if their counts would need more than 128 MB.
 
     Returns
     -------
     counts : list of int arrays
-        Counts of each chart, see `count_rows`.
+        Number of rows in each bin, one array per chart with one dimension per axis.
     outside : list of int
-        For each chart, rows within the limits that have a finite value on every axis and lie outside of a span.
+        For each chart, number of rows within the limits whose values on the axes are all finite, but at least one of
+        them is outside the range of its axis.
 
     Raises
     ------
     BadInput
-        If the number of columns is wrong, a number of a column does not exist, or there are too many bins.
+        If there are no columns, more than 30, or columns of different lengths; if a chart or a limit refers to a column
+        that does not exist; or if the charts have more than 8 million bins together.
     """
     if not 1 <= len(columns) <= _MAX_COLUMNS or len({len(column) for column in columns}) != 1:
         raise BadInput(f"counting requires 1 to {_MAX_COLUMNS} columns of equal length")
@@ -136,7 +157,7 @@ def count_with_outside(
     cells = sum(chart.cells for chart in charts)
 
     def count_part(number: int) -> Int:
-        # The numbers of rows outside of each chart's spans follow the counts.
+        # One array holds the counts of all bins of all charts, and then the number of rows outside each chart's axes.
         counts = np.zeros(cells + len(charts), np.int64)
         for first in range(int(edges[number]), int(edges[number + 1]), _BLOCK):
             last = min(first + _BLOCK, int(edges[number + 1]))
@@ -154,7 +175,10 @@ def count_with_outside(
 
 
 def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
-    """Refuse numbers that would lead compiled loops outside of their arrays, since they do not check bounds."""
+    """Raise BadInput if a chart or a limit refers to a column that does not exist, or there are too many bins.
+
+    `number` is the number of columns. The check is necessary because the compiled loops do not check array bounds.
+    """
     if any(not 0 <= column < number for column in [*limits, *(c for chart in charts for c in chart.columns)]):
         raise BadInput(f"a chart or a limit refers to a column that is none of the {number}")
     if sum(chart.cells for chart in charts) > MAX_CELLS:
@@ -162,10 +186,11 @@ def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
 
 
 def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float32, Bool, Int, Float, Int, Int, Int]:
-    """Arrays for the compiled loops: limits of columns, which of them are set, and properties of each chart.
+    """Return the limits and the charts as arrays, for the compiled function `_count_block`.
 
-    They have the shapes (column, 2), (column,), and (chart, axis, ...) for axes, spans, bins, limits that apply and
-    starts.
+    `number` is the number of columns. The arrays are: limits (column, 2); True if a column has limits (column,);
+    columns on the axes (chart, axis), -1 for missing axes; ranges of the axes (chart, axis, 2); numbers of bins (chart,
+    axis); bits of the columns whose limits apply (chart,); position of the chart's first bin in the counts (chart,).
     """
     bounds, is_set = np.zeros((number, 2), np.float32), np.zeros(number, np.bool_)
     for column, (lo, hi) in limits.items():
@@ -183,7 +208,10 @@ def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float
 
 
 def _next_float32(limit: float, up: bool) -> np.float32:
-    """Nearest float32 that is not below (up) or not above a limit; float32 values compare the same with both."""
+    """Round a limit to float32: up to the next number that is not below the limit, or down to one not above it.
+
+    A float32 value is within the rounded limit exactly if it is within the original one.
+    """
     with np.errstate(over="ignore"):
         rounded = np.float32(limit)
     is_past = float(rounded) < limit if up else float(rounded) > limit
@@ -195,10 +223,12 @@ def _count_block(
     values: Float32, bounds: Float32, is_set: Bool, axes: Int, spans: Float, bins: Int, heeded: Int, starts: Int,
     counts: Int, outside: Int,
 ) -> None:  # fmt: skip
-    """Add the rows of a block, shape (column, n), to the counts and to the numbers of rows outside of the spans.
+    """Add the rows in `values`, shape (column, n), to the arrays `counts` and `outside`.
 
-    Loops over rows have no branches, so that the compiler can vectorise them. Rows that do not count are added to an
-    extra cell, which is discarded.
+    `counts` holds the numbers of rows in the bins of all charts, one chart after another. `outside` holds the number of
+    rows outside each chart's axes. The function `_tables` makes the arrays from `bounds` to `starts`. Most loops over
+    rows have no branches, so that the compiler can vectorise them. Rows that do not count are therefore added to an
+    extra bin, which is discarded.
     """
     rows = values.shape[1]
     fails = np.zeros(rows, np.int32)
@@ -225,7 +255,7 @@ def _count_block(
                 place = (x - low) / width * size
                 place = place if place < last else last
                 cell[i] = cell[i] * n + np.int32(place if inside else 0.0)
-                # Missing and infinite values are not counted anywhere.
+                # Rows with a NaN or infinite value on an axis are counted neither in a bin nor as outside.
                 out[i] |= np.int32(0) if inside else (np.int32(_OUTSIDE_BIT) if abs(x) < np.inf else np.int32(1))
             cells *= n
         if cells > _SPARSE * rows:
@@ -246,33 +276,35 @@ def _count_block(
 
 
 def points(columns: Sequence[Float32], chart: Chart, limits: Limits, max_points: int) -> tuple[Float32, int]:
-    """Return the positions of rows that count in a chart, at most `max_points`.
+    """Return the rows in a chart as points for a scatter plot, at most `max_points`.
 
-    If more rows count, rows at equal steps are returned; the step is a power of two.
+    If the chart may contain more rows, only every `step`-th row of the table is used; the step is a power of two. It is
+    chosen so that more than half of `max_points` are usually returned.
 
     Parameters
     ----------
     columns : sequence of float32 arrays, shape (n,)
-        Columns.
+        Values of the columns for the same rows.
     chart : Chart
-        The chart.
+        Chart with the columns and the ranges of the axes; its numbers of bins are not used.
     limits : mapping of int to (float, float)
-        Lowest and highest value, both included, by number of the column.
+        Lowest and highest value, both included, that select rows, by index of the column. The chart ignores the limits
+        of the columns on its axes by default. Indices in `chart` and `limits` are not checked.
     max_points : int
-        Largest number of points, at least 1.
+        Largest number of points, at least 1; this is not checked.
 
     Returns
     -------
     positions : float32 array, shape (m, axes)
-        Values on the axes of the chart.
+        Values of the chart's columns for each point; m is 0 if no row counts.
     step : int
-        One row in this number was examined.
+        Distance of the examined rows in the table: rows 0, step, 2 step and so on were examined; 1 means all rows.
     """
     ignored = frozenset(chart.columns) if chart.ignored_limits is None else chart.ignored_limits
     bounds = [(column, limit) for column, limit in limits.items() if column not in ignored]
     bounds += zip(chart.columns, chart.spans, strict=True)
     step = 1
-    # Few rows of a large table are examined at first, and more only if these are not enough.
+    # A few rows of a large table are examined first. The step is halved until more than half of the points are found.
     while len(columns[0]) > step * max_points * _ROWS_PER_POINT:
         step *= 2
     while True:
@@ -294,7 +326,12 @@ def points(columns: Sequence[Float32], chart: Chart, limits: Limits, max_points:
 
 
 def span(column: Float32) -> tuple[float, float]:
-    """Return a range that contains nearly all finite values of a column, from a sample; (0, 1) if there are none."""
+    """Return the range (lowest, highest) of an axis that shows nearly all finite values of a column.
+
+    It is estimated from 200,000 to 400,000 evenly spaced values, or from all if there are fewer. 0.2 % of them are cut
+    off at each end, and then a margin of 2 % of the range is added, but not beyond their extremes. The range is 1 wide
+    if its ends are equal. The result is (0, 1) if no value is finite.
+    """
     sample = np.asarray(column[:: max(len(column) // _SPAN_SAMPLE, 1)], float)
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -307,16 +344,16 @@ def span(column: Float32) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class ChartColumns:
-    """Columns of the same rows with their properties.
+    """Columns of the same rows, with default ranges of axes and numbers of missing values.
 
     Attributes
     ----------
     columns : list of float32 arrays, shape (n,)
-        Columns.
+        Values of each column.
     spans : list of (float, float)
-        Range that contains nearly all values of each column.
+        Range that contains nearly all finite values of each column, see `span`.
     missing : list of int
-        Number of rows without a finite value, for each column.
+        Number of values of each column that are NaN or infinite.
     """
 
     columns: list[Float32]
@@ -325,11 +362,14 @@ class ChartColumns:
 
 
 def inspect_columns(columns: Sequence[Float32]) -> ChartColumns:
-    """Determine the spans and missing values of columns once; this takes as long as counting."""
+    """Return columns with their default ranges of axes and their numbers of NaN or infinite values.
+
+    Call this once per set of columns, since it takes as long as counting a chart.
+    """
     return ChartColumns([*columns], [span(column) for column in columns], [_missing(column) for column in columns])
 
 
 def _missing(column: Float32) -> int:
-    """Number of values that are NaN or infinite."""
+    """Return the number of values that are NaN or infinite."""
     pieces = (column[first : first + _PIECE] for first in range(0, len(column), _PIECE))
     return len(column) - sum(int(np.count_nonzero(np.isfinite(piece))) for piece in pieces)

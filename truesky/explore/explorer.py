@@ -1,4 +1,7 @@
-"""Explore the tables of a lake as they were when it was opened, whatever is published later."""
+"""Query the tables of a lake (the folder with all tables of the simulator): SQL, circles, histograms and sky maps.
+
+The versions of the tables are fixed when the lake is opened. New versions that are published later are not used.
+"""
 
 from __future__ import annotations
 
@@ -21,32 +24,37 @@ Range = tuple[float, float]
 
 # Default HEALPix order of sky maps.
 ORDER = 8
+# Largest number of bins of an axis.
 _MAX_BINS = 10_000
-# Status in the list of tables that cannot be read, by error; other errors mean "damaged".
+# Status of a table that cannot be opened, by type of the error. For all other errors the status is "damaged".
 _UNREADABLE: dict[type[LakeError], str] = {VersionMismatch: "unreadable version"}
 
 
 class Explorer:
-    """Tables of a lake, and a process that answers queries about them. It ends with `close` or a `with` block.
+    """Tables of a lake, with methods for queries, histograms and maps.
+
+    Queries run in a separate process, which `close` or the end of a `with` block ends. BadInput is raised if the lake
+    has no tables, the request does not exist, or a limit is out of range.
 
     Parameters
     ----------
     lake : str or Folder
-        Folder of the lake.
-    memory : float
-        Memory limit of a query and its result together, bytes.
-    timeout : float
-        Time limit of a query, s.
+        Folder of the lake, or s3://BUCKET/PREFIX.
+    memory : float, optional
+        Memory limit of a query and its result together, 1e7 to 1e15 bytes.
+    timeout : float, optional
+        Time limit of a query, 0 to 1e6 s.
     request : str, optional
-        Name of the request whose tables are used. Without it, tables that all requests share have their plain names.
-        Any table of a request is also available as "demo.products", in SQL too.
+        Name of the request whose tables have plain names such as "products". Without it, a table has its plain name
+        only if all requests of the lake share the same version of it. Any table of a request is also available as
+        "demo.products" (request, dot, table), in SQL too.
 
     Attributes
     ----------
     versions : dict of str to Version
-        Tables that can be read, by name.
+        Versions of the tables that can be read, by name of the table.
     damaged : dict of str to LakeError
-        Tables that cannot be opened, and the reasons; the other tables remain usable.
+        Errors of the tables that cannot be opened, by name. All other tables can be used.
     """
 
     def __init__(
@@ -70,7 +78,8 @@ class Explorer:
         if not self.versions and not self.damaged:
             raise BadInput(f"lake {self.root} holds no table")
         versions = [f"{name}={version.key}" for name, version in self.versions.items()]
-        # The worker raises the error of these tables again if a query uses them.
+        # Tables that could not be opened are also declared to the process that runs queries, so that a query that uses
+        # one of them raises the reason.
         versions += [f"{name}=?{request or name.rpartition('.')[0]}" for name in (*self.damaged, *self._ambiguous)]
         self._table_arguments, self._memory = versions, memory
         self._process = self.process()
@@ -85,9 +94,17 @@ class Explorer:
             self.damaged[name] = error
 
     def process(self, extra_tables: Sequence[str] = ()) -> Process:
-        """Return a new process for the same versions, for use in parallel.
+        """Return a new query process for the same versions of the tables, so that queries can run in parallel.
 
-        `extra_tables` are entries NAME=@FILE of further tables in Arrow files.
+        Parameters
+        ----------
+        extra_tables : sequence of str, optional
+            Further tables, each a text NAME=@FILE, where FILE is the path of an Arrow file.
+
+        Returns
+        -------
+        Process
+            The process, which the caller must close.
         """
         return Process(self.root, [*self._table_arguments, *extra_tables], self._memory)
 
@@ -98,13 +115,19 @@ class Explorer:
         self.close()
 
     def close(self) -> None:
-        """End the process; a later query starts it again."""
+        """End the process that runs queries; a later query starts a new one."""
         self._process.close()
 
-    # ------------------------------------------------------------------------------------------------ what there is
-
     def tables(self) -> pd.DataFrame:
-        """Return a list of the tables: rows, megabytes, files, version and meaning."""
+        """Return a list of the tables as a DataFrame, indexed by name.
+
+        Returns
+        -------
+        DataFrame
+            Columns `rows`, `MB` (10^6 bytes), `files` (number of files), `version` (key of the version: a hash that
+            identifies it) and `meaning`. If a table cannot be opened, `version` is "damaged" or "unreadable version",
+            `meaning` is the error, and the numbers are missing.
+        """
         rows = [
             {
                 "table": name,
@@ -127,16 +150,45 @@ class Explorer:
         return frame.set_index("table").sort_index()
 
     def is_listed(self, name: str) -> bool:
-        """Return True if `tables` lists a table by this name.
+        """Return True if the method `tables` lists a table under this name.
 
-        A table is listed by its plain name. If requests have different versions, it is also listed by the name with the
-        request.
+        A table is listed by its plain name, such as "products". If requests have different versions of it, each version
+        is listed with the name of its request, such as "demo.products".
+
+        Parameters
+        ----------
+        name : str
+            Name with or without a request.
+
+        Returns
+        -------
+        bool
+            True if the name has the form under which the table is listed.
         """
         table = name.rpartition(".")[2]
         return name == table or table in self._ambiguous
 
     def describe(self, table: str) -> pd.DataFrame:
-        """Return a list of the columns of a table: type, unit, range, UCD and meaning."""
+        """Return a list of the columns of a table as a DataFrame, indexed by name of the column.
+
+        Parameters
+        ----------
+        table : str
+            Name of the table.
+
+        Returns
+        -------
+        DataFrame
+            Columns `type`, `unit`, `range` (allowed values), `null` (True if values may be missing), `ucd` and
+            `meaning`.
+
+        Raises
+        ------
+        BadInput
+            If the lake has no such table.
+        LakeError
+            If the table cannot be opened.
+        """
         rows = []
         for field in self._version(table).schema:
             facts = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -153,30 +205,28 @@ class Explorer:
             raise BadInput(f"lake {self.root} has no table {table}; it has {', '.join(self.versions)}")
         return self.versions[table]
 
-    # ------------------------------------------------------------------------------------------------ rows
-
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Return the result of one SELECT over the tables of the lake.
 
         Parameters
         ----------
         text : str
-            Query in DuckDB's SQL; $name is a parameter. Additional functions are separation(ra1, dec1, ra2, dec2) in
-            deg and mag_ab(f_nu) for f_nu in microjansky.
-        into : str
-            "pandas", "astropy" (a Table with units) or "arrow".
+            Query in DuckDB's SQL; $name is a parameter. Two functions are added: separation(ra1, dec1, ra2, dec2) is
+            the angle between two positions in deg, and mag_ab(f_nu) is the AB magnitude of a flux in microjansky.
+        into : str, optional
+            Type of the result: "pandas", "astropy" (a Table with units) or "arrow".
         **parameters : object
-            Numbers, texts, booleans or lists of them.
+            Values of the parameters: numbers, texts, booleans or lists of them.
 
         Returns
         -------
-        DataFrame or Table
+        DataFrame, astropy Table or pyarrow.Table
             Rows of the result.
 
         Notes
         -----
-        BadInput is raised if the text is not an allowed SELECT or exceeds the limits of time or memory. Damaged is
-        raised if a file does not agree with its checksum.
+        BadInput is raised if the text is not a single SELECT over tables of the lake, if it exceeds the limits of time
+        or memory, or if `into` is another text. Damaged is raised if a file does not agree with its checksum.
         """
         return results.convert(self._process.ask(text, parameters, self.timeout), into)
 
@@ -184,25 +234,29 @@ class Explorer:
         self, table: str, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None,
         on: str = "observed", into: str = "pandas",
     ) -> Any:  # fmt: skip
-        """Return the rows of a catalogue within a circle.
+        """Return the rows of a catalogue within a circle on the sky, including its edge.
 
         Parameters
         ----------
         table : str
             Name of the table.
         ra, dec, radius : float
-            Centre and radius of the circle, deg.
+            Centre (ICRS) and radius of the circle, deg; the radius is 0 to 180.
         columns : sequence of str, optional
-            Columns to return; by default all.
-        on : str
-            "observed" or "true" positions.
-        into : str
-            "pandas", "astropy" or "arrow".
+            Names of the columns to return; by default all.
+        on : str, optional
+            Positions that are compared with the circle: "observed" (with gravitational lensing) or "true" (without).
+        into : str, optional
+            Type of the result: "pandas", "astropy" (a Table with units) or "arrow".
 
         Returns
         -------
-        DataFrame or Table
-            Rows inside the circle.
+        DataFrame, astropy Table or pyarrow.Table
+            Rows inside the circle; none if the circle is empty.
+
+        Notes
+        -----
+        BadInput is raised if the table or a column does not exist, or an argument is outside its bounds.
         """
         return results.convert(self._version(table).cone(ra, dec, radius, columns, on), into)
 
@@ -212,22 +266,24 @@ class Explorer:
         Parameters
         ----------
         text : str
-            Query as for `sql`.
+            Query in DuckDB's SQL, as for the method `sql`.
         path : str or Path
-            File to write.
+            File to write; an existing file is replaced. The type of the file follows from its ending.
         **parameters : object
-            Numbers, texts, booleans or lists of them.
+            Values of the parameters of the query: numbers, texts, booleans or lists of them.
 
         Returns
         -------
         Path
-            The file.
+            Path of the file.
+
+        Notes
+        -----
+        BadInput is raised as by `sql`, if the path has another ending, or if the file type cannot hold the result.
         """
         target = user_files.expand_path(path)
         results.write(self._process.ask(text, parameters, self.timeout), target)
         return target
-
-    # ------------------------------------------------------------------------------------------------ distributions
 
     def hist(
         self,
@@ -238,29 +294,35 @@ class Explorer:
         where: str = "true",
         weight: str | None = None,
     ) -> tuple[Float, Float]:
-        """Count the values of an expression in equal bins.
+        """Return a histogram of an SQL expression with bins of equal width.
 
         Parameters
         ----------
         table : str
-            Name of a table, or SQL after FROM such as "galaxies JOIN galaxy_fluxes USING (id)".
+            Name of a table, or other SQL after FROM such as "galaxies JOIN galaxy_fluxes USING (id)".
         x : str
-            SQL expression.
-        bins : int
-            Number of bins.
+            SQL expression whose values are counted; NULL and values outside `span` are ignored.
+        bins : int, optional
+            Number of bins, 1 to 10,000.
         span : (float, float), optional
-            Lowest and highest value; by default the range of the values.
-        where : str
-            SQL condition of the rows.
+            Lower edge of the first bin and upper edge of the last bin, both included. By default the smallest and the
+            largest value, or 0.5 below and above them if they are equal.
+        where : str, optional
+            SQL condition that selects rows; by default all rows.
         weight : str, optional
-            SQL expression to sum instead of counting rows.
+            SQL expression that is summed in each bin; by default rows are counted.
 
         Returns
         -------
         counts : float array, shape (bins,)
             Number of rows or sum of weights in each bin.
         edges : float array, shape (bins + 1,)
-            Edges of the bins.
+            Edges of the bins, ascending.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or if `span` is missing and an expression has no values or not
+        only finite ones.
         """
         bins = arguments.check_integer("bins", bins, 1, _MAX_BINS)
         lo, hi = self._span(table, x, where) if span is None else _check_span(span)
@@ -277,29 +339,35 @@ class Explorer:
         self, table: str, x: str, y: str, bins: tuple[int, int] = (100, 100),
         span: tuple[Range, Range] | None = None, where: str = "true", weight: str | None = None,
     ) -> tuple[Float, Float, Float]:  # fmt: skip
-        """Count the values of two expressions in a grid of equal bins.
+        """Return a two-dimensional histogram of two SQL expressions with bins of equal width.
 
         Parameters
         ----------
         table : str
-            Name of a table, or SQL after FROM.
+            Name of a table, or other SQL after FROM such as a join.
         x, y : str
-            SQL expressions.
-        bins : (int, int)
-            Number of bins in x and y.
+            SQL expressions whose values are counted; rows with NULL or a value outside `span` are ignored.
+        bins : (int, int), optional
+            Number of bins in x and in y, 1 to 10,000 each.
         span : ((float, float), (float, float)), optional
-            Lowest and highest value of x and y; by default the range of the values.
-        where : str
-            SQL condition of the rows.
+            Lowest and highest edge of the bins in x, and in y, both included. By default the smallest and the largest
+            value of each expression, or 0.5 below and above them if they are equal.
+        where : str, optional
+            SQL condition that selects rows; by default all rows.
         weight : str, optional
-            SQL expression to sum instead of counting rows.
+            SQL expression that is summed in each bin; by default rows are counted.
 
         Returns
         -------
         counts : float array, shape (y bins, x bins)
             Number of rows or sum of weights in each bin.
         x_edges, y_edges : float array, shape (x bins + 1,) and (y bins + 1,)
-            Edges of the bins.
+            Edges of the bins, ascending.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or if `span` is missing and an expression has no values or not
+        only finite ones.
         """
         x_bins, y_bins = (arguments.check_integer("bins", axis, 1, _MAX_BINS) for axis in _pair("bins", bins))
         if span is None:
@@ -320,25 +388,29 @@ class Explorer:
     def skymap(
         self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
     ) -> tuple[Int, Float]:
-        """Count rows in nested HEALPix cells.
+        """Count the rows of a table in HEALPix cells of the sky.
 
         Parameters
         ----------
         table : str
-            Name of a table, or SQL after FROM.
-        order : int
-            HEALPix order of the cells.
-        where : str
-            SQL condition of the rows.
+            Name of a table with the column `_healpix_29`, or other SQL after FROM.
+        order : int, optional
+            HEALPix order of the cells, 0 to 29.
+        where : str, optional
+            SQL condition that selects rows; by default all rows.
         weight : str, optional
-            SQL expression to sum instead of counting rows.
+            SQL expression that is summed in each cell; by default rows are counted.
 
         Returns
         -------
         cells : int array, shape (n,)
-            Cells with rows, ascending.
+            Nested indices of the cells that contain rows, ascending.
         counts : float array, shape (n,)
             Number of rows or sum of weights in each cell.
+
+        Notes
+        -----
+        BadInput is raised if an argument is not allowed, or the rows have no column `_healpix_29`.
         """
         order = arguments.check_integer("order", order, 0, sky.MAX_ORDER)
         text = f"""
@@ -374,7 +446,11 @@ def _check_span(span: Range) -> Range:
 
 
 def _bin_sql(axis: str) -> str:
-    """SQL for the number of the bin of column `x` or `y`; the last bin includes its upper edge."""
+    """Return SQL for the index of the bin in which a value lies; the last bin includes its upper edge.
+
+    `axis` is "x" or "y", the name of the column with the values. For "x" the query needs the parameters $x_lo and $x_hi
+    (lowest and highest edge of the bins) and $x_bins (their number), and for "y" those that begin with $y.
+    """
     return f"least(floor(({axis} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
 
 
@@ -383,5 +459,5 @@ def _weight_sql(weight: str | None) -> str:
 
 
 def _count_sql(weight: str | None) -> str:
-    # The sum is NULL if no row has a weight; rows without a weight add nothing.
+    # Rows whose weight is NULL add nothing. If this applies to all rows, the sum is NULL, which coalesce makes 0.
     return "count(*)" if weight is None else "coalesce(sum(w), 0)"

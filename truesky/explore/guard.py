@@ -1,6 +1,8 @@
-"""Check that a query is one SELECT over the tables of the lake that cannot reach anything else.
+"""Check that the SQL of a user is a single SELECT that reads only tables of the lake.
 
-DuckDB parses the text into the tree that it would run, and the tree is checked, not the text.
+Queries must not read files or settings, call functions that change the session, or change data. DuckDB parses the text
+into the syntax tree that it would run. The tree is checked and not the text, so a trick in the text cannot hide
+anything.
 """
 
 from __future__ import annotations
@@ -15,11 +17,14 @@ import duckdb
 
 from lake_schema.errors import BadInput
 
-_MAX_CHARACTERS, _MAX_LENGTH = 100_000, 500
+# Largest number of characters of a query.
+_MAX_CHARACTERS = 100_000
+# Longer messages of DuckDB are cut at this number of characters.
+_MAX_LENGTH = 500
 _QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 _SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE_FUNCTION"}
 _TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
-# Scalar functions that read or change the session, wait, or run other text.
+# Functions that a query must not call: they read or change settings of the session, wait, or run a text as SQL.
 _FUNCTIONS = {
     "current_query", "current_setting", "currval", "getenv", "getvariable", "json_deserialize_sql",
     "json_serialize_sql", "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
@@ -31,14 +36,16 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Names of a result's columns, in lower case, that are unchanged columns of the lake's tables.
+    """Set of the names of result columns that are unchanged copies of a table's column with the same name.
+
+    Such columns keep the unit and the description of the table's column. Names are in lower case.
 
     Attributes
     ----------
     names : frozenset of str, optional
-        These names; None for every name of a column of a table.
+        Names of unchanged columns. None means that every column of a table is unchanged, as after SELECT *.
     other : frozenset of str
-        Names that something else has as well; they do not count.
+        Names that a computed or renamed column has; they are not in the set, even if they are in `names`.
     """
 
     names: frozenset[str] | None
@@ -53,16 +60,16 @@ _NO_ORIGINS = Origins(frozenset())
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A query that may run.
+    """A query that `check_query` has accepted.
 
     Attributes
     ----------
     text : str
         SQL of the query.
     tables : tuple of str
-        Tables of the lake that it uses.
+        Sorted names of the tables of the lake that the query reads.
     columns : Origins
-        Columns of the result that are unchanged columns of these tables.
+        Names of the result's columns that are unchanged columns of these tables.
     """
 
     text: str
@@ -71,26 +78,31 @@ class Query:
 
 
 def check_query(text: str, table_names: Collection[str], connection: duckdb.DuckDBPyConnection | None = None) -> Query:
-    """Check that a query may run.
+    """Check that a query is a single SELECT that reads only tables of the lake.
+
+    In FROM a query may use these tables, subqueries, joins, VALUES, the names of its WITH clauses, and the functions
+    range, generate_series and unnest. It may call all scalar functions but those that read or change the session, wait,
+    or run a text as SQL.
 
     Parameters
     ----------
     text : str
         SQL of the query.
     table_names : collection of str
-        Names of the lake's tables.
+        Names of the lake's tables, in lower case, such as "galaxies" or "demo.galaxies".
     connection : DuckDBPyConnection, optional
-        Parser to use; by default a new one.
+        Connection to DuckDB that parses the text, see `parser`; by default a new one.
 
     Returns
     -------
     Query
-        The query and the tables that it uses.
+        The query, the tables that it reads, and the names of unchanged columns.
 
     Raises
     ------
     BadInput
-        If the text is not one SELECT, or uses anything that is not allowed; the message names it.
+        If the text has more than 100,000 characters or contains NUL, cannot be parsed, is not a single SELECT, or uses
+        another table or function. The message names the problem.
     """
     if len(text) > _MAX_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MAX_CHARACTERS} characters and no NUL")
@@ -111,19 +123,21 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
 
 
 def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = None) -> None:
-    """Check that a text is exactly one SQL expression, so that it cannot extend beyond its place in a query.
+    """Check that a text is exactly one SQL expression, so that it can be inserted into a query in brackets.
+
+    Other texts, such as "x) FROM t --", could change the rest of the query.
 
     Parameters
     ----------
     text : str
         SQL expression.
     connection : DuckDBPyConnection, optional
-        Parser to use; by default a new one.
+        Connection to DuckDB that parses the text, see `parser`; by default a new one.
 
     Raises
     ------
     BadInput
-        If the text is not one expression.
+        If the text is empty, has more than 100,000 characters, contains NUL, or is not exactly one expression.
     """
     if not 0 < len(text.strip()) <= _MAX_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: an expression has 1 to {_MAX_CHARACTERS} characters and no NUL")
@@ -137,7 +151,10 @@ def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = N
 
 
 def parser() -> duckdb.DuckDBPyConnection:
-    """Return a database without tables for parsing; opening it takes a hundred times as long as parsing a query."""
+    """Return a connection to an empty DuckDB database, with which queries can be parsed.
+
+    Use one connection for many queries: opening it takes a hundred times as long as parsing a query.
+    """
     return duckdb.connect(":memory:", config={"threads": 1})
 
 
@@ -161,12 +178,15 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
 
 
 def one_line(error: BaseException | str) -> str:
-    """Return the text of an error, or a name, on one line."""
+    """Return a text, or the message of an error, on one line of at most 500 characters."""
     return " ".join(str(error).split())[:_MAX_LENGTH]
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
-    """Every node, and the WITH clauses that it can use. Other names could refer to DuckDB's internal tables."""
+    """Yield every node of a syntax tree with the names, in lower case, of the WITH clauses that can be used there.
+
+    Any other name that is not a table of the lake could refer to an internal table of DuckDB.
+    """
     stack: list[tuple[Any, frozenset[str]]] = [(tree, frozenset())]
     while stack:
         node, visible = stack.pop()
@@ -174,10 +194,11 @@ def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
             yield node, visible
             rest = {key: value for key, value in node.items() if key != "cte_map"}
             for entry in node.get("cte_map", {}).get("map", ()):
-                # A clause can use those before it, but not itself.
+                # A WITH clause can use the clauses before it, but not itself.
                 stack.append((entry["value"], visible))
                 visible |= {str(entry["key"]).lower()}
-            # Exceptions are the second half of a recursive clause, and the query after a materialised clause.
+            # The name of a WITH clause can also be used in the second half of a recursive clause ("right"), and in the
+            # query after a materialised clause ("child").
             inner_visible = visible | {str(node["cte_name"]).lower()} if "cte_name" in node else visible
             stack += [(value, inner_visible if key in ("right", "child") else visible) for key, value in rest.items()]
         elif isinstance(node, list):
@@ -189,7 +210,11 @@ def _words(node: Tree) -> str:
 
 
 def _source(node: Tree, table_names: Collection[str], with_names: Collection[str]) -> set[str]:
-    """Table of the lake to which a FROM entry refers, if any."""
+    """Return the name of the lake's table that an entry of FROM reads, as a set of one name.
+
+    The set is empty for other allowed entries, such as a join or a subquery. `with_names` contains the names of the
+    WITH clauses that can be used there. BadInput is raised for entries that are not allowed.
+    """
     kind = node["type"]
     if kind not in _SOURCES:
         raise BadInput(f"SQL: {_words(node)} is not possible here")
@@ -212,9 +237,10 @@ def _refuse_function(name: str) -> None:
 
 
 def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) -> Origins:
-    """Unchanged table columns in the result of a query, through any depth of subqueries.
+    """Return the names of the result's columns that are unchanged columns of the lake's tables.
 
-    `outer` contains the origins of the WITH clauses that the query can use.
+    `node` is the syntax tree of the query, and `tables` contains the names of the lake's tables. `outer` contains, for
+    each WITH clause around the query, which of its columns are unchanged. Subqueries are followed to any depth.
     """
     visible = dict(outer)
     for entry in node.get("cte_map", {}).get("map", ()):
@@ -232,7 +258,8 @@ def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) 
             everything = True
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
             *within, name = (str(part).lower() for part in entry["column_names"])
-            # A field of a structure that the query creates is not a column of a table.
+            # In "s.name", s may be a structure that a subquery creates, and name a field of it. Such a field is not a
+            # column of a table.
             (other if source_origins.other & set(within) else names).add(name)
         else:
             other.add(str(entry["alias"]).lower())
@@ -242,7 +269,11 @@ def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) 
 
 
 def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str, Origins]) -> Origins:
-    """Unchanged table columns in a FROM clause."""
+    """Return the names of the columns of a FROM clause that are unchanged columns of the lake's tables.
+
+    `tables` contains the names of the lake's tables. `visible` contains, for each WITH clause that the FROM clause can
+    use, which of its columns are unchanged.
+    """
     if source.get("column_name_alias"):
         return _NO_ORIGINS
     if source["type"] == "JOIN":
@@ -266,5 +297,5 @@ def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str,
 
 
 def _table_name(source: Tree) -> str:
-    """Name of a table in FROM, with the name of its request if it is given."""
+    """Return the name of a table in FROM, in lower case: "galaxies", or "demo.galaxies" with the name of a request."""
     return ".".join(str(source[key]).lower() for key in ("schema_name", "table_name") if source.get(key))

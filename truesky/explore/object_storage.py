@@ -1,6 +1,7 @@
-"""Open catalogues on object storage for programs that use fsspec, such as lsdb; objects are read with pyarrow.
+"""Open catalogues on object storage (such as Amazon S3) for programs that use fsspec, such as lsdb.
 
-Files read in this way are not compared with the manifest. Use `truesky verify --deep s3://sky/lake` for this.
+Objects are read with pyarrow. Their checksums are not compared with the manifest (the list of a table's files with
+their checksums). Use `truesky verify --deep s3://sky/lake` to check them.
 
 Examples
 --------
@@ -26,12 +27,16 @@ _PROTOCOL = "truesky"
 
 
 class Objects(ArrowFSWrapper):  # type: ignore[misc]
-    """Buckets of an object store as a file system for fsspec; truesky://BUCKET/NAME is an object.
+    """File system for fsspec that reads the buckets of an object store.
+
+    The path of an object is truesky://BUCKET/NAME or BUCKET/NAME.
 
     Parameters
     ----------
     endpoint, region : str
-        Endpoint and region of the store, see s3.Address.
+        URL and region of the object store, as in `s3.Address`; "" for the defaults.
+    **_
+        Further options of fsspec, ignored.
     """
 
     protocol = _PROTOCOL
@@ -57,16 +62,17 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
         Parameters
         ----------
         path : str
-            Path of the object.
+            Path of the object, truesky://BUCKET/NAME or BUCKET/NAME.
         start, end : int, optional
-            Range of bytes; negative values count from the end, which pyarrow's files do not support.
+            First byte, and byte after the last one. Negative values count from the end of the object, as in a slice.
+            By default the range begins at the beginning and ends at the end of the object.
         **_
             Ignored.
 
         Returns
         -------
         bytes
-            Content in this range.
+            Content in this range; b"" if the range is empty.
         """
         with self.fs.open_input_file(self._strip_protocol(path)) as stream:
             first, last, _step = slice(start, end).indices(stream.size())
@@ -75,26 +81,29 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
 
 
 def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
-    """Return the current version of a catalogue on object storage, for lsdb and hats.
+    """Return the path of a catalogue on object storage, with which lsdb and hats can open it.
+
+    A table can have several versions; the path is that of the current version.
 
     Parameters
     ----------
     lake : str
-        s3://BUCKET/PREFIX, optionally with ?endpoint_override=URL.
+        Address of the lake: s3://BUCKET/PREFIX, optionally with ?endpoint_override=URL.
     table : str
         Name of the table.
     request : str, optional
-        Name of the request, if the lake contains several.
+        Name of the request; required if requests of the lake have different versions of the table.
 
     Returns
     -------
     UPath
-        Path of the catalogue.
+        Path of the catalogue's folder, with the protocol truesky.
 
     Raises
     ------
     BadInput
-        If `lake` is not an address on object storage, or the table is not a catalogue.
+        If `lake` is not an address on object storage, the table does not exist, or it is not stored as a HATS catalogue
+        (files sorted by HEALPix cells).
     """
     root = layout.open_lake(lake)
     if not isinstance(root, s3.ObjectPath):
@@ -105,6 +114,6 @@ def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
     fsspec.register_implementation(_PROTOCOL, Objects, clobber=True)
     name = root.store.object_path(table, f"v-{version.key}")
     with warnings.catch_warnings():
-        # UPath warns that it does not know this protocol.
+        # UPath would warn that the protocol truesky has no implementation in UPath itself.
         warnings.simplefilter("ignore")
         return UPath(f"{_PROTOCOL}://{name}", endpoint=place.endpoint, region=place.region)

@@ -1,4 +1,7 @@
-"""Plot counts: each function draws the result of the method of `truesky.Lake` with the same name."""
+"""Plot histograms, heat maps and sky maps with matplotlib.
+
+Each function draws the result of the method of `truesky.Lake` with the same name: `hist`, `heatmap` or `skymap`.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ from truesky.explore.explorer import ORDER
 
 
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Draw counts as steps.
+    """Draw a histogram as steps.
 
     Parameters
     ----------
     counts : float array, shape (bins,)
-        Counts of `Lake.hist`.
+        Number of rows or sum of weights in each bin, as returned by `Lake.hist`.
     edges : float array, shape (bins + 1,)
-        Edges of the bins.
+        Edges of the bins, ascending.
     ax : matplotlib Axes, optional
         Axes to draw in. The default is a new figure.
     **style
@@ -36,12 +39,14 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
 
 
 def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Draw counts as colours on a logarithmic scale; empty bins are blank.
+    """Draw a two-dimensional histogram as colours on a logarithmic scale, with a colour bar.
+
+    Bins whose value is not positive are blank.
 
     Parameters
     ----------
     counts : float array, shape (y bins, x bins)
-        Counts of `Lake.heatmap`.
+        Number of rows or sum of weights in each bin, as returned by `Lake.heatmap`.
     x_edges : float array, shape (x bins + 1,)
         Edges of the bins in x.
     y_edges : float array, shape (y bins + 1,)
@@ -67,16 +72,16 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
 
 
 def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **style: Any) -> Any:
-    """Draw the number per square degree in HEALPix cells, with east to the left.
+    """Draw a sky map in HEALPix cells: the number of rows per square degree, with east to the left.
 
     Parameters
     ----------
     cells : int array, shape (n,)
-        Nested cells of `Lake.skymap`.
+        Nested HEALPix indices of the cells, as returned by `Lake.skymap`.
     counts : float array, shape (n,)
-        Their counts.
+        Number of rows or sum of weights in each cell.
     order : int, optional
-        Order of the cells, as given to `Lake.skymap`.
+        HEALPix order of the cells, as given to `Lake.skymap`.
     ax : matplotlib Axes, optional
         Axes to draw in. The default is a new figure.
     **style
@@ -91,7 +96,8 @@ def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **styl
 
     axes = _axes(ax)
     corners = sky.cell_corners(order, cells)
-    # Corners are placed relative to the first corner of each cell, so that no cell is split at RA 0.
+    # Right ascensions of corners are moved by 360 deg to within 180 deg of the cell's first corner, so that a cell at
+    # RA 0 is not drawn across the whole map.
     corners[:, :, 0] = corners[:, :1, 0] + (corners[:, :, 0] - corners[:, :1, 0] + 180.0) % 360.0 - 180.0
     collection = PolyCollection(list(corners), array=counts / sky.cell_area(order), **{"cmap": "viridis", **style})
     axes.add_collection(collection)

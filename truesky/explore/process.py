@@ -1,4 +1,7 @@
-"""Run queries in a separate process with strict limits of memory and time; worker.py is the program of that process."""
+"""Run SQL queries in a separate process (the worker) with strict limits of memory and time.
+
+The module `truesky.explore.worker` is the program of that process.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,15 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
-# Default memory (bytes) and time (s) of a query, and limits of both.
-MEMORY, TIMEOUT = 4e9, 300.0
+# Default memory limit of a query in bytes.
+MEMORY = 4e9
+# Default time limit of a query in seconds.
+TIMEOUT = 300.0
+# Smallest and largest memory limit that a caller may set, bytes.
 _MEMORY_LO, _MEMORY_HI = 1e7, 1e15
+# Largest time limit that a caller may set, s.
 TIMEOUT_HI = 1e6
-# Fraction of the memory that a result in one piece may fill.
+# Fraction of the memory limit that the result of `Process.ask` may fill.
 _RESULT_SHARE = 0.5
 _BUFFER = 1 << 20
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
@@ -38,7 +45,10 @@ _INTERRUPTED = "SQL: another query began before all rows of this one were read"
 
 @dataclass(slots=True)
 class _Worker:
-    """The other process; `is_stopped` is True if a thread stopped it while another may have waited for an answer."""
+    """Process that runs queries.
+
+    `is_stopped` is True if `Process.stop` has killed the process, perhaps while a thread waited for an answer.
+    """
 
     process: subprocess.Popen[bytes]
     is_stopped: bool = False
@@ -49,19 +59,22 @@ class _Worker:
 
 
 class Process:
-    """Process that answers queries of some tables. The first query starts it; `close` ends it until the next query.
+    """Separate process that answers SQL queries of tables of a lake.
 
-    Several threads may use it. `ask` waits until the queries of other threads are answered. A query whose rows are read
-    piece by piece, with `batches`, ends if another query begins before its last piece was read.
+    The first query starts the process. `close` ends it, and the next query starts a new one. Several threads may use an
+    object of this class. `ask` waits until the `ask` calls of other threads have returned. `batches` yields a result
+    batch by batch. Such a query is abandoned if another query begins before its last batch was read.
 
     Parameters
     ----------
     root : Folder
         Folder of the lake.
     tables : sequence of str
-        NAME=KEY or REQUEST.NAME=KEY for tables of the lake, NAME=@FILE for an Arrow file.
-    memory : float
-        Memory limit of a query and its result together, bytes.
+        Tables that queries can use: NAME=KEY or REQUEST.NAME=KEY with the key (hash) of a version of a table of the
+        lake, NAME=@FILE for an Arrow file, or NAME=?REQUEST for a table that could not be opened, so that a query of it
+        raises the reason.
+    memory : float, optional
+        Memory limit of a query and its result together, 1e7 to 1e15 bytes. OutOfRange is raised for other values.
     """
 
     def __init__(self, root: Folder, tables: Sequence[str], memory: float = MEMORY) -> None:
@@ -69,28 +82,33 @@ class Process:
         self.max_bytes = int(memory * _RESULT_SHARE)
         self.command = [sys.executable, "-m", "truesky.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: _Worker | None = None
-        # Answer that is currently read, None between two answers.
+        # Answer whose batches are being read, None between two answers.
         self._answer: _Answer | None = None
         self._numbers = itertools.count(1)
-        # This lock protects the pipes: `ask` holds it for the whole answer, `batches` for each piece.
+        # The lock protects the pipes to and from the process: `ask` holds it until it has the whole answer, `batches`
+        # while it reads one batch.
         self._lock = threading.RLock()
 
     def close(self) -> None:
-        """End the process and its current query; a later query starts a new process."""
+        """End the process and the query that it is answering, which raises BadInput; a later query starts a new one."""
         self.stop()
         with self._lock:
             self._end()
 
     def _end(self) -> None:
-        # Garbage collection of another generator may call this again before it returns.
+        # Garbage collection of a generator from `batches` may call `_end` again before this call returns, so the
+        # attributes are cleared first.
         worker, self._worker, self._answer = self._worker, None, None
         if worker is not None:
             worker.process.kill()
             worker.process.communicate()
 
     def stop(self) -> None:
-        """Stop the query for which another thread waits, without waiting for it; later queries are answered."""
-        # The attribute is read once, since another thread may change it meanwhile.
+        """Kill the process, so that a query for which another thread waits raises BadInput in that thread.
+
+        The method returns at once. A later query starts a new process.
+        """
+        # Read `self._worker` only once, since another thread may set it to None at any time.
         if (worker := self._worker) is not None:
             worker.is_stopped = True
             worker.process.kill()
@@ -101,20 +119,22 @@ class Process:
         Parameters
         ----------
         text : str
-            SQL of the query.
+            SQL of the query; $name is a parameter.
         parameters : mapping of str to object
-            Values of its parameters.
-        timeout : float
-            Time after which the query is stopped, s.
+            Values of the parameters by name: numbers, texts, booleans or lists of them.
+        timeout : float, optional
+            Time in seconds after which the query is stopped, 0 to 1e6.
 
         Returns
         -------
-        Table
+        pyarrow.Table
             Rows of the result.
 
         Notes
         -----
-        BadInput and Damaged are raised as by `Explorer.sql`.
+        BadInput is raised if the text is not an allowed SELECT, the query exceeds its time or memory, the result has
+        more bytes than half of the memory limit, or `stop` or `close` ends the query. Damaged is raised if the content
+        of a file does not agree with its checksum.
         """
         with self._lock:
             return pa.Table.from_batches(list(self.batches(text, parameters, timeout, max_bytes=self.max_bytes)))
@@ -128,33 +148,37 @@ class Process:
         max_bytes: int | None = None,
         expressions: Sequence[str] = (),
     ) -> Iterator[pa.RecordBatch]:
-        """Yield the result of a SELECT piece by piece, at least one piece; closing the generator stops the query.
+        """Yield the result of a SELECT in batches of rows; closing the generator stops the query.
+
+        At least one batch is yielded; it is empty if the result has no rows.
 
         Parameters
         ----------
         text : str
-            SQL of the query.
+            SQL of the query; $name is a parameter.
         parameters : mapping of str to object, optional
-            Values of its parameters.
-        timeout : float
-            Time until the last piece, s.
+            Values of the parameters by name: numbers, texts, booleans or lists of them.
+        timeout : float, optional
+            Time limit in seconds, 0 to 1e6, from the beginning of the query to the last batch.
         max_rows : int, optional
-            Largest number of rows; by default all.
+            Largest number of rows; further rows are not returned. By default all rows are returned.
         max_bytes : int, optional
             Size above which a result is refused. By default any size is allowed, but a single row must not exceed
             64 MiB.
-        expressions : sequence of str
-            Parts of the text that a user wrote; each must be exactly one expression.
+        expressions : sequence of str, optional
+            Parts of `text` that a user wrote. Each must be exactly one SQL expression, so that it cannot change the
+            rest of the query.
 
         Yields
         ------
-        RecordBatch
-            Piece of the result.
+        pyarrow.RecordBatch
+            Rows of the result, at most 8 MiB unless a single row is larger.
 
         Notes
         -----
-        Errors are those of `ask`; they can also be raised after some pieces. BadInput is raised if another query began
-        before the last piece.
+        BadInput is raised if the text is not an allowed SELECT, an item of `expressions` is not one expression, the
+        query exceeds its limits, or `stop`, `close` or the beginning of another query ends it. Damaged is raised if the
+        content of a file does not agree with its checksum. Both can be raised after some batches have been yielded.
         """
         arguments.check_number("timeout", timeout, 0.0, TIMEOUT_HI)
         question = {"sql": text, "parameters": dict(parameters or {}), "rows": max_rows, "bytes": max_bytes}
@@ -166,7 +190,11 @@ class Process:
             self._give_up(answer)
 
     def _send(self, question: dict[str, Any], timeout: float) -> _Answer:
-        """Send a question; an answer that is not completely read is abandoned."""
+        """Send a query to the process, and return the object from which its answer can be read.
+
+        If an earlier answer has not been read completely, the process is ended and a new one is started. BadInput is
+        raised if a parameter cannot be sent, or if the process has ended.
+        """
         number = next(self._numbers)
         line = _line_of(question | {"id": number})
         with self._lock:
@@ -186,7 +214,11 @@ class Process:
             return self._answer
 
     def _next(self, answer: _Answer) -> pa.RecordBatch | None:
-        """Next piece, None after the last one."""
+        """Return the next batch of rows of an answer, or None after the last one.
+
+        BadInput is raised if the time is over, the process has ended, or another query has begun. Errors that the
+        process reports are raised after its last batch.
+        """
         with self._lock:
             if self._answer is not answer:
                 raise BadInput(_CLOSED if answer.worker.is_stopped else _INTERRUPTED)
@@ -208,9 +240,9 @@ class Process:
             raise BadInput(message)
 
     def _give_up(self, answer: _Answer) -> None:
-        """End the process if it still answers this question."""
-        # A thread that collects a generator must not wait for the answer to another thread's question. If another
-        # thread holds the lock, it has ended this answer, or will end it with its next question.
+        """End the process if it is still sending `answer`; do nothing if the answer is complete or abandoned."""
+        # Garbage collection can call this in any thread, which must not wait until another thread has its answer. If
+        # another thread holds the lock, that thread has ended `answer`, or will end it with its next query.
         if self._answer is answer and self._lock.acquire(blocking=False):
             try:
                 if self._answer is answer:
@@ -222,25 +254,25 @@ class Process:
         if self._worker is None or not self._worker.is_alive:
             self._end()
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            # Arrow's other allocators reserve a gigabyte at the start, which would count towards the limit.
+            # Arrow's other memory pools reserve a gigabyte at the start, which would count towards the memory limit.
             environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
             self._worker = _Worker(subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes))
         return self._worker
 
 
 class _Answer:
-    """Answer of a worker to one question.
+    """Answer to one query, read batch by batch from the process that runs queries.
 
     Attributes
     ----------
     worker : _Worker
-        The worker.
+        The process.
     number : int
-        Number of the question, which the answer repeats.
+        Number of the query, which the answer repeats.
     timeout : float
-        Time from now until the last piece, s.
+        Time in seconds from the creation of this object until the last batch must have been read.
     error : LakeError, optional
-        Error from the worker, known after the last piece.
+        Error that the process reported before or after the rows; None until an error is reported.
     """
 
     def __init__(self, worker: _Worker, number: int, timeout: float) -> None:
@@ -251,9 +283,10 @@ class _Answer:
         self._stream: pa.RecordBatchStreamReader | None = None
 
     def read(self) -> pa.RecordBatch | None:
-        """Return the next piece, None after the last one.
+        """Return the next batch of rows, or None after the last one or if the query failed; `error` is then set.
 
-        TimeoutError is raised after the timeout; OSError, EOFError or an error of Arrow if the worker has ended.
+        TimeoutError is raised after the timeout. OSError, EOFError or an error of Arrow is raised if the process has
+        ended.
         """
         if self._stream is None:
             if not self._read_status():
@@ -266,7 +299,11 @@ class _Answer:
             return None
 
     def _read_status(self) -> bool:
-        """Read the status line before or after the pieces; True if there is no error."""
+        """Read the line of JSON before or after the rows, which may contain an error; return True if it has none.
+
+        An error is stored in `error`. EOFError is raised if the process has ended, and LakeError if the line belongs to
+        the answer to another query.
+        """
         line = self._pipe.readline()
         if not line.endswith(b"\n"):
             raise EOFError
@@ -279,10 +316,11 @@ class _Answer:
 
 
 class _TimedPipe(io.RawIOBase):
-    """Pipe that can be read until a deadline of the monotonic clock; TimeoutError is raised after it."""
+    """Pipe that can be read until a deadline (a time of `time.monotonic`, s); later reads raise TimeoutError."""
 
     def __init__(self, pipe: IO[bytes], deadline: float) -> None:
-        # The file object is kept, not its descriptor, which a new file might reuse.
+        # Keep the file object and not the number of its descriptor: after the pipe is closed, a new file may get the
+        # same number.
         self.pipe, self.deadline = pipe, deadline
 
     def readable(self) -> bool:
@@ -297,7 +335,10 @@ class _TimedPipe(io.RawIOBase):
 
 
 def _line_of(question: dict[str, Any]) -> bytes:
-    """Encode a question as a line of JSON for the worker."""
+    """Encode a query as a line of JSON for the process that runs queries.
+
+    BadInput is raised if the SQL is not text, or a parameter is not a finite number, text, boolean or list of them.
+    """
     if not isinstance(question["sql"], str):
         raise BadInput(f"SQL: the query must be text, not {type(question['sql']).__name__}")
     try:

@@ -1,4 +1,7 @@
-"""Convert query results to pandas, astropy or Arrow, or write them to files."""
+"""Convert results of SQL queries (Arrow tables) to pandas or astropy, or write them to files.
+
+The files are CSV, Parquet, FITS or VOTable.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,14 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from truesky.explore import votables
 
-# Largest size of a FITS file, and bytes per piece; other file types are written piece by piece without a limit.
-MAX_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
+# Largest size in bytes of a FITS file that `stream_file` yields. Other file types have no limit there, because they are
+# sent while rows are read. The function `write` has no limit.
+MAX_FITS_BYTES = 8 << 30
+# Number of bytes of a FITS file that are sent at a time.
+_PIECE = 1 << 20
 INTO = ("pandas", "astropy", "arrow")
-# Types of columns with missing values: by default pandas converts integers to floats, which would round identifiers.
+# Types of pandas columns with missing values, by Arrow type. By default pandas would convert such integers to floats,
+# which would round identifiers.
 _NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
 _NULLABLE |= {
     pa.type_for_alias(kind.lower()): pd.api.types.pandas_dtype(kind)
@@ -33,10 +40,12 @@ _NULLABLE |= {
 def convert(rows: pa.Table, into: str) -> Any:
     """Return rows as a pandas DataFrame, an astropy Table with units, or an Arrow table.
 
+    `into` is "pandas", "astropy" or "arrow".
+
     Raises
     ------
     BadInput
-        If `into` is not one of INTO, or astropy cannot represent columns with the same name.
+        If `into` is another text, or two columns have the same name, which an astropy Table cannot represent.
     """
     if into == "pandas":
         gaps = {column.type for column in rows.columns if column.null_count}
@@ -58,7 +67,7 @@ def _astropy(rows: pa.Table) -> Any:
     for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
         attributes: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
-        # astropy stores the UCD of VOTable columns in the same place.
+        # The UCD goes to meta["ucd"], where astropy also stores the UCD of columns that it reads from a VOTable.
         attributes |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
         if values.null_count:
             filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
@@ -73,12 +82,15 @@ def _facts(field: pa.Field) -> dict[str, str]:
 
 
 def write(rows: pa.Table, path: Path) -> None:
-    """Write rows to a .csv, .parquet, .fits or .vot file, which is replaced atomically.
+    """Write rows to a .csv, .parquet, .fits or .vot file.
+
+    An existing file is replaced only after the new one has been written completely.
 
     Raises
     ------
     BadInput
-        If the ending is another one, or the file type cannot hold a column; the message names the column.
+        If the path has another ending, two columns have the same name, or the file type cannot hold a column. The
+        message names the ending or the column.
     OSError
         If writing fails.
     """
@@ -91,7 +103,7 @@ def write(rows: pa.Table, path: Path) -> None:
 
 
 def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Path) -> Exception | None:
-    """Error that prevents a file type from holding the rows, None if there is no error."""
+    """Write rows to a file, and return the error if the file type cannot hold them, else None."""
     try:
         writer(rows, path)
     except (pa.ArrowException, ValueError, TypeError, OverflowError) as error:
@@ -115,7 +127,7 @@ def _parquet(rows: pa.Table, path: Path) -> None:
 
 
 def _fits(rows: pa.Table, path: Path) -> None:
-    # This import takes longer than a page of the sky, so it is delayed.
+    # The import is delayed, because it takes longer than most answers that need no FITS file.
     from lake_schema.fits.tables import table_to_fits
 
     declared = _declare_table(rows.schema)
@@ -127,7 +139,7 @@ def _declare_table(schema: pa.Schema) -> Table:
 
 
 def _column(field: pa.Field) -> Column:
-    """Declare a column for a field of a result."""
+    """Convert an Arrow field to a `Column`, which carries its name, type, unit, UCD and description to the file."""
     facts, kind = _facts(field), _kind(field.type)
     return Column(
         field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True
@@ -158,14 +170,16 @@ ENDINGS = tuple(_WRITERS)
 
 
 def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
-    """Yield a .csv, .parquet, .vot or .fits file of any number of rows piece by piece.
+    """Yield the bytes of a .csv, .parquet, .vot or .fits file while its rows are read.
 
-    For FITS all batches are read before the first piece, since the header contains the number of rows.
+    `batches` contains the rows, in at least one batch. `ending` includes the dot, for example ".csv". For FITS all
+    batches are read before the first bytes are yielded, since the header contains the number of rows.
 
     Raises
     ------
     BadInput
-        If the ending is not supported, or the file type cannot hold the columns; this is raised before the first piece.
+        If the ending is another one, two columns have the same name, or the file type cannot hold the result. A FITS
+        file must not have more than 8 GiB.
     """
     first = next(batches)
     _refuse_same_names(pa.Table.from_batches([first]))
@@ -183,7 +197,10 @@ def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[byte
 
 
 def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterator[bytes]:
-    """Yield a FITS file through temporary files, since its header contains the number of rows and the longest text."""
+    """Yield the bytes of a FITS file with the rows of all batches.
+
+    The rows are first written to a temporary file, since the header needs the number of rows and the longest text.
+    """
     from lake_schema.fits.tables import stream_to_fits
 
     declared = _declare_table(schema)
@@ -201,7 +218,10 @@ def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterat
 
 
 def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schema) -> None:
-    """Cast batches to a schema and store them on disc; raise BadInput if they are too large or cannot be cast."""
+    """Convert batches of rows to the types of a schema, and write them to the file `spool` as an Arrow stream.
+
+    BadInput is raised if a value cannot be converted, or if the file has more than 8 GiB.
+    """
     with pa.ipc.new_stream(spool, schema) as writer:
         for batch in batches:
             columns = []
@@ -223,7 +243,10 @@ def _parquet_writer(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def _write_pieces(batches: Iterator[pa.RecordBatch], open_writer: Callable[[Any], Any]) -> Iterator[bytes]:
-    """Yield the output of a writer as it is written."""
+    """Yield the bytes that a writer of Arrow batches produces, as soon as they are written.
+
+    `open_writer` opens the writer for a file object. BadInput is raised if the file type cannot hold the rows.
+    """
     sink = _Sink()
     try:
         writer = open_writer(sink)
@@ -238,7 +261,7 @@ def _write_pieces(batches: Iterator[pa.RecordBatch], open_writer: Callable[[Any]
 
 
 class _Sink(io.RawIOBase):
-    """Buffer that keeps written bytes until they are taken."""
+    """File object in memory that keeps written bytes until `take` returns them."""
 
     def __init__(self) -> None:
         self._buffer, self._position = bytearray(), 0
@@ -255,7 +278,7 @@ class _Sink(io.RawIOBase):
         return self._position
 
     def take(self) -> bytes:
-        """Return the bytes written since the last call."""
+        """Return the bytes written since the last call of `take`, b"" if nothing was written."""
         piece = bytes(self._buffer)
         self._buffer.clear()
         return piece

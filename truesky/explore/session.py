@@ -1,4 +1,7 @@
-"""DuckDB session over the tables of a lake: locked, kept open between queries, and read in batches."""
+"""DuckDB session that runs SQL queries over the tables of a lake.
+
+The session can reach nothing but these tables. It stays open between queries, and yields results in batches of rows.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,14 @@ from truesky.explore import adql
 from truesky.explore.guard import Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
-    # Great-circle distance with the haversine formula, deg.
+    # Angle between two positions in deg, computed with the haversine formula; the arguments are in deg.
     """CREATE MACRO separation(ra1, dec1, ra2, dec2) AS degrees(2 * asin(least(1.0, sqrt(
        pow(sin(radians(dec2 - dec1) / 2), 2)
        + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
-    # AB magnitude of f_nu in microjansky, NULL if the flux is not positive.
+    # AB magnitude of the flux density f_nu in microjansky; NULL if f_nu is not positive.
     "CREATE MACRO mag_ab(f_nu) AS 23.9 - 2.5 * log10(CASE WHEN f_nu > 0 THEN f_nu END)",
 )
-# After these commands the session can only reach registered tables, and cannot change its configuration.
+# After these commands a query can only read the tables that Python registered, and cannot change the settings.
 _LOCKS = (
     "SET python_enable_replacements = false",
     "SET autoload_known_extensions = false",
@@ -33,21 +36,22 @@ _LOCKS = (
     "SET enable_external_access = false",
     "SET lock_configuration = true",
 )
-# Fraction of the memory of a query that DuckDB may fill; the same fraction is for its result.
+# Fraction of the memory limit of a query that DuckDB may fill; the rest is for the result.
 _SHARE = 0.5
 TOO_LARGE = "SQL: the query or its result needs more memory than its limit: ask for less"
 OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
 class Session:
-    """Session that answers queries one after another; after an error it starts again.
+    """DuckDB session that runs one query after another. After an error all tables are closed and opened again.
 
     Parameters
     ----------
     root : Folder
         Folder of the lake.
     tables : mapping of str to str
-        NAME or REQUEST.NAME -> key of a version, ?REQUEST for a table that could not be opened, @FILE for Arrow rows.
+        Where each table is, by its name NAME or REQUEST.NAME: the key (hash) of a version of the table, @FILE for the
+        rows of an Arrow file, or ?REQUEST for a table that could not be opened (a query of it raises the error again).
     memory : int
         Memory limit of a query and its result together, bytes.
     """
@@ -61,15 +65,18 @@ class Session:
         self._parser = parser()
 
     def check_query(self, text: str) -> Query:
-        """Return the query if it may run; raise BadInput otherwise."""
+        """Parse a query and return it with the tables that it reads.
+
+        BadInput is raised if it is not a single SELECT over the tables of the session.
+        """
         return check_query(text, self.table_keys, self._parser)
 
     def check_expression(self, text: str) -> None:
-        """Raise BadInput if a text is not exactly one expression."""
+        """Raise BadInput if a text is not exactly one SQL expression."""
         check_expression(text, self._parser)
 
     def close(self) -> None:
-        """Close all tables; the next query opens those that it uses."""
+        """Close the database and all tables; the next query opens the tables that it reads again."""
         self.open_tables.clear()
         self._rows.clear()
         if self._database is not None:
@@ -77,16 +84,17 @@ class Session:
             self._database = None
 
     def run(self, query: Query, parameters: Mapping[str, object]) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a query in batches, at least one, which may be empty.
+        """Yield the rows of a query in batches; the first batch is empty and defines the columns.
 
-        Columns that are unchanged columns of a table have its units.
+        `parameters` contains the values of the query's parameters by name. A result column that is an unchanged copy of
+        a table's column has the unit and the description of that column.
 
         Raises
         ------
         BadInput
-            If the query cannot be run; some batches may have been returned before.
+            If the query fails or needs too much memory; some batches may have been yielded before.
         Damaged
-            If a file is not as it was written; some batches may have been returned before.
+            If the content of a file does not agree with its checksum; some batches may have been yielded before.
         """
         finished = False
         try:
@@ -106,7 +114,8 @@ class Session:
         except duckdb.OutOfMemoryException:
             raise BadInput(TOO_LARGE) from None
         except (duckdb.Error, OSError, pa.ArrowException) as error:
-            # Arrow and DuckDB hide the error of a damaged file in their own errors.
+            # If a file is damaged, the error of Arrow or DuckDB does not tell it. The attribute `fault` of the object
+            # that reads the damaged table contains the reason.
             if fault := next((fault for rows in self._rows.values() if (fault := getattr(rows, "fault", ""))), ""):
                 raise Damaged(fault) from None
             raise BadInput(f"SQL: {one_line(error)}") from None
@@ -127,7 +136,10 @@ class Session:
         return self._database
 
     def _open(self, name: str) -> None:
-        """Open a table by its name; a table of a request goes into a schema with the name of the request."""
+        """Make a table known to DuckDB, unless it is already open.
+
+        A table REQUEST.NAME becomes the view NAME in a schema REQUEST.
+        """
         if name in self._rows:
             return
         source = _open_table(self.root, name, self.table_keys[name])
@@ -141,14 +153,14 @@ class Session:
             database.execute(f'CREATE OR REPLACE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
 
     def _with_units(self, schema: pa.Schema, query: Query) -> pa.Schema:
-        """Add unit and description of table columns to result columns that are unchanged."""
+        """Add the unit, description and other metadata of table columns to result columns that are unchanged copies."""
         fields = []
         for field in schema:
             name = field.name.lower()
             tables = [self.open_tables[table].schema for table in query.tables]
             columns = [column for table in tables for column in table if column.name.lower() == name]
             candidate_facts = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
-            # If several tables have this column, only facts that they share are used.
+            # If several tables have a column of this name and type, only metadata with equal values in all are used.
             facts = (
                 dict(set.intersection(*map(set, candidate_facts)))
                 if candidate_facts and name in query.columns
@@ -163,13 +175,16 @@ def _open_table(root: Folder, name: str, key: str) -> OpenTable:
         return ds.dataset(key[1:], format="ipc")
     table = name.rpartition(".")[2]
     if key.startswith("?"):
-        # Opening it raises the same error again.
+        # The key ?REQUEST marks a table that could not be opened before; opening it again raises the reason.
         return read.version(root, table, request=key[1:] or None)
     return read.version(root, table, key)
 
 
 def _exportable(schema: pa.Schema) -> pa.Schema:
-    """Replace 128-bit decimals, which are sums of integers, by types that file formats of astronomy have."""
+    """Replace the 128-bit decimals in a schema: int64 if they have no decimal places, else float64.
+
+    DuckDB returns sums of integers as such decimals, which file formats of astronomy do not have.
+    """
     return pa.schema(
         [
             field.with_type(pa.float64() if field.type.scale else pa.int64())
@@ -192,5 +207,8 @@ def _cast(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def _kind(kind: pa.DataType) -> pa.DataType:
-    """Type without the name of list elements, which differs in DuckDB."""
+    """Return an Arrow type without the name of the elements of a list, so that types can be compared.
+
+    DuckDB gives another name to these elements.
+    """
     return pa.list_(_kind(kind.value_type)) if pa.types.is_list(kind) else kind

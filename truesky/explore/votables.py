@@ -1,4 +1,4 @@
-"""Write VOTables of any number of rows piece by piece, for answers of TAP.
+"""Write VOTables (XML tables of the Virtual Observatory) while their rows are read, for answers of the TAP service.
 
 References
 ----------
@@ -34,7 +34,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Metadata of a field, in addition to its name and type."""
+    """Metadata of a FIELD (column) of a VOTable, in addition to its name and type; "" means that it is not given."""
 
     unit: str = ""
     ucd: str = ""
@@ -45,14 +45,14 @@ class Facts:
 
 @dataclass(slots=True)
 class RowLimit:
-    """Largest number of rows to send.
+    """Largest number of rows of a VOTable.
 
     Attributes
     ----------
     max_rows : int, optional
-        Largest number of rows; None for all.
+        Rows after this number are left out; None for no limit.
     overflowed : bool
-        True if there were more rows; set when the last piece has been made.
+        True if rows were left out. `pieces` sets it; the value is final after the last bytes have been yielded.
     """
 
     max_rows: int | None = None
@@ -62,21 +62,26 @@ class RowLimit:
 def pieces(
     batches: Iterable[pa.RecordBatch], row_limit: RowLimit | None = None, infos: Sequence[str] = ()
 ) -> Iterator[bytes]:
-    """Yield a VOTable, serialised as TABLEDATA, piece by piece.
+    """Yield the XML of a VOTable in the serialisation TABLEDATA, while its rows are read.
 
     Parameters
     ----------
-    batches : iterable of RecordBatch
-        Rows, at least one batch; the first is read before the first piece is yielded.
+    batches : iterable of pyarrow.RecordBatch
+        Rows. The first batch, which may be empty, defines the columns; without any batch the table has no columns.
     row_limit : RowLimit, optional
-        Largest number of rows; it also records if there were more.
-    infos : sequence of str
-        Further INFO elements, XML.
+        Largest number of rows. Its attribute `overflowed` is set to True if there are more. By default all rows are
+        written.
+    infos : sequence of str, optional
+        Further INFO elements for the header, as XML, which is not checked.
 
     Yields
     ------
     bytes
-        Piece of the VOTable.
+        Consecutive parts of the VOTable: the header, up to 8192 rows each, and the end.
+
+    Notes
+    -----
+    BadInput is raised if Python cannot represent a value, see `python_values`; the header has been yielded before.
     """
     row_limit = row_limit or RowLimit()
     remaining_batches = iter(batches)
@@ -90,7 +95,7 @@ def pieces(
         remaining = batch.num_rows if row_limit.max_rows is None else max(row_limit.max_rows - sent, 0)
         row_limit.overflowed |= batch.num_rows > remaining
         limited = batch.slice(0, remaining)
-        # Batches are divided, since Python values as text take many times their size.
+        # Batches are divided, since their values as Python objects and text need many times the memory.
         for first in range(0, limited.num_rows, _ROWS_A_PIECE):
             yield _rows(limited.slice(first, _ROWS_A_PIECE))
         sent += min(remaining, batch.num_rows)
@@ -100,23 +105,24 @@ def pieces(
 
 
 def refusal(message: str) -> bytes:
-    """Return a VOTable with an error message."""
+    """Return a VOTable without rows that reports an error to a client of TAP, with `message` as its text."""
     return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{_text(message)}</INFO>\n{_CLOSE}'.encode()
 
 
 def field_facts(column: pa.Field) -> Facts:
-    """Return the unit, UCD, description, xtype and utype of a field."""
+    """Return the unit, UCD, description, xtype and utype in the metadata of an Arrow field, "" if they are missing."""
     metadata = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
     return Facts(*(metadata.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
 
 
 def python_values(column: pa.Array, name: str = "") -> list[Any]:
-    """Return the values of a column as Python objects.
+    """Return the values of a column as Python objects; NULL becomes None.
 
     Raises
     ------
     BadInput
-        If Python cannot represent a value, such as a time before the year 1 or after 9999.
+        If Python cannot represent a value, such as a time before the year 1 or after 9999. The message contains `name`,
+        the name of the column.
     """
     try:
         values: list[Any] = column.to_pylist()
@@ -126,10 +132,14 @@ def python_values(column: pa.Array, name: str = "") -> list[Any]:
 
 
 def datatype(kind: pa.DataType) -> tuple[str, str]:
-    """Return the VOTable datatype and arraysize ("" for a scalar) of an Arrow type."""
+    """Return the attributes datatype and arraysize of a VOTable field for an Arrow type.
+
+    The arraysize is "*" for texts and lists, and "" for scalars. Decimals become "double". Lists of texts and all other
+    types become texts.
+    """
     if pa.types.is_list(kind):
         inner, size = datatype(kind.value_type)
-        # VOTable cannot represent arrays of texts.
+        # VOTable cannot represent arrays of texts, so a list of texts becomes one text.
         return ("char", "*") if size else (inner, "*")
     if kind in _TYPES:
         return _TYPES[kind], ""
@@ -147,7 +157,8 @@ def _field(column: pa.Field) -> str:
     return f"<FIELD {words}>{description}{null}</FIELD>\n"
 
 
-# Values for missing integers; VOTable 1.4 also allows empty cells, which older readers take as zero.
+# Integers that represent a missing value, by VOTable datatype. VOTable 1.4 also allows empty cells, which older readers
+# take as zero.
 _NULLS = {"short": -32768, "int": -2147483648, "long": -9223372036854775808}
 
 
@@ -188,7 +199,7 @@ _NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _text(text: str) -> str:
-    """Escape a text; characters that XML does not allow are replaced."""
+    """Escape a text for XML; characters that XML 1.0 does not allow become U+FFFD, the replacement character."""
     return escape(_NO_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 

@@ -1,10 +1,12 @@
-"""Process that runs queries: python -m truesky.explore.worker LAKE MEMORY TABLE=KEY|@FILE ...; answers go to stdout.
+"""Program of the separate process that runs SQL queries: python -m truesky.explore.worker LAKE MEMORY TABLE=KEY ...
 
-DuckDB does not count the memory of every function nor of its result, and some functions do not stop on request. A
-process has a strict limit of memory and can be killed.
+Queries run in a separate process, because a process has a strict memory limit and can be killed. DuckDB does not count
+the memory of every function and of the result, and some of its functions cannot be interrupted.
 
-A query is a line of JSON on stdin. An answer is a line of JSON. If it is a result, an Arrow stream follows, and a line
-of JSON that reports if the stream is complete. Both lines repeat the number of the query, `id`.
+The process reads each query as one line of JSON from stdin, and writes the answer to stdout. An answer begins with a
+line of JSON that contains the number `id` of the query, and the error if the query failed. If it succeeded, an Arrow
+stream with the rows follows, and then a second line of JSON. The second line contains `id` again, and an error if the
+stream is incomplete.
 """
 
 from __future__ import annotations
@@ -23,23 +25,28 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import layout
 from truesky.explore.session import TOO_LARGE, Session
 
-# Memory that Python and the libraries need before any query.
+# Memory in bytes that Python and the libraries need before any query; it is added to the memory limit of queries.
 _BASE_BYTES = 1 << 30
-# Bytes per piece, and largest size of a row.
-_PIECE_BYTES, _MAX_ROW_BYTES = 8 << 20, 64 << 20
+# Batches of more bytes than this are divided before they are sent; a single row is never divided.
+_PIECE_BYTES = 8 << 20
+# Largest size of a single row in bytes, if the query has no limit for the size of its result.
+_MAX_ROW_BYTES = 64 << 20
 
 
 def main(argv: Sequence[str]) -> int:
-    """Answer queries until stdin ends, and return the exit status.
+    """Answer queries until stdin ends, and return the exit status 0.
 
-    `argv` contains the lake, the memory limit in bytes, and entries for the tables: TABLE=KEY or REQUEST.TABLE=KEY,
-    =?REQUEST for a table that could not be opened, TABLE=@FILE for rows in an Arrow file.
+    `argv` contains the lake, the memory limit of a query in bytes, and one entry per table. An entry is TABLE=KEY or
+    REQUEST.TABLE=KEY with the key of the table's version (a hash of everything that determines its content).
+    TABLE=?REQUEST means a table that could not be opened, so that a query of this table raises the error. TABLE=@FILE
+    means the rows of an Arrow file.
     """
     root, memory = layout.open_lake(argv[0]), int(argv[1])
     command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
     command.limit_resource("RLIMIT_CORE", 0)
     session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)
-    # Output of libraries must not get between the answers, so it is redirected to stderr.
+    # Answers go to a copy of stdout. Descriptor 1 is redirected to stderr, so that text that a library prints cannot
+    # get between the answers.
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -51,7 +58,8 @@ def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
     header, fault = {"id": question["id"]}, dict[str, str]()
     batches = _batches(session, question)
     try:
-        # Errors in the text are raised before the first of these two batches.
+        # The first batch is empty, and errors in the query are raised before the second one. Two batches are read
+        # before anything is written, so that a wrong query is answered by its error alone.
         first = list(itertools.islice(batches, 2))
         out.write(json.dumps(header).encode() + b"\n")
         with pa.ipc.new_stream(out, first[0].schema) as stream:
@@ -67,7 +75,11 @@ def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
 
 
 def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBatch]:
-    """Batches of the answer, at most `rows` rows; raise BadInput if they have more than `bytes` bytes."""
+    """Yield the result of a query in Arrow batches.
+
+    The keys `rows` and `bytes` of `question` are optional limits. Rows after the first `rows` are not returned.
+    BadInput is raised if the result has more than `bytes` bytes, or the query is not allowed.
+    """
     max_rows, max_bytes = question.get("rows"), question.get("bytes")
     rows = size = 0
     for text in question.get("expressions", ()):
@@ -83,9 +95,9 @@ def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBa
 
 
 def _pieces(batch: pa.RecordBatch, max_bytes: int) -> Iterator[pa.RecordBatch]:
-    """Divide a batch into small pieces, so that receivers hold one piece at a time.
+    """Divide a batch of rows into batches of at most 8 MiB, so that the receiver needs little memory.
 
-    BadInput is raised if a single row has more than `max_bytes` bytes.
+    A single row may be larger, but BadInput is raised if it has more than `max_bytes` bytes.
     """
     if batch.nbytes <= _PIECE_BYTES:
         yield batch

@@ -1,4 +1,7 @@
-"""Show a lake in the browser: python -m truesky.page --lake LAKE, or truesky page LAKE."""
+"""Start the web page of a lake (the folder with all tables and images): python -m truesky.page --lake LAKE.
+
+`truesky page LAKE` does the same. The address of the page is printed and opened in the browser.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,17 @@ from truesky.page.server import Server
 
 _GIGABYTE = 1e9
 _LOCAL_NAMES, _ALL_INTERFACES = ("127.0.0.1", "localhost"), ("", "0.0.0.0")
-# Allowed tokens contain only characters that need no escaping in addresses and cookies.
+# A token that a user may choose: 16 to 256 characters that need no escaping in addresses and cookies.
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]{16,256}")
 _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the server. Return 0 when it is stopped, 1 if the lake is damaged or the port in use, 2 for bad options."""
+    """Run the server of the page until it is stopped, and return the exit status.
+
+    `argv` contains the command-line arguments without the name of the program; None means those of this process. The
+    status is 0 after a stop with Ctrl-C, 1 if the lake is damaged or the port is in use, and 2 if an option is wrong.
+    """
     options = _options(argv)
     return command.run("page", lambda: _serve(options))
 
@@ -43,7 +50,7 @@ def _serve(options: argparse.Namespace) -> int:
     def open_lake() -> LakeSession:
         return LakeSession(root, options.name, options.memory * _GIGABYTE, options.timeout)
 
-    # Open the socket before the address is printed, because port 0 selects a free port.
+    # Open the socket before the address is printed: the port is known only then, because port 0 selects a free port.
     server_socket = socket.create_server((options.host, options.port))
     port = int(server_socket.getsockname()[1])
     access = AccessRules(host_names, port, options.token or new_token())
@@ -64,9 +71,11 @@ def _lake_folder(options: argparse.Namespace) -> str:
 
 
 def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
-    """Allowed host names of the server; the first one is printed.
+    """Return the host names under which the server answers; the first name is part of the printed address.
 
-    Other names are refused, because another site can let its name resolve to this machine (DNS rebinding).
+    HTTP requests with other names are refused, because another site can let its name resolve to this machine (DNS
+    rebinding). BadInput is raised if a name of --called is not a host name, or if --host is 0.0.0.0 or "" (all
+    addresses of this machine) and --called is missing.
     """
     if invalid_name := next((name for name in options.called if not _NAME.fullmatch(name)), None):
         raise BadInput(f"--called {invalid_name[:80]!r} is not a host name or address")

@@ -1,7 +1,7 @@
-"""Refuse requests that lack the token of the page or of the TAP service, or that another web site caused.
+"""Refuse HTTP requests that lack the secret token of the page or of the TAP service, or that another web site caused.
 
-A web page of another site can make the user's browser send requests to this machine. It does not know the token, and
-it cannot set the headers Host, Origin and Sec-Fetch-Site.
+A web page of another site can make the user's browser send HTTP requests to this machine. Such a page does not know the
+token, and it cannot change the headers Host, Origin and Sec-Fetch-Site, which the browser sets.
 """
 
 from __future__ import annotations
@@ -32,24 +32,25 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 def new_token() -> str:
-    """Return a URL-safe token of 192 random bits."""
+    """Return a new random token of 192 bits as 32 characters that need no escaping in addresses."""
     return secrets.token_urlsafe(_TOKEN_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
 class AccessRules:
-    """Rules of access to one server.
+    """Host names and tokens that HTTP requests to the server of the page must have.
 
     Attributes
     ----------
     hosts : tuple of str
-        Allowed host names or addresses of the server, without the port.
+        Host names or addresses under which the server answers, without the port.
     port : int
         Port of the server.
     token : str
-        Token of the page. The browser sends it once in the address, then as a cookie.
+        Secret token of the page; by default a random one. The browser sends it once in the address, then as a cookie.
     tap_token : str
-        Token of the TAP service. It is part of the address, because TAP clients send no cookies.
+        Secret token of the TAP service; by default a random one. It is part of the address, because TAP clients send no
+        cookies.
     """
 
     hosts: tuple[str, ...]
@@ -59,16 +60,20 @@ class AccessRules:
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie. It contains the port, so that several servers on this machine do not share cookies."""
+        """Name of the cookie with the token. It contains the port, so that servers on this machine do not share it."""
         return f"truesky-{self.port}"
 
     @property
     def origins(self) -> set[str]:
-        """Allowed values of the header Origin."""
+        """Allowed values of the HTTP header Origin: the addresses of this server, such as http://localhost:8000."""
         return {f"http://{host}:{self.port}" for host in self.hosts}
 
     def refusal(self, request: web.Request) -> tuple[int, str] | None:
-        """Return status and reason if the request must be refused, else None."""
+        """Return the HTTP status and the reason if a request must be refused, else None.
+
+        The status is 403 for a wrong header Host or Origin or a request of another site, 401 for a missing or wrong
+        token of the page, and 404 for a wrong token of the TAP service.
+        """
         if request.headers.get("Host") not in {f"{host}:{self.port}" for host in self.hosts}:
             return 403, "truesky does not listen on this address"
         if request.headers.get("Origin", next(iter(self.origins))) not in self.origins:
@@ -78,7 +83,7 @@ class AccessRules:
             return 403, "requests from other sites are refused"
         if request.path.startswith(TAP_PATH):
             presented_token = request.path.removeprefix(TAP_PATH).partition("/")[0]
-            # A wrong token gets the same answer as an address that does not exist.
+            # A wrong token of the TAP service gets the same answer as an address that does not exist.
             return None if _tokens_match(presented_token, self.tap_token) else (404, "there is nothing here")
         if is_entry and "token" in request.query:
             return None if _tokens_match(request.query["token"], self.token) else (401, "the token is wrong")
@@ -88,7 +93,10 @@ class AccessRules:
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse a request, set the cookie, or pass the request to its handler."""
+        """Answer an HTTP request: refuse it, set the cookie, or call its handler.
+
+        A request for "/" with the right token in the address gets a redirection to "/" without it, and the cookie.
+        """
         refusal = self.refusal(request)
         if refusal is not None:
             status, reason = refusal
@@ -105,7 +113,10 @@ class AccessRules:
 
 
 async def add_security_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Add headers that restrict what the page may load and do. aiohttp calls this just before it sends a response."""
+    """Add HTTP headers to a response that restrict which files and servers the page may use.
+
+    aiohttp calls this function just before it sends a response.
+    """
     response.headers.update(_SECURITY_HEADERS)
 
 

@@ -1,4 +1,4 @@
-"""Answers to the page about tables: list of tables and columns, first rows of a query."""
+"""Answers to the web page about tables: their names and columns, and the first rows of an SQL query."""
 
 from __future__ import annotations
 
@@ -19,14 +19,22 @@ from lake_schema.store import read
 from truesky.explore import votables
 from truesky.page.lake_session import LakeSession
 
-MAX_ROWS, MAX_BYTES = 500, 8 << 20
-# Integers up to this value are exact in JavaScript.
+# Largest number of rows that are shown of a query's result.
+MAX_ROWS = 500
+# Largest size in bytes of the rows that are shown of a query's result.
+MAX_BYTES = 8 << 20
+# JavaScript has no separate integers; integers up to this absolute value are exact.
 _MAX_SAFE_INTEGER = 1 << 53
 Json = dict[str, Any]
 
 
 def describe_lake(lake: LakeSession) -> Json:
-    """Return a description of the lake: its tables, and their columns with unit, UCD, limits and meaning."""
+    """Return a description of the lake for the page.
+
+    Among its keys are `tables` (name, number of rows, bytes, meaning, and columns with unit, UCD, limits and meaning of
+    each table), `damaged` (errors of the tables that cannot be opened) and `key` (an identifier that changes if the
+    content of a table changes).
+    """
     tables = [
         {
             "name": name,
@@ -51,7 +59,7 @@ def describe_lake(lake: LakeSession) -> Json:
 
 
 def is_catalogue(version: read.Version) -> bool:
-    """Return True if the rows of a table have positions on the sky."""
+    """Return True if a table has the HEALPix column `_healpix_29`, so its rows have positions on the sky."""
     return "_healpix_29" in version.schema.names
 
 
@@ -68,24 +76,25 @@ def _describe_column(field: pa.Field) -> Json:
 
 
 async def run_query(lake: LakeSession, request_body: Json) -> Json:
-    """Run a query and return its first rows with units.
+    """Run an SQL query of the user, and return the first rows of its result.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     request_body : dict
-        The query, under key `sql`.
+        Body of the HTTP request; its key `sql` contains the query.
 
     Returns
     -------
     dict
-        `columns`, `rows` (at most MAX_ROWS), `more` (True if the result has more rows) and `seconds` (wall time).
+        `columns` (name, type, unit and meaning of each column), `rows` (at most 500, each a list of values), `more`
+        (True if the result has more rows) and `seconds` (wall time of the query).
 
     Raises
     ------
     BadInput
-        If `sql` is not a string, or the query is refused.
+        If `sql` is not a string, the query is not an allowed SELECT or fails, or 501 rows have more than 8 MiB.
     """
     text = request_body.get("sql")
     if not isinstance(text, str):
@@ -113,7 +122,11 @@ async def run_query(lake: LakeSession, request_body: Json) -> Json:
 
 
 def to_json_value(value: object) -> Any:
-    """Convert a value to JSON without loss: integers beyond 2^53, NaN and infinities become strings."""
+    """Convert a value to one that JSON can represent without loss.
+
+    Integers beyond 2^53, NaN, infinities, and values of other types such as dates become strings. Lists and
+    dictionaries are converted item by item.
+    """
     if isinstance(value, bool) or value is None or isinstance(value, str):
         return value
     if isinstance(value, int):
@@ -128,26 +141,27 @@ def to_json_value(value: object) -> Any:
 
 
 def json_response(content: object) -> web.Response:
-    """Return a JSON response."""
+    """Return an HTTP response with the content as JSON; ValueError is raised if it contains NaN or an infinity."""
     return web.Response(text=json.dumps(content, allow_nan=False), content_type="application/json")
 
 
 def pack(header: Json, *arrays: Array) -> bytes:
-    """Pack a JSON header and arrays into bytes.
+    """Pack a JSON header and arrays into bytes, which the JavaScript of the page reads.
 
     Parameters
     ----------
     header : dict
-        The header.
+        Content of the header; it must contain what is needed to read the arrays, such as their shapes.
     *arrays : array
         Arrays of a little-endian type.
 
     Returns
     -------
     bytes
-        The length of the header (4 bytes, little-endian), the header as JSON, then the bytes of the arrays.
+        The length of the header (4 bytes, little-endian), the header as JSON (padded with spaces to a multiple of four
+        bytes), then the bytes of the arrays without gaps.
     """
     header_bytes = json.dumps(header).encode()
-    # JavaScript requires that the arrays start at a multiple of four bytes.
+    # Typed arrays of JavaScript must start at a multiple of four bytes.
     header_bytes += b" " * (-len(header_bytes) % 4)
     return b"".join([struct.pack("<I", len(header_bytes)), header_bytes, *(array.tobytes() for array in arrays)])

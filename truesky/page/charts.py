@@ -1,4 +1,7 @@
-"""Counts for linked charts: a selection in one chart filters all others. One pass over cached columns fills all."""
+"""Counts for the linked histograms (charts) of the web page: limits set in one chart select the rows of all others.
+
+The columns on the axes are cached as arrays, and one pass over them fills all charts.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,20 @@ from truesky.explore.counting import Chart, ChartColumns
 from truesky.page.answers import pack
 from truesky.page.lake_session import LakeSession
 
-# Rows per core that are counted at every move of a selection. In larger tables, one row in SUBSAMPLING is counted
-# first.
+# Tables with more rows per thread (one thread per processor core, but at most 8) are subsampled by default, because all
+# rows are counted again at every movement of the limits in a chart.
 ROWS_PER_CORE = 25_000_000
+# In a subsampled table one row in this number is counted.
 SUBSAMPLING = 64
-_MAX_AXES, _MAX_CHARTS, MAX_POINTS = 16, 16, 20_000
-# Number of selections whose columns stay memory-mapped.
+# Largest number of SQL expressions (axes of charts) in one HTTP request of the page.
+_MAX_AXES = 16
+# Largest number of charts in one HTTP request of the page.
+_MAX_CHARTS = 16
+# Largest number of points that are returned for one chart.
+MAX_POINTS = 20_000
+# Number of sets of columns that stay memory-mapped; the oldest set is dropped first.
 _MAX_CACHED = 4
-# One thread counts this number of rows as fast as several threads.
+# Up to this number of rows one thread is used, because several threads are not faster.
 _SINGLE_THREAD_ROWS = 1_000_000
 Json = dict[str, Any]
 
@@ -33,24 +42,28 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
     lake : LakeSession
         The open lake.
     question : dict
-        `source` : table, or the text that follows FROM. `where` : SQL condition. `axes` : list of SQL expressions.
-        `charts` : list of dictionaries with `axes` (indices into the axes), `bins` (numbers of bins), `spans` (ranges,
-        or null for the default), and optionally `own` (axes whose limits do not apply to this chart) and `points`
-        (largest number of sample points to return). `limits` : list of [axis, lowest, highest] that filter the rows.
-        `part` : 1 for all rows, SUBSAMPLING for one row in SUBSAMPLING, or null for the default.
+        The question of the page, with these keys. `source` : name of a table, or other SQL after FROM. `where` : SQL
+        condition that selects rows. `axes` : list of 1 to 16 SQL expressions. `charts` : list of 1 to 16 dictionaries
+        with `axes` (indices into the list of expressions), `bins` (number of bins of each axis), `spans` (lowest and
+        highest value of each axis, or null for the default), and optionally `own` (indices of expressions whose limits
+        do not apply to this chart; by default those on its axes) and `points` (largest number of rows to return as
+        points). `limits` : list of [index of an expression, lowest, highest] that select rows. `part` : 1 for all rows,
+        64 for one row in 64, or null for 64 in large tables only. All rows are counted if `source` is not a single
+        table with columns that identify a row.
 
     Returns
     -------
     bytes
         The length of the header (4 bytes), the header (JSON), the counts of every chart (uint32, first axis slowest),
-        and the points of every chart that requests them (float32 [n, axes]). The header has `rows`, `part`, `spans`
-        (for each axis the range of nearly all values), `missing` (rows without a value, for each axis) and `charts`.
-        For each chart, `outside` is the number of rows within the limits but outside the spans.
+        and the points of every chart that requests them (float32 [n, axes]). The header has `rows` (number of rows that
+        were counted), `part` (1, or 64 for a subsample), `spans` (for each expression the range of nearly all values),
+        `missing` (for each expression the number of rows without a finite value) and `charts`. In each chart, `outside`
+        is the number of rows within the limits but outside the ranges of its axes.
 
     Raises
     ------
     BadInput
-        If the question is invalid or an expression is refused.
+        If the question is invalid, or a text is not exactly one valid SQL expression.
     """
     source, where = str(question.get("source", "")), str(question.get("where") or "true")
     axes = [str(axis) for axis in _required_list(question, "axes", _MAX_AXES)]
@@ -70,7 +83,7 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
                 return counting.inspect_columns(loaded)
 
             cached_columns = await asyncio.to_thread(load_columns)
-        # Cache the columns, so that their checksums are verified once and not at every move of a selection.
+        # Keep the columns in memory, so that their checksums are verified once and not at every movement of a limit.
         while len(lake.cached_columns) >= _MAX_CACHED:
             lake.cached_columns.pop(next(iter(lake.cached_columns)))
         lake.cached_columns[(selection, *axes)] = cached_columns
@@ -85,7 +98,7 @@ def _required_list(question: Json, name: str, max_length: int) -> list[Any]:
 
 
 def _key_columns(lake: LakeSession, source: str) -> tuple[str, ...]:
-    """Columns that identify a row of a table; empty if the source is not a table."""
+    """Return the quoted names of the columns that identify a row of a table; () if `source` is not a known table."""
     source = source.replace('"', "")
     if source not in lake.versions:
         return ()
@@ -103,18 +116,18 @@ def _choose_subsampling(lake: LakeSession, source: str, key_columns: tuple[str, 
 
 
 def pack_counts(cached_columns: ChartColumns, question: Json, subsampling: int, threads: int) -> bytes:
-    """Count the rows of cached columns and pack the answer of `count_rows`.
+    """Count the rows of cached columns in the bins of several charts, and pack the answer of `count_rows`.
 
     Parameters
     ----------
     cached_columns : ChartColumns
-        Columns of the axes, in their order.
+        Columns with the values of the question's SQL expressions, in their order.
     question : dict
-        The question, see `count_rows`.
+        The question of the page, see `count_rows`; only `charts` and `limits` are used.
     subsampling : int
-        The columns contain one row in `subsampling`.
+        Subsampling of the columns: they contain one row of the table in this number. The header repeats it as `part`.
     threads : int
-        Number of threads for many rows.
+        Number of threads; up to a million rows only one is used.
 
     Returns
     -------
@@ -124,7 +137,7 @@ def pack_counts(cached_columns: ChartColumns, question: Json, subsampling: int, 
     Raises
     ------
     BadInput
-        If the question is invalid.
+        If the charts or limits are invalid, refer to an expression that does not exist, or have too many bins.
     """
     columns = cached_columns.columns
     try:

@@ -1,4 +1,4 @@
-"""Send query results as files, in chunks."""
+"""Send files and query results to HTTP clients in chunks, while they are read or computed."""
 
 from __future__ import annotations
 
@@ -19,12 +19,19 @@ CONTENT_TYPES = {
     "fits": "application/fits",
 }
 _CHUNK_SIZE = 1 << 20
-# A client must read _WRITE_SIZE bytes within STALL_TIMEOUT seconds, so that a stalled client frees its process.
-STALL_TIMEOUT, _WRITE_SIZE = 60.0, 1 << 18
+# Longest time in seconds that a client may take to read 256 KiB (_WRITE_SIZE). Slower clients are disconnected, so that
+# the query process becomes free.
+STALL_TIMEOUT = 60.0
+# Number of bytes that are sent to a client at a time.
+_WRITE_SIZE = 1 << 18
 
 
 async def export(lake: LakeSession, request: web.Request) -> web.StreamResponse:
-    """Send the result of the query in parameter `sql` as a file in the format of parameter `format`."""
+    """Send the result of an SQL query as a file.
+
+    The query is the HTTP parameter `sql`. The parameter `format` is csv (default), parquet, vot or fits. BadInput is
+    raised for another format, and if the query fails before its first rows.
+    """
     form, text = request.query.get("format", "csv"), request.query.get("sql", "")
     if form not in CONTENT_TYPES:
         raise BadInput(f"format = {form[:40]!r} is not one of {', '.join(CONTENT_TYPES)}")
@@ -45,30 +52,33 @@ def read_chunks(path: Path) -> Iterator[bytes]:
 async def send_stream(
     request: web.Request, stream: AsyncIterator[bytes], content_type: str, file_name: str | None
 ) -> web.StreamResponse:
-    """Send a stream of bytes.
+    """Send a stream of bytes to an HTTP client.
 
-    The first piece is computed before the status is sent, so that an error in the query gives an error status.
+    The first chunk is computed before the HTTP status is sent, so that an error in it gives an error status.
 
     Parameters
     ----------
     request : aiohttp.web.Request
-        The request to answer.
+        The HTTP request to answer.
     stream : asynchronous iterator of bytes
-        Content of the response in pieces.
+        Content of the response in chunks.
     content_type : str
-        Content type of the response.
+        HTTP content type of the response.
     file_name : str or None
         Name under which the browser saves the response; None to show it in the browser.
 
     Returns
     -------
     aiohttp.web.StreamResponse
-        The response, sent completely or aborted after an error in the stream.
+        The response. It was sent completely, or the connection was aborted, because a LakeError was raised after the
+        first chunk.
 
     Raises
     ------
     ConnectionError
-        If the client has closed the connection or does not read.
+        If the client has closed the connection, or has not read for 60 s.
+    LakeError
+        If the first chunk cannot be computed.
     """
     first = await anext(stream, b"")
     response = web.StreamResponse(headers={"Content-Type": content_type})
@@ -80,7 +90,8 @@ async def send_stream(
         async for piece in stream:
             await _write_piece(request, response, piece)
     except LakeError:
-        # Abort without the last chunk, so that the client does not take a part of the rows for the whole result.
+        # Abort the connection without the chunk that marks the end of the response. The client then reports an error,
+        # and does not take a part of the rows for the whole result.
         if request.transport is not None:
             request.transport.abort()
         return response
@@ -89,7 +100,10 @@ async def send_stream(
 
 
 async def _write_piece(request: web.Request, response: web.StreamResponse, piece: bytes) -> None:
-    """Write a piece as fast as the client reads it; raise ConnectionError if the client does not read in time."""
+    """Send bytes as fast as the client reads them.
+
+    ConnectionError is raised if the client takes more than 60 s for 256 KiB.
+    """
     view = memoryview(piece)
     for first in range(0, len(view), _WRITE_SIZE):
         try:

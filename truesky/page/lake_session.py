@@ -1,7 +1,8 @@
-"""A lake that the page shows: its tables as they were when it was opened, and the processes that answer queries.
+"""An open lake (folder with tables and images) for the web page, with the processes that answer its SQL queries.
 
-The key of the versions of its tables identifies an open lake. If new versions are published, the page reports that the
-lake has changed, but shows the old versions until the user opens the lake again.
+The versions of the tables are fixed when the lake is opened, and a hash of them (`LakeSession.key`) identifies the open
+lake. If new versions are published, the page reports that the lake has changed, but it shows the old versions until the
+user opens the lake again.
 """
 
 from __future__ import annotations
@@ -27,36 +28,39 @@ from truesky.explore.explorer import Explorer
 from truesky.explore.process import MEMORY, TIMEOUT, Process
 
 if TYPE_CHECKING:
-    # This module loads compiled code, which is slow.
+    # Import this module for type checks only, because it loads compiled code, which takes long.
     from truesky.explore.counting import ChartColumns
 
-# Largest number of queries that wait for a process; further queries are refused.
+# Largest number of SQL queries that wait for a process; further queries are refused.
 MAX_WAITING = 8
-# Number of threads for short, frequent requests (tiles, sources), and for requests that may take seconds; largest
-# number of requests that wait for each of the two pools.
-PIXEL_THREADS, TABLE_THREADS, MAX_QUEUED = 4, 2, 64
+# Number of threads for short, frequent HTTP requests, such as tiles of images.
+PIXEL_THREADS = 4
+# Number of threads for HTTP requests that may take seconds.
+TABLE_THREADS = 2
+# Largest number of HTTP requests that wait for a thread of a pool.
+MAX_QUEUED = 64
 _KEY_LENGTH = 16
-# Tables of plans and images. Their exposure numbers are unique only within one request.
+# Tables with the plans and images of a request. Their exposure numbers are unique only within one request.
 _EXPOSURE_TABLES = ("exposures", "tasks", "products")
 Item = TypeVar("Item")
 Arguments = ParamSpec("Arguments")
 
 
 class Busy(LakeError):
-    """Too many requests are waiting."""
+    """Error: too many queries or HTTP requests are waiting; the client may try again later."""
 
 
 class Closed(Busy):
-    """The lake was opened again while a request waited."""
+    """Error: the lake was opened again while a query or an HTTP request waited, so it is not answered."""
 
 
 class ProcessPool:
-    """Pool of processes, each of which answers one query at a time.
+    """Pool of query processes, each of which answers one SQL query at a time.
 
     Parameters
     ----------
     start_process : callable
-        Function that returns a new process.
+        Function without arguments that returns a new `Process`.
     number : int
         Number of processes.
     """
@@ -70,22 +74,25 @@ class ProcessPool:
 
     @asynccontextmanager
     async def process(self, is_patient: bool = False) -> AsyncIterator[Process]:
-        """Lend a free process. If its user is cancelled, a new process replaces it.
+        """Wait for a free process and lend it for the duration of an `async with` block.
+
+        If the block ends with an error other than a LakeError, for example because the client has left, the process is
+        stopped and replaced by a new one.
 
         Parameters
         ----------
         is_patient : bool, optional
-            Wait even if MAX_WAITING queries are waiting, and do not count as one of them.
+            If True, wait even if 8 queries are waiting, and do not count as one of them.
 
         Yields
         ------
         Process
-            The process.
+            Process that no other query uses.
 
         Raises
         ------
         Busy
-            If too many queries are waiting.
+            If 8 queries are waiting and `is_patient` is False.
         Closed
             If the pool has been closed.
         """
@@ -103,7 +110,8 @@ class ProcessPool:
         except LakeError:
             raise
         except BaseException:
-            # The user left in the middle of an answer. Replace the process: the next user must not get the rest.
+            # The client may have left in the middle of an answer. Replace the process, so that the next query cannot
+            # get the rest of this answer.
             process.stop()
             self._processes.discard(process)
             process = self._start_process()
@@ -119,13 +127,13 @@ class ProcessPool:
             raise Closed("the lake has been opened again")
 
     async def warm(self) -> None:
-        """Start all processes."""
+        """Start all processes with a trivial query, so that later queries need not wait for a start."""
         async with AsyncExitStack() as stack:
             processes = [await stack.enter_async_context(self.process()) for _ in range(len(self._processes))]
             await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
 
     def close(self) -> None:
-        """Stop idle processes now and busy processes when their queries end. Waiting queries raise Closed."""
+        """Stop idle processes now, and busy processes when their queries end. Queries that wait raise Closed."""
         self._is_closed = True
         for _ in range(self._free.qsize()):
             process = self._free.get_nowait()
@@ -134,14 +142,14 @@ class ProcessPool:
 
 
 class ThreadPool:
-    """Pool of threads with a limited queue.
+    """Pool of threads with a limited queue, in which blocking functions run.
 
     Parameters
     ----------
     threads : int
         Number of threads.
     max_queued : int, optional
-        Largest number of requests that wait for a thread.
+        Largest number of function calls that wait for a thread.
     """
 
     def __init__(self, threads: int, max_queued: int = MAX_QUEUED) -> None:
@@ -151,14 +159,16 @@ class ThreadPool:
     async def run(
         self, function: Callable[Arguments, Item], *arguments: Arguments.args, **keywords: Arguments.kwargs
     ) -> Item:
-        """Run a function in a thread and return its result. A cancelled caller leaves the queue.
+        """Run a function in a thread and return its result; errors of the function are raised again.
+
+        If the caller is cancelled while the function waits for a thread, the function is not run.
 
         Parameters
         ----------
         function : callable
-            The function.
+            Function to run.
         *arguments, **keywords
-            Its arguments.
+            Arguments of the function.
 
         Returns
         -------
@@ -168,7 +178,7 @@ class ThreadPool:
         Raises
         ------
         Busy
-            If too many requests are waiting.
+            If all threads are busy and the queue is full.
         Closed
             If the pool has been closed.
         """
@@ -179,27 +189,28 @@ class ThreadPool:
         except RuntimeError:
             self._slots.release()
             raise Closed("the lake has been opened again") from None
-        # Free the slot only when the thread is done, even if the caller has been cancelled.
+        # Free the place in the queue only when the thread has finished, even if the caller has been cancelled.
         future.add_done_callback(lambda _: self._slots.release())
         return await asyncio.wrap_future(future)
 
     def close(self) -> None:
-        """Accept no further requests; waiting requests are still answered."""
+        """Accept no further functions; functions that wait for a thread are still run."""
         self._threads.shutdown(wait=False)
 
 
 @dataclass(frozen=True, slots=True)
 class RequestTables:
-    """The tables of one request, including the tables that all requests share.
+    """Tables of one request (a simulation that a user asked for), including tables that all requests share.
 
     Attributes
     ----------
     request : str or None
-        Name of the request; the first name if several requests share these tables; None if no other request has tables.
+        Name of the request, or the first name if several requests have the same versions. None if the lake has no other
+        versions of the tables, so that a name is not necessary.
     names : tuple of str
-        Names of all requests that share these tables; empty in a lake without named requests.
+        Names of all requests with these versions; empty in a lake without named requests.
     versions : mapping of str to Version
-        Versions by name of the table.
+        Version of each table, by name of the table.
     """
 
     request: str | None
@@ -209,7 +220,7 @@ class RequestTables:
     def rows(
         self, table: str, columns: Sequence[str] | None = None, exposures: Collection[int] | None = None
     ) -> list[dict[str, Any]]:
-        """Read rows of a table.
+        """Read rows of a table into memory.
 
         Parameters
         ----------
@@ -218,12 +229,13 @@ class RequestTables:
         columns : sequence of str, optional
             Names of the columns. The default is all columns.
         exposures : collection of int, optional
-            Read only rows of exposures with these numbers. The default is all rows.
+            Numbers of exposures: only rows with these values in the column `exposure_id` are read. The default is all
+            rows.
 
         Returns
         -------
         list of dict
-            One dictionary per row; empty if the request has no such table.
+            One dictionary per row, by column; empty if the request has no such table.
         """
         version = self.versions.get(table)
         numbers = None if exposures is None else pa.array([*exposures], pa.int64())
@@ -231,13 +243,16 @@ class RequestTables:
         return [] if version is None else version.rows(columns, where=where).to_pylist()
 
     def iterate_rows(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Yield the rows of a table partition by partition, because a table may be larger than the memory."""
+        """Yield the rows of a table file by file, because all rows together may need more than the memory.
+
+        Nothing is yielded if the request has no such table.
+        """
         version = self.versions.get(table)
         return iter(()) if version is None else (version.rows(columns, [part]) for part in version.partitions)
 
 
 class LakeSession:
-    """An open lake with its processes and threads.
+    """An open lake with the processes and threads that answer HTTP requests about it.
 
     Parameters
     ----------
@@ -246,14 +261,14 @@ class LakeSession:
     request : str, optional
         Name of the request whose tables are shown. The default is all requests.
     memory : float, optional
-        Memory limit of each process, in bytes.
+        Memory limit of an SQL query and its result together, in bytes.
     timeout : float, optional
-        Time limit of a query, in seconds.
+        Time limit of an SQL query, in seconds.
 
     Attributes
     ----------
     key : str
-        Key of the versions of all tables; it changes if a table changes.
+        Hash of the names and versions of all tables, which identifies the open lake; it changes if a table changes.
     """
 
     def __init__(
@@ -262,32 +277,42 @@ class LakeSession:
         self.explorer = Explorer(root, memory, timeout, request)
         self.root, self.request, self.timeout = self.explorer.root, request, timeout
         self.key = digest({name: version.key for name, version in self.explorer.versions.items()})[:_KEY_LENGTH]
-        # A query of the user may take minutes. Separate processes keep it from delaying the queries of the page.
+        # An SQL query of the user may take minutes. Queries that the page needs run in a separate process, so that they
+        # do not wait for it.
         self.user_queries = ProcessPool(self.explorer.process, 2)
         self.page_queries = ProcessPool(self.explorer.process, 1)
         self.pixel_pool, self.table_pool = ThreadPool(PIXEL_THREADS), ThreadPool(TABLE_THREADS)
         self.threads = min(os.cpu_count() or 1, 8)
-        # Memory-mapped columns of charts, by selection and expressions of the axes.
+        # Memory-mapped columns of the charts. The key is the selection of rows, and then the SQL expressions.
         self.cached_columns: dict[tuple[Hashable, ...], ChartColumns] = {}
 
     @property
     def versions(self) -> Mapping[str, read.Version]:
-        """Versions of all tables by name, with and without the name of the request."""
+        """Versions of all tables, by name: "products", and "demo.products" for the table of the request "demo"."""
         return self.explorer.versions
 
     @property
     def listed_versions(self) -> Mapping[str, read.Version]:
-        """Versions by listed name: the name of the table, and REQUEST.TABLE if the versions of requests differ."""
+        """Versions of the tables in lists for the user, by name.
+
+        The name is "products" if this name is unambiguous, else "demo.products" for the table of the request "demo".
+        """
         return {name: version for name, version in sorted(self.versions.items()) if self.explorer.is_listed(name)}
 
     def find_version(self, table: str) -> read.Version:
-        """Return the version of a table; raise BadInput if the lake has no such table."""
+        """Return the version of the table with this name (such as "products" or "demo.products").
+
+        BadInput is raised if the lake has no such table, or if it cannot be opened.
+        """
         if table not in self.versions:
             raise BadInput(f"the lake has no table {table}")
         return self.versions[table]
 
     def request_tables(self, *tables: str) -> list[RequestTables]:
-        """Return the tables of each request that has any of these tables. Requests with equal versions count once."""
+        """Return all tables of each request that has at least one of the tables `tables`.
+
+        Requests with the same versions of these tables are returned once.
+        """
         request_versions: dict[str, dict[str, read.Version]] = {}
         for name, version in sorted(self.versions.items()):
             request, _, table = name.rpartition(".")
@@ -313,28 +338,32 @@ class LakeSession:
 
     @cached_property
     def observed_requests(self) -> list[RequestTables]:
-        """Tables of the requests that have a plan or images. Exposure numbers are unique within each of them."""
+        """All tables of each request that has a plan or images; exposure numbers are unique only within a request."""
         return self.request_tables(*_EXPOSURE_TABLES)
 
     def is_changed(self) -> bool:
-        """Return True if a table was added, removed or published again since the lake was opened."""
+        """Return True if a table was added, removed or published again since the lake was opened, or is damaged now."""
         try:
             return _table_keys(Explorer(self.root, request=self.request)) != _table_keys(self.explorer)
         except LakeError:
             return True
 
     async def run_query(self, text: str, parameters: Mapping[str, object] | None = None) -> pa.Table:
-        """Run a query of the page and return its result."""
+        """Run an SQL query that the page needs, and return all rows of its result.
+
+        `parameters` contains the values of $name in the text. Busy is raised if too many queries are waiting, and
+        BadInput if the query fails.
+        """
         async with self.page_queries.process() as process:
             return await asyncio.to_thread(process.ask, text, dict(parameters or {}), self.timeout)
 
     async def warm(self) -> None:
-        """Start the processes now, because the first query of each would wait for it; first those of the page."""
+        """Start all query processes now, because otherwise the first query in each would wait for its start."""
         for pool in (self.page_queries, self.user_queries):
             await pool.warm()
 
     def close(self) -> None:
-        """Stop the processes. Running queries finish with the versions of this lake."""
+        """Stop all processes and threads. Queries that are running finish with the versions of this lake."""
         self.user_queries.close()
         self.page_queries.close()
         self.pixel_pool.close()
@@ -343,12 +372,12 @@ class LakeSession:
 
 
 def _table_keys(explorer: Explorer) -> tuple[dict[str, str], set[str]]:
-    """Return the keys of the tables by name, and the names of the tables that cannot be opened."""
+    """Return the key (hash) of the version of each table by name, and the names of the tables that cannot be opened."""
     return {name: version.key for name, version in explorer.versions.items()}, {*explorer.damaged}
 
 
 async def iterate_in_thread(batches: Iterator[Item]) -> AsyncIterator[Item]:
-    """Yield the items of a blocking iterator, computed in a thread so that the event loop is not blocked."""
+    """Yield the items of a blocking iterator, which runs in a thread, so that the server can do other work."""
     sentinel = object()
     while (piece := await asyncio.to_thread(next, batches, sentinel)) is not sentinel:
         yield piece  # type: ignore[misc]

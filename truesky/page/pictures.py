@@ -1,4 +1,4 @@
-"""Images of a lake for the page: pyramids of tiles, sky coordinates, and the sources on each image."""
+"""Images of a lake for the web page: tiles of pixels at several resolutions, sky coordinates, and the drawn sources."""
 
 from __future__ import annotations
 
@@ -25,26 +25,27 @@ from truesky.render.products import pyramids, read_back
 from truesky.render.products.pyramids import TILE
 from truesky.render.products.sidecar_files import truth_file
 
-# Number of grid nodes along each side of an image. Sky coordinates are given at nodes and interpolated between them.
+# Number of grid nodes along each side of an image. The page gets sky coordinates at these nodes, and interpolates.
 _GRID_NODES = 33
+# Default of the largest number of sources that are returned for an image.
 MAX_SOURCES = 4000
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image file of the table `products`.
+    """An image file of one detector and exposure: a row of the table `products`, which lists all image files.
 
     Attributes
     ----------
     version : Version
-        Version of the table `products`.
+        Version of the table `products` that lists the file.
     row : mapping
-        Row of the file in the table.
+        Row of the file in the table, by column.
     cosmic_ray_file : str or None
-        Path of the image of cosmic rays of the same detector and exposure, if there is one.
+        Path of the truth image with the cosmic rays of the same detector and exposure; None if it does not exist.
     request_tables : RequestTables
-        Tables of the request that the image belongs to.
+        All tables of the request (the simulation) to which the image belongs.
     """
 
     version: read.Version
@@ -54,18 +55,23 @@ class Picture:
 
     @property
     def detector_key(self) -> tuple[str | None, int, str]:
-        """Request, number of the exposure, and detector; together they identify one read-out of a detector."""
+        """Name of the request (or None), number of the exposure, and name of the detector.
+
+        Together they identify one readout of a detector, of which there can be several image files.
+        """
         return self.request_tables.request, self.row["exposure_id"], self.row["detector"]
 
     @cached_property
     def can_remove_cosmic_rays(self) -> bool:
-        """True if the cosmic rays of the image can be subtracted."""
+        """True if cosmic rays can be removed: the image is a science image, and a truth image of them exists."""
         return self.row["content"] == "science" and self.cosmic_ray_file is not None
 
     def levels(self, without_cosmic_rays: bool = False) -> list[Array]:
-        """Return the image pyramid: the pixels, then repeated means of 2 x 2 pixels until one tile holds the image.
+        """Return the image at decreasing resolutions, each as a memory-mapped float32 array [ny, nx].
 
-        Each level is a memory-mapped float32 array [ny, nx].
+        Level 0 has the full resolution. Each further level contains means of 2 x 2 pixels of the one before, until the
+        image has at most 512 x 512 pixels. Pixels are in electrons, except in images of saturation flags. If
+        `without_cosmic_rays` is True, cosmic rays are removed if possible.
         """
         return self._cleaned_levels if without_cosmic_rays and self.can_remove_cosmic_rays else self._original_levels
 
@@ -78,7 +84,10 @@ class Picture:
         return self._make_levels(str(self.cosmic_ray_file))
 
     def _make_levels(self, cosmic_ray_file: str) -> list[Array]:
-        """Make or map the pyramid. The files are verified by checksum, which reads them completely, so do it once."""
+        """Return the image at decreasing resolutions, computed or from the cache; "" keeps the cosmic rays.
+
+        Call this once per image, because the files are read completely to verify their checksums.
+        """
         checksums = (
             self.version.file_sha256(self.row["path"]),
             self.version.file_sha256(cosmic_ray_file) if cosmic_ray_file else "",
@@ -90,7 +99,7 @@ class Picture:
 
     @cached_property
     def header_cards(self) -> tuple[tuple[str, Any, str], ...]:
-        """FITS header of the image as (keyword, value, comment)."""
+        """Cards of the FITS header of the image: (keyword, value, comment)."""
         return read_back.frame(self.version.sidecar_path(self.row["path"])).cards
 
     @cached_property
@@ -99,21 +108,21 @@ class Picture:
         return astrometry.from_cards(self.header_cards)
 
     def tile(self, level: int, row: int, column: int, without_cosmic_rays: bool = False) -> Array:
-        """Return one tile of the pyramid.
+        """Return one tile of the image at one of its resolutions.
 
         Parameters
         ----------
         level : int
-            Level of the pyramid; 0 is the full resolution.
+            Resolution: 0 is the full resolution, and each further level halves it.
         row, column : int
-            Indices of the tile in this level.
+            Indices of the tile in this level; the first tile of a row or column has index 0.
         without_cosmic_rays : bool, optional
-            Subtract cosmic rays if their image exists.
+            Remove cosmic rays if a truth image of them exists.
 
         Returns
         -------
-        float32 array
-            Pixels in electrons, at most 512 x 512.
+        float32 array, shape (ny, nx)
+            Pixels in electrons (flags in an image of saturation), 512 x 512 or fewer at the edges.
 
         Raises
         ------
@@ -131,7 +140,10 @@ class Picture:
 
 @lru_cache(maxsize=4)
 def pictures(lake: LakeSession) -> list[Picture]:
-    """Return all image files in the order of the tables `products`. The page refers to a file by its index here."""
+    """Return all image files of the lake, in the order of the tables `products` of its requests.
+
+    The index of a file in this list is the number by which the page refers to the image.
+    """
     images = []
     for request_tables in lake.observed_requests:
         rows = request_tables.rows("products")
@@ -153,7 +165,7 @@ def _exposure_and_detector(row: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def picture(lake: LakeSession, number: int) -> Picture:
-    """Return the image with this number; raise BadInput if it does not exist."""
+    """Return the image with this number (its index in the list of `pictures`); raise BadInput if it does not exist."""
     images = pictures(lake)
     if not 0 <= number < len(images):
         raise BadInput(f"the lake has no image {number}; it has {len(images)}")
@@ -161,7 +173,11 @@ def picture(lake: LakeSession, number: int) -> Picture:
 
 
 def list_images(lake: LakeSession) -> list[Json]:
-    """Return one description per image for the menu of the page."""
+    """Return one dictionary per image for the menu of the page.
+
+    Its keys are `number`, `is_mendable` (True if cosmic rays can be removed), `request` (name), and the columns of the
+    table `products` except `mission`.
+    """
     return [
         {
             "number": number,
@@ -174,7 +190,12 @@ def list_images(lake: LakeSession) -> list[Json]:
 
 
 def describe_image(lake: LakeSession, number: int) -> Json:
-    """Return the shape and levels of an image, sky and noise for its initial stretch, and a grid of sky coordinates."""
+    """Return the data that the page needs to show an image.
+
+    Among them are its shape `nx` and `ny`, the shapes of its `levels` (resolutions), estimates of the `sky` level and
+    the `noise` for the initial scale of brightness, a `grid` of sky coordinates, its `header`, and its `row` in the
+    table `products`. BadInput is raised if there is no image with this number.
+    """
     image = picture(lake, number)
     levels = image.levels()
     ny, nx = levels[0].shape
@@ -198,10 +219,11 @@ def describe_image(lake: LakeSession, number: int) -> Json:
 
 
 def _grid(wcs: WCS, nx: int, ny: int) -> Json:
-    """Return tangent-plane coordinates (deg, east and north of the image centre) at nodes of a grid of pixels.
+    """Return tangent-plane coordinates at the nodes of a grid of pixels, from which the page interpolates.
 
-    The keys are `ra`, `dec` (centre), `x`, `y` (pixels of the nodes, [n]), `xi` and `eta` (coordinates, [n, n]).
-    Tangent-plane coordinates are smooth and, unlike RA, do not jump at 360 degrees.
+    The keys are `ra`, `dec` (centre of the image, deg), `x`, `y` (columns and rows of the nodes, pixels, n values
+    each), and `xi`, `eta` (coordinates to the east and north of the centre, deg, n * n values each, row by row). Unlike
+    RA, such coordinates do not jump at 360 degrees.
     """
     x, y = np.linspace(-0.5, nx - 0.5, _GRID_NODES), np.linspace(-0.5, ny - 0.5, _GRID_NODES)
     (ra0,), (dec0,) = astrometry.sky_of_pixel(wcs, [(nx - 1) / 2], [(ny - 1) / 2])
@@ -213,19 +235,19 @@ def _grid(wcs: WCS, nx: int, ny: int) -> Json:
 
 
 def to_tangent_plane(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Float, Float]:
-    """Project positions onto a tangent plane.
+    """Project positions on the sky onto a tangent plane (gnomonic projection).
 
     Parameters
     ----------
     ra, dec : float array, shape (n,)
-        Positions in degrees.
+        Positions in degrees, less than 90 degrees from the tangent point; this is not checked.
     ra0, dec0 : float
-        Point where the plane touches the sphere, in degrees.
+        Tangent point, where the plane touches the sphere, in degrees.
 
     Returns
     -------
     east, north : float array, shape (n,)
-        Coordinates in the plane relative to this point, in degrees.
+        Coordinates in the plane relative to the tangent point, in degrees.
     """
     a, d, d0 = np.radians(ra - ra0), np.radians(dec), np.radians(dec0)
     depth = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * np.cos(a)
@@ -234,22 +256,29 @@ def to_tangent_plane(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Fl
 
 
 def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCES) -> Json:
-    """Return the brightest sources of an image.
+    """Return the brightest sources that were drawn on an image.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     number : int
-        Number of the image.
+        Number of the image, see `pictures`.
     max_sources : int, optional
-        Largest number of sources.
+        Largest number of sources to return.
 
     Returns
     -------
     dict
-        `total` (number of sources on the image) and lists with one value per source: `id`, pixel `x` and `y`, electrons
-        `expected` and `drawn`, and `kind`. The brightest source comes first.
+        `total` (number of sources on the image), and lists with one value per source: `id` (text), pixel coordinates
+        `x` and `y`, `expected` (electrons expected in the exposure, on and off the detector), `drawn` (electrons drawn
+        on the image) and `kind` (type of the source, such as "star"). The source with the most expected electrons comes
+        first.
+
+    Raises
+    ------
+    BadInput
+        If there is no image with this number.
     """
     image = picture(lake, number)
     exposure, detector = image.row["exposure_id"], image.row["detector"]
@@ -264,7 +293,7 @@ def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCE
     }
 
 
-# Names of the kinds of sources, by the code in their identifiers.
+# Names of the kinds (types) of sources, such as "star", by the code in the first bits of an identifier.
 KIND_NAMES = {int(code): name for code, name in GALAXIES.column("kind").codes} | {5: "star", 6: "moving body"}
 
 
@@ -273,7 +302,11 @@ def _kind_names(rows: pa.Table) -> list[str]:
 
 
 def failed_detectors(lake: LakeSession, request_tables: RequestTables) -> list[Json]:
-    """Return rows of the detectors of a request whose last attempt failed; empty if there is no log of a run."""
+    """Return one dictionary per detector of a request whose last attempt to render it failed.
+
+    Its keys are the columns of `truesky.render.archive.failures`, such as `error`. The list is empty if no run has left
+    a log, or if a log is damaged.
+    """
     try:
         return [row for name in request_tables.names or [None] for row in archive.failures(lake.root, name).to_pylist()]
     except LakeError:
@@ -281,14 +314,17 @@ def failed_detectors(lake: LakeSession, request_tables: RequestTables) -> list[J
 
 
 def is_north_up(lake: LakeSession, number: int) -> bool:
-    """Return True if declination increases with the row number of an image."""
+    """Return True if declination increases with the row number at the first pixel of an image.
+
+    BadInput is raised if there is no image with this number.
+    """
     image = picture(lake, number)
     _, dec = astrometry.sky_of_pixel(image.wcs, [0.0, 0.0], [0.0, 1.0])
     return bool(dec[1] > dec[0])
 
 
 def images_at(lake: LakeSession, ra: float, dec: float) -> list[tuple[int, float, float]]:
-    """Find the images that contain a position.
+    """Find the images that contain a position on the sky.
 
     Parameters
     ----------
@@ -300,12 +336,13 @@ def images_at(lake: LakeSession, ra: float, dec: float) -> list[tuple[int, float
     Returns
     -------
     list of (int, float, float)
-        Number of the image, column and row of the position; 0 is the centre of the first pixel.
+        Number of the image, and column and row of the position in it (0 is the centre of the first pixel). Empty if no
+        image contains the position.
     """
     images = pictures(lake)
     regions = pa.table({"number": range(len(images)), "s_region": [str(image.row["s_region"]) for image in images]})
     matches = []
-    # Open only images whose footprint contains the position.
+    # Test the footprints in the table first, so that only the files of images that may contain the position are opened.
     for number in archive.rows_at_place(regions, ra, dec)["number"].to_pylist() if images else []:
         image = images[number]
         (x,), (y,) = astrometry.pixel_of_sky(image.wcs, [ra], [dec])

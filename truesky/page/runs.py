@@ -1,7 +1,7 @@
-"""Answers to the page about the runs of a lake.
+"""Answers to the web page about the computations that filled a lake.
 
-They contain the cost of the jobs with its forecast, the progress and failures of rendering, the changed parameters of
-the mission, and the provenance of an image.
+They contain the time and disc space of the jobs with their forecasts, the progress and failures of rendering, the
+mission parameters (of telescope, cameras and survey) that users changed, and the provenance of an image.
 """
 
 from __future__ import annotations
@@ -27,7 +27,13 @@ Json = dict[str, Any]
 
 
 def runs(lake: LakeSession) -> Json:
-    """Return the jobs with their forecasts, the numbers of finished tasks, failures and changed mission parameters."""
+    """Return the state of all computations of the lake.
+
+    The keys of the result are `jobs` (time, memory and disc space of each job, measured and forecast), `tasks` (per
+    request the numbers of planned and of finished detectors, and the forecast CPU time of the others in s), `failures`
+    (detectors whose last attempt failed) and `mission` (mission parameters that a request has changed). If the logs
+    cannot be read, `jobs` is empty, and `said` is the reason.
+    """
     result: Json = {"jobs": [], "tasks": [], "failures": [], "mission": []}
     try:
         result["jobs"] = [
@@ -57,7 +63,10 @@ def runs(lake: LakeSession) -> Json:
 
 
 def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -> tuple[int, float]:
-    """Return the number of planned detectors that are not rendered yet, and the forecast of their CPU time (s)."""
+    """Return the number of planned detector images that do not exist yet, and the forecast of their CPU time in s.
+
+    `done` contains the number of the exposure and the name of the detector for each existing image.
+    """
     begun = pa.array([*{exposure for exposure, _ in done}], pa.int64())
     number, seconds = 0, 0.0
     for rows in request_tables.iterate_rows("tasks", ["exposure_id", "detector", "seconds"]):
@@ -71,7 +80,11 @@ def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -
 
 
 def _overridden_parameters(version: read.Version) -> list[Json]:
-    """Mission parameters that a request has changed, with their default values when the version was made."""
+    """Return the mission parameters (of telescope, cameras or survey) that a request has changed.
+
+    `version` is the request's version of the table `mission`. Each dictionary has `name`, `value`, `unit`, and `usual`,
+    the default value in the mission database of the running truesky (None if this database has no such parameter).
+    """
     rows = version.rows(["name", "value", "unit", "overridden"]).to_pylist()
     defaults = resolve()
     return [
@@ -83,19 +96,26 @@ def _overridden_parameters(version: read.Version) -> list[Json]:
 
 
 def provenance(lake: LakeSession, number: int) -> Json:
-    """Return the provenance of an image as a tree: image, version of its table, versions of the inputs, and so on.
+    """Return the provenance of an image as a tree.
+
+    The root is the image file. Its child is the version of the table `products` that lists the file. The children of a
+    version are the versions of other tables from which it was computed, and so on.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     number : int
-        Number of the image in `pictures.pictures`.
+        Number of the image: its index in the list of `pictures.pictures`.
 
     Returns
     -------
     dict
-        A node with `name`, `about` (a description) and `from` (list of nodes).
+        A node of the tree with `name`, `about` (a text) and `from` (list of child nodes).
+
+    Notes
+    -----
+    BadInput is raised if there is no image with this number.
     """
     image = pictures.picture(lake, number)
     return {

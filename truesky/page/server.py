@@ -1,6 +1,7 @@
-"""HTTP server of the page: maps addresses to handlers.
+"""HTTP server of the web page of a lake (the folder with all tables and images): maps addresses to handlers.
 
-The modules of the handlers take long to import. They are imported on first use, or after the first sky map was sent.
+The modules that the handlers use take long to import. They are imported on first use, or after the first sky map has
+been sent.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from truesky.page.tap import service
 
 _STATIC = Path(__file__).with_name("static")
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-# Start the query processes after the first sky map, but at the latest after this time (s).
+# The query processes start after the first sky map has been sent, but at the latest this time (s) after the server.
 _FIRST_SKY_TIMEOUT = 3.0
 LakeHandler = Callable[[LakeSession, web.Request], Awaitable[web.StreamResponse]]
 
 
 class Server:
-    """Server of the page and of TAP for one lake, which can be opened again while the server runs.
+    """Server of the web page and of the TAP service for one lake, which can be opened again while the server runs.
 
     Parameters
     ----------
     open_lake : callable
-        Function that opens the lake and returns a LakeSession.
+        Function without arguments that opens the lake and returns a new `LakeSession`.
     access : AccessRules
-        Rules of access.
+        Host names and tokens that HTTP requests must have.
     """
 
     def __init__(self, open_lake: Callable[[], LakeSession], access: AccessRules) -> None:
@@ -46,7 +47,7 @@ class Server:
         self._opening, self._first_sky_shown = asyncio.Lock(), asyncio.Event()
 
     def application(self) -> web.Application:
-        """Return the aiohttp application with all routes."""
+        """Return the aiohttp application with all addresses of the page and of the TAP service."""
         app = web.Application(middlewares=[self.access.middleware, _errors_to_json], client_max_size=MAX_BODY_BYTES)
         app.on_response_prepare.append(add_security_headers)
         app.on_startup.append(self._start_warm_up)
@@ -64,7 +65,10 @@ class Server:
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
     async def _warm_up(self) -> None:
-        """Start the query processes after the first sky map is sent, because starting them earlier would delay it."""
+        """Import the modules of the handlers and start the query processes.
+
+        This begins after the first sky map has been sent, or after 3 s, because it would delay that map.
+        """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._first_sky_shown.wait(), _FIRST_SKY_TIMEOUT)
         await asyncio.to_thread(_import_handlers)
@@ -77,7 +81,10 @@ class Server:
         self.lake.close()
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        """Send a file of the page. Only files in the folder static/ are found; a name with a path is refused."""
+        """Send an HTML, CSS, JavaScript or SVG file of the page.
+
+        Only files directly in the folder static/ can be sent. Other names, also those with a path, get status 404.
+        """
         name = request.match_info.get("name", "index.html")
         files = {path.name: path for path in _STATIC.iterdir() if path.suffix in _TYPES}
         if name not in files:
@@ -91,9 +98,14 @@ class Server:
         return answers.json_response({**answers.describe_lake(lake), "is_changed": is_changed, "tap": tap_address})
 
     async def _reopen_lake(self, request: web.Request) -> web.StreamResponse:
-        """Open the lake again if it has changed. Requests with the key of the previous lake are refused from now on."""
+        """Open the lake again if one of its tables has changed, and send its description.
+
+        After a change, HTTP requests with the key of the previous state get the status 409, so that the page loads all
+        data again.
+        """
         async with self._opening:
-            # If two requests come at the same time, the second finds an unchanged lake.
+            # The lock makes sure that the lake is opened only once if two clients ask for it at the same time: the
+            # second request then finds an unchanged lake.
             if await self.lake.table_pool.run(self.lake.is_changed):
                 previous, self.lake = self.lake, await self.lake.table_pool.run(self._open_lake)
                 previous.close()
@@ -113,7 +125,7 @@ class Server:
 
 
 def _import_handlers() -> None:
-    """Import the modules of the handlers before their first request."""
+    """Import the modules of the handlers, so that their first HTTP request need not wait for it."""
     from truesky.page import charts, pictures, runs, sources  # noqa: F401
     from truesky.page.tap import images  # noqa: F401
 
@@ -122,7 +134,11 @@ def _import_handlers() -> None:
 async def _errors_to_json(
     request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
 ) -> web.StreamResponse:
-    """Turn errors into JSON responses: 409 lake opened again, 429 busy, 400 bad input, 500 damaged lake or disc."""
+    """Call a handler and turn its errors into JSON responses with an HTTP status.
+
+    The status is 409 if the lake was opened again, 429 if too many requests are waiting, 400 for wrong input, and 500
+    if the lake is damaged, a disc fails or the memory is exhausted.
+    """
     try:
         return await handler(request)
     except Closed as error:
@@ -133,9 +149,6 @@ async def _errors_to_json(
         return web.json_response({"error": str(error)}, status=400)
     except (LakeError, OSError, MemoryError) as error:
         return web.json_response({"error": str(error) or type(error).__name__}, status=500)
-
-
-# ------------------------------------------------------------------------------------------------ handlers
 
 
 async def _read_json(request: web.Request) -> dict[str, Any]:
@@ -255,16 +268,17 @@ async def _nearest(lake: LakeSession, request: web.Request) -> web.StreamRespons
 
 
 def _json_handler(function: Callable[..., Any], *names: str, is_small: bool = False) -> LakeHandler:
-    """Make a handler that runs a function in a thread and sends its result as JSON.
+    """Return an HTTP handler that runs a function in a thread and sends its result as JSON.
 
     Parameters
     ----------
     function : callable
-        Function of the lake and of the named parts of the address.
+        Function whose first argument is the open lake, followed by one argument for each of `names`.
     *names : str
-        Names of these parts.
+        Names of variable parts of the HTTP path, such as "id" in source/{id}. They are passed to the function as text,
+        and "number" as an integer.
     is_small : bool, optional
-        Use the threads for short, frequent requests.
+        If True, use the threads for short, frequent HTTP requests.
 
     Returns
     -------

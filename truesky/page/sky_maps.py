@@ -1,6 +1,7 @@
-"""Sky maps of a lake: densities in HEALPix cells, sources in a small field, footprints of exposures and detectors.
+"""Data of the sky maps of the web page: densities in HEALPix cells, sources in a field, footprints of exposures.
 
-Functions import the modules of the renderer only when they need them, so that the first map is shown early.
+The modules of the renderer take long to import. They are imported inside the functions, so that the first map, which
+does not need them, is shown early.
 """
 
 from __future__ import annotations
@@ -24,20 +25,30 @@ from truesky.page.lake_session import LakeSession, RequestTables
 
 _CIRCLE_COLUMNS = ("exposure_id", "ra", "dec", "radius")
 _TASK_COLUMNS = (*_CIRCLE_COLUMNS, "s_region")
-MAX_CELLS, MAX_SOURCES = 200_000, 20_000
+# Largest number of HEALPix cells of a map.
+MAX_CELLS = 200_000
+# Largest number of sources that `sources_in_view` returns.
+MAX_SOURCES = 20_000
+# Largest HEALPix order of a map.
 _MAX_ORDER = 16
+# Largest number of exposures whose footprints are returned at once.
 MAX_EXPOSURES = 20_000
-# If a plan has more than LARGE_PLAN detectors, only detectors near the view are read. Their exposures, at most
-# MAX_LOOKED_UP, have boresights within MAX_CAMERA_RADIUS degrees of the edge of the view.
-LARGE_PLAN, MAX_LOOKED_UP, MAX_CAMERA_RADIUS = 200_000, 1_000, 2.0
+# If a request plans more detector images than this, the map reads only the planned exposures that may be in view.
+LARGE_PLAN = 200_000
+# Largest number of exposures in view whose detectors are read if the request plans more than LARGE_PLAN images.
+MAX_LOOKED_UP = 1_000
+# An exposure may be in view if its pointing is within this angle (deg) of the edge of the view.
+MAX_CAMERA_RADIUS = 2.0
 Json = dict[str, Any]
-# Columns by which the sources in a field are ordered; the first one that the table has is used. Sources come in
-# ascending order (1, magnitudes) or descending order (-1, masses).
+# Columns by which the sources in a field can be sorted, brightest or most massive first: the name, and 1 for ascending
+# order (magnitudes) or -1 for descending order (masses). The first column that the table has is used.
 _SORT_COLUMNS = (("mag_r01", 1), ("mag_h", 1), ("phot_g_mean_mag", 1), ("log_mass", -1))
 
 
 def partition_density(lake: LakeSession, table: str) -> bytes:
-    """Return the mean density of a catalogue in the cell of each of its files. Only the manifest is read.
+    """Return a coarse density map of a catalogue: the mean density in the HEALPix cell of each of its files.
+
+    This is fast, because the numbers of rows are in the manifest (the list of the files), and no file is read.
 
     Parameters
     ----------
@@ -49,7 +60,9 @@ def partition_density(lake: LakeSession, table: str) -> bytes:
     Returns
     -------
     bytes
-        Packed cells as in `density`, in sources per deg2. The header has `cells` and `rows`.
+        The length of the header (4 bytes), the header (JSON), the corners of the cells in degrees (float32
+        [n, 4, 2]), and the number of sources per deg2 (float32 [n]). The header has `cells` (n) and `rows` (the number
+        of sources).
 
     Raises
     ------
@@ -81,31 +94,32 @@ async def density(
     order : int
         HEALPix order of the cells, 0 to 16.
     where : str
-        SQL condition that selects rows.
-    view : float array or None
+        SQL condition that selects rows; "true" for all rows.
+    view : float array, shape (3,), or None
         RA, Dec and radius of the field in degrees; None for the whole sky.
     value : str, optional
-        SQL expression whose mean per cell is returned instead of the density.
+        SQL expression whose mean per cell is returned; by default the density is returned.
 
     Returns
     -------
     bytes
         The length of the header (4 bytes), the header (JSON), the corners of the cells in degrees (float32
-        [n, 4, 2]), and the number of rows per deg2 or the mean (float32 [n]). The header has `cells`, `order`, `rows`
-        and `missing`, the number of rows without a finite value, which do not enter the mean.
+        [n, 4, 2]), and the number of rows per deg2 or the mean (float32 [n]). The header has `cells` (n), `order`,
+        `rows` (the number of rows) and `missing` (the number of rows without a finite value, which do not enter the
+        mean).
 
     Raises
     ------
     BadInput
-        If the order is outside its limits, the table has no positions, an expression is refused, or more than
-        MAX_CELLS cells contain rows.
+        If the order is outside its limits, the lake has no such table, the table has no positions, `where` or `value`
+        is not exactly one valid SQL expression, or more than 200,000 cells contain rows.
     """
     if not 0 <= order <= _MAX_ORDER:
         raise BadInput(f"order = {order} is outside [0, {_MAX_ORDER}]")
     shift = 2 * (sky.MAX_ORDER - order)
     aggregate = "count(*)::DOUBLE AS told, 0 AS lost"
     if value is not None:
-        # A single NaN would turn the mean of its cell into NaN.
+        # Values that are not finite are left out: a single NaN would make the mean of its cell NaN.
         number = f"TRY_CAST(({value}\n) AS DOUBLE)"
         finite = f"FILTER (isfinite({number}))"
         aggregate = f"avg({number}) {finite} AS told, count(*) - count(*) {finite} AS lost"
@@ -132,21 +146,23 @@ def coverage(lake: LakeSession, order: int, view: Float | None, band: str | None
         The open lake.
     order : int
         HEALPix order of the cells, 0 to 16.
-    view : float array or None
+    view : float array, shape (3,), or None
         RA, Dec and radius of the field in degrees; None for the whole sky.
     band : str or None
-        Passband of the exposures; None for all.
+        Passband of the exposures; None for all exposures.
 
     Returns
     -------
     bytes
-        Packed cells as in `density`, with the number of exposures. The header has `cells`, `order` and `rows`, the
-        number of planned detectors.
+        The length of the header (4 bytes), the header (JSON), the corners of the covered cells in degrees (float32
+        [n, 4, 2]), and their numbers of exposures (float32 [n]). The header has `cells` (n), `order` and `rows` (the
+        number of planned detector images, on the whole sky).
 
     Raises
     ------
     BadInput
-        If the order is outside its limits, or more than MAX_CELLS cells are covered.
+        If the order is outside its limits, or more than 200,000 cells are covered. For the whole sky, also if the
+        circles around all planned detectors touch more cells.
     """
     from truesky.render.camera import footprints
 
@@ -172,9 +188,9 @@ def coverage(lake: LakeSession, order: int, view: Float | None, band: str | None
 
 
 def _planned_tasks(lake: LakeSession, band: str | None, columns: Sequence[str]) -> Iterator[pa.Table]:
-    """Yield the planned tasks of a band (None for all bands), partition by partition.
+    """Yield the planned detector images in a passband (None for all), as rows of the table `tasks`.
 
-    A plan that several requests share is read once.
+    Each yielded table contains the rows of one file of the plan. A plan that several requests share is read once.
     """
     for request_tables in {
         request_tables.versions["tasks"].key: request_tables
@@ -190,7 +206,7 @@ def _planned_tasks(lake: LakeSession, band: str | None, columns: Sequence[str]) 
 
 
 def bands(lake: LakeSession) -> list[str]:
-    """Return the sorted names of the passbands of all planned exposures."""
+    """Return the sorted names of the passbands of all planned exposures, each once."""
     tables = (
         rows
         for request_tables in lake.observed_requests
@@ -209,7 +225,7 @@ def _corners(order: int, cells: Int) -> Float:
 
 
 async def sources_in_view(lake: LakeSession, table: str, view: Float, where: str) -> Json:
-    """Return the brightest (or most massive) sources of a catalogue in a field.
+    """Return the brightest (or most massive) sources of a catalogue in a circular field, at most 20,000.
 
     Parameters
     ----------
@@ -217,22 +233,23 @@ async def sources_in_view(lake: LakeSession, table: str, view: Float, where: str
         The open lake.
     table : str
         Name of a catalogue.
-    view : float array
+    view : float array, shape (3,)
         RA, Dec and radius of the field in degrees.
     where : str
-        SQL condition that selects rows.
+        SQL condition that selects rows; "true" for all rows.
 
     Returns
     -------
     dict
-        Lists with one value per source: `ra`, `dec` (deg), `id` (string), `mag` and `kind`. `by` is the name of the
-        column in `mag`, a magnitude or a mass, or None; `sense` is 1 if sources are in ascending order of it, -1 if in
-        descending order. `total` is the number of sources in the field, `most` the largest number that is returned.
+        Lists with one value per source: `ra`, `dec` (deg), `id` (text), `mag`, and `kind` (code of the source type, or
+        None). `by` is the name of the table's column in `mag`, a magnitude or a log10 mass, or None if the table has
+        neither. `sense` is 1 if sources are in ascending order of `mag`, and -1 if in descending order. `total` is the
+        number of sources in the field, and `most` the largest number that is returned.
 
     Raises
     ------
     BadInput
-        If the lake has no such table, the table has no positions, or the condition is refused.
+        If the lake has no such table, the table has no positions, or `where` is not exactly one valid SQL expression.
     """
     version = lake.find_version(table)
     names = version.schema.names
@@ -269,7 +286,11 @@ def _catalogue_name(lake: LakeSession, table: str) -> str:
 
 
 def _view_condition(view: Float | None) -> str:
-    """SQL condition that a row lies in a cell that touches the view, so that DuckDB can skip files and row groups."""
+    """Return an SQL condition on the HEALPix cell of a row, with which DuckDB skips files outside the view.
+
+    `view` is RA, Dec and radius of a circle in degrees. The condition is true for all rows in the circle and for some
+    outside it; it is "true" if `view` is None.
+    """
     if view is None:
         return "true"
     return adql.cone_condition("_healpix_29", *(float(number) for number in view))
@@ -279,11 +300,8 @@ def _pack_cells(corners: Float, density: Float, header: Json) -> bytes:
     return pack({**header, "cells": len(density)}, np.asarray(corners, "<f4"), np.asarray(density, "<f4"))
 
 
-# ------------------------------------------------------------------------------------------------ footprints
-
-
 def regions(lake: LakeSession) -> list[Json]:
-    """Return the footprint of each planned or rendered detector, with its state and its images.
+    """Return the footprint on the sky of each planned or rendered detector image, with its state.
 
     Parameters
     ----------
@@ -294,23 +312,25 @@ def regions(lake: LakeSession) -> list[Json]:
     -------
     list of dict
         One entry per detector and exposure: `request` (None unless requests have different plans or images),
-        `exposure_id`, `detector`, `channel`, `band`, `polygon` (corners in degrees), `state` ("planned", "observed" or
-        "failed"), `error` (only if failed), `images` (numbers) and `contents` (content of each image). Images without
-        a plan are listed, too. A large plan is listed only for exposures with images.
+        `exposure_id`, `detector`, `channel`, `band`, `polygon` (RA and Dec of the corners in degrees), `state`
+        ("planned", "observed" or "failed"), `error` (only if failed), `images` (numbers of the image files, see
+        `pictures.pictures`) and `contents` (content of each file, such as "science"). Images without a plan are listed,
+        too. If a request plans more than 200,000 detector images, only exposures that have an image are listed.
     """
     failures = _failure_messages(lake)
     return [_current_region(place, region, failures) for place, region in _known_regions(lake).items()]
 
 
-# Key of a footprint: request, number of the exposure, detector.
+# Identifies a detector image: name of the request (or None), number of the exposure, name of the detector.
 _DetectorKey = tuple[str | None, int, str]
 
 
 @lru_cache(maxsize=4)
 def _known_regions(lake: LakeSession) -> Mapping[_DetectorKey, Json]:
-    """Footprints of planned and rendered detectors, which do not change while the lake is open.
+    """Return the footprints of planned and rendered detector images, with the state "planned" or "observed".
 
-    A large plan is included only for exposures with images.
+    The result is cached, because it does not change while the lake is open. If a request plans more than 200,000
+    detector images, only exposures that have an image are included.
     """
     from truesky.page import pictures
 
@@ -338,7 +358,10 @@ def _is_large(request_tables: RequestTables) -> bool:
 def _planned_regions(
     request_tables: RequestTables, exposure_ids: Collection[int] | None = None
 ) -> dict[_DetectorKey, Json]:
-    """Footprints of the planned detectors of some exposures of a request; None for all exposures."""
+    """Return the footprints of the planned detector images of a request.
+
+    `exposure_ids` selects exposures by number; None selects all.
+    """
     band_by_exposure = {
         row["exposure_id"]: row["band"]
         for row in request_tables.rows("exposures", ("exposure_id", "band"), exposure_ids)
@@ -359,7 +382,11 @@ def _planned_regions(
 
 
 def _regions_in_view(lake: LakeSession, view: Float | None) -> dict[_DetectorKey, Json]:
-    """Footprints of detectors of large plans that may be in view; raise BadInput if there are too many."""
+    """Return the footprints of planned detector images that may be in view, for requests with large plans only.
+
+    `view` is RA, Dec and radius of a circle in degrees; None is the whole sky. A plan is large if it has more than
+    200,000 detector images. BadInput is raised if more than 1,000 exposures of such a plan may be in view.
+    """
     regions_by_key: dict[_DetectorKey, Json] = {}
     for request_tables in filter(_is_large, lake.observed_requests):
         exposures = request_tables.versions["exposures"].rows(("exposure_id", "ra", "dec"))
@@ -379,7 +406,11 @@ def _refuse_many_exposures(exposures: int, max_exposures: int) -> None:
 
 
 def _failure_messages(lake: LakeSession) -> dict[tuple[str | None, str], str]:
-    """Error messages of failed tasks by request and task. They are read each time, because runs may be in progress."""
+    """Return the error messages of detectors whose rendering failed.
+
+    The keys are the name of the request (or None) and the name of the detector's table file in lower case, such as
+    "000012-det22.parquet" for exposure 12. The logs are read at each call, because rendering may be in progress.
+    """
     from truesky.page import pictures
 
     return {
@@ -403,32 +434,32 @@ def _detector_region(request_tables: RequestTables, row: Mapping[str, Any]) -> J
 
 
 def exposure_footprints(lake: LakeSession, view: Float | None = None) -> list[Json]:
-    """Return the footprints of exposures, each the convex hull of its detectors.
+    """Return the footprints of exposures on the sky, each the convex hull of its detectors.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
-    view : float array, optional
+    view : float array, shape (3,), optional
         RA, Dec and radius of the field in degrees. The default is the whole sky.
 
     Returns
     -------
     list of dict
         One entry per exposure: `request`, columns of the table `exposures`, `state` ("planned", "partly", "observed" or
-        "failed"), the numbers of detectors that are `done`, that `failed` and of `all`, and `outline` (list of
-        polygons, corners in degrees).
+        "failed"), the numbers of detector images that are `done`, that `failed`, and of `all`, and `outline` (a list
+        with one polygon: RA and Dec of the corners in degrees).
 
     Raises
     ------
     BadInput
-        If more than MAX_EXPOSURES exposures are in view.
+        If more than 20,000 exposures are in view, or more than 1,000 of a plan with more than 200,000 detector images.
     """
     regions_by_key, (descriptions, detector_keys, circles) = _known_regions(lake), _cached_outlines(lake)
     if added_regions := _regions_in_view(lake, view):
         regions_by_key = {**added_regions, **regions_by_key}
         descriptions, detector_keys, circles = _outline_exposures(lake, regions_by_key)
-    # Select exposures whose circumscribed circle overlaps the circle in view.
+    # Select exposures whose circle (around the corners of all detectors) overlaps the circle in view.
     in_view = np.full(len(descriptions), True)
     if view is not None:
         in_view = sky.separation(circles[:, 0], circles[:, 1], view[0], view[1]) <= circles[:, 2] + view[2]
@@ -465,9 +496,10 @@ def _cached_outlines(lake: LakeSession) -> tuple[list[Json], list[list[_Detector
 def _outline_exposures(
     lake: LakeSession, regions_by_key: Mapping[_DetectorKey, Json]
 ) -> tuple[list[Json], list[list[_DetectorKey]], Float]:
-    """Return for each exposure its description, its detectors, and a circle around their corners.
+    """Group the footprints of detector images by exposure.
 
-    The circles are an array [n, 3]: RA, Dec and radius in degrees.
+    Return for each exposure its description, the keys of its detector images in `regions_by_key`, and a circle that
+    contains their corners. The circles are an array [n, 3]: RA, Dec and radius in degrees.
     """
     detectors = dict[tuple[str | None, int], list[_DetectorKey]]()
     for detector_key in regions_by_key:
@@ -506,15 +538,16 @@ def _state(done: int, failed: int, number: int) -> str:
 
 
 def _mean_position(corners: Float) -> tuple[float, float]:
-    """RA and Dec (deg) of the mean of the unit vectors of the corners."""
+    """Return RA and Dec (deg) of the mean of the unit vectors of positions [n, 2], given as RA and Dec in deg."""
     x, y, z = sky.unit_vectors(corners[:, 0], corners[:, 1]).mean(0)
     return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
 def _convex_hull(corners: Float) -> Float:
-    """Return the corners [n, 2] (deg) of the convex hull on the sphere, counter-clockwise with north up and east left.
+    """Return the corners of the convex hull of positions on the sphere, [n, 2] RA and Dec in deg.
 
-    In a tangent plane great circles are straight lines. If all corners lie on one line, its two ends are returned.
+    The order is counter-clockwise with north up and east to the left. If all positions lie on one great circle, its
+    two ends are returned. The hull is computed in a tangent plane, where great circles are straight lines.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -522,7 +555,8 @@ def _convex_hull(corners: Float) -> Float:
 
     plane = np.stack(pictures.to_tangent_plane(corners[:, 0], corners[:, 1], *_mean_position(corners)), axis=1)
     try:
-        # East is to the left of north, so reverse the order of the plane.
+        # ConvexHull returns corners counter-clockwise with east to the right. On the sky east is to the left, so the
+        # order is reversed.
         hull: Float = corners[ConvexHull(plane).vertices[::-1]]
     except QhullError:
         hull = corners[np.lexsort((plane[:, 1], plane[:, 0]))[[-1, 0]]]

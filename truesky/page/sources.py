@@ -1,4 +1,4 @@
-"""Answers to the page about one source: its rows, its observed spectrum, its images and traces, and cutouts."""
+"""Answers to the web page about one galaxy or star: its table rows, spectrum, images, cutouts and dispersed traces."""
 
 from __future__ import annotations
 
@@ -21,16 +21,19 @@ from truesky.page.answers import pack, to_json_value
 from truesky.page.lake_session import LakeSession, RequestTables
 
 _TABLES_BY_KIND = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
-# Approximate number of wavelengths at which a spectrum is shown.
+# Spectra are averaged to about this number of wavelengths.
 _SPECTRUM_SAMPLES = 2400
+# Width and height of a cutout, pixels.
 _CUTOUT_SIDE = 64
-# Rows on each side of a trace in a strip (pixels), and largest number of columns along the trace.
-_STRIP_HALF_WIDTH, _MAX_STRIP_LENGTH = 12, 4096
+# Number of pixels that a straightened spectrum shows on each side of its trace.
+_STRIP_HALF_WIDTH = 12
+# Largest number of pixels that a straightened spectrum shows along its trace.
+_MAX_STRIP_LENGTH = 4096
 Json = dict[str, Any]
 
 
 def describe_source(lake: LakeSession, identifier_text: str) -> Json:
-    """Describe a source: its kind, its rows with units, and the detectors on which it was drawn or dispersed.
+    """Describe a source: its type, its table rows with units, and the detectors on which it was drawn or dispersed.
 
     Parameters
     ----------
@@ -42,14 +45,15 @@ def describe_source(lake: LakeSession, identifier_text: str) -> Json:
     Returns
     -------
     dict
-        `id`, `kind`, `request`, `tables` (columns of its row by table), `drawn` (rows of `rendered_truth`), `spectra`
-        (rows of `rendered_spectra` with lines) and, if it is in a catalogue, `place` (RA and Dec in degrees) and
-        `images` (images that contain this position).
+        `id`, `kind` (type of the source, such as "star"), `request` (name of the request, or None), `tables` (for each
+        table a list of the columns of the source's row), `drawn` (rows of the table `rendered_truth`), `spectra` (rows
+        of the table `rendered_spectra` with emission lines). If the source is in a catalogue, also `place` (RA and Dec
+        in degrees) and `images` (images that contain this position).
 
     Raises
     ------
     BadInput
-        If the identifier is invalid, or the lake has no such source.
+        If the text is not an integer from 0 to 2^63 - 1, or the lake has no such source.
     """
     identifier = _parse_identifier(identifier_text)
     kind = int(ids.kind_from_id(np.array([identifier]))[0])
@@ -88,15 +92,16 @@ def describe_source(lake: LakeSession, identifier_text: str) -> Json:
 
 
 def _matching_rows(request_tables: RequestTables, table: str, condition: ds.Expression) -> list[Json]:
-    """Rows of a table of a request that meet a condition; empty if the request has no such table."""
+    """Return the rows of a request's table that meet a condition, as dictionaries; [] if there is no such table."""
     version = request_tables.versions.get(table)
     return [] if version is None else version.rows(where=condition).to_pylist()
 
 
 def _redshift(request_tables: RequestTables, identifier: int, rows: Mapping[str, pa.Table]) -> float:
-    """Redshift of a galaxy in the catalogue of a request, else in `rows`; 0 if it is in neither.
+    """Return the observed redshift of a galaxy, or 0 if it is not in a catalogue.
 
-    Requests may have different universes, so `rows`, which may belong to another request, are the second choice.
+    It is read from the table `galaxies` of the request. If the request has no such table, it is taken from the rows of
+    another request in `rows`, which may be from another simulated universe.
     """
     version = request_tables.versions.get("galaxies")
     row = rows.get("galaxies") if version is None else _source_rows(version, identifier)
@@ -104,7 +109,12 @@ def _redshift(request_tables: RequestTables, identifier: int, rows: Mapping[str,
 
 
 def _describe_trace(lake: LakeSession, request_tables: RequestTables, row: Json, z: float) -> Json:
-    """Describe a row of `rendered_spectra`: the images that contain the trace, and its lines by name."""
+    """Describe a dispersed spectrum on a detector: its row of the table `rendered_spectra` in a form for the page.
+
+    `images` contains the numbers of the detector's images by content, and `lines` the emission lines with name,
+    wavelength (angstrom), expected electrons and signal-to-noise ratio. `z` is the redshift, from which the names of
+    the lines are found.
+    """
     detector_key = request_tables.request, row["exposure_id"], row["detector"]
     images = pictures.pictures(lake)
     numbers = [k for k, image in enumerate(images) if image.detector_key == detector_key]
@@ -137,11 +147,15 @@ def _parse_identifier(text: str) -> int:
 
 
 def _source_rows(version: read.Version, identifier: int) -> pa.Table:
-    """Read the row of a source. Only files around its cell are read, unless it lies far from its halo."""
+    """Return the row of a source in a table, as a table of one row, or of none if the source is not in it.
+
+    The identifier contains the HEALPix cell of the source, or of its halo. Files of this cell and its neighbours are
+    read first, and all files only if the source is not found there.
+    """
     cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
     for order in (ids.GENERATION_ORDER, ids.FILE_ORDER):
         parent_cell = int(sky.parent(cell, ids.GENERATION_ORDER, order))
-        # Lensing may have moved the source into a neighbouring cell.
+        # The neighbouring cells are read, too, because lensing may have moved the source into one of them.
         rows = version.rows_in_cells([parent_cell, *sky.margin_cells(order, parent_cell, order).tolist()], order)
         rows = rows.filter(pc.equal(rows["id"], identifier))
         if rows.num_rows:
@@ -150,7 +164,11 @@ def _source_rows(version: read.Version, identifier: int) -> pa.Table:
 
 
 def _find_source(lake: LakeSession, identifier: int, kind: int) -> tuple[dict[str, pa.Table], RequestTables | None]:
-    """Return the rows of a source by table, from the first request that has the largest number of its tables."""
+    """Return the rows of a source by name of the table, and the request to which they belong.
+
+    `kind` is the code of the source's type. The tables are the catalogue and the fluxes. If several requests contain
+    the source, the first one with the most of these tables is used. The result is ({}, None) if no request contains it.
+    """
     best: tuple[dict[str, pa.Table], RequestTables | None] = {}, None
     tables = _TABLES_BY_KIND.get(kind, ())
     for request_tables in lake.request_tables(*tables):
@@ -179,7 +197,7 @@ def _describe_columns(rows: pa.Table) -> list[Json]:
 
 
 def spectrum(lake: LakeSession, identifier_text: str) -> Json:
-    """Return the observed spectrum of a source, its lines, and its fluxes in the passbands of the lake.
+    """Return the model spectrum of a source in the observer's frame, its lines, and its fluxes in passbands.
 
     Parameters
     ----------
@@ -191,8 +209,9 @@ def spectrum(lake: LakeSession, identifier_text: str) -> Json:
     Returns
     -------
     dict
-        `wavelength` (angstrom), `f_lambda` (erg s-1 cm-2 A-1), `lines`, `bands` with fluxes `f_nu` in microjansky,
-        and `z` for galaxies. If there is no spectrum, only `said`, a message with the reason.
+        `wavelength` (angstrom), `f_lambda` (erg s-1 cm-2 A-1), `lines` (name and observed wavelength in angstrom of
+        each emission line of a galaxy), `bands` (passbands with the flux `f_nu` in microjansky), and `z` (redshift,
+        only for galaxies). If there is no spectrum or the identifier is invalid, only `said`, a text with the reason.
     """
     try:
         return _spectrum(lake, identifier_text)
@@ -225,7 +244,7 @@ def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
         )
     step = max(len(wavelength) // _SPECTRUM_SAMPLES, 1)
     size = len(wavelength) // step * step
-    # Average over each step instead of sampling, so that no line is lost between two samples.
+    # Average the spectrum over bins of `step` wavelengths. Taking every step-th value could miss a narrow line.
     result: Json = {
         "wavelength": np.round(wavelength[:size].reshape(-1, step).mean(axis=1), 2).tolist(),
         "f_lambda": [float(f"{value:.5g}") for value in flux_density[:size].reshape(-1, step).mean(axis=1)],
@@ -243,7 +262,11 @@ def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
 
 
 def _band_fluxes(request_tables: RequestTables, row: pa.Table) -> list[Json]:
-    """Passbands of a request with the fluxes of a source in them."""
+    """Return the passbands of a request in which the source has a flux.
+
+    Each dictionary has `name`, `wavelength` (pivot wavelength, angstrom), `width` (angstrom) and `f_nu` (flux density
+    in microjansky). `row` is the row of the source in the table of fluxes.
+    """
     fluxes = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")}
     return [
         {
@@ -258,26 +281,27 @@ def _band_fluxes(request_tables: RequestTables, row: pa.Table) -> list[Json]:
 
 
 def cutout(lake: LakeSession, number: int, x: float, y: float) -> bytes:
-    """Return 64 x 64 pixels around a position on an image, without cosmic rays if possible.
+    """Return 64 x 64 pixels around a position on an image; cosmic rays are removed if their truth image exists.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     number : int
-        Number of the image.
+        Number of the image, see `pictures.pictures`.
     x, y : float
-        Column and row of the position; 0 is the centre of the first pixel.
+        Column and row of the position; 0 is the centre of the first pixel. The nearest pixel gets the indices [32, 32].
 
     Returns
     -------
     bytes
-        Pixels as float32 [64, 64], NaN outside the image.
+        Pixels as float32 [64, 64] in the byte order of the machine, in electrons (flags in an image of saturation); NaN
+        outside the image.
 
     Raises
     ------
     BadInput
-        If there is no such image, or the position is not finite or beyond 1e6 pixels.
+        If there is no such image, or the absolute value of `x` or `y` is NaN or not below 1e6.
     """
     image = pictures.picture(lake, number).levels(without_cosmic_rays=True)[0]
     if not (np.isfinite([x, y]).all() and abs(x) < 1e6 and abs(y) < 1e6):
@@ -294,30 +318,31 @@ def cutout(lake: LakeSession, number: int, x: float, y: float) -> bytes:
 
 
 def trace_strip(lake: LakeSession, number: int, identifier_text: str, order: int) -> bytes:
-    """Return the pixels along the trace of a source's spectrum, straightened into a strip.
+    """Return the pixels along the trace of a source's dispersed spectrum, straightened into a strip.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     number : int
-        Number of the image.
+        Number of the image, see `pictures.pictures`.
     identifier_text : str
         Identifier of the source as a decimal number.
     order : int
-        Order of the grism.
+        Spectral order of the grism, for example 1.
 
     Returns
     -------
     bytes
         The length of the header (4 bytes), the header (JSON) and the pixels (float32 [rows, columns]). The header has
-        `rows`, `columns`, and `first` and `last`, the wavelengths of the first and last column in angstrom. Rows run
-        across the trace, which is in the middle. Each value is the nearest pixel of the image, or NaN outside it.
+        `rows` and `columns` (shape of the strip), and `first` and `last` (wavelengths of the first and last column in
+        angstrom). The trace is the middle row; it has 12 rows on each side. Each value is the nearest pixel of the
+        image, or NaN outside it. Cosmic rays are removed if their truth image exists.
 
     Raises
     ------
     BadInput
-        If there is no such image, or it has no spectrum of this source in this order.
+        If there is no such image, the identifier is invalid, or the image has no spectrum of this source in this order.
     """
     image = pictures.picture(lake, number)
     trace_key = {"exposure_id": image.row["exposure_id"], "detector": image.row["detector"], "order": order}
@@ -344,7 +369,7 @@ def trace_strip(lake: LakeSession, number: int, identifier_text: str, order: int
 
 
 def nearest_source(lake: LakeSession, ra: float, dec: float, radius: float) -> Json:
-    """Find the galaxy or star that is nearest to a position.
+    """Find the galaxy or star that is nearest to a position on the sky, in all requests of the lake.
 
     Parameters
     ----------
@@ -353,12 +378,16 @@ def nearest_source(lake: LakeSession, ra: float, dec: float, radius: float) -> J
     ra, dec : float
         Position in degrees.
     radius : float
-        Search radius in degrees.
+        Search radius in degrees, 0 to 180.
 
     Returns
     -------
     dict
-        `id` and `separation` (degrees); empty if there is no source within the radius.
+        `id` (text) and `separation` (degrees) of the source; empty if there is no source within the radius.
+
+    Notes
+    -----
+    BadInput is raised if the position or the radius is outside its bounds.
     """
     best: Json = {}
     for table in ("galaxies", "stars"):

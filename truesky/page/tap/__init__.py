@@ -1,1 +1,4 @@
-"""TAP service for the tables and images of a lake, with ObsCore, for tools such as TOPCAT, Aladin and pyvo."""
+"""TAP service (IVOA Table Access Protocol) for the tables and images of a lake, for tools such as TOPCAT and pyvo.
+
+The images are described by the table ivoa.obscore (ObsCore).
+"""

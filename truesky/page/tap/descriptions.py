@@ -1,4 +1,4 @@
-"""XML documents of a TAP service: capabilities, tables, availability, and descriptions of jobs.
+"""XML documents of the TAP service: capabilities, list of tables, availability, and states of asynchronous jobs.
 
 References
 ----------
@@ -25,7 +25,7 @@ _ADQL_GEO = "ivo://ivoa.net/std/TAPRegExt#features-adqlgeo"
 
 
 def availability(up_since: datetime) -> str:
-    """Return the VOSI document that the service is available since a time (UTC)."""
+    """Return the VOSI document (XML) which states that the service has been available since a time (UTC)."""
     return (
         f'{_XML_HEADER}<vosi:availability xmlns:vosi="http://www.ivoa.net/xml/VOSIAvailability/v1.0">'
         f"<vosi:available>true</vosi:available><vosi:upSince>{format_time(up_since)}</vosi:upSince></vosi:availability>\n"
@@ -33,16 +33,16 @@ def availability(up_since: datetime) -> str:
 
 
 def capabilities(address: str, max_rows: int, default_rows: int, seconds: float) -> str:
-    """Return the VOSI document of the capabilities and addresses of the service.
+    """Return the VOSI document (XML) with the addresses, languages, formats and limits of the TAP service.
 
     Parameters
     ----------
     address : str
-        Address of the service.
+        URL of the service.
     max_rows : int
         Largest number of rows of an answer.
     default_rows : int
-        Largest number of rows if a query has no MAXREC.
+        Largest number of rows if a query has no parameter MAXREC.
     seconds : float
         Time limit of a query in seconds.
 
@@ -80,7 +80,7 @@ def capabilities(address: str, max_rows: int, default_rows: int, seconds: float)
 
 
 def describe_tables(entries: Iterable[TableEntry]) -> str:
-    """Return the VOSI document of the tables, their columns and foreign keys."""
+    """Return the VOSI document (XML) of tables, with their columns and foreign keys, grouped by schema."""
     by_schema: dict[str, list[TableEntry]] = {}
     for table in entries:
         by_schema.setdefault(table.schema, []).append(table)
@@ -127,25 +127,22 @@ def _column(column: Mapping[str, object]) -> str:
     return f'<column std="{"true" if column["std"] else "false"}">{text_elements}{type_element}{flags}</column>\n'
 
 
-# ------------------------------------------------------------------------------------------------ jobs
-
-
 _UWS = 'xmlns:uws="http://www.ivoa.net/xml/UWS/v1.0" xmlns:xlink="http://www.w3.org/1999/xlink" ' + _XSI
 
 
 def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], result: str | None, error: str) -> str:
-    """Return the UWS document of a job.
+    """Return the UWS document (XML) that describes an asynchronous job.
 
     Parameters
     ----------
     facts : mapping of str to object
-        Properties by their UWS names; None if a property has no value yet.
+        Properties of the job by their names in UWS, such as "phase"; None if a property has no value yet.
     parameters : mapping of str to str
-        Parameters of the job.
+        Parameters of the query by name, such as QUERY.
     result : str or None
-        Address of the result; None if there is no result yet.
+        URL of the result; None if there is no result yet.
     error : str
-        Error message, or "".
+        Error message; "" if the job has not failed.
 
     Returns
     -------
@@ -159,7 +156,7 @@ def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], res
 
 
 def describe_parameters(parameters: Mapping[str, str], is_document: bool = True) -> str:
-    """Return the parameters of a job as a document, or as an element of one."""
+    """Return the parameters of a UWS job as an XML document, or as an element of one if `is_document` is False."""
     rows = "".join(
         f"<uws:parameter id={quoteattr(name)}>{escape(value)}</uws:parameter>" for name, value in parameters.items()
     )
@@ -167,13 +164,16 @@ def describe_parameters(parameters: Mapping[str, str], is_document: bool = True)
 
 
 def describe_results(result: str | None, is_document: bool = True) -> str:
-    """Return the results of a job as a document, or as an element of one."""
+    """Return the list of results of a UWS job as an XML document, or as an element of one if `is_document` is False.
+
+    `result` is the URL of the only result; None makes an empty list.
+    """
     row = f'<uws:result id="result" xlink:type="simple" xlink:href={quoteattr(result)}/>' if result else ""
     return _wrap_element("results", row, is_document)
 
 
 def list_jobs(rows: Iterable[tuple[str, str, str, datetime]]) -> str:
-    """Return the UWS document of a list of jobs: (identifier, address, phase, creation time)."""
+    """Return the UWS document (XML) that lists jobs; each row is (identifier, URL, phase, creation time in UTC)."""
     references = "".join(
         f'<uws:jobref id={quoteattr(name)} xlink:type="simple" xlink:href={quoteattr(address)}>'
         f"<uws:phase>{phase}</uws:phase><uws:creationTime>{format_time(creation_time)}</uws:creationTime></uws:jobref>\n"
@@ -206,5 +206,5 @@ def _error_element(error: str) -> str:
 
 
 def format_time(time: datetime) -> str:
-    """Format a UTC time by ISO 8601 with milliseconds."""
+    """Format a UTC time by ISO 8601 with milliseconds, such as 2024-07-01T12:00:00.000Z."""
     return time.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"

@@ -1,4 +1,4 @@
-"""Describe the images of a lake by ObsCore, and find their files."""
+"""Describe the images of a lake for the table ivoa.obscore (ObsCore) of the TAP service, and find their files."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from truesky.page.lake_session import LakeSession, RequestTables
 from truesky.page.pictures import pictures
 from truesky.page.tap.tables import obscore_row
 
-# The ends of a passband are where its response falls below this fraction of its maximum.
+# A passband extends over the wavelengths at which its response is at least this fraction of its maximum.
 _MIN_RESPONSE = 0.01
 
 
 def obscore_rows(lake: LakeSession, address: str) -> list[dict[str, Any]]:
-    """Return one row of the table ivoa.obscore per image.
+    """Return the rows of the table ivoa.obscore: one per image of the lake, in the order of `pictures.pictures`.
 
     Parameters
     ----------
     lake : LakeSession
         The open lake.
     address : str
-        Address of the TAP service, which also serves the files.
+        URL of the TAP service; the URLs of the image files begin with it.
 
     Returns
     -------
     list of dict
-        The rows.
+        Values by column for each image; empty if the lake has no images.
     """
     tables_by_request = {request_tables.request: request_tables for request_tables in lake.observed_requests}
     images = pictures(lake)
@@ -69,7 +69,11 @@ def _diameter(ra: float, dec: float, corners: Float) -> float:
 
 
 def _wavelength_ranges(request_tables: RequestTables) -> dict[str, tuple[float, float]]:
-    """Shortest and longest wavelength (angstrom) by passband."""
+    """Return the shortest and longest wavelength (angstrom) of each passband of a request, by name.
+
+    The passband extends over the wavelengths at which its response is at least 1 % of its maximum. Passbands without a
+    positive response are left out.
+    """
     wavelength_ranges = {}
     for row in request_tables.rows("passbands", ["name", "first_wavelength", "wavelength_step", "response"]):
         response = np.array(row["response"])
@@ -82,7 +86,10 @@ def _wavelength_ranges(request_tables: RequestTables) -> dict[str, tuple[float, 
 
 
 def find_file(lake: LakeSession, number: int) -> Path:
-    """Return the path of an image after its sha256 is verified; raise BadInput if there is no such image."""
+    """Return the path of the file of an image, after its sha256 has been verified.
+
+    `number` is the index of the image in the list of `pictures.pictures`. BadInput is raised if there is no such image.
+    """
     images = pictures(lake)
     if not 0 <= number < len(images):
         raise BadInput(f"the lake has no image {number}; it has {len(images)}")

@@ -1,6 +1,6 @@
-"""TAP service of a lake for tools such as TOPCAT, Aladin, pyvo and astroquery.
+"""HTTP handlers of the TAP service of a lake, for tools such as TOPCAT, Aladin, pyvo and astroquery.
 
-These tools send no cookies, so the address of the service contains a token, which differs from the token of the page.
+These tools send no cookies, so the address of the service contains a secret token. The web page has another token.
 
 References
 ----------
@@ -30,7 +30,10 @@ from truesky.page.tap import descriptions, uws_jobs
 from truesky.page.tap.queries import PARALLEL_JOBS, Jobs
 from truesky.page.tap.tables import list_tables, write_tables
 
-MAX_ROWS, DEFAULT_ROWS = 20_000_000, 1_000_000
+# Largest number of rows of an answer.
+MAX_ROWS = 20_000_000
+# Largest number of rows if a query has no parameter MAXREC.
+DEFAULT_ROWS = 1_000_000
 _LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 _VOTABLE, _XML = "application/x-votable+xml", "text/xml"
 _FORMATS = {
@@ -43,7 +46,11 @@ _FORMATS = {
 
 @dataclass(slots=True)
 class _LakeProcesses:
-    """Query processes of one open lake, the folder of the additional tables, and the names of tables with positions."""
+    """Query processes of one open lake.
+
+    `folder` contains the tables that TAP adds to the lake, as Arrow files. `catalogues` contains the names of the
+    tables with positions on the sky, in lower case.
+    """
 
     lake: LakeSession
     process_pool: ProcessPool
@@ -56,12 +63,12 @@ class _LakeProcesses:
 
 
 class Service:
-    """TAP service of the lake that is currently open.
+    """TAP service of the lake that the server currently shows.
 
     Parameters
     ----------
     access : AccessRules
-        Rules of access of the server.
+        Host names, port and tokens of the server.
     """
 
     def __init__(self, access: AccessRules) -> None:
@@ -72,16 +79,16 @@ class Service:
         self.jobs = Jobs(self.run_query)
 
     def add_routes(self, router: web.UrlDispatcher, path: str, lake: Callable[[], LakeSession]) -> None:
-        """Add the routes of the service.
+        """Add the addresses of the service and their handlers to an application.
 
         Parameters
         ----------
         router : aiohttp.web.UrlDispatcher
             Router of the application.
         path : str
-            Path of the service.
+            Path of the service; all its addresses begin with it.
         lake : callable
-            Function that returns the open lake.
+            Function without arguments that returns the `LakeSession` that the server currently shows.
         """
         self._current_lake = lake
         for method in ("GET", "POST"):
@@ -95,45 +102,41 @@ class Service:
         ).add(router, path, self._errors_to_votable)
 
     async def close(self) -> None:
-        """Stop all jobs and processes."""
+        """Stop all asynchronous jobs and query processes."""
         await self.jobs.close()
         if self._lake_processes is not None:
             self._lake_processes.close()
 
     def service_address(self, request: web.Request) -> str:
-        """Return the absolute address of the service."""
+        """Return the absolute URL of the service, with the host name that the client used in `request`."""
         return f"http://{request.headers['Host']}/tap/{self._access.tap_token}"
-
-    # -------------------------------------------------------------------------------------------- queries
 
     @asynccontextmanager
     async def run_query(
         self, parameters: dict[str, str], seconds: float, is_patient: bool = True
     ) -> AsyncIterator[tuple[str, AsyncIterator[bytes]]]:
-        """Run a query and provide its result.
+        """Run an ADQL query and provide its result during an `async with` block.
 
         Parameters
         ----------
-        parameters : dict of str
-            Parameters of TAP, such as QUERY and MAXREC.
+        parameters : dict of str to str
+            Parameters of TAP by upper-case name, such as QUERY, LANG and MAXREC.
         seconds : float
-            Time limit in seconds; the limit of the lake applies, too.
+            Time limit of the query in seconds; the time limit of the lake applies, too.
         is_patient : bool, optional
-            Wait for a process even if many queries are waiting, see `ProcessPool.process`.
+            If True, wait for a query process even if many queries are waiting.
 
         Yields
         ------
         content_type : str
-            Content type of the result.
+            HTTP content type of the result.
         pieces : asynchronous iterator of bytes
-            The result. Its errors are BadInput and Damaged.
+            Content of the result. It raises BadInput if the query fails, and Damaged if a file is damaged.
 
-        Raises
-        ------
-        BadInput
-            If a parameter is invalid.
-        Busy
-            If too many queries are waiting.
+        Notes
+        -----
+        BadInput is raised if a parameter is invalid or the query cannot be translated to SQL. Busy is raised if too
+        many queries are waiting and `is_patient` is False.
         """
         self.check_parameters(parameters)
         content_type, suffix = _output_format(parameters)
@@ -149,7 +152,11 @@ class Service:
             yield content_type, iterate_in_thread(data)
 
     def check_parameters(self, parameters: dict[str, str]) -> None:
-        """Raise BadInput if the parameters are not a query that this service can run."""
+        """Raise BadInput if the parameters of TAP do not describe a query that this service can run.
+
+        REQUEST must be doQuery if given, LANG must be ADQL, ADQL-2.0 or ADQL-2.1, QUERY must not be empty, UPLOAD must
+        not be given, and the format and MAXREC must be valid. The text of the query is not checked here.
+        """
         if parameters.get("REQUEST", "doQuery") != "doQuery":
             raise BadInput(f"REQUEST = {parameters['REQUEST'][:40]} is not doQuery")
         language = parameters.get("LANG", "")
@@ -174,18 +181,21 @@ class Service:
                 address = f"http://{self._access.hosts[0]}:{self._access.port}/tap/{self._access.tap_token}"
                 rows = await asyncio.to_thread(images.obscore_rows, lake, address)
                 table_files = await asyncio.to_thread(write_tables, lake.listed_versions, rows, Path(folder.name))
-                # One process more than parallel jobs, so that jobs never block synchronous queries.
+                # There is one process more than the jobs that can run at the same time, so that one is always free for
+                # synchronous queries.
                 process_pool = ProcessPool(lambda: lake.explorer.process(table_files), PARALLEL_JOBS + 1)
                 catalogues = {name.lower() for name, version in lake.versions.items() if is_catalogue(version)}
                 self._lake_processes = _LakeProcesses(lake, process_pool, folder, catalogues)
             return self._lake_processes
 
-    # -------------------------------------------------------------------------------------------- addresses
-
     def _errors_to_votable(
         self, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
-        """Wrap a handler: errors become VOTables with status 503 (busy), 400 (bad input) or 500."""
+        """Wrap an HTTP handler, so that its errors become VOTables with the message.
+
+        The HTTP status is 503 if too many queries are waiting, 400 for wrong input, and 500 for other LakeErrors and
+        for OSError. Further errors are raised unchanged.
+        """
 
         async def respond(request: web.Request) -> web.StreamResponse:
             try:
@@ -216,7 +226,11 @@ class Service:
         )
 
     async def _image(self, request: web.Request) -> web.StreamResponse:
-        """Send the FITS file of an image by its number, if the key in the address is the key of the open lake."""
+        """Send the FITS file of the image with the number in the address.
+
+        The status is 404 if there is no such image, or if the lake has changed since the address was given out: then
+        the key in the address differs from the key of the lake.
+        """
         from truesky.page import pictures
         from truesky.page.tap import images
 
@@ -232,7 +246,10 @@ class Service:
 
 
 def _output_format(parameters: dict[str, str]) -> tuple[str, str]:
-    """Content type and file suffix of the requested format."""
+    """Return the HTTP content type and the file suffix of the format that a query requests; VOTable by default.
+
+    BadInput is raised for an unknown format.
+    """
     format_name = parameters.get("RESPONSEFORMAT") or parameters.get("FORMAT") or "votable"
     if (output_format := _FORMATS.get(format_name.lower().replace(" ", ""))) is None:
         raise BadInput(f"RESPONSEFORMAT = {format_name[:60]!r} is not one of {', '.join(_FORMATS)}")

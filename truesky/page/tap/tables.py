@@ -1,4 +1,6 @@
-"""Tables that a TAP service adds to the tables of the lake: TAP_SCHEMA and ivoa.obscore (images).
+"""Tables that the TAP service adds to the tables of the lake: TAP_SCHEMA and ivoa.obscore.
+
+TAP_SCHEMA lists all tables and columns, and ivoa.obscore contains one row per image.
 
 References
 ----------
@@ -63,7 +65,11 @@ _SCHEMAS: dict[str, tuple[str, pa.Schema]] = {
 
 
 def _obscore_schema() -> pa.Schema:
-    """Read the columns of ivoa.obscore from obscore.csv: the columns of ObsCore 1.1, table 1, and two more."""
+    """Read the columns of the table ivoa.obscore with their types and metadata from obscore.csv.
+
+    They are the mandatory columns of ObsCore 1.1, table 1, its optional column dataproduct_subtype, and two more:
+    band_name (the passband) and detector.
+    """
     with Path(__file__).with_name("obscore.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     metadata_keys = ("unit", "ucd", "utype", "xtype", "description")
@@ -84,7 +90,11 @@ _SCHEMAS["ivoa.obscore"] = ("The images, as ObsCore describes observations.", _o
 
 @dataclass(frozen=True, slots=True)
 class TableEntry:
-    """A table as TAP_SCHEMA and VOSI list it; `name` is the name to use in a query, quoted if necessary."""
+    """A table as it is listed in TAP_SCHEMA and in the VOSI document of tables.
+
+    `name` is the name to use in an ADQL query, in quotes if necessary. `is_standard` is True if an IVOA standard
+    defines the table.
+    """
 
     schema: str
     name: str
@@ -94,7 +104,11 @@ class TableEntry:
 
 
 def list_tables(versions: Mapping[str, read.Version]) -> list[TableEntry]:
-    """Return all tables; tables of the lake come first."""
+    """Return all tables of the TAP service: the tables of the lake, then those of TAP_SCHEMA and ivoa.obscore.
+
+    `versions` contains the versions of the lake's tables by name, such as "products" or "demo.products". Tables without
+    columns are left out.
+    """
     lake_tables = [
         TableEntry(
             name.rpartition(".")[0] or LAKE, ".".join(map(column_name, name.split("."))),
@@ -120,13 +134,16 @@ _RESERVED = {
 
 
 def column_name(name: str) -> str:
-    """Return a name for ADQL, in quotes if it has special characters or is a reserved word."""
+    """Return the name of a column or table as it must be written in ADQL.
+
+    The name is put in quotes if it has special characters, does not begin with a letter, or is a reserved word.
+    """
     plain = name.isascii() and name.replace("_", "a").isalnum() and name[0].isalpha()
     return name if plain and name.lower() not in _RESERVED else f'"{name}"'
 
 
 def describe_columns(table: TableEntry) -> Iterator[Json]:
-    """Yield the columns of a table as rows of TAP_SCHEMA.columns."""
+    """Yield the columns of a table as rows of the table TAP_SCHEMA.columns (values by column)."""
     for number, field in enumerate(table.fields, start=1):
         metadata = field_facts(field)
         datatype_name, size = datatype(field.type)
@@ -141,7 +158,7 @@ def describe_columns(table: TableEntry) -> Iterator[Json]:
         }  # fmt: skip
 
 
-# Foreign keys of the tables of TAP_SCHEMA: key, table, column, target table, target column.
+# Foreign keys between the tables of TAP_SCHEMA: name of the key, table, column, table and column to which they refer.
 FOREIGN_KEYS = (
     ("tables_schema", "tap_schema.tables", "schema_name", "tap_schema.schemas", "schema_name"),
     ("columns_table", "tap_schema.columns", "table_name", "tap_schema.tables", "table_name"),
@@ -157,21 +174,21 @@ SCHEMA_DESCRIPTIONS = {
 
 
 def write_tables(versions: Mapping[str, read.Version], images: list[Json], folder: Path) -> list[str]:
-    """Write TAP_SCHEMA and ivoa.obscore as Arrow files for the query processes.
+    """Write the tables of TAP_SCHEMA and ivoa.obscore as Arrow files, which the query processes read.
 
     Parameters
     ----------
     versions : mapping of str to Version
-        Versions of the tables of the lake.
+        Versions of the lake's tables by name, which TAP_SCHEMA describes.
     images : list of dict
-        Rows of ivoa.obscore.
+        Rows of ivoa.obscore: values by column for each image.
     folder : Path
-        Folder for the files.
+        Existing folder in which the files are written.
 
     Returns
     -------
     list of str
-        NAME=@FILE for every table, as `Explorer.process` requires.
+        NAME=@FILE for every table with the path of its file, the form that `Explorer.process` requires.
     """
     tables = list_tables(versions)
     names = list(dict.fromkeys(table.schema for table in tables))
@@ -210,24 +227,25 @@ def write_tables(versions: Mapping[str, read.Version], images: list[Json], folde
 
 
 def obscore_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], file: Mapping[str, Any]) -> Json:
-    """Return the row of ivoa.obscore of an image.
+    """Return the row of the table ivoa.obscore that describes an image.
 
     Parameters
     ----------
     number : int
-        Number of the image.
+        Number of the image; not used.
     row : mapping
-        Row of the table `products`.
+        Row of the image file in the table `products`.
     exposure : mapping
-        Row of the table `exposures`, or {} if there is no such row.
+        Row of the exposure in the table `exposures`, or {} if there is no such row.
     file : mapping
-        Facts of the file: `url`, `kbyte`, `nx`, `ny`, `fov` (diameter, deg), `wavelengths` (shortest and longest in
-        angstrom, or None), `version`, and `exposure`, an identifier that is unique in the lake.
+        Further properties of the file: `url`, `kbyte` (size, KiB), `nx`, `ny` (shape), `fov` (diameter of the field,
+        deg), `wavelengths` (shortest and longest in angstrom, or None), `version` (key of the version of `products`),
+        and `exposure` (an identifier of the exposure that is unique in the lake).
 
     Returns
     -------
     dict
-        Values by column. Wavelengths are in metres.
+        Values by column of ivoa.obscore; None for unknown values. Wavelengths are in metres.
     """
     start, seconds = exposure.get("mjd"), exposure.get("exposure_time_s")
     wavelengths = file["wavelengths"] or (None, None)

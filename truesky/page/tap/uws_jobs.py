@@ -1,4 +1,4 @@
-"""Addresses of the asynchronous jobs of a TAP service, as UWS defines them.
+"""HTTP handlers of the asynchronous jobs of the TAP service, at the addresses that the UWS standard defines.
 
 References
 ----------
@@ -27,7 +27,10 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 async def read_parameters(request: web.Request) -> dict[str, str]:
-    """Read the parameters of a request from its address and form, with upper-case names; raise BadInput for a file."""
+    """Return the parameters of an HTTP request from its address and, for POST, from its form; names are upper-case.
+
+    BadInput is raised if the form contains a file.
+    """
     values = {name.upper(): value for name, value in request.query.items()}
     if request.method == "POST":
         for name, value in (await request.post()).items():
@@ -38,18 +41,18 @@ async def read_parameters(request: web.Request) -> dict[str, str]:
 
 
 class Routes:
-    """Handlers of the addresses below /async.
+    """HTTP handlers of the addresses below /async: the list of jobs, single jobs, their properties and results.
 
     Parameters
     ----------
     jobs : Jobs
-        The jobs.
+        All jobs of the service.
     address : callable
-        Function that returns the address of the service for a request.
+        Function that returns the URL of the service for an HTTP request.
     check : callable
-        Function that raises BadInput if parameters are not a valid query.
+        Function that raises BadInput if the parameters of TAP are not a valid query. It is stored, but not called.
     max_seconds : callable
-        Function that returns the time limit of a query in seconds.
+        Function without arguments that returns the largest time limit of a query in seconds.
     """
 
     def __init__(
@@ -62,16 +65,16 @@ class Routes:
         self._jobs, self._address, self._check, self._max_seconds = jobs, address, check, max_seconds
 
     def add(self, router: web.UrlDispatcher, path: str, wrap: Callable[[Handler], Handler]) -> None:
-        """Add the routes.
+        """Add the addresses below /async and their handlers to an application.
 
         Parameters
         ----------
         router : aiohttp.web.UrlDispatcher
             Router of the application.
         path : str
-            Path of the service.
+            Path of the TAP service, without /async.
         wrap : callable
-            Function that wraps a handler so that its errors become responses.
+            Function that wraps a handler, so that its errors become HTTP responses.
         """
         router.add_get(f"{path}/async", wrap(self._list))
         router.add_post(f"{path}/async", wrap(self._create))
@@ -89,7 +92,10 @@ class Routes:
         return job
 
     def _redirect(self, request: web.Request, job: Job | None = None) -> web.Response:
-        """Redirect to a job or to the list of jobs. Clients require an absolute address."""
+        """Return an HTTP redirection to a job, or to the list of jobs if `job` is None.
+
+        The address is absolute, because clients require it.
+        """
         location = f"{self._address(request)}/async" + (f"/{job.name}" if job else "")
         return web.Response(status=303, headers={"Location": location})
 
@@ -129,7 +135,11 @@ class Routes:
         return self._redirect(request)
 
     async def _change(self, request: web.Request) -> web.StreamResponse:
-        """Start, abort or delete a job, or change the parameters of a job that has not been started."""
+        """Handle a POST to a job: start, abort or delete it, or change its parameters, time limit or destruction time.
+
+        BadInput is raised for an invalid value, a property that cannot be changed, and for query parameters of a job
+        that has been started.
+        """
         job, values = self._find_job(request), await read_parameters(request)
         if values.get("ACTION") == "DELETE":
             return await self._delete(request)
@@ -177,7 +187,11 @@ class Routes:
 
 
 async def _wait_for_change(job: Job, request: web.Request) -> None:
-    """Handle WAIT=seconds: return when the phase changes, the job has ended, or the time is over."""
+    """Wait as the parameter WAIT of an HTTP request demands: until the phase of the job changes or the time is over.
+
+    WAIT is a number of seconds, at most 60; -1 means 60. The function returns at once if there is no WAIT, if the job
+    has not been started or has ended, or if its phase is not the parameter PHASE.
+    """
     wait = request.query.get("WAIT")
     if wait is None or job.has_ended or request.query.get("PHASE", job.phase) != job.phase:
         return
@@ -192,7 +206,10 @@ async def _wait_for_change(job: Job, request: web.Request) -> None:
 
 
 def _parse_seconds(text: str, max_seconds: float) -> float:
-    """Parse a whole number of seconds, at most `max_seconds`; 0 means `max_seconds`."""
+    """Parse a whole number of seconds; 0 and numbers above `max_seconds` become `max_seconds`.
+
+    BadInput is raised for other texts.
+    """
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise BadInput(f"{text[:40]!r} is not a number of seconds")
     return min(float(text) or max_seconds, max_seconds)
