@@ -1,12 +1,12 @@
 """Print digests of the arrays of the chain as JSON: python -m tests.chain table|quick|whole FOLDER.
 
-table  the table of galaxies' fluxes in one band
-quick  tables of galaxies' fluxes, of the PSF, of shapes; products and solutions as they occur
-whole  besides, those of stars; a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in
-       the cache
+table  the table of galaxy fluxes in one band
+quick  also fluxes, distances and positions, the PSF, shapes of galaxies, and a least-squares solution
+whole  also the table of star fluxes; a small lake from the plans of the jobs (galaxies, stars, fluxes, two CCDs); and
+       every array in the cache
 
-Only what is made is imported, since a process for a single table is mostly imports. With --keep the arrays themselves
-are written beside the digests, to be compared number by number.
+Only the modules of the requested arrays are imported, because a process for a single table mostly imports. With --keep,
+the arrays are also written to FOLDER, so that they can be compared number by number.
 """
 
 import argparse
@@ -44,7 +44,7 @@ REQUEST = {
 
 
 def random_galaxies(n):
-    """Return rows for integration and for the tables."""
+    """Return galaxies as the functions for integration and for tables need them."""
     from benchmarks.fluxes import sample
 
     return galaxies_from_table(sample(n, 1), templates.galaxy_library())

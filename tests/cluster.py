@@ -1,7 +1,7 @@
 """Run a cluster of processes on loopback: a standalone Spark master, workers, and submitted jobs.
 
-Everything goes through spark-submit, as it would from a login node; what a job was told, and who did its tasks, is in
-Spark's event log.
+Everything goes through spark-submit, as it would from a login node. The event log of Spark contains the settings of a
+job and the workers that ran its tasks.
 """
 
 import json
@@ -55,9 +55,10 @@ def daemon(main_class, *arguments):
 
 @contextmanager
 def running(folder, names):
-    """Address of a master, and a process a worker of one core and 1 GB; each has its name's folder below `folder`.
+    """Run a master and one worker per name, each with one core and 1 GB; yield the master's address and the workers.
 
-    Each worker is a host of its own: Spark begins a second copy of a task on none that has a first one.
+    Each worker has a folder with its name below `folder`. Each has a separate host address, because Spark does not
+    start a second copy of a task on the host of the first copy.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -100,12 +101,12 @@ def told(folder, **more):
 
 
 def events(path):
-    """Lines of an event log, or of the log of a run."""
+    """Return the lines of an event log, or of the log of a run."""
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def below(pid):
-    """Process ids below `pid`."""
+    """Return the ids of all processes below `pid`."""
     found = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout.split()
     tree, parents = {pid}, dict(zip(map(int, found[::2]), map(int, found[1::2]), strict=True))
     for _ in range(5):

@@ -30,7 +30,7 @@ def test_the_figures(tmp_path):
     figures = json.loads(file.read_text())
     assert {"lsst_survey_s", "lsst_draft_s", "decam_survey_s", "lsst_peak_gb", "effect_bleeding_s"} <= set(figures)
     assert {"gpc1_s_error", "memory_error"} <= set(figures)
-    # The time of the effects is included, however few the sources are.
+    # The time includes the effects, even if there are few sources.
     assert 0.2 < figures["lsst_survey_s"] < 15.0
     assert 0.3 < figures["lsst_peak_gb"] < 2.0
 
@@ -40,7 +40,7 @@ def test_the_figures(tmp_path):
 def test_a_whole_exposure_of_lsstcam(tmp_path):
     """189 sensors are planned and rendered at draft accuracy on 2 cores. The target is 12 minutes.
 
-    Of the processor, whatever else it does.
+    Only CPU time counts, because it does not depend on other processes.
     """
     assert benchmark.time_exposure(tmp_path, (24.0, 22.0))["lsst_exposure_s"] > 0.0
     images = [*tmp_path.rglob("EXT_lsst_r_*_science.fits")]

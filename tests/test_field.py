@@ -1,6 +1,6 @@
 """A whole field, from a request to two FITS images, measured as an astronomer would measure it.
 
-The five jobs run once, in the shared session, on the demo's request; everything else looks at what they published.
+The five jobs run once per session, for the demo request. The tests examine the tables and images that they published.
 """
 
 import hashlib
@@ -45,10 +45,11 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 
 @dataclass(frozen=True)
 class Image:
-    """An image with its truth: e-, sky subtracted; sources with 0-based pixel positions and expected e-.
+    """An image and its truth: sky-subtracted electrons, and sources with 0-based positions and expected electrons.
 
-    bad     : hit by a cosmic ray, full or beside what is full, or blind
-    delayed : e- that traps took from what lies there, or gave back from what passed, cosmic rays above all
+    `bad` marks pixels that were hit by a cosmic ray, that are saturated or close to saturated ones, or that detect no
+    light. `delayed` is the change of the charge by traps, which capture electrons and release them in later pixels.
+    Most of it is the charge of cosmic rays.
     """
 
     header: fits.Header
@@ -68,10 +69,10 @@ class Image:
 
 @pytest.fixture(scope="session")
 def field(spark, tmp_path_factory):
-    """The lake of the demo."""
+    """Return the root folder of a lake with all tables of the demo request."""
     root = layout.resolve_lake(tmp_path_factory.mktemp("field") / "lake")
     wanted = parse(DEMO)
-    # Compiled here, so that no worker's memory is the compiler's.
+    # Compile here, so that the memory of the workers does not include the compiler.
     for channel in ("VIS", "EXT"):
         small(channel, forced={effect.name: True for effect in registry.CHANNELS[channel].effects["science"]})
     for job in JOBS:
@@ -158,12 +159,12 @@ def image(request, field):
     diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
     charge, delayed = fits.getdata(product(field, channel, "cosmic_rays")), 0.0
-    # Bled charge is at positions without sources.
+    # Charge that bled lies where the truth has no sources.
     hit = (charge > 0) | ndimage.binary_dilation(read_back.frame(path).data >= header["SATURATE"], iterations=3)
     if channel == "VIS":
         held = np.minimum(noise_free + charge, 2e5) + diffuse
         delayed = trailed(held, header) - held
-        # No pixels lie between the halves.
+        # The rows of charge injection between the halves detect no light.
         rows = int(header["INJROWS"])
         hit[(len(hit) - rows) // 2 : (len(hit) + rows) // 2] = True
     variance = noise_free + diffuse + header["RDNOISE"] ** 2 + header["GAIN"] ** 2 / 12
@@ -224,7 +225,7 @@ def diffuse_electrons(header):
 
 
 def sources(field, header):
-    """Positions and expected electrons of everything on the detector, from the catalogues and the flux tables alone."""
+    """Return positions and expected electrons of all sources on the detector, from catalogues and flux tables only."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)  # astropy adds DATE-OBS to its own copy
         system = WCS(header)
@@ -245,7 +246,7 @@ def sources(field, header):
 
 @pytest.fixture(scope="session")
 def photometry(image):
-    """Apertures of every unblended source away from the edge: (index, measured, noise-free, predicted noise)."""
+    """Return aperture sums of isolated sources away from the edge: (index, measured, noise-free, predicted noise)."""
     radius = image.aperture / 2 / image.pixel_scale
     points = np.stack([image.x, image.y], 1)
     tree = cKDTree(points)
@@ -257,7 +258,7 @@ def photometry(image):
     ny, nx = image.electrons.shape
     edge = 2 * radius
     alone &= (image.x > edge) & (image.x < nx - edge) & (image.y > edge) & (image.y < ny - edge)
-    # A cosmic ray in the aperture is no fault of the image's.
+    # A cosmic ray in the aperture is not an error of the photometry.
     hits = sep.sum_circle(image.bad.astype(float), image.x, image.y, radius, subpix=0)[0]
     index = np.flatnonzero(alone & (hits == 0))
 
@@ -288,7 +289,7 @@ def test_bright_unblended_sources_are_found(image, photometry):
     objects = sep.extract(
         data, 1.5, err=sigma, mask=image.bad, minarea=5, deblend_cont=0.001, deblend_nthresh=64
     )  # fmt: skip
-    # Windowed positions, as SExtractor's XWIN_IMAGE: the barycentre of a noisy isophote is a third worse.
+    # Windowed positions, like XWIN_IMAGE of SExtractor: the errors of isophotal barycentres are a third larger.
     width = 1.5 * image.header["PSFFWHM"] / 2.355 / image.pixel_scale
     x, y, _ = sep.winpos(data, objects["x"], objects["y"], width)
     distance, which = cKDTree(np.stack([x, y], 1)).query(np.stack([image.x[bright], image.y[bright]], 1))
@@ -302,7 +303,7 @@ def test_bright_unblended_sources_are_found(image, photometry):
 def test_photometry_and_its_noise_agree_with_prediction(image, photometry):
     _, measured, truth, noise = photometry
     bright = truth > 10 * noise
-    # A saturated source has lost what the converter could not hold.
+    # A saturated source has lost the charge above the limit of the converter.
     full = image.header["GAIN"] * 65000
     peaks = image.noise_free[np.rint(image.y[photometry[0]]).astype(int), np.rint(image.x[photometry[0]]).astype(int)]
     use = bright & (peaks < 0.5 * full)
@@ -320,7 +321,7 @@ def test_frame_contains_the_light_of_its_sources(image):
 
 
 def test_background_agrees_with_prediction(image):
-    """Sample of a fifth of the pixels or more; significance 6e-7 of their mean (5 standard errors)."""
+    """The mean of empty pixels, at least a fifth of all, agrees within 5 standard errors (significance 6e-7)."""
     empty = (image.noise_free < 0.05 * np.sqrt(image.variance)) & ~image.bad
     assert empty.mean() > 0.2
     pixels = (image.electrons - image.noise_free - image.delayed)[empty]

@@ -1,6 +1,6 @@
 """Run all jobs for every shipped request, reduced in area, depth, detectors and exposures.
 
-That of the demo does so every day, as it is (test_field.py); and the check takes each (`test_checks.py` of requests).
+test_field.py runs the demo request in full every day, and `test_checks.py` of the requests checks every request.
 """
 
 import re
@@ -49,7 +49,7 @@ def small(name):
         block |= {key: 1 for key in ("fields", "visits", "exposures") if key in block}
         if not ground and block.get("image_type", "science") in ("science", "deep"):
             block["dither"] = "none"
-        # Fields and calibrations lie where they lay.
+        # Blocks without coordinates keep the area of the request, so fields and calibrations keep their positions.
         if "ra" not in block:
             block.setdefault("area", table["area"])
     with pytest.raises(BadInput, match="this area is large enough") as refused:
@@ -61,7 +61,7 @@ def small(name):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", [path.stem for path in sorted(REQUESTS.glob("*.toml"))])
 def test_shipped_requests_run_through_all_jobs(name, tmp_path, monkeypatch):
-    # The parts here, not in Spark's workers.
+    # Run the tasks in this process instead of in Spark workers.
     monkeypatch.setattr(submitted_job, "_spark_map", lambda function, parts, *rest: map(function, parts))
     request = from_table(small(name))
     plan.check(request)
@@ -70,7 +70,7 @@ def test_shipped_requests_run_through_all_jobs(name, tmp_path, monkeypatch):
         submitted_job.run(module.JOB, root, request)
     exposures = {row["exposure_id"]: row for row in read.version(root, "exposures").rows().to_pylist()}
     tasks = read.version(root, "tasks").rows(["exposure_id", "detector"]).to_pylist()
-    # An exposure of NISP has all of its detectors: the middle one is enough.
+    # NISP exposures contain all detectors; rendering the central one is enough.
     some = {task["detector"] for task in tasks} & {middle(row["camera"]) for row in exposures.values()}
     submitted_job.run(render_exposures.JOB, root, replace(request, detectors=tuple(sorted(some))))
     is_rendered = {k for k, row in exposures.items() if row["image_type"] in RENDERED_TYPES.get(row["channel"], ())}

@@ -1,7 +1,7 @@
 """Comparison in which the given relative tolerance applies.
 
-pytest.approx passes what lies within the larger of its two tolerances, and the absolute one is 1e-12 where none is
-given: of a flux of 1e-30 W/m2, every other flux of that size is "within 1e-9".
+pytest.approx accepts values within the larger of its two tolerances, and the absolute tolerance is 1e-12 by default. If
+a flux is 1e-30 W/m2, every other flux of that size is therefore "within 1e-9".
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ _approx = pytest.approx
 def approx(expected, rel=None, abs=None, nan_ok=False):
     """Return pytest.approx; refuse numbers for which the default absolute tolerance exceeds the relative one.
 
-    Zero has no relative tolerance, so it is let pass: it is compared within 1e-12.
+    Zero has no relative tolerance, so it is accepted: it is compared within 1e-12.
     """
     if abs is None:
         least = smallest(expected)

@@ -16,7 +16,7 @@ from lake_schema.store import parquet
 
 
 class Killed(BaseException):
-    """Raised when the simulated process dies; later operations have no effect on the disc."""
+    """Raised when the simulated process ends; later operations have no effect on the disc."""
 
 
 class Disc:

@@ -48,7 +48,11 @@ _WORD = re.compile(rb"[A-Za-z_][\w-]*")
 
 @dataclass(frozen=True)
 class Target:
-    """seeds : good inputs;  read : reads a file of that ending;  may_die : a process of its own reads it in truth"""
+    """Reader of a kind of file, and inputs for it.
+
+    `seeds` returns valid inputs. `read` reads a file whose name has the given ending. `may_die` is true if the program
+    runs this reader in a separate process, which may crash.
+    """
 
     seeds: Callable[[], list[bytes]]
     read: Callable[[Path], object]
@@ -124,7 +128,7 @@ def _replaced(pattern, choices, data, rng, same_length):
         return data
     start, stop = rng.choice(found)
     new = rng.choice(choices).encode()
-    # Formats of fixed width keep it more often than not.
+    # Half of the replacements keep the length, because some formats have columns of fixed width.
     if same_length:
         new = new[: stop - start].rjust(stop - start)
     return data[:start] + new + data[stop:]
@@ -173,7 +177,7 @@ def _too_long(signum, frame):
 
 
 def judged(target, path):
-    """Return the fault of a reader for a file, or "" if there is none."""
+    """Return the fault of a reader for a file, or "" if the reader is correct."""
     started = time.process_time()
     signal.setitimer(signal.ITIMER_PROF, 5 * MOST_SECONDS)
     try:
@@ -215,7 +219,7 @@ def _child(target, seeds, folder, numbers, report):
 
 
 def run(name, first, count, keep=None):
-    """[(number, what is wrong)] of a target's mutations; keep : folder for their inputs"""
+    """Return (number, fault) of mutations that a target handles wrongly; inputs are kept in the folder `keep`."""
     target = TARGETS[name]
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     try:

@@ -1,7 +1,7 @@
-"""Every bit of a small file of every table: the readers refuse the file by name, or give the same numbers.
+"""Flip bits of small files of every table: readers refuse the file by name, or return the same numbers.
 
-Small files are one or two blocks, which any reading compares as a whole; of large ones only those blocks are compared
-that hold what is asked for.
+Small files consist of one or two blocks, and every reader verifies them completely. In large files, readers verify only
+the blocks that contain the requested data.
 """
 
 import os
@@ -93,7 +93,8 @@ def answer(reader):
 def harmed(path, bits, reader, step=1):
     """Return (bits for which a reader refused the file by name, bits tried); other bits must not change the rows.
 
-    bits : how many, None = all of them, or one in `step`
+    `bits` is the number of random bits to try. If it is None, every `step`-th bit is tried, in large files only one bit
+    per byte.
     """
     good, size, refused = reader(), 8 * path.stat().st_size, 0
     every = range(size) if size <= 8 * SMALL else [8 * byte + byte % 8 for byte in range(size // 8)]
@@ -177,7 +178,7 @@ def large(tmp_path_factory):
     """Return a file of several row groups, in which each column has separate blocks."""
     root = tmp_path_factory.mktemp("large")
     rows = toy_rows(1607, 3 * parquet.ROWS_PER_GROUP)
-    # Identifiers in no order, whose pages are not small.
+    # Shuffled identifiers, because the pages of sorted ones would be small.
     ids = np.random.default_rng(4).permutation(1 << 20)[: rows.num_rows]
     return published(root, TOY, rows.set_column(0, rows.schema.field(0), pa.array(ids)))
 
@@ -218,7 +219,7 @@ def test_checksums_of_read_blocks_are_verified(large, flips):
             needed = not column or (column in columns and group in groups)
             # These bytes are read together with the footer.
             with_footer = end > path.stat().st_size - (64 << 10)
-            # A page's header is where its chunk begins.
+            # The header of a page is at the beginning of its chunk.
             for bit in [8 * start, 8 * start + 60, *rng.integers(8 * start, 8 * end, flips).tolist()]:
                 flip(path, bit)
                 rows, why = answer(reader)
@@ -252,7 +253,7 @@ def test_swapped_pieces_of_equal_length_are_refused(lake, what):
     n = 2 * parquet.ROWS_PER_GROUP
     rows = replace(PLAIN, name="wide", columns=tuple(replace(PLAIN.columns[1], name=c) for c in "ab"), key=("a",))
     rng = np.random.default_rng(3)
-    # Noise is stored as it is: pieces of one length.
+    # Noise cannot be compressed, so the pieces have the same length.
     version = published(lake, rows, rows.build({c: rng.random(n) for c in "ab"}))
     path, part = version.partition_path(version.partitions[0]), version.partitions[0]
     a0, b0, a1, *_ = ((start, end) for _, _, start, end in spans(version, part))
@@ -326,7 +327,7 @@ def swapped(whole, rng):
 
 @pytest.mark.parametrize("writer", [picture, packed])
 def test_swapped_pieces_of_an_image_are_refused(lake, writer):
-    """The checksums in FITS do not detect it; the sha256 in the manifest does."""
+    """The checksums in FITS do not detect swapped pieces; the sha256 in the manifest does."""
     publish.make_version(
         lake, plain_plan(parts=1), lambda root, facts: Output(plain_work(root, facts).rows, {"images/a.fits": writer})
     )

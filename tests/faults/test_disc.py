@@ -11,7 +11,7 @@ from tests.faults import promise, victims
 from tests.faults.disc import Disc, Killed
 from tests.universe import plain_plan, plain_work
 
-# (kind of table, every how many calls one is tried)
+# (kind of table, stride between the disc calls that are tried)
 SHORT = [("plain", 3), ("toy", 9)]
 LONG = [pytest.param(kind, 1, marks=pytest.mark.nightly) for kind in ("plain", "toy")]
 
@@ -100,7 +100,7 @@ def test_death_in_gc_leaves_no_half_version(older):
         assert promise.current(root, "plain") == promise.key("plain", 2)
         promise.make(root, "plain", 1)
         assert promise.current(root, "plain") == promise.key("plain", 1)
-        # The one that was on its way out has been made again, and is no longer wanted again.
+        # The version whose deletion was interrupted has been made again. Now it is unused again.
         promise.make(root, "plain", 2)
         garbage.collect(root, "plain", delete=True)
         assert [path.name for path in layout.table_folder(root, "plain").glob("*v-*")] == [
@@ -123,9 +123,10 @@ def versions(root):
 
 @pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.nightly)])
 def test_death_at_any_step_keeps_the_versions_of_all_requests(stride, two_requests):
-    """The one that publishes has its old or its new version, whole, the other its own; then gc takes from neither.
+    """The request that publishes has its complete old or new version; the other request keeps its version.
 
-    Every step that changes a link is tried, and one in `stride` of the others.
+    Garbage collection then deletes neither of them. All steps that change a link are tried, and one in `stride` of the
+    others.
     """
     first, other, new = (promise.key("plain", seed) for seed in (1, 3, 2))
     root = two_requests()

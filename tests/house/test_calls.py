@@ -36,7 +36,7 @@ def imported(tree):
 
 
 def found(module, name):
-    """Return an attribute of a module or a module of a package. Raises AttributeError if there is none."""
+    """Return an attribute of a module or a module of a package. Raises AttributeError if it does not exist."""
     try:
         return getattr(importlib.import_module(module), name)
     except AttributeError:
@@ -70,7 +70,7 @@ def faults(tree):
             called = ours.get(function.id)
         elif isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name):
             called = getattr(ours.get(function.value.id), function.attr, None)
-        # Classes of others' libraries may say nothing of their arguments.
+        # Classes of other libraries may have no signature.
         ours_too = (getattr(called, "__module__", None) or "").split(".")[0] in ("lake_schema", "truesky")
         if ours_too and all(keyword.arg for keyword in node.keywords):
             try:

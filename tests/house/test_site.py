@@ -1,4 +1,4 @@
-"""The documentation site is made of what the clone holds; by night it is built, without a warning."""
+"""The documentation site is complete; the nightly test builds it without warnings."""
 
 import re
 import subprocess
@@ -15,7 +15,10 @@ EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.
 
 
 def test_pages_of_the_site(tmp_path, monkeypatch):
-    """Each is in the contents; every effect is described, with its figure, of which one is drawn by day."""
+    """Each page is in the table of contents, and each effect has a description and a figure.
+
+    Only the first figure is drawn, because drawing takes long.
+    """
     # Sphinx and nbconvert take seconds to load, in each process of tests.
     from scripts import docs_references, make_docs
 
@@ -42,7 +45,7 @@ def test_pages_of_the_site(tmp_path, monkeypatch):
 
 @pytest.mark.nightly
 def test_the_site(tmp_path):
-    """Every page, every effect with its figure; nothing in it is fetched from elsewhere when it is read."""
+    """The site contains every page, and every effect with its figure. A browser loads nothing from other hosts."""
     command = [sys.executable, "-m", "scripts.make_docs", "--out", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -61,7 +61,7 @@ def test_a_full_disc_is_refused_before_the_first_job(tmp_path, capsys, monkeypat
     (line,) = capsys.readouterr().err.splitlines()
     assert "0.40 GB are free, the forecast is 0." in line
     assert asked == [tmp_path]
-    # One detector of LSST's, and there is room.
+    # A single detector of LSSTCam fits on the disc.
     assert run.main([str(DEMO), "--lake", str(lake), "--detectors", "R22_S11"], lambda *job: 5) == 5
 
 
@@ -85,7 +85,10 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "code"))
 
     def compiling(*known):
-        """Planning compiles a little, and so it may once have done something of the renderer."""
+        """Store compiled code of the renderer before planning, as if an earlier part of planning had compiled it.
+
+        Code that planning compiles must not suppress the warning about compilation.
+        """
         (folder := cache.machine_code_dir() / "render.drawing.kernels").mkdir(parents=True, exist_ok=True)
         (folder / "some.nbi").touch()
         return planned(*known)
@@ -103,13 +106,13 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
     told = ("--lake", str(root), "--request", str(DEMO))
     assert started == [("build_galaxies", *told), ("build_stars", *told)]
     first, *others = capsys.readouterr().out.splitlines()
-    # What it will take is said first.
+    # The first line is the forecast.
     assert re.fullmatch(
         r"forecast: 2 detectors, 0\.\d\d core-hours of this machine \(.*\), 0\.\d\d h on 2 cores; 0\.\d\d GB to write, "
         r"[\d.]+ GB are free",
         first,
     )
-    # And that it takes longer the first time.
+    # The second line warns that the first run takes longer, because code is compiled.
     if not compiled:
         assert "not been compiled" in others.pop(0)
     assert others == ["", "build_galaxies ...", "build_stars ..."]

@@ -11,12 +11,12 @@ from matplotlib.image import imread
 
 
 def at(view):
-    """Address of a view, so that the default view is not drawn first."""
+    """Return the address of a view, so that the default view is not drawn first."""
     return "/#" + quote(json.dumps({"view": view}))
 
 
 VIEWS = ("sky", "plots", "sql", "images", "runs")
-# What the address holds.
+# State of the page, which is stored in its address.
 HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
 
 
@@ -24,7 +24,7 @@ def until(tab, expression, seconds=30.0):
     """Wait for an expression without eval, which the security policy of the page forbids."""
     end = time.monotonic() + seconds
     while True:
-        # A page that is being loaded says nothing, but an error of the browser's.
+        # While a page is loading, expressions raise an error of the browser.
         with suppress(Exception):
             if value := tab.evaluate(expression):
                 return value
@@ -34,9 +34,9 @@ def until(tab, expression, seconds=30.0):
 
 @contextmanager
 def tab_of(browser, page, address="/", refused=None, **context):
-    """The page in a tab that has its cookie; at its end nothing may have gone wrong but what a test wants refused.
+    """Yield the page in a tab that has its cookie. At the end, only errors that the test expects may have occurred.
 
-    refused : part of an address
+    `refused` is a part of the addresses whose requests the test expects to fail.
     """
     faults = []
     opened = browser.new_context(viewport={"width": 1280, "height": 800}, **context)
@@ -45,7 +45,7 @@ def tab_of(browser, page, address="/", refused=None, **context):
     tab.on("pageerror", lambda error: faults.append(str(error)))
 
     def lost(request):
-        # What is under way when an address is left is given up.
+        # Requests in progress are aborted when the tab leaves an address.
         if request.failure != "net::ERR_ABORTED":
             faults.append(f"{request.url} {request.failure}")
 
@@ -62,14 +62,14 @@ def tab_of(browser, page, address="/", refused=None, **context):
         tab.goto(page.origin + address)
     until(tab, "document.body.dataset.ready === '1'")
     yield tab
-    # Requests that are under way when the tab closes fail, which is no fault of the page.
+    # Requests in progress fail when the tab closes, which is not a fault of the page.
     wrong = [one for one in faults if refused is None or not ("status of 400" in one or refused in one)]
     opened.close()
     assert wrong == []
 
 
 def canvas_colours(tab, selector):
-    """Number of colours in a screenshot of an element."""
+    """Return the number of colours in a screenshot of an element."""
     pixels = imread(io.BytesIO(tab.locator(selector).first.screenshot()), format="png")[..., :3]
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
@@ -86,12 +86,12 @@ def drag(tab, selector, first, last):
 
 
 def plain(text):
-    """Text with numbers without separators of thousands."""
+    """Return a text without separators of thousands in its numbers."""
     return text.replace("\N{NARROW NO-BREAK SPACE}", "")
 
 
 def copied(tab, selector):
-    """Text that a button copies to the clipboard."""
+    """Return the text that a button copies to the clipboard."""
     tab.evaluate("navigator.clipboard.writeText('')")
     tab.click(selector)
     return until(tab, "navigator.clipboard.readText()")

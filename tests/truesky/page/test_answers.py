@@ -70,7 +70,7 @@ def test_a_join_is_counted(page):
     source = "galaxies JOIN galaxy_fluxes USING (id)"
     _, (counts,) = asked(page, source=source, axes=["f_nu_euclid_vis - bulge_fraction"],
                             charts=[{"axes": [0], "bins": [3], "spans": [[-1, 1]]}])  # fmt: skip
-    # The flux was made of that very column: row by row the difference is nothing.
+    # The flux was computed from this column, so the difference is zero in every row.
     assert counts.tolist() == [0, GALAXIES_N, 0]
 
 
@@ -85,7 +85,7 @@ def test_counts_of_identifiers_and_missing_values_are_duckdbs(page):
     """
     odd = "CASE kind WHEN 0 THEN 'inf'::FLOAT WHEN 1 THEN 'nan'::FLOAT WHEN 2 THEN NULL ELSE z_obs END"
     source = f"(SELECT id, round(z_obs * 8)::BIGINT AS eighths, {odd} AS odd FROM galaxies) AS rows"
-    # The last bin holds its upper edge, others do not: of whole numbers n in [0, 20 k] it is n // k.
+    # Only the last bin includes its upper edge. If n is an integer in [0, 20 k], its bin is n // k.
     axes = ["id % 1000000", "eighths / 8", "odd"]
     spans = [[0.0, 1e6], [0.0, 2.0], [0.0, 5.0]]
     charts_ = [
@@ -106,17 +106,17 @@ def test_counts_of_identifiers_and_missing_values_are_duckdbs(page):
     assert edges > 100
     ((lost,),) = rows_by_sql(page, "SELECT count(*) FROM galaxies WHERE kind IN (0, 1, 2)")
     assert head["missing"] == [0, 0, lost]
-    # Of one identifier one row, though its neighbours are the same number of float32.
+    # A condition on an identifier selects one row, although neighbouring identifiers are the same float32 number.
     ((own,),) = rows_by_sql(page, "SELECT id FROM galaxies ORDER BY id LIMIT 1 OFFSET 7")
     one = asked(page, source="galaxies", where=f"id = {own}", axes=["ra"], charts=[{"axes": [0], "bins": [3]}])
     assert one[0]["rows"] == 1
 
 
 def test_rows_outside_a_chart_are_counted(page, shown):
-    """Rows outside the span of a chart, and rows without a value for each axis."""
+    """Count rows outside the span of a chart, and rows without a value on each axis."""
     rows = read.version(shown, "galaxies").rows(["id", "z_obs", "mag_r01"])
     identifiers, z, mag = (rows[name].to_numpy() for name in ("id", "z_obs", "mag_r01"))
-    # A few lie far from all others.
+    # A few values are far from all others.
     third = np.sort(identifiers)[-3]
     mag = np.where(identifiers >= third, 1e6, mag)
     axes = [
@@ -252,7 +252,7 @@ def test_tiles_contain_the_pixels_of_the_image(page):
             view[:] = piece.reshape(view.shape)
     coarse = np.frombuffer(page.of_lake("tile/1/1/0/0")[2], "<f4").reshape(300, 350)
     np.testing.assert_allclose(coarse, pixels.reshape(300, 2, 350, 2).mean((1, 3)), rtol=1e-5, atol=1e-4)
-    # The true places of the brightest stars are where the pixels peak.
+    # The true positions of the brightest stars are at peaks of the pixels.
     truth, checked = page.json("truth/1"), 0
     for x, y in zip(truth["x"][:60], truth["y"][:60], strict=True):
         c, r = round(x), round(y)
@@ -316,7 +316,7 @@ def test_the_grid_gives_the_sky(page):
     centre = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
     x, y, z = (np.radians(plane[0])[:, None] * east + np.radians(plane[1])[:, None] * north + centre).T
     found = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
-    # To 0.001 pixel.
+    # The tolerance is 0.001 pixel.
     assert sky.separation(*found, ra, dec).max() < 3e-8
 
 

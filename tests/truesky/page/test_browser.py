@@ -63,7 +63,7 @@ def test_a_new_version_of_the_lake_is_announced(browser, shown, tmp_path):
         assert tab.locator("#changed").is_hidden()
         old = page.server.lake.key
         publish.make_version(root, plain_plan(2), plain_work)
-        # The page looks by itself every half a minute, and whenever it is loaded.
+        # The page checks for new versions every half a minute, and whenever it is loaded.
         tab.reload()
         until(tab, "!document.getElementById('changed').hidden")
         assert page.server.lake.key == old
@@ -83,7 +83,7 @@ def test_a_tab_is_notified_if_another_tab_opens_a_new_version(browser, shown, tm
         tab.click("#reopen")
         until(tab, "document.body.dataset.ready === '1' && document.getElementById('changed').hidden")
         assert page.server.lake.key != old
-        # What the page does every half a minute: nothing of the new lake gets between what is shown of the old one.
+        # The page makes this request every half a minute. It must not mix data of the new lake into the old one.
         learnt = "import('/static/api.js').then((api) => api.open()).then((lake) => lake.key)"
         assert [other.evaluate(learnt) for _ in range(2)] == [old] * 2
         assert other.is_visible("#changed")
@@ -125,7 +125,7 @@ CONTRAST = """() => {
 
 @pytest.fixture(scope="module")
 def any_view(browser, page):
-    """A tab for tests that change only the view and the theme."""
+    """Return a tab for tests that change only the view and the theme."""
     with tab_of(browser, page, at("sql")) as opened:
         yield opened
 
@@ -147,7 +147,7 @@ NAMELESS = """() => [...document.querySelectorAll('button, input, select, textar
     || one.getAttribute('aria-label') || one.closest('label'))).map((one) => one.outerHTML)"""
 
 
-# Text of each visible element against what lies behind it; a picture behind text has its own ground.
+# Contrast of the text of each visible element with its background. Text over a picture has a background colour.
 SEEN = """() => {
   const part = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
   const rgb = (text) => text.match(/[\\d.]+/g).map(Number);

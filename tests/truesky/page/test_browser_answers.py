@@ -1,6 +1,6 @@
-"""Answers in a browser that are late, or refusals: what was asked for last is shown, and what went wrong is said.
+"""Late and refused answers in a browser: the latest request is shown, and errors are displayed.
 
-Answers are held back or replaced in the page, so that no request fails.
+Answers are delayed or replaced in the page, so that no request fails.
 """
 
 import json
@@ -13,11 +13,11 @@ from tests.truesky.page.test_requests import REQUESTS, two  # noqa: F401
 from truesky.page import sky_maps
 from truesky.request.from_toml import from_table
 
-# Most tests leave it at once; drawing it takes the least time.
+# First view of the tests. Most tests leave it at once, and it is the fastest to draw.
 VIEW = "sql"
 SAID = "document.getElementById('said').textContent"
 PIN = "document.querySelector('#pin h2')?.textContent"
-# Answers of addresses that hold a text: after so many ms, then perhaps a refusal; `times` of them.
+# Delay the first `times` answers from addresses with `part` by `delay` ms; then refuse them if `error` is given.
 REPLACED = """([part, delay, error, times]) => {
   const real = window.fetch;
   window.fetch = async (address, options) => {
@@ -160,7 +160,7 @@ def test_copied_queries_keep_conditions_that_end_in_a_comment(browser, page):
             assert "-- far" in query
             found = page.json("sql", method="POST", body=json.dumps({"sql": query}).encode())
             assert found["rows"]
-        # Of no chart there is no plot.
+        # Without charts there is no plot to copy.
         tab.evaluate("import('/static/plots.js').then((plots) => plots.usePlot('galaxies', []))")
         tab.click("#plot-python")
         until(tab, f"{SAID}.includes('There is no chart.')")
@@ -195,7 +195,7 @@ def test_only_exposures_in_view_are_shown_if_there_are_many(browser, sky, monkey
         until(tab, f"{STATES} === 'exposures partly: 1'")
 
 
-# ------------------------------------------------------------------------------------------------ of two requests
+# ------------------------------------------------------------------------------------------------ two requests
 
 TRACES = """async ([identifier, number]) => {
   const api = await import('/static/api.js'), { drawTraces } = await import('/static/trace.js'), said = [];
@@ -217,7 +217,7 @@ def test_traces_and_copied_requests_belong_to_the_request_of_the_image(browser, 
             until(tab, f"{HELD}.images.one === {number}")
             request = from_table(tomllib.loads(copied(tab, "#image-request")))
             assert [(one.band, one.detectors) for one in request.pointings] == [(band, ("DET22",))]
-        # What is copied names the tables of the request.
+        # The copied queries name the tables of the request.
         tab.evaluate(f"import('/static/pin.js').then(({{ pin }}) => pin('{identifier}'))")
         queries = [copied(tab, "#pin button:has-text('Copy as SQL')")]
         tab.keyboard.press("1")
@@ -226,7 +226,7 @@ def test_traces_and_copied_requests_belong_to_the_request_of_the_image(browser, 
         for query, rows in zip(queries, (1, 2), strict=True):
             found = page.json("sql", method="POST", body=json.dumps({"sql": query}).encode())
             assert len(found["rows"]) >= rows
-        # Of a field all that see it, each with its own place and band.
+        # The request for a field contains the exposures that cover it, with their positions and bands.
         far = REQUESTS["b"][1]
         tab.keyboard.press("1")
         tab.fill("#sky-go", f"{far} {CENTRE[1]}")

@@ -36,7 +36,7 @@ def test_a_source_through_the_grism(browser, tmp_path):
         words = tab.locator("#pin details[open]").inner_text()
         assert f"{wavelength / 10:.1f}".removesuffix(".0") in words
         assert "Hα" in words
-        # Nothing is cut out of where the source is not.
+        # There are no cutouts, because the light is not at the position of the source.
         assert tab.locator("#pin .cutouts canvas").count() == 0
         tab.locator("#pin button", has_text="Show in the image").click()
         time.sleep(0.6)
@@ -45,7 +45,7 @@ def test_a_source_through_the_grism(browser, tmp_path):
 
 
 def peaks(tab, page, number, most):
-    """Number of bright isolated stars whose pixel under the cursor is the largest of 3 x 3 pixels."""
+    """Check that the pixel under each of `most` bright isolated stars is the largest of 3 x 3; return their number."""
     until(tab, "document.getElementById('image-one').childElementCount === 3")
     tab.select_option("#image-one", str(number))
     time.sleep(1.5)
@@ -85,7 +85,7 @@ def test_an_image_its_places_and_a_pinned_source(tab, page):
     box = tab.locator("#image-canvas").bounding_box()
     truth = page.json("truth/0")
     zoom = 0.98 * min(box["width"] / 700, box["height"] / 600)
-    # North is down in the file: it is shown turned.
+    # North is down in the file, so the image is shown rotated.
     star = next(k for k in range(20) if 100 < truth["x"][k] < 600 and 100 < truth["y"][k] < 500)
     at = (box["x"] + box["width"] / 2 - (truth["x"][star] - 349.5) * zoom,
           box["y"] + box["height"] / 2 + (truth["y"][star] - 299.5) * zoom)  # fmt: skip
@@ -104,7 +104,7 @@ def test_an_image_its_places_and_a_pinned_source(tab, page):
 
 
 def opened(tab):
-    """Show the images and return the zoom at which the whole first image is visible."""
+    """Show the images; return the box of the canvas and the zoom at which the whole first image is visible."""
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
     box = tab.locator("#image-canvas").bounding_box()
     return box, 0.98 * min(box["width"] / 700, box["height"] / 600)
@@ -140,7 +140,7 @@ def test_keys_announce_pixels_and_pin_sources(tab, page):
     tab.locator("#image-canvas").focus()
     place = "document.getElementById('image-place').textContent"
     truth = page.json("truth/0")
-    # A star that stands alone, at the end of a walk by pixels of some tens.
+    # The star nearest to the centre, which some tens of steps of one pixel reach.
     away = np.hypot(np.array(truth["x"]) - 349.5, np.array(truth["y"]) - 299.5)
     star = int(np.argmin(away))
     for _ in range(6):
@@ -153,7 +153,7 @@ def test_keys_announce_pixels_and_pin_sources(tab, page):
         (truth["y"][star] - row, "ArrowDown", "ArrowUp"),
     ):
         for _ in range(round(abs(steps))):
-            # North is down in the file: it is shown turned.
+            # North is down in the file, so the image is shown rotated.
             tab.keyboard.press(f"Shift+{more if steps > 0 else less}")
     told = tab.evaluate(place)
     column, row = (int(text) for text in told.split("pixel ")[1].split("   ")[0].split(","))
@@ -162,7 +162,7 @@ def test_keys_announce_pixels_and_pin_sources(tab, page):
     until(tab, f"document.getElementById('told').textContent.includes('{truth['id'][star]}')")
     tab.keyboard.press("Enter")
     until(tab, f"document.getElementById('pin').textContent.includes('{truth['id'][star]}')")
-    # Places of the row have the digits of a hundredth of an arcsecond; every column has its sentence.
+    # Positions in the table have enough digits for 0.01 arcsec, and every column has a description.
     tab.locator("#pin summary").first.click()
     words = tab.locator("#pin details[open]").first.inner_text()
     assert f"{page.json(f'''source/{truth['id'][star]}''')['place'][0]:.7f}" in words
@@ -171,13 +171,13 @@ def test_keys_announce_pixels_and_pin_sources(tab, page):
 
 def test_cosmic_rays_come_and_go(tab):
     box, zoom = opened(tab)
-    # At the edge of the hits, which are 5000 electrons: what lies around a pixel stands for it.
+    # A pixel at the edge of the hits of 5000 electrons. Without the hits, its value comes from its surroundings.
     at = box["x"] + box["width"] / 2 - (120 - 349.5) * zoom, box["y"] + box["height"] / 2 + (200 - 299.5) * zoom
     place = "document.getElementById('image-place').textContent"
 
     value = f"Number({place}.split('   ').pop().split(' electron')[0].replace('\u202f', ''))"
     tab.mouse.move(*at)
-    # What is told of the place under the cursor follows the tiles as they come.
+    # The value under the cursor changes when tiles arrive.
     until(tab, f"{place}.includes('pixel 120, 200') && Math.abs({value} - 100) < 50")
     tab.evaluate("document.getElementById('image-mended').click()")
     until(tab, f"Math.abs({value} - 5100) < 50")
@@ -191,7 +191,7 @@ def test_blinking_shows_both_in_turn(tab):
     tab.select_option("#image-two", "1")
     time.sleep(1.0)
     tab.keyboard.press("b")
-    # The last of so many shown: on a busy machine the first may be of tiles that are still on their way.
+    # Compare the last screenshots: on a busy machine, the first ones may show tiles that are still loading.
     shown = []
     for _ in range(24):
         shown.append(tab.locator("#image-canvas").screenshot())

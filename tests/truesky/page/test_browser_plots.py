@@ -26,7 +26,7 @@ def test_brushes_filter_the_other_charts(tab, shown):
     inside = (z >= brush[0]) & (z <= brush[1]) & (mag >= spans[0]) & (mag <= spans[1])
     assert 0 < inside.sum() < GALAXIES_N
     assert tab.evaluate(ranges)[1].replace("\N{NARROW NO-BREAK SPACE}", "").startswith(f"{inside.sum()} rows")
-    # The map of the same column against another is cut, too.
+    # The map of the same column against another is also filtered.
     assert tab.evaluate(ranges)[4] != whole[4]
     tab.locator("#plot-grid canvas").first.focus()
     tab.keyboard.press("Escape")
@@ -42,7 +42,7 @@ def test_a_held_brush_sends_no_requests(tab):
     tab.on("request", lambda request: asked.append(request.url))
     tab.on("requestfinished", lambda request: answered.append(request.url))
     mouse = drag(tab, "#plot-grid canvas", 0.3, 0.35)
-    # What was asked when it was taken hold of.
+    # Wait for the requests that were sent when the brush was grabbed.
     rest = time.monotonic() + 1.0
     while time.monotonic() < rest:
         tab.wait_for_timeout(50)
@@ -101,7 +101,7 @@ def test_charts_are_tables_too(tab):
         numbers = [int(text.replace("\N{NARROW NO-BREAK SPACE}", "")) for text in
                    figure.locator("tbody td:last-child").all_inner_texts()]  # fmt: skip
         total = figure.locator(".range").inner_text().replace("\N{NARROW NO-BREAK SPACE}", "").split(" rows")[0]
-        # Of a map the fullest bins.
+        # The table of a map contains only the fullest bins.
         assert sum(numbers) == int(total) if place == 0 else 0 < sum(numbers) <= int(total)
 
 
@@ -121,7 +121,7 @@ def test_rows_outside_all_bins_are_counted_for_every_axis(tab, shown):
     galaxies = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
     z = galaxies["z_obs"].to_numpy()
     bound = float(np.median(z))
-    # A long tail, which the axis cuts.
+    # The column has a long tail, which the axis cuts off.
     source = f"(SELECT exp(3 * z_obs) AS w, CASE WHEN z_obs > {bound} THEN mag_r01 END AS m FROM galaxies) AS t"
     tab.evaluate(f"import('/static/plots.js').then((plots) => plots.usePlot({source!r}, [['w', 'm'], ['w']]))")
     text = plain(until(tab, f"{RANGES}.length === 2 && {RANGES}.every((text) => text.includes('rows')) && {RANGES}[0]"))

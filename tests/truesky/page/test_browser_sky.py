@@ -47,7 +47,7 @@ def test_from_the_sky_to_a_pixel_and_back(browser, sky):
         gone_to(tab)
         until(tab, f"{STATES}.includes('observed')")
         box = tab.locator("#sky-canvas").bounding_box()
-        # Wheels are told of in whole pixels.
+        # Wheel events have whole pixels as coordinates.
         tab.mouse.move(round(box["x"] + box["width"] / 2), round(box["y"] + box["height"] / 2))
         told = until(tab, "document.getElementById('sky-place').textContent")
         aimed = [float(text) for text in told.split("\n")[0].split()[-3:-1]]
@@ -59,7 +59,7 @@ def test_from_the_sky_to_a_pixel_and_back(browser, sky):
         there = tab.evaluate(f"{HELD}.images")
         (x,), (y,) = astrometry.pixel_of_sky(system(), *np.array(aimed).reshape(2, 1))
         assert (there["x"], there["y"]) == pytest.approx((x, y), abs=1)
-        # As large as it was on the sky: some pixels of the screen for each of the image.
+        # The image is as large as it was on the sky: 0.01 deg fill at least 90 % of the height.
         assert there["zoom"] * 0.01 / PIXEL >= tab.locator("#image-canvas").bounding_box()["height"] * 0.9
         tab.click("#image-sky")
         until(tab, f"{HELD}.view === 'sky'")
@@ -122,13 +122,13 @@ def test_the_copied_request_covers_the_view(browser, sky):
         assert (first.channel, first.camera, first.band) == ("VIS", "vis", "euclid_vis")
         assert (first.detectors, second.detectors) == (("1-1", "1-2"), ("3-4",))
         assert (second.position_angle, second.mjd, second.exposure_time_s) == (12.5, 60906.5, 90.0)
-        # Of an image its own exposure and detector.
+        # The request for an image contains only its exposure and detector.
         tab.keyboard.press("4")
         until(tab, f"{HELD}.images?.one >= 0 && {HELD}.images.zoom > 0")
         request = from_table(tomllib.loads(copied(tab, "#image-request")))
         assert [one.detectors for one in request.pointings] == [("1-1",)]
         assert (request.area.ra, request.area.dec) == pytest.approx(CENTRE, abs=3 * PIXEL)
-        # What asks for rows asks for those in view.
+        # A copied query selects the rows in view.
         tab.keyboard.press("1")
         assert copied(tab, "#sky-sql").startswith("SELECT *\nFROM galaxies\nWHERE separation(ra, dec, ")
 

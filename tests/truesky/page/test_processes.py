@@ -27,7 +27,7 @@ from truesky.page.tap.queries import Jobs
 
 
 def killed(lane):
-    """Kill the processes of a pool, as the system does if memory is short."""
+    """Kill the processes of a pool, as the system does if memory is short, and return their number."""
     found = [process._worker.process for process in lane._processes if process._worker is not None]
     for worker in found:
         os.kill(worker.pid, signal.SIGKILL)
@@ -75,7 +75,7 @@ def test_a_process_is_stopped_while_it_ends():
 
         @_worker.setter
         def _worker(self, worker):
-            """Of the constructor."""
+            """Ignore the value that the constructor sets."""
 
     Ending(Path(), []).stop()
     assert len(killed) == 1

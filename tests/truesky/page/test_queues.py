@@ -251,7 +251,7 @@ def test_others_are_answered_while_a_result_is_written(monkeypatch):
         jobs = Jobs(run_one)
         job = jobs.add({}, 1.0)
         jobs.start(job)
-        # The loop goes on: else nobody would ever let the file be written.
+        # The event loop must continue, or the write would never be allowed to finish.
         await asyncio.sleep(0.05)
         assert job.phase == "EXECUTING"
         go.set()

@@ -40,7 +40,7 @@ truth = ["noise_free"]
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """A lake with a VIS detector and a grism detector with the same stars."""
+    """Return a lake with a VIS detector and a grism detector with the same stars."""
     folder, rng = tmp_path_factory.mktemp("rendered"), np.random.default_rng(11)
     x, y = rng.uniform(-0.48, 0.48, (2, COUNT)) * SIDE * 0.1 / 3600.0
     ra, dec, mags = 53.117 + x / np.cos(np.radians(-27.808)), -27.808 + y, rng.uniform(15.0, 22.0, COUNT)
@@ -57,7 +57,7 @@ def rendered(tmp_path_factory):
 
 
 def peak(image, x, y):
-    """Peak near a position, by a parabola through the magnitudes of the brightest pixel and its neighbours."""
+    """Return the peak near a position, from a parabola through magnitudes of the brightest pixel and its neighbours."""
     column, row = round(x), round(y)
     near = image[row - 2 : row + 3, column - 2 : column + 3].astype(float)
     r, c = np.unravel_index(near.argmax(), near.shape)
@@ -84,15 +84,15 @@ def test_the_brightest_stars_are_where_the_truth_says(rendered):
         lake.close()
     place = np.array([truth["x"], truth["y"]]).T
     inside = ((place > 6) & (place < SIDE - 7)).all(axis=1)
-    # Rows of charge injection hold no light.
+    # Rows of charge injection contain no light.
     dark = np.flatnonzero((image == 0.0).all(axis=1))
     inside &= (np.abs(place[:, 1, None] - dark) > 3.0).all(axis=1)
-    # Whoever lies in the light of a brighter one has no peak of its own.
+    # Stars in the light of a brighter star have no separate peak.
     apart = np.array([all(np.hypot(*(place[:k] - at).T) > 12.0) for k, at in enumerate(place)])
     brightest = place[inside & apart][:STARS]
     assert len(brightest) == STARS
     away = np.array([peak(image, *at) - at for at in brightest])
-    # Ten times closer than the half pixel by which the brightest pixel alone may miss it.
+    # Ten times smaller than the half pixel by which the centre of the brightest pixel may be wrong.
     assert np.abs(away).max() <= 0.05
 
 
@@ -106,5 +106,5 @@ def test_the_trace_lies_on_the_spectrum(rendered):
     for head, rest in strips:
         pixels = np.frombuffer(rest, "<f4").reshape(head["rows"], head["columns"])
         middle = head["rows"] // 2
-        # Of the rows next to it the trace's own has the most light; beyond may lie others.
+        # Among the nearest rows, the row of the trace has the most light. Rows farther away may contain other spectra.
         assert np.nanmedian(pixels, axis=1)[middle - 3 : middle + 4].argmax() == 3

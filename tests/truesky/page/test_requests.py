@@ -16,8 +16,8 @@ from tests.universe import plain_plan, plain_work, rows_of
 from truesky.page.lake_session import LakeSession
 from truesky.page.tap import images
 
-# Of each request: its band, where its second exposure looks, the date of its first, the first pixel of its trace, and
-# the ends of its passband, angstrom.
+# For each request: band, right ascension of the second exposure, MJD of the first exposure, first pixel of the trace,
+# and ends of the passband (angstrom).
 REQUESTS = {
     "a": ("nisp_red", CENTRE[0] + 1.0, 60000.0, 80.0, (12000.0, 18000.0)),
     "b": ("nisp_blue", CENTRE[0] + 5.0, 61000.0, 95.0, (9000.0, 13000.0)),
@@ -30,7 +30,7 @@ def square(ra, dec, half):
 
 
 def planned(root, name):
-    """Exposures 7, which has been rendered, and 8, which has not."""
+    """Publish the plan of a request: exposure 7, which has been rendered, and exposure 8, which has not."""
     band, ra, mjd, _, ends = REQUESTS[name]
     rows, dec = rows_of(EXPOSURES, 2), CENTRE[1]
     exposures = {column: rows[column] for column in EXPOSURES.names} | {
@@ -56,7 +56,7 @@ def planned(root, name):
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """Exposure 8 of the first request failed; a third request shares the tables of the second."""
+    """Serve a lake of three requests: exposure 8 of the first failed, and the third shares the tables of the second."""
     root = tmp_path_factory.mktemp("two") / "lake"
     root.mkdir()
     for seconds, name in enumerate(("a", "b", "c"), start=1):
@@ -65,7 +65,7 @@ def two(tmp_path_factory):
         identifier, _ = test_traces.published(root, [first, *test_traces.TRACE_X[1:]], name, band, min(seconds, 2))
         if name != "c":
             planned(root, name)
-    # Shares the plan, too.
+    # The third request also shares the plan.
     for table in ("exposures", "tasks", "passbands"):
         target = layout.request_link(root, "b", table).readlink()
         layout.request_link(root, "c", table).symlink_to(target)
@@ -160,7 +160,7 @@ def test_traces_lie_on_the_images_of_their_request(two):
     assert [(one["request"], one["band"], one["images"], one["trace_x"][0]) for one in spectra] == [
         (name, REQUESTS[name][0], {"science": number}, REQUESTS[name][3]) for number, name in enumerate("ab")
     ]
-    # Where the trace of an image's own request lies, its light is: both were drawn at the place of the first.
+    # Both images have their light on the trace of the first request, so only this trace contains light.
     pixels = []
     for number in (0, 1):
         head, rest = unpacked(page.of_lake(f"trace/{number}/{identifier}?order=1")[2])

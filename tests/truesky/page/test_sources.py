@@ -58,7 +58,7 @@ def test_the_position_comes_from_the_request_that_has_the_source(tmp_path):
     here = {name: {row["id"]: row for row in found.to_pylist()} for name, found in rows.items()}
     both, alone = next(iter(here["a"].keys() & here["b"])), next(iter(here["b"].keys() - here["a"]))
     with serving(root) as page:
-        # What both have is that of the first, in its row and its place.
+        # A source of both requests has the row and the position of the first request.
         for own, request in ((both, "a"), (alone, "b")):
             found, row = page.json(f"source/{own}"), here[request][own]
             assert found["request"] == request

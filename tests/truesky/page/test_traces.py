@@ -17,14 +17,14 @@ from truesky.fluxes.spectra import lines
 from truesky.render.camera import astrometry
 from truesky.render.products.sidecar_files import truth_file
 
-# A trace that falls and bends, from 1206 to 1892 nm; the line's wavelength.
+# Polynomials of a bent trace, its wavelength range (angstrom), and pixel values of the continuum and of the line.
 TRACE_X, TRACE_Y = [80.0, 500.0, 0.0], [300.0, -40.0, 12.0]
 FIRST, LAST = 12060.0, 18920.0
 LEVEL, LINE = 50.0, 900.0
 
 
 def galaxy():
-    """A galaxy with an observed H-alpha line, and the wavelength of the line."""
+    """Return galaxies, the id of one whose H-alpha line is near 15000 angstrom, and the wavelength of this line."""
     rows = rows_of(GALAXIES, 20, seed=4)
     z = rows["z_obs"].to_numpy()
     halpha = next(line.vacuum for line in lines.line_list() if line.name == "halpha")
@@ -33,7 +33,7 @@ def galaxy():
 
 
 def spectrum_image(wavelength):
-    """A bright band of one pixel's width along the trace, with a brighter line."""
+    """Return an image with a bright band, one pixel wide, along the trace, and a brighter line."""
     out = np.full((NY, NX), 1.0)
     t = np.linspace(0.0, 1.0, 20_000)
     x, y = (np.rint(np.polynomial.polynomial.polyval(t, part)).astype(int) for part in (TRACE_X, TRACE_Y))
@@ -45,9 +45,9 @@ def spectrum_image(wavelength):
 
 
 def published(root, trace_x=TRACE_X, name=None, band="nisp_red", seconds=0):
-    """A galaxy, an image through a grism, and the truth of it.
+    """Publish galaxies, a grism image of one of them and its truth; return its id and the wavelength of its line.
 
-    name : of the request that has them;  seconds : tells its versions from those of others
+    `name` is the name of the request. A different number of `seconds` gives a different version.
     """
     rows, own, wavelength = galaxy()
     cards = (*astrometry.cards(system()), ("BUNIT", "electron", "unit"))
@@ -114,11 +114,11 @@ def test_pixels_along_a_trace(grism):
     assert (status, head["first"], head["last"]) == (200, FIRST, LAST)
     pixels = np.frombuffer(rest, "<f4").reshape(head["rows"], head["columns"])
     middle = head["rows"] // 2
-    # Straightened: the light is in the middle row, or a pixel beside it where the trace passes between two.
+    # In the straightened pixels, the light is in the middle row, or one row off where the trace is between rows.
     bright = pixels >= LEVEL
     assert set(np.flatnonzero(bright.any(axis=1))) <= {middle - 1, middle, middle + 1}
     assert bright[middle].mean() > 0.95
-    # The line lies at its wavelength, to a pixel.
+    # The line is at its wavelength, within about a pixel.
     column = pixels[middle].argmax()
     step = (LAST - FIRST) / (head["columns"] - 1)
     assert FIRST + column * step == pytest.approx(wavelength, abs=1.5 * step)

@@ -186,7 +186,7 @@ def test_level_2_files_are_in_one_folder(jpcam):
 
 
 def test_scamp_reads_the_catalogue(jpcam, tmp_path):
-    """With the .head file, positions agree with those in the catalogue."""
+    """With the .head file, SCAMP finds the positions that the catalogue contains."""
     command = test_tools.tool("scamp")
     for end in (".cat", ".head"):
         shutil.copy(jpcam.path.with_suffix(end), tmp_path / f"a{end}")
@@ -376,7 +376,7 @@ truth = ["noise_free", "sky", "cosmic_rays"]
     ("survey", "camera", "band", "detector", "mjd", "size"),
     [
         ("jedis", "jpcam", "jedis_g", "ccd05", 60905.08, 1024),
-        # Its pixels are smaller, and more of its stars saturated.
+        # HSC has smaller pixels, and more of its stars are saturated.
         ("whigs", "hsc", "hsc_g", "1_00", 60905.6, 2048),
     ],
 )
@@ -405,7 +405,7 @@ def test_level_2_of_a_lake_with_its_masters(tmp_path, survey, camera, band, dete
         images.read_images(version.sidecar_path(image.replace("_sky", kind)))[0].data
         for kind in ("_sky", "_noise_free", "_cosmic_rays")
     )
-    # Outer light of galaxies is everywhere.
+    # Galaxies have faint light in all pixels, so a small fraction of the sky is accepted.
     good = (found.reduced.weight > 0.0) & (light < 0.01 * np.median(sky)) & (rays == 0)
     dark = found.card("DARKRATE") * found.card("EXPTIME")
     left = np.where(good, found.reduced.image * found.card("GAIN") - light - sky - dark, np.nan)

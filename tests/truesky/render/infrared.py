@@ -56,7 +56,7 @@ def rendered(
     mags=(), x=(), y=(), detector=None, body=None, forced=None, truth=(), mission=MISSION, accuracy=SURVEY,
     earlier=(), **columns,
 ):  # fmt: skip
-    """Render a detector, by default of 96 x 96 pixels; `columns` are those of `exposed`."""
+    """Render a detector, by default of 96 x 96 pixels; `columns` are arguments of `exposed`."""
     detector = detector or small("nisp", "DET22", 96)
     row = exposed(detector, mission=mission, **columns)
     with pytest.MonkeyPatch.context() as patch:

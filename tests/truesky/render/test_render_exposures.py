@@ -64,7 +64,7 @@ REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7
 
 @contextmanager
 def small_detectors():
-    """Detectors of LSSTCam cut to their centres, close together."""
+    """Cut the detectors of LSSTCam to their centres, and move them close together."""
     listed = detectors._read_layout
 
     def smaller(section, mission):
@@ -90,7 +90,7 @@ def catalogues(tmp_path_factory):
 
 @pytest.fixture
 def lake(catalogues, tmp_path):
-    """A lake of catalogues and fluxes."""
+    """Return a lake of catalogues and fluxes."""
     return layout.resolve_lake(shutil.copytree(catalogues, tmp_path / "lake", symlinks=True))
 
 
@@ -103,7 +103,7 @@ def _once(catalogues, tmp_path_factory):
 
 @pytest.fixture
 def rendered(_once, tmp_path):
-    """A lake with the products of `wanted()`."""
+    """Return a lake with the products of `wanted()`."""
     return layout.resolve_lake(shutil.copytree(_once, tmp_path / "rendered", symlinks=True))
 
 
@@ -165,7 +165,7 @@ def test_products_of_every_detector_and_rows_of_every_source(rendered):
         assert (np.diff(ids) > 0).all()
         with fits.open(version.sidecar_path(row["path"])) as file:
             electrons, system = file[0].data.astype(float), WCS(file[0].header)
-        # The image is the sum of the stamps and of wings fainter than the noise: 4 % with the aureole.
+        # The image is the sum of the stamps and of wings fainter than the noise, which are 4 % with the aureole.
         assert onto.sum() <= electrons.sum() * (1 + 1e-5)
         assert onto.sum() > 0.94 * electrons.sum()
         assert (onto <= expected * 1.001).all()
@@ -182,7 +182,7 @@ def test_products_of_every_detector_and_rows_of_every_source(rendered):
 
 
 def test_a_cone_search_finds_a_galaxy_of_an_image(rendered):
-    """With the header of the file alone; a cross-match contains all sources of the image."""
+    """The header of the file alone gives the positions. A cross-match contains all sources of the image."""
     products, truth = (read.version(rendered, name) for name in ("products", "rendered_truth"))
     catalogues = [read.version(rendered, name) for name in ("galaxies", "galaxy_fluxes")]
     matched = 0
@@ -272,7 +272,7 @@ def _check_archive(lake, capsys):
 
 
 def test_distant_sources_do_not_change_the_image(lake, rendered):
-    """The same lake without sources 8 arcmin or more from the detectors, in the cells that they read."""
+    """Sources 8 arcmin or more from the detectors are removed from the lake, in cells that the detectors read."""
     for name in ("galaxies", "stars"):
         version = read.version(lake, name)
         table, whole = tables.find_table(name, version.schema.names), version.manifest
@@ -286,7 +286,7 @@ def test_distant_sources_do_not_change_the_image(lake, rendered):
         publish.make_version(lake, Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
         assert 20 < read.version(lake, name).num_rows < 0.95 * version.num_rows
     make(lake, wanted(), compute_fluxes)
-    # Their files differ, so that the detectors are rendered again, to the same bytes.
+    # The files differ, so the detectors are rendered again. The bytes are the same.
     assert render(lake, wanted()) == BOTH
     assert images(lake) == images(rendered)
     drawn = [read.version(root, "rendered_truth").rows() for root in (lake, rendered)]
@@ -386,7 +386,7 @@ def test_new_products_are_added_to_existing_ones(rendered):
     named(lake, two := wanted(pointings=2), plan_exposures)
     assert planned_parts(lake, replace(two, limit=1)) == [both, both]
     assert planned_parts(lake, replace(two, limit=3)) == [[*both, "000002-r22_s11.parquet"]] * 2
-    # Another noise seed gives other images; another request has none of them.
+    # Another noise seed gives other images; another request does not have these images.
     named(lake, other := replace(whole, noise_seed=8), plan_exposures)
     assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
     named(lake, other := replace(whole, name="y"), plan_exposures)
@@ -399,7 +399,7 @@ def size_of(root, *tables):
 
 
 def test_reused_files_need_no_disk_space(rendered):
-    """Reused catalogues and images with unchanged product keys need no space; those of other requests do not count."""
+    """Reused catalogues and images with unchanged keys need no space; products of other requests do not count."""
     lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
     # The version belongs to the request, as after a job.
     request_links.link_version(lake, whole.name, "products", str(layout.current_key(lake, "products")))
@@ -586,7 +586,7 @@ def test_an_old_product_is_rendered_again_with_its_mission(rendered, tmp_path, c
     assert (tmp_path / "again.fits").read_bytes() == images(rendered)[path]
     assert archive.main([*command[:3], "images/no.fits", *command[4:]]) == 2
     assert "has no product images/no.fits" in capsys.readouterr().err
-    # The tables that it was made from have been removed.
+    # Garbage collection removes a table from which the product was made.
     garbage.collect(rendered, "mission", delete=True)
     assert archive.main([*command, "--version", old.key]) == 2
     assert "no table mission of version" in capsys.readouterr().err

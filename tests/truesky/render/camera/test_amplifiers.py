@@ -1,4 +1,4 @@
-"""Amplifiers of the ground cameras: no pixel is read twice or forgotten, and the raw file says where each lies."""
+"""Amplifiers of the ground cameras: each pixel is read exactly once, and the raw file contains its position."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from truesky.render.camera import amplifiers, detectors
 from truesky.render.camera.sections import Section
 
 GAIN = "electron / adu"
-# Of raw files, as published: rows and columns.
+# Published numbers of rows and columns of raw files.
 RAW = {"decam": (4146, 2160), "megacam": (4644, 2112), "hsc": (4241, 2144)}
 
 
@@ -29,14 +29,14 @@ def layout_of(detector, mission=MISSION):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_every_pixel_is_read_once_and_found_again(camera):
-    """In the planes, in the raw file, and in the sections that its header names."""
+    """Each pixel is once in the planes, in the raw file, and in the sections that the header names."""
     own = layout_of(first(camera, nx=96, ny=80))
     frame = np.arange(1, 96 * 80 + 1).reshape(80, 96)
     planes = own.split(frame)
     there = ~own.unread_pixels
     np.testing.assert_array_equal(own.assemble(planes), np.where(there, frame, 0))
     assert np.count_nonzero(planes) == there.sum()
-    # Pre- and overscan, too, are in the file once, each of them.
+    # The raw file also contains each pixel of the prescan and overscan exactly once.
     marked = np.arange(1, planes.size + 1).reshape(planes.shape)
     raw = own.to_raw_image(marked)
     np.testing.assert_array_equal(np.sort(raw[raw > 0]), marked.ravel())
@@ -65,7 +65,7 @@ def test_raw_files_have_their_published_size(camera):
 
 
 def test_sensors_of_two_makers_have_different_gains():
-    """Rubin Observatory: segments of 576 x 2048 (e2v) or 576 x 2048 with other scans (ITL); gains 1.47 and 1.57."""
+    """Rubin Observatory gives 576 x 2048 pixels per segment with scans, and gains of 1.47 (e2v) and 1.57 (ITL)."""
     makers = {d.kind: d for d in detectors.detectors("lsstcam", MISSION)}
     e2v, itl = (layout_of(makers[kind]) for kind in ("e2v", "itl"))
     for own in (e2v, itl):
@@ -117,7 +117,7 @@ def test_a_detector_too_small_for_its_amplifiers_is_refused():
 
 
 def test_crosstalk_beyond_neighbours_is_as_small_as_measured():
-    """Rubin Observatory, LSSTCam: 1.5e-4 to 2.9e-4 between neighbours, less than 5e-5 between others."""
+    """Rubin Observatory measured 1.5e-4 to 2.9e-4 between neighbours in LSSTCam, and less than 5e-5 between others."""
     for one in detectors.detectors("lsstcam", MISSION)[:60]:
         own = layout_of(one)
         found = amplifiers.crosstalk_couplings(2.2e-4, 2.9e-4, one, own)
@@ -128,7 +128,7 @@ def test_crosstalk_beyond_neighbours_is_as_small_as_measured():
 
 
 def test_amplifiers_that_would_have_no_gain_are_refused():
-    """Exactly those: a spread that is wide, and a camera whose own amplifiers all lie on one side of it."""
+    """A spread is refused exactly if it would give an amplifier of the camera a gain below 1e-3."""
     every, key = detectors.detectors("decam", MISSION), "ext.decam.gain_spread"
     amplifiers.refuse_spread(every, MISSION)
     for rms in (0.5, 1.0, 1.35, 1.5, 2.0, 3.0):

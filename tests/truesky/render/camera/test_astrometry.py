@@ -1,4 +1,4 @@
-"""Where detectors are and where their pixels look: rules, parity, poles, the FITS header."""
+"""Positions of detectors and sky positions of their pixels: layouts, parity, pointing, poles, the FITS header."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from truesky.render.camera.detectors import detector, detectors
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.effects.scene import Scene
 
-# As drawn on paper: no distortion, every detector where the grid has it.
+# Ideal cameras: no distortion, and all detectors at their nominal positions.
 MISSION = resolve(
     overrides={
         f"{camera}.fpa.{key}": (0.0, unit)
@@ -49,7 +49,7 @@ def test_vis_fills_the_published_field():
 
 
 def test_rows_between_the_halves_of_a_vis_detector_are_not_read():
-    """Four rows of charge injection between 2 x 2066: 4136 of them from edge to edge."""
+    """A VIS detector has 2 x 2066 rows with four charge injection rows between them: 4136 rows from edge to edge."""
 
     def half_rows(detector):
         return Scene(MISSION, detector.section, 1.0, 0.0, 0.0, detector).half_rows
@@ -139,7 +139,7 @@ def test_unknown_cameras_and_detectors_are_refused():
 
 @pytest.mark.parametrize("d", [VIS[0], VIS[35], LSST[0], LSST[94]])
 def test_east_is_left_when_north_is_up(d):
-    """Alcyone and Atlas, in the Pleiades: Atlas lies 23' east and 3' south of Alcyone."""
+    """In the Pleiades, Atlas is 23' east and 3' south of Alcyone."""
     alcyone, atlas = (56.87115, 24.10514), (57.29059, 24.05342)
     system = wcs(d, *alcyone, 0.0)
     (x1, x2), (y1, y2) = pixel_of_sky(system, *np.transpose([alcyone, atlas]))
@@ -155,14 +155,14 @@ def test_east_is_left_when_north_is_up(d):
 def test_the_sky_is_never_mirrored(pointing, d):
     system = wcs(d, *boresight_for(d, *pointing))
     j = jacobian(system, [(d.nx - 1) / 2], [(d.ny - 1) / 2])[0]
-    # (u west, v north) against (column, row): a rotation.
+    # The Jacobian of (u west, v north) with respect to (column, row) is a rotation.
     assert np.linalg.det(j) == pytest.approx(d.pixel_scale**2, rel=2e-3)
     assert np.linalg.det(j) > 0
 
 
 @given(st.floats(-180, 180))
 def test_position_angle_of_the_columns(angle):
-    """The focal plane's y axis points to the position angle, north through east."""
+    """The y axis of the focal plane points to the position angle, which counts from north through east."""
     d = LSST[94]
     system = wcs(d, 150.0, 2.0, angle)
     ra, dec = sky_of_pixel(system, [(d.nx - 1) / 2] * 2, [(d.ny - 1) / 2, (d.ny - 1) / 2 + 10])
@@ -181,7 +181,7 @@ def test_a_pointing_puts_the_detector_on_its_target(pointing, d):
     x, y = pixel_of_sky(system, [ra], [dec])
     assert np.hypot(x[0] - (d.nx - 1) / 2, y[0] - (d.ny - 1) / 2) < 1e-6
     if abs(dec) < 89.9 and not d.distortion_terms:
-        # At the target itself, the detector's axes have the angle that was asked for.
+        # At the target, the axes of the detector have the requested position angle.
         j = jacobian(system, x, y)[0]
         measured = np.degrees(np.arctan2(-j[0, 1], j[1, 1])) - d.rotation
         assert (measured - angle + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-4)
@@ -229,7 +229,10 @@ def test_right_ascension_wraps():
 
 @given(SKY, ANY_DETECTOR, st.floats(0, 4000), st.floats(0, 4000))
 def test_jacobian_against_the_sky(pointing, d, x, y):
-    """Against great circles of astropy, half a pixel either way, away from where north has no meaning."""
+    """The Jacobian agrees with great circles by astropy over half a pixel in both directions.
+
+    Declinations above 80 deg are left out, because the direction of north is not defined at the poles.
+    """
     ra, dec, angle = pointing
     system = wcs(d, *boresight_for(d, ra, max(min(dec, 80.0), -80.0), angle))
     j = jacobian(system, [x], [y])[0]
@@ -243,7 +246,7 @@ def test_jacobian_against_the_sky(pointing, d, x, y):
 
 @given(SKY, ANY_DETECTOR)
 def test_the_header_is_the_whole_truth(pointing, d):
-    """astropy, from the cards alone, finds every pixel where we do."""
+    """From the header cards alone, astropy gives the same position for every pixel."""
     system = wcs(d, *boresight_for(d, *pointing))
     header = fits.Header([fits.Card(*card) for card in astrometry.cards(system)])
     for other in (WCS(header), astrometry.from_cards(astrometry.cards(system))):
@@ -262,7 +265,7 @@ def test_a_header_without_a_world_is_refused():
 def test_footprints(pointing, d):
     system = wcs(d, *boresight_for(d, *pointing))
     corners = astrometry.corners(d, system)
-    # Corners are a half-diagonal from the centre, to what the projection bends.
+    # The corners are half a diagonal from the centre, except for the curvature of the projection.
     reach = sky.separation(*astrometry.centre(d, system), *corners.T) * 3600
     np.testing.assert_allclose(reach, d.half_diagonal, rtol=3e-3)
     words = astrometry.s_region(d, system).split()

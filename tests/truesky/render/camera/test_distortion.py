@@ -1,4 +1,4 @@
-"""Distortion of the optics, and mounting rotation of detectors: as large as the mission says, undone, or absent."""
+"""Distortion of the optics and mounting errors of detectors: their size, their inverse, and switching them off."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ MISSION = resolve()
 VIS, NISP = detectors("vis", MISSION), detectors("nisp", MISSION)
 CAMERAS = pytest.mark.parametrize("camera", [VIS, NISP], ids=["vis", "nisp"])
 FARTHEST = [max(detectors(camera, MISSION), key=lambda d: np.hypot(d.x, d.y)) for camera in GROUND]
-# Half of the field of each, arcsec.
+# Half width and half height of the tested field of each camera, arcsec.
 HALF = {"vis": (1260, 1400), "nisp": (1300, 1376)}
 HALF |= {d.section: (abs(d.x) + 500, abs(d.y) + 500) for d in FARTHEST}
 
@@ -32,7 +32,7 @@ def field(camera, n):
 
 
 def scales(x, y, terms, step=0.05):
-    """Singular values of the distortion's derivative, from differences."""
+    """Return the singular values of the derivative of the distortion, from finite differences."""
     columns = [
         np.subtract(distortion.distort(x + a, y + b, terms), distortion.distort(x - a, y - b, terms)) / (2 * step)
         for a, b in ((step, 0.0), (0.0, step))
@@ -52,14 +52,17 @@ def test_the_scale_changes_by_as_much_as_the_mission_says(camera):
 
 @CAMERAS
 def test_it_is_a_cubic_about_the_telescope_s_axis(camera):
-    """Which the field lies beside: D = k r^2 r, less what shifts and scales the whole field."""
+    """The field of view is off the axis of the telescope. The distortion about this axis is D = k r^2 r.
+
+    The shift and the scale at the centre of the field are subtracted from it.
+    """
     axis = MISSION.value("plm.vis_field_offset_y", "arcsec")
     x, y = field(camera, 9)
 
     def cubic(x, y):
         return np.stack([x, y + axis]) * (x**2 + (y + axis) ** 2)
 
-    # The cubic's own shift and scales at the centre.
+    # Linear part of the cubic at the centre of the field.
     slope = np.array([axis**2 * x, 3 * axis**2 * y])
     wanted = cubic(x, y) - cubic(0.0, 0.0)[:, None, None] - slope
     found = np.array(distortion.distort(x, y, camera[0].distortion_terms)) - np.stack([x, y])
@@ -69,8 +72,9 @@ def test_it_is_a_cubic_about_the_telescope_s_axis(camera):
 
 @pytest.mark.parametrize(
     ("camera", "radius", "seen"),
-    # What a place so many mm from the axis sees over what a perfect camera of the scale on the axis has there, by the
-    # camera's description; HSC's polynomial of ninth order in the mean of ten directions.
+    # Field angle at a radius (mm) from the axis, relative to a perfect camera with the scale on the axis. The values
+    # follow from the description of each camera. For HSC, they are means of its polynomial of ninth order in ten
+    # directions.
     [
         ("decam", 225.0, (8.5165e-5 * 225.0 - 4.5014e-12 * 225.0**3) / (8.5165e-5 * 225.0)),
         ("lsstcam", 317.0, 1 - 8.337e-9 * 317.0**2 - 1.41e-15 * 317.0**4),
@@ -84,12 +88,12 @@ def test_a_ground_camera_sees_what_its_description_says(camera, radius, seen):
     for angle in (0.0, 0.4, 2.0):
         x, y = radius * plate * np.array([np.cos(angle), np.sin(angle)])
         found = np.hypot(*distortion.distort(x, y, one.distortion_terms))
-        # 0.1 arcsec at HSC's edge; the others are exact.
+        # The tolerance of HSC is 0.1 arcsec at the edge; the polynomials of the others are exact.
         assert found / (radius * plate) == pytest.approx(seen, abs=4e-5 if camera == "hsc" else 1e-7)
 
 
 def test_megacam_sees_less_at_the_edge():
-    """0.187 arcsec a pixel at the centre, 0.185 half a degree away."""
+    """The scale is 0.187 arcsec per pixel at the centre, and 0.185 half a degree away."""
     one = detectors("megacam", MISSION)[0]
     edge = scales(np.array([1800.0]), np.array([0.0]), one.distortion_terms)[0]
     assert one.pixel_scale == pytest.approx(0.187)
@@ -98,7 +102,10 @@ def test_megacam_sees_less_at_the_edge():
 
 @pytest.mark.parametrize("d", FARTHEST, ids=GROUND)
 def test_a_ground_camera_s_header_is_where_sources_are_drawn(d, tmp_path):
-    """In the form of its pipeline, as astropy reads it, on the detector that the optics distort most."""
+    """astropy reads the header in the convention of the camera's pipeline.
+
+    The detector is the one with the largest distortion.
+    """
     camera = d.section.removeprefix("ext.")
     ra, dec, angle = boresight_for(d, 53.1, -27.8, 12.0)
     system = wcs(d, ra, dec, angle)
@@ -113,7 +120,7 @@ def test_a_ground_camera_s_header_is_where_sources_are_drawn(d, tmp_path):
     assert here.sum() > 5
     there = SkyCoord(*theirs.all_pix2world(column, row, 0), unit="deg")
     assert there.separation(SkyCoord(lon, lat, unit="deg")).to_value("mas")[here].max() < 1e-2
-    # Without the distortion they would lie arcseconds off.
+    # Without the distortion, the positions would be arcseconds off.
     flat = pixel_of_sky(wcs(replace(d, distortion_terms=()), ra, dec, angle), lon, lat)
     assert np.hypot(flat[0] - column, flat[1] - row)[here].min() * d.pixel_scale > 2.0
 
@@ -129,7 +136,7 @@ def test_the_outline_of_a_field_is_its_detectors(d):
 
 @given(st.sampled_from([*VIS, *NISP, *FARTHEST]), st.floats(-1, 1), st.floats(-1, 1), st.floats(-180, 180))
 def test_the_header_s_polynomial_is_the_focal_plane_s(d, across, up, angle):
-    """What a place of the focal plane sees: by the polynomial there, and by the detector's SIP."""
+    """A position in the focal plane has the same sky position by its polynomial and by the SIP of the detector."""
     pointing = (150.0, 2.0, angle)
     turn = np.radians(d.rotation)
     x, y = across * HALF[d.section][0], up * HALF[d.section][1]
@@ -143,7 +150,7 @@ def test_the_header_s_polynomial_is_the_focal_plane_s(d, across, up, angle):
 
 @given(st.sampled_from([*VIS, *NISP, *FARTHEST]), st.floats(-4000, 8000), st.floats(-4000, 8000))
 def test_the_inverse_is_exact(d, column, row):
-    """To a hundredth of a milliarcsecond, and a thousand times better; and as astropy's own."""
+    """Pixel to sky and back is accurate to 1e-5 mas, and agrees with the inverse of astropy."""
     system = wcs(d, *boresight_for(d, 53.1, -27.8, 12.0))
     sky = sky_of_pixel(system, [column], [row])
     found = pixel_of_sky(system, *sky)
@@ -171,13 +178,13 @@ def test_it_can_be_switched_off(camera, columns, pitch):
     scale = straight[0].pixel_scale
     np.testing.assert_allclose(rms, [2 * scale, 2 * scale, 0.02], rtol=1e-2)
     assert {round(d.rotation, 12) for d in on_grid} == {0.0, 180.0}
-    # One pixel along the grid is one pixel.
+    # Detectors at nominal positions have the nominal pitch.
     np.testing.assert_allclose(np.diff([d.x for d in on_grid[:columns]]), pitch, rtol=1e-12)
 
 
 @pytest.mark.parametrize("far", [1.3, 2.0, 6.0, 40.0])
 def test_positions_beyond_the_invertible_radius_are_unchanged(far):
-    """HSC's distortion folds 1.7 deg from its axis, where there is no detector."""
+    """The distortion of HSC cannot be inverted beyond 1.7 deg from the axis, where there are no detectors."""
     system = wcs(FARTHEST[-1], 150.0, 2.0, 0.0)
     place = [150.0], [2.0 + far]
     inside = far < 1.4
@@ -186,7 +193,7 @@ def test_positions_beyond_the_invertible_radius_are_unchanged(far):
     assert np.allclose((column, row), straight, atol=1e-6) != inside
     if inside:
         np.testing.assert_allclose(sky_of_pixel(system, column, row), place, rtol=1e-12)
-    # Far from every detector.
+    # These positions are far from all detectors.
     assert max(abs(column[0]), abs(row[0])) > 7000
 
 

@@ -1,4 +1,4 @@
-"""Sections: where pixels are in the mosaic of a camera is where its detectors lie."""
+"""Sections: pixels have the same positions in the mosaic of a camera as in its focal plane."""
 
 import re
 
@@ -27,7 +27,7 @@ def test_no_two_detectors_share_a_pixel_and_all_are_inside(camera):
     every = detectors(camera, MISSION)
     _, right, _, top = numbers(mosaic_size(every))
     places = {d.name: to_mosaic_section(d, Section(0, 0, d.nx, d.ny), every) for d in every}
-    # Those that lie across have no such section: in HSC four.
+    # Detectors that are rotated by 90 deg have no such section. HSC has four of them.
     assert sum(place is None for place in places.values()) == (4 if camera == "hsc" else 0)
     found = [numbers(place) for place in places.values() if place]
     corners = np.array([(*sorted(one[:2]), *sorted(one[2:])) for one in found])
@@ -44,7 +44,10 @@ def test_no_two_detectors_share_a_pixel_and_all_are_inside(camera):
 
 @pytest.mark.parametrize("camera", ["vis", "nisp", "decam", "megacam"])
 def test_a_pixel_of_the_mosaic_lies_where_it_lies_in_the_focal_plane(camera):
-    """Of every detector, however it is mounted, to two pixels: mounted detectors are turned a little besides."""
+    """The offset between mosaic and focal plane is the same for all detectors within 8 pixels.
+
+    The tolerance is needed because the rotation of mounted detectors has small errors.
+    """
     every, corners = detectors(camera, MISSION), []
     for d in every:
         section = Section(3, 7, d.nx // 2, d.ny // 3)
@@ -53,7 +56,7 @@ def test_a_pixel_of_the_mosaic_lies_where_it_lies_in_the_focal_plane(camera):
         u, v = (3 - (d.nx - 1) / 2, 7 - (d.ny - 1) / 2)
         x = d.x / d.pixel_scale + np.cos(angle) * u - np.sin(angle) * v
         y = d.y / d.pixel_scale + np.sin(angle) * u + np.cos(angle) * v
-        # Along the columns of DECam's detectors its mosaic has rows of the focal plane.
+        # The mosaic of DECam is rotated by 90 deg: its rows are parallel to columns of the detectors.
         corners.append((x0 - y, y0 + x) if camera == "decam" else (x0 - x, y0 - y))
         sign = -1 if d.upside_down and camera != "decam" else 1
         assert (x1 - x0, y1 - y0) == (sign * (section.nx - 1), sign * (section.ny - 1))

@@ -23,16 +23,16 @@ from truesky.render.sources import colours
 BAND = passbands.load("nisp_red")
 CHANNEL = registry.CHANNELS["NISP-S"]
 HALPHA = 6564.614
-# What an observer has taken out, or knows that it has to leave out.
+# Effects that an observer has corrected, or masks.
 CLEAN = dict.fromkeys(("ramp_cosmic_rays", "dark_map", "pixel_response", "output_gain"), False)
-# Of a box about a line, half, pixels.
+# Half of the side of a box around a line, pixels.
 HALF = 12
 OUTPUTS, FOLLOWED = 32, 64
 
 
 @dataclass(frozen=True)
 class Lines:
-    """H alpha lines of n galaxies: wavelengths [n] A, fluxes [n] erg s-1 cm-2, half-light radii [n] arcsec."""
+    """H alpha lines of n galaxies: wavelength (A), flux (erg s-1 cm-2) and half-light radius (arcsec), all [n]."""
 
     wavelength: np.ndarray
     flux: np.ndarray
@@ -40,19 +40,19 @@ class Lines:
 
 
 def trace(detector, grism, angle, number=1):
-    """Of the first order."""
+    """Return the trace of the first order of an exposure."""
     row = fields.exposure(**spectroscopic.exposed(detector, grism, angle, number=number))
     return next(one for one in CHANNEL.dispersion.traces(row, detector, MISSION, infrared.SEED) if one.order == 1)
 
 
 def grid(detector, step):
-    """[2, n] columns and rows where lines do not touch: every `step` pixels across and along a detector."""
+    """Return columns and rows [2, n], every `step` pixels of a detector, at which lines do not overlap."""
     places = [np.arange(step, n - step, step, dtype=float) for n in (detector.nx, detector.ny)]
     return np.stack(np.meshgrid(*places)).reshape(2, -1)
 
 
 def undispersed(path, wavelength, at):
-    """[2, n] Where galaxies lie whose lines are at columns and rows [2, n]."""
+    """Return the positions [2, n] of galaxies whose lines are at columns and rows [2, n]."""
     found = at.copy()
     for _ in range(4):
         for i, (column, row) in enumerate(found.T.tolist()):
@@ -62,7 +62,7 @@ def undispersed(path, wavelength, at):
 
 
 def exposure(lines, places, detector, shining=True, **columns):
-    """The galaxies' spectra on a detector, with or without their lines; their continua are of some 24 mag."""
+    """Render the spectra of galaxies on a detector, with or without their lines; their continua have about 24 mag."""
     n = len(lines.flux)
     body = {name: np.zeros(n) for name in colours.GALAXY_COLUMNS}
     body |= {
@@ -84,7 +84,7 @@ def exposure(lines, places, detector, shining=True, **columns):
 
 
 def kernel():
-    """float64[3, 3] How pixels share their charge, as the mission has it."""
+    """Return the coupling of pixels by inter-pixel capacitance in the mission, float64[3, 3]."""
     on = MISSION.value("nisp.ipc_spectroscopic")
     side, corner = on * MISSION.value("nisp.ipc.side"), on * MISSION.value("nisp.ipc.diagonal")
     out = np.array([[corner, side, corner], [side, 0.0, side], [corner, side, corner]])
@@ -93,11 +93,11 @@ def kernel():
 
 
 def ramp_variance(rates, numbers, ramps=6000):
-    """[n] e-^2 of the signals of ramps of charge of `rates` e- a second, every frame drawn and read.
+    """Return the variances [n] (e-^2) of signals of ramps that collect `rates` e- per second, from simulated frames.
 
-    Kubik et al. 2016: the most likely signal of n differences of groups whose noise they estimate.  It is told by how
-    much it is more or less than that of the difference of the last group and the first, which is known: of these few
-    ramps alone it would be uncertain by 2 %.
+    The signal is the maximum-likelihood estimate from n differences of groups, whose noise depends on the signal (Kubik
+    et al. 2016). Its variance is measured relative to the difference between the last and the first group, whose
+    variance is known. Without this comparison, it would be uncertain by 2 % because there are few ramps.
     """
     groups, reads, drops = (
         int(MISSION.value(f"nisp.macc.spectroscopic.{name}")) for name in ("groups", "reads", "drops")
@@ -106,7 +106,7 @@ def ramp_variance(rates, numbers, ramps=6000):
     a = 1.0 + (1.0 - reads**2) / (3.0 * reads * (reads + drops))
     beta = 2.0 * noise**2 / (reads * a)
     first = (reads + drops) * np.arange(groups)[:, None] + np.arange(reads)
-    # What an electron adds to the difference of the last group and the first, by the frame in which it comes.
+    # Contribution of an electron to the difference between the last and first group, by the frame of its arrival.
     begin, *_, end = (np.arange(first[-1, -1] + 1)[:, None] <= group for group in first)
     weight = end.mean(axis=1) - begin.mean(axis=1)
     found = []
@@ -121,40 +121,44 @@ def ramp_variance(rates, numbers, ramps=6000):
 
 
 class Noise:
-    """Of the pixels of a frame: that of photons, shared among neighbours, of reads, and of drifts of the outputs."""
+    """Noise of the pixels of a frame: photons, shared among neighbours, reads, and drifts of the outputs."""
 
     def __init__(self, background, shape, numbers):
-        """background : e- a second of sky and dark current;  shape : of a frame"""
+        """Compute the noise of a frame; `background` is the rate of sky and dark current (e- per second)."""
         rates = background * np.array([0.0, 1.0, 2.0, 4.0, 8.0])
         reads, *photons = ramp_variance(rates, numbers)
         self.reads, self.levels, self.photons = reads, rates * TIME, np.array([0.0, *(v - reads for v in photons)])
         self.background, self.shape, self.kernel = background * TIME, shape, kernel()
         self.drift = MISSION.value("nisp.drift_spectroscopic", "electron")
-        # Of a stream of an output's pixels, row by row: 1 / f from what reference pixels do not follow.
+        # Column edges of the outputs. The pixels of an output, row by row, have 1/f noise that reference pixels miss.
         self.edges = np.linspace(0, shape[1], OUTPUTS + 1).astype(int)
 
     def photons_of(self, light):
-        """e-^2 of pixels with so many electrons of sources."""
+        """Return the photon noise (variance, e-^2) of pixels with `light` electrons of sources."""
         return np.interp(light + self.background, self.levels, self.photons)
 
     def weights(self, template, light):
-        """Of the pixels [ny, nx] of a box, whose sum is the best measure of a template on an even background.
+        """Return weights [ny, nx] of the pixels of a box. The weighted sum is the best measure of a template.
 
-        light : e- of sources;  drifts are taken as white
+        The background in the box is constant. `light` contains the electrons of sources. Drifts are treated as white
+        noise.
         """
         basis = np.stack([template.ravel(), np.ones(template.size)])
         scaled = basis / (self.photons_of(light) + self.reads + self.drift**2).ravel()
         return np.linalg.solve(scaled @ basis.T, scaled)[0].reshape(template.shape)
 
     def variance(self, weights, light, corner):
-        """Of the sum of a box of pixels times weights; light : of sources there;  corner : row, column of its first."""
+        """Return the variance of a weighted sum of the pixels of a box.
+
+        `light` contains the electrons of sources in the box, and `corner` is the row and column of its first pixel.
+        """
         seen = np.pad(weights, 1)
         own = convolve(seen, self.kernel, mode="constant")[1:-1, 1:-1]
         total = (own**2 * self.photons_of(light)).sum() + self.reads * (weights**2).sum()
         return total + self.drift**2 * self._drifts(weights, corner)
 
     def _drifts(self, weights, corner):
-        """Variance of a sum of pixels of outputs that drift by 1 e- rms."""
+        """Return the variance of a weighted sum of pixels if the outputs drift by 1 e- rms."""
         (low, left), rows, total = corner, self.shape[0], 0.0
         for first, last in zip(self.edges[:-1], self.edges[1:], strict=True):
             begin, end = max(first, left), min(last, left + weights.shape[1])
@@ -175,10 +179,10 @@ class Noise:
 
 
 def measured(noisy, without, at, noise, images=1):
-    """([images, n] flux of each line, of that which was put in; [n] its error): sums of pixels, the background fitted.
+    """Return relative fluxes [images, n] of lines, and their expected errors [n], from weighted sums of pixels.
 
-    noisy, without : with all lines, and without;  at : [2, n] where the lines are
-    images : with noise of their own, of the same light
+    The background is fitted with each line. `noisy` and `without` are exposures with and without the lines, whose pixel
+    positions are `at` [2, n]. `images` is the number of images of the same light with independent noise.
     """
     shared = [convolve(one.noise_free.astype(float), noise.kernel) for one in (noisy, without)]
     seen = [
@@ -197,7 +201,7 @@ def measured(noisy, without, at, noise, images=1):
 
 
 def _again(one, noise_seed):
-    """float64[ny, nx] e- of the same light in a detector of the same pixels, with noise of another seed."""
+    """Return the electrons [ny, nx] of the same light on the same detector, with noise of another seed."""
 
     def stream(effect):
         return rng.stream(*random_identity(effect, one.exposure, one.detector.name, one.seed, noise_seed))

@@ -1,4 +1,4 @@
-"""Stars that calibrate VIS: five that bleed or are white dwarfs, one beside the field whose light strays into it."""
+"""Calibration stars of VIS: five that bleed or are white dwarfs, and one outside the field that gives stray light."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ MISSION = resolve()
 SIDE = 256
 FIVE = np.array([(0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75)]) * (SIDE - 1)
 PER_DETECTOR = ("bleeding", "white_dwarf")
-# Electrons stay where they are, and are read as they are.
+# Effects are off, so that electrons stay in their pixels and are read without errors.
 QUIET = dict.fromkeys(
     (
         "cosmic_rays", "readout_cosmic_rays", "poisson", "read_noise", "hot_pixels", "dark_current", "brighter_fatter",
@@ -30,7 +30,7 @@ QUIET = dict.fromkeys(
 
 
 def rendered(kind, magnitude, name="3-4", forced=None, truth=("noise_free", "saturation", "sky"), **parameters):
-    """A field without any other source."""
+    """Render a field without other sources; return it and its header."""
     mission = MISSION.with_overrides({f"survey.{kind}.magnitude": (magnitude, "mag"), **parameters})
     detector = replace(detectors.detector("vis", name, mission), nx=SIDE, ny=SIDE, injection_rows=0)
     target = "white dwarf DA" if kind == "white_dwarf" else "Vega"
@@ -68,7 +68,7 @@ def test_none_lies_on_rows_that_are_not_read():
 
 
 def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
-    """In each column what fell on the full pixels is what they hold, and not an electron is lost."""
+    """In each column, the full pixels hold the charge that fell on them, and no electron is lost."""
     one, _ = rendered("bleeding", 14.0)
     well, full = one.scene.value("full_well", "electron"), one.maps["saturation"] > 0
     fallen = one.noise_free + 0.25 * 561.0
@@ -80,7 +80,7 @@ def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
             if not len(rows):
                 continue
             assert len(rows) == rows[-1] - rows[0] + 1
-            # The pixel at either end takes what is left.
+            # The pixels at the two ends take the rest of the charge.
             reach = slice(max(rows[0] - 1, 0), rows[-1] + 2)
             assert len(rows) == pytest.approx(fallen[half, column][reach].sum() / well, abs=2.0)
     image = (one.science - one.scene.value("bias", "adu")) * one.scene.value("gain", "electron / adu")
@@ -88,7 +88,7 @@ def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
 
 
 def test_a_star_beside_the_field_measures_the_halo():
-    """Some arcmin from what is cut out of detector 1-3: its light outside of its image gives fraction and scale."""
+    """The star is more than 30 arcsec outside the frame. Its light gives the fraction and the scale of the halo."""
     detector = replace(detectors.detector("vis", "1-3", MISSION), nx=SIDE, ny=SIDE, injection_rows=0)
     distance = (detector.y + 0.1 * SIDE / 2 + 36.0) / 3600
     own = {"survey.stray_light.distance": (distance, "deg")}
@@ -110,6 +110,6 @@ def test_a_star_beside_the_field_measures_the_halo():
     fraction, scale = optimize.curve_fit(profile, r.ravel(), halo.ravel(), (1e-3, 30.0))[0]
     assert fraction == pytest.approx(MISSION.value("vis.halo.fraction"), rel=0.01)
     assert scale == pytest.approx(MISSION.value("vis.halo.radius", "arcsec"), rel=0.01)
-    # In the image, too, and the spikes with it.
+    # The image contains the halo, and also the diffraction spikes.
     excess = (one.science.astype(float) - without.science).mean() * one.scene.value("gain", "electron / adu")
     assert excess > halo.mean() > 5.0

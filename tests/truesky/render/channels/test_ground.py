@@ -1,4 +1,4 @@
-"""Ground cameras from outside: from files alone, what a laboratory measures of a detector."""
+"""Ground cameras: laboratory measurements of a detector, from its files alone."""
 
 from dataclasses import replace
 from functools import cache
@@ -33,7 +33,7 @@ NOBODY = galaxies([], []), stars([], [])
 
 
 def exposure(camera, side, sky, number=1, forced=None, truth=(), mission=MISSION):
-    """Of the sky alone, e- in a pixel."""
+    """Render an exposure of the sky alone, with `sky` electrons per pixel."""
     one = fields.small(camera, detectors.detectors(camera, MISSION)[0].name, side)
     band = BANDS[camera]
     exposed = {
@@ -47,7 +47,7 @@ def exposure(camera, side, sky, number=1, forced=None, truth=(), mission=MISSION
 
 @cache
 def sections(path):
-    """Pixels and bias columns [q] of a raw file, float, and its header."""
+    """Return pixels and bias columns of each amplifier of a raw file, as floats, and its header."""
     with astropy_fits.open(path) as units:
         raw, header = units[0].data.astype(float), units[0].header
     numbers = range(1, header["NAMPS"] + 1)
@@ -56,9 +56,9 @@ def sections(path):
 
 
 def check_photon_transfer(camera, side, folder):
-    """Gain to 1 % and read noise to 2 % of each amplifier: from pairs of flats, and from overscans."""
+    """Measure the gain of each amplifier within 1 % from pairs of flats, and read noise within 2 % from overscans."""
     files = []
-    # So faint that pixels' borders hardly move: the brighter-fatter effect takes 1e-3 of the variance.
+    # The levels are low, so the brighter-fatter effect reduces the variance by only 1e-3.
     for number, sky in enumerate((600.0, 600.0, 600.0, 600.0, 1800.0), 1):
         one = exposure(camera, side, sky, number, {"cosmic_rays": False, "read_noise": True})
         files.append(put(one, folder)["science"])
@@ -73,7 +73,7 @@ def check_photon_transfer(camera, side, folder):
             good = np.abs(difference - np.median(difference)) <= 6.0 * difference.std()
             level = 0.5 * (light[first][good].mean() + light[second][good].mean())
             gains.append(level / (0.5 * difference[good].var() - spread))
-        # What rounding adds to the spread is not of the amplifier.
+        # Rounding adds to the scatter, but is not noise of the amplifier.
         assert np.mean(gains) == pytest.approx(header[f"GAIN{q + 1}"], rel=0.01)
         assert np.sqrt(spread - 1.0 / 12.0) * np.mean(gains) == pytest.approx(header[f"RDN{q + 1}"], rel=0.02)
         assert np.median(bright[0][q] - bright[1][q].mean()) / np.median(light[0]) == pytest.approx(3.0, rel=0.01)
@@ -103,11 +103,11 @@ def test_levels_of_amplifiers_differ_and_are_measured_in_overscans(tmp_path):
 
 
 def check_crosstalk(camera, nx, ny):
-    """Each amplifier has light in rows that are read while the others are dark."""
+    """Illuminate rows of each amplifier that are read while all other amplifiers are dark."""
     one = replace(detectors.detectors(camera, MISSION)[0], nx=nx, ny=ny)
     scene = Scene(MISSION, one.section, SECONDS, 0.0, 5e4, one, forced={"cosmic_rays": False, "hot_pixels": False})
     own, count = scene.layout, len(scene.layout.amplifiers)
-    # Of a band; the last is dark in all of them.
+    # Rows per band. Each amplifier is illuminated in one band, and the last band is dark in all amplifiers.
     rows = own.height // (count + 1)
     planes = np.zeros((count, own.height + own.overscan_rows, own.scan_columns + own.width))
     bands = [slice(q * rows, (q + 1) * rows) for q in range(count)]
@@ -117,13 +117,13 @@ def check_crosstalk(camera, nx, ny):
     assert {d.name for d in decisions if d.applied} >= {"crosstalk", "parallel_loss", "serial_loss", "amplifiers"}
     level = found[:, count * rows + 6 : own.height].mean(axis=1, keepdims=True)
     light = (found - level) * scene.amplifier_values("gain", "electron / adu")[:, None, None]
-    # Borders of pixels beside another amplifier's light are displaced.
+    # Pixel boundaries next to the light of another amplifier are displaced.
     pixels = slice(own.prescan + 4, own.prescan + own.width - 4)
-    # Charge that transfers have left behind is in the first rows of the next band.
+    # The first rows of a band contain charge of the previous band that was delayed in the transfer.
     seen = np.array([light[:, band, pixels][:, 6:-3].mean(axis=(1, 2)) for band in bands]).T
     recovered = seen / np.diag(seen)
     table = crosstalk.coefficients(scene)
-    # A hundred-thousandth of the light is half an electron: as much as the noise of these rows.
+    # 1e-5 of the light is half an electron, which equals the noise of these rows.
     measured = table > 1e-4
     assert measured.any()
     np.testing.assert_allclose(recovered[measured], table[measured], rtol=0.1)

@@ -1,4 +1,4 @@
-"""Biases, darks and dome flats of ground cameras: planned as DES asks for them, each with noise of its own."""
+"""Biases, darks and dome flats of ground cameras: the plan follows DES, and each frame has independent noise."""
 
 import warnings
 from collections import Counter
@@ -34,7 +34,7 @@ SIDE, BLOCK, FRAMES = 256, 64, 7
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    """Calibrations of DES in the pilot phase: rows of the tables `exposures` and `tasks`."""
+    """Return the calibrations of DES in the pilot phase: rows of the table `exposures`, and the table `tasks`."""
     request = parse(PILOT)
     own = tuple(b for b in request.observations if b.survey == "des" and b.image_type != "science")
     _, exposures, tasks = plan(tmp_path_factory.mktemp("none"), replace(request, observations=own, pointings=()))
@@ -63,7 +63,7 @@ def test_no_two_of_them_have_the_same_noise(planned):
 
 @cache
 def frame(camera, kind, number=1, seconds=10.0, forced=(), sky=0.0):
-    """e- above zero [ny, nx] of the pixels, with the amplifiers' levels; and what was rendered."""
+    """Return the electrons above zero [ny, nx] of a frame, with amplifier levels, and the rendered detector."""
     one = fields.small(camera, detectors.detectors(camera, MISSION)[0].name, SIDE)
     exposed = {
         "exposure_id": number, "channel": "EXT", "camera": camera, "band": BANDS[camera], "image_type": kind,
@@ -91,9 +91,9 @@ def test_a_flat_is_the_lamps_light_through_the_telescope(camera):
     expected = illumination.apply(expected, *illumination.EFFECT.parameters(one.scene))
     light = 0.5 * (first + second) - bias
     assert np.median(light / expected) == pytest.approx(1.0, abs=0.003)
-    # Vignetted, as the sky is.
+    # The flat is vignetted like the sky.
     assert abs(1.0 - expected.mean() / level) > 0.01
-    # Shot noise of each alone.
+    # The two flats have independent shot noise.
     difference = first - second
     spread = 1.4826 * np.median(np.abs(difference - np.median(difference)))
     assert spread == pytest.approx(np.sqrt(2.0 * expected.mean()), rel=0.03)
@@ -109,7 +109,7 @@ def test_biases_have_read_noise_of_their_own_and_a_pattern_in_common(camera):
     for i in range(4):
         for j in range(i):
             assert (frames[i] - frames[j]).std() == pytest.approx(np.sqrt(2.0) * noise, rel=0.03)
-    # Amplifiers settle while a row is read.
+    # Amplifiers settle while a row is read, so all biases have the same column pattern.
     columns = frames.mean(axis=(0, 1))
     assert np.ptp(columns) > 5.0 * noise / np.sqrt(4.0 * SIDE)
     assert {d.name for d in one.decisions} & {"poisson", "background", "cosmic_rays"} == set()
@@ -125,7 +125,7 @@ def test_a_dark_has_dark_current_and_no_light():
 
 
 def stored(one, folder):
-    """The raw file, with what is known of it."""
+    """Write the raw file of a rendered detector, and return it as a frame for the reduction."""
     path = put(one, folder)["science"]
     cards, scene = read_back.header(path), replace(one.scene, band=passbands.load(one.exposure.band))
     return Frame(path, one.exposure, scene, lake_frames._applied_effects(cards), cards)
@@ -133,7 +133,7 @@ def stored(one, folder):
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
-    """A folder with masters of biases and flats of DECam; a frame of the sky alone."""
+    """Return a folder with master biases and flats of DECam, and a frame of the sky alone."""
     folder = tmp_path_factory.mktemp("calibrated")
     kinds = ((kind, number) for kind in ("bias", "flat") for number in range(1, FRAMES + 1))
     raw = [stored(frame("decam", kind, number + 50 * (kind == "flat"))[1], folder) for kind, number in kinds]
@@ -149,7 +149,7 @@ def write(folder, master, kind, own):
 
 
 def check_flat(found, scene):
-    """Blocks of 64 pixels within 0.3 % of the sky, of which pixels far from the axis see less."""
+    """Blocks of 64 x 64 pixels deviate by less than 0.3 % from the sky, which is fainter far from the axis."""
     nothing = np.full((SIDE, SIDE), scene.dark_electrons + scene.sky_electrons)
     expected = pixel_area.apply(nothing, *pixel_area.parameters(scene)).mean()
     blocks = np.nanmean(found.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK), axis=(1, 3)) / expected - 1.0
@@ -159,7 +159,7 @@ def check_flat(found, scene):
 
 
 def test_ccdproc_with_the_masters_leaves_a_flat_sky(calibrated):
-    """Each amplifier by the header, then master bias and master flat: the vignetting is in that."""
+    """Amplifiers are reduced by the header, then with the master bias and the master flat, which has the vignetting."""
     ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is not installed (extra test)")
     folder, science = calibrated
     (bias, _), (flat, _) = (
@@ -173,14 +173,14 @@ def test_ccdproc_with_the_masters_leaves_a_flat_sky(calibrated):
             light = ccdproc.subtract_bias(image, ccdproc.CCDData(bias.mean[place], unit=u.electron))
             even = ccdproc.flat_correct(light, ccdproc.CCDData(flat.mean[place], unit=""), norm_value=1.0)
         found[place] = np.where(flat.mean[place] > 0.7, even.data, np.nan)
-    # Without the flat the vignetting stands out.
+    # Without the flat, the vignetting is visible.
     raw = read_back.electrons(science.path).data
     assert abs(np.median(raw) / science.scene.sky_electrons - 1.0) > 0.02
     check_flat(found, science.scene)
 
 
 def test_our_reduction_does_so_too(calibrated):
-    """Vignetting is undone once."""
+    """The reduction corrects the vignetting exactly once."""
     folder, science = calibrated
     image, _ = reduce.reduce_frame(
         science, files.read_masters(folder, science, ("dark",)), reduce.ReductionOptions(without=("dark",))

@@ -1,4 +1,4 @@
-"""Every parameter of a ground camera is asked for by what plans or renders it."""
+"""Planning or rendering uses every parameter of a ground camera."""
 
 from fnmatch import fnmatchcase
 from types import SimpleNamespace
@@ -18,12 +18,12 @@ from truesky.render.products import raw_pointing
 from truesky.request.area import Area
 from truesky.request.observations import Observation
 
-# Declared, and asked for by nothing that renders: what zero points are checked with.
+# Parameters that rendering does not use: zero points are checked with them.
 WAITING = ("*.collecting_area", "*.throughput")
 
 
 def seen(method, found):
-    """The method, which adds the name that it is asked for."""
+    """Wrap a method so that it adds the requested key to the set `found`."""
 
     def see(self, key):
         found.add(key)
@@ -33,7 +33,7 @@ def seen(method, found):
 
 
 def asked(camera, mission, monkeypatch):
-    """Names that planning and rendering a camera in all its bands ask for."""
+    """Return the keys that planning and rendering request for a camera in all its bands."""
     found = set()
     for name in ("parameter", "model"):
         monkeypatch.setattr(MissionConfiguration, name, seen(getattr(MissionConfiguration, name), found))

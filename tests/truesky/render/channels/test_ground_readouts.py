@@ -1,4 +1,4 @@
-"""The same detector in the forms that surveys give it: one array, one of each amplifier, electrons."""
+"""File formats of a ground detector: one array, one array per amplifier, electrons."""
 
 from functools import cache
 
@@ -29,7 +29,7 @@ def rendered(way, kind="science"):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Way -> file."""
+    """Return readout -> file."""
     return {way: put(rendered(way), tmp_path_factory.mktemp(way))["science"] for way in schema.READOUTS}
 
 
@@ -63,7 +63,7 @@ def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
             assert unit.data.shape == (layout.height + layout.overscan_rows, layout.scan_columns + layout.width)
         np.testing.assert_array_equal(together, raw[Section.from_text(whole["DATASEC"]).slices])
         np.testing.assert_array_equal(together, rendered("raw").science)
-        # Each pixel of the mosaic is one amplifier's.
+        # Each pixel of the mosaic belongs to one amplifier.
         place = [Section.from_text(unit.header["DETSEC"]) for unit in arrays]
         assert (
             sum(p.nx * p.ny for p in place)
@@ -78,7 +78,7 @@ def test_what_is_read_back_is_the_same(files, way):
     np.testing.assert_array_equal(image.data, rendered("raw").science)
     system = astrometry.from_cards(image.cards)
     np.testing.assert_allclose(system.wcs.crpix, rendered("raw").wcs.wcs.crpix, rtol=1e-12)
-    # Overscan rows are of the amplifiers' files only: their mean is of as many columns.
+    # Only files with an array per amplifier contain overscan rows, so the mean bias levels differ slightly.
     electrons = read_back.electrons(files[way]).data
     np.testing.assert_allclose(electrons, read_back.electrons(files["raw"]).data, atol=3.0)
 
@@ -134,7 +134,7 @@ def test_the_rotation_of_a_table_of_pointings_turns_the_camera(tmp_path):
     one = render("EXT", exposed={**EXPOSED, "position_angle": planned.position_angle})
     header = fits.getheader(put(one, tmp_path)["science"])
     assert header["ROTPA"] == 310.0
-    # The camera's y axis, along a sensor's columns: north through east.
+    # Position angle of the camera's y axis, along the columns of a sensor, from north through east.
     assert np.degrees(np.arctan2(header["CD1_2"], header["CD2_2"])) == pytest.approx(-50.0, abs=0.01)
 
 

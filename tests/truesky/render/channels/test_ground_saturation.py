@@ -1,4 +1,4 @@
-"""A ground camera's bright stars, from its files: what a full pixel reads, how far it bleeds, and where it is said."""
+"""Bright stars in files of ground cameras: values of full pixels, length of bleed trails, keyword and mask."""
 
 from functools import cache
 
@@ -23,7 +23,7 @@ LARGEST = {"lsstcam": 2**18 - 1, "decam": 2**16 - 1}
 
 @cache
 def star(camera, electrons=3e7, largest=None, way="raw"):
-    """One in the middle of a part of a detector."""
+    """Render a star in the middle of a part of a detector."""
     mission = MISSION if largest is None else resolve(overrides={f"ext.{camera}.adc_max": (largest, "adu")})
     one = fields.small(camera, detectors.detectors(camera, MISSION)[0].name, SIDE)
     exposed = {
@@ -45,17 +45,17 @@ def test_a_full_pixel_reads_what_its_well_holds_and_bleeds_along_its_column(came
     files = put(one, tmp_path, ("saturation",))
     header, full = fits.getheader(files["science"]), one.scene.value("full_well", "electron")
     electrons, raw = read_back.electrons(files["science"]).data, read_back.frame(files["science"]).data
-    # Below the end of the converter: the well is what is full.
+    # The converter has a higher limit, so the full well limits the charge.
     gains, biases = (one.scene.amplifier_values(*of) for of in (("gain", "electron / adu"), ("bias", "adu")))
     assert header["SATURATE"] == pytest.approx(np.min(0.985 * full / gains + biases), rel=0.02)
     assert header["SATURATE"] < raw.max() < 1.02 * np.max(full / gains + biases) < LARGEST[camera]
     truth = fits.getdata(files["saturation"]) > 0
-    # As the response of amplifiers near a full well leaves it.
+    # The amplifiers are not linear near the full well.
     assert 0.97 * full < np.median(electrons[truth]) < 1.005 * full
     np.testing.assert_array_equal((raw >= header["SATURATE"]) & truth, truth)
     rows, columns = np.nonzero(truth)
     assert np.ptp(rows) > 3 * np.ptp(columns) > 0
-    # No charge is lost on the way; the optics let this part through.
+    # No charge is lost. The illumination map is the fraction of the light that the optics transmit.
     shown = calibration.illumination_map(one.scene, ["illumination"])
     (tmp_path / "faint").mkdir()
     sky = read_back.electrons(put(star(camera, 1.0), tmp_path / "faint")["science"]).data
@@ -63,7 +63,10 @@ def test_a_full_pixel_reads_what_its_well_holds_and_bleeds_along_its_column(came
 
 
 def test_more_than_sixteen_bits_are_stored_in_thirty_two(tmp_path):
-    """Packed or not, of one array and of one of each amplifier; and as few as there are, otherwise."""
+    """Pixels of 18 bits are stored in 32 bits, compressed or not, in one array or in one per amplifier.
+
+    Files of pixels with 16 bits have 16 bits.
+    """
     one, few = star("lsstcam"), star("lsstcam", largest=2.0**16 - 1)
     assert (one.raw.dtype, few.raw.dtype) == (np.int32, np.uint16)
     for name, rice, way in (("plain", False, "raw"), ("rice", True, "raw"), ("apart", True, "amplifiers")):
@@ -73,7 +76,7 @@ def test_more_than_sixteen_bits_are_stored_in_thirty_two(tmp_path):
             assert {unit.header["BITPIX"] for unit in units if unit.data is not None} == {32}
             assert "BZERO" not in units[-1].header
         np.testing.assert_array_equal(read_back.frame(path).data, one.science)
-    # Where the converter ends below the well, it is what is full.
+    # If the limit of the converter is below the full well, it limits the charge.
     header = fits.getheader(put(few, tmp_path)["science"])
     assert header["BITPIX"] == 16
     assert header["SATURATE"] == few.raw.max() == 65_535

@@ -23,13 +23,13 @@ from truesky.render.products import fits_files, read_back
 from truesky.request.from_toml import parse
 
 EXAMPLE = Path(__file__).parents[4] / "requests" / "vis_calibration.toml"
-# As in other tests, so that they share the planes of the PSF.
+# Same size as in other tests, so that they share the planes of the PSF.
 SIDE = 256
 
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    """Mission, one exposure of each kind (of a flat: each lamp), by (image type, seconds, lamp)."""
+    """Return the request, the mission and one exposure of each kind, by (image type, seconds, lamp)."""
     request = parse(EXAMPLE)
     mission, exposures, tasks = plan(tmp_path_factory.mktemp("none"), request)
     assert len(tasks) == len(exposures) == 3 + 20 + 3 + 24 + 3 + 4 + 4 + 2 + 1 + 1 + 1
@@ -40,7 +40,7 @@ def planned(tmp_path_factory):
 
 
 def written(planned, row, folder, forced=None, magnitude=20.0):
-    """(what was rendered, what is read of its file): a galaxy and a star in the lower half of the detector."""
+    """Render a galaxy and a star in the lower half of a detector; return the result and the header of its file."""
     request, mission, _ = planned
     mission = variants.variant(row["settings"], mission, request.accuracy, {}).mission
     detector = replace(detectors.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, injection_rows=0)
@@ -66,7 +66,7 @@ def test_the_example_asks_for_every_kind(planned):
     assert set(planned[2]) == {
         ("science", 561, None), ("science", 90, None), ("flat", 10, 1), ("bias", 0, None), ("dark", 1000, None),
         *(("flat", 10, lamp) for lamp in range(1, 7)), ("charge_injection", 0, None), ("self_calibration", 561, None),
-        # 5000 cycles of six phases.
+        # Exposure times of 5000 cycles of six phases.
         *(("trap_pumping", seconds, None) for seconds in (60, 180, 600, 1800)), ("defocus", 561, None),
         ("bleeding", 561, None), ("stray_light", 561, None), ("white_dwarf", 561, None),
     }  # fmt: skip
@@ -76,10 +76,10 @@ def test_the_example_asks_for_every_kind(planned):
 @pytest.mark.parametrize(
     ("key", "least", "most"),
     [
-        # Electrons above the bias: what is in the frame, and nothing else.
+        # Limits of the median of the frame, in electrons above the bias.
         (("science", 561, None), 100, 200),
         pytest.param(("science", 90, None), 14, 40, marks=pytest.mark.nightly),
-        # As a science frame; by day it is among the kinds that the jobs render.
+        # This kind equals a science frame. A daily test renders it through the jobs.
         pytest.param(("self_calibration", 561, None), 100, 200, marks=pytest.mark.nightly),
         (("bias", 0, None), -4, 4),
         (("dark", 1000, None), -4, 4),
@@ -87,7 +87,7 @@ def test_the_example_asks_for_every_kind(planned):
         (("charge_injection", 0, None), -4, 4),
         (("trap_pumping", 600, None), 13_500, 16_500),
         (("defocus", 561, None), 100, 200),
-        # Wings of five stars of 12 mag on so few pixels.
+        # The wings of five stars of 12 mag fill the small frame.
         (("bleeding", 561, None), 200, 600),
         (("white_dwarf", 561, None), 100, 200),
     ],
@@ -101,12 +101,12 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
     level = (np.median(one.science) - header["BIAS"]) * header["GAIN"]
     assert least < level < most
     looks = vis.CHANNEL.sees_sky(key[0])
-    # The catalogue's, and those of the calibration.
+    # Sources of the catalogue, and calibration stars.
     assert len(one.sources) == 2 * looks + 5 * (key[0] in ("bleeding", "white_dwarf"))
     names = {d.name for d in one.decisions if d.applied}
     assert ("readout_trail" in {d.name for d in one.decisions}) == (key[0] == "flat")
     assert ("cosmic_rays" in names) == (header["EXPTIME"] > 0)
-    # Each effect that was applied tells which random numbers it took.
+    # The header contains the key of the random numbers of each applied effect.
     effects = {e.name: e for e in vis.EFFECTS[key[0]]}
     for number, decision in enumerate(one.decisions, start=1):
         assert header[f"EFFECT{number}"].startswith(f"{decision.name}: {'on' if decision.applied else 'off'}")
@@ -122,7 +122,7 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
 
 
 def test_sky_and_stars_are_in_a_flat(planned, tmp_path):
-    """The shutter is open: a bright star stands in it, trails off while it is read, and the zodiacal light too."""
+    """The shutter is open: a bright star is exposed and leaves a trail during readout, as does the zodiacal light."""
     row = planned[2]["flat", 10, 1]
     quiet = dict.fromkeys(("cosmic_rays", "readout_cosmic_rays", "poisson", "read_noise", "hot_pixels"), False)
     one, _ = written(planned, row, tmp_path, quiet, magnitude=15.0)
@@ -131,10 +131,10 @@ def test_sky_and_stars_are_in_a_flat(planned, tmp_path):
     gain, mission = planned[1].value("vis.gain"), planned[1]
     assert one.science[30, 90].astype(float) - one.science[30, 120] > 1e4 / gain
     trail = (one.science.astype(float) - still.science)[:, 85:96].sum(axis=1) * gain
-    # Row 30 is read downwards, after those below it: its light falls into what passes it, rows 31 to 127.
+    # The lower half is read downwards: rows 31 to 127 pass the star in row 30, and collect its light.
     share = mission.value("vis.readout_time") / (4132 / 2 + mission.value("vis.fpa.parallel_overscan")) / 10.0
     light = one.noise_free[:50, 85:96].sum()
-    # Beside it the trail of zodiacal light, up to 128 rows of it, and the amplifier's slope.
+    # The tolerance allows for the trail of zodiacal light over up to 128 rows, and for the slope of the amplifier.
     zodiacal = 11 * 128 * share * row["sky"] * 10.0
     assert trail[45:60].mean() == pytest.approx(share * light, rel=0.1, abs=zodiacal)
     assert abs(trail[:10].mean()) < 0.02 * share * light + zodiacal
@@ -143,12 +143,12 @@ def test_sky_and_stars_are_in_a_flat(planned, tmp_path):
 
 
 def test_lamps_shine_from_their_own_side(planned, tmp_path):
-    """Sixty degrees apart: between halves of the frame, the second and the fourth against the first."""
+    """Lamps are 60 deg apart. Gradients over the frame of the second and fourth lamp are compared with the first."""
     _, mission, rows = planned
     quiet = dict.fromkeys(("cosmic_rays", "readout_cosmic_rays", "poisson", "pixel_response"), False)
     slopes = {}
     for lamp in (1, 2, 4):
-        # Each as bright as the others, whatever the band sees of it.
+        # All lamps give the same signal, whatever the response of the band is.
         seen = calibration_lamp.efficiency_of_scene(Scene(mission, "vis", 10.0, 0.0, 0.0), lamp)
         level = mission.value("vis.flat.signal", "electron") / seen
         as_bright = resolve(overrides={"vis.flat.signal": (level, "electron")})
@@ -158,19 +158,19 @@ def test_lamps_shine_from_their_own_side(planned, tmp_path):
         slopes[lamp] = np.array([np.diff([f[:, :half].mean(), f[:, half:].mean()])[0] for f in (frame, frame.T)])
     everything = detectors.detectors("vis", mission)
     reach = [max(abs(getattr(d, a)) for d in everything) + d_n * 0.05 for a, d_n in (("x", 4096), ("y", 4136))]
-    # ADU between the halves' middles; the detector is mounted upside down.
+    # Difference (ADU) between the middles of the halves. The detector is mounted upside down.
     steepest = -mission.value("vis.flat.signal") * mission.value("vis.flat.gradient") / mission.value("vis.gain")
     gx, gy = (steepest * half * 0.1 / r for r in reach)
     for lamp, wanted in ((2, (-0.5 * gx, 3**0.5 / 2 * gy)), (4, (-2.0 * gx, 0.0))):
-        # Read noise, four halves; the response at this level is 2 % below 1.
+        # The tolerance covers the read noise of four halves, and the response, which is 2 % below 1 at this level.
         np.testing.assert_allclose(slopes[lamp] - slopes[1], wanted, atol=0.12)
 
 
 @pytest.mark.parametrize("kind", ["science", "flat", "charge_injection"])
 def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
-    """Whatever is switched on or off, every other effect is given its own generator, that has drawn nothing.
+    """Each effect gets a separate, unused random generator, whichever other effects are switched on or off.
 
-    One that follows another's pattern is given a generator of the same numbers.
+    An effect that depends on the pattern of another effect gets a generator with the same numbers.
     """
     row = next(row for (name, *_), row in planned[2].items() if name == kind)
     _, mission, _ = planned

@@ -1,4 +1,4 @@
-"""Where NISP-P's sources are: in the drawn light through the header of its file, and from dither to dither."""
+"""Astrometry of NISP-P: the header of the file gives the positions of the drawn light, and dithers agree."""
 
 from dataclasses import replace
 
@@ -20,14 +20,14 @@ from truesky.render.psf import euclid
 from truesky.render.sources.source_list import Sources
 
 MAS = 1e-3 / 0.3
-# Half the box that a position is fitted in, pixels; half the side that the model's PSF is kept to.
+# Half of the box in which a position is fitted, and half of the side of the PSF in the model, pixels.
 HALF, KEPT = 7, 32
-# What the wheel has of its own: nothing of an image but the light.
+# Effects that are off, so that the image contains only the light that passes the filter wheel.
 DARK = ("ramp_cosmic_rays", "dark_map", "pixel_response", "background", "pixel_area", "chromatic_response", "ipc")
 
 
 def dithers(detector, count):
-    """Exposures of a field, in one band after the other dither."""
+    """Return exposures of a field in one band at `count` dithers."""
     centre = infrared.exposed(detector)
     out = []
     for i in range(1, count + 1):
@@ -39,7 +39,7 @@ def dithers(detector, count):
 
 
 def rendered(detector, row, where, psf):
-    """Stars of 18 mag at places of the sky."""
+    """Render stars of 18 mag at given sky positions."""
     points, none = stars(*where), galaxies(0.0, 0.0).slice(0, 0)
     light = fluxes(points, row["band"], 10 ** (-0.4 * (18.0 - 23.9)))
     tables = none, fluxes(none, row["band"], 0.0), points, light
@@ -49,7 +49,7 @@ def rendered(detector, row, where, psf):
 
 
 def model(psf, x, y):
-    """[2 HALF + 1, 2 HALF + 1] a star of unit flux at x, y of a box's pixels, by the Fourier series of its PSF."""
+    """Return the image of a star of unit flux at pixel x, y of a box of 2 HALF + 1 pixels, by a Fourier series."""
     planes, samples = psf.planes, psf.planes.samples
     middle, half = planes.images.shape[1] // 2, samples * KEPT
     kept = np.s_[:, middle - half : middle + half + 1, middle - half : middle + half + 1]
@@ -61,7 +61,7 @@ def model(psf, x, y):
 
 
 def fitted(image, psfs, x, y):
-    """Positions [n], [n] of stars near x, y: those that the image of the PSF of each fits best."""
+    """Return positions [n], [n] of stars near x, y, from fits of the PSF image of each star."""
     found, step = [], 1e-2
     for psf, column, row in zip(psfs, x, y, strict=True):
         x0, y0 = round(column) - HALF, round(row) - HALF
@@ -80,13 +80,13 @@ def inside(detector, x, y):
 
 
 def off(found, truth):
-    """East and north offsets of ra, dec [2, n] deg, mas: [2, n]."""
+    """Return the offsets (mas) to the east and north of ra, dec [2, n] (deg) from the truth, shape [2, n]."""
     east, north = SkyCoord(*truth, unit="deg").spherical_offsets_to(SkyCoord(*found, unit="deg"))
     return np.array([east.to_value("mas"), north.to_value("mas")])
 
 
 def residuals(detector, row, where, psf, folder):
-    """(stars seen, offsets [2, n] mas of their light through the file's header as SIP, and as TPV)."""
+    """Return numbers of the visible stars, and offsets [2, n] (mas) of their light in each file, with SIP and TPV."""
     one = rendered(detector, row, where, psf)
     rows = truth_table.truth(one)
     order = np.searchsorted(stars(*where)["id"].to_numpy(), rows["id"].to_numpy())
@@ -102,14 +102,14 @@ def residuals(detector, row, where, psf, folder):
             with fits.open(folder / "image.fits") as units:
                 header = units[1].header if "science" in path else units[0].header
             assert header["CTYPE1"].endswith(convention.upper())
-            # Reference pixels stand about those that see the sky.
+            # Reference pixels surround the pixels that detect light.
             border = 4 if "science" in path else 0
             out.append(off(WCS(header).all_pix2world(*(found + border), 0), np.array(where)[:, order]))
     return order, out
 
 
 def field(detector, row, pitch):
-    """Places of the sky on a lattice over a detector in an exposure."""
+    """Return sky positions on a lattice over a detector in an exposure."""
     x, y = nominal.lattice(detector.nx, pitch)
     return astrometry.sky_of_pixel(Aim.from_exposure(fields.exposure(**row), detector).wcs, x, y)
 
@@ -119,7 +119,7 @@ def rms(offsets):
 
 
 def check(name, pitch, count, psf, folder):
-    """Positions in `count` dithers, each behind its filter as the wheel left it."""
+    """Check positions in `count` dithers, in each of which the filter has a different tilt."""
     detector = detectors.detector("nisp", name, MISSION)
     rows = dithers(detector, count)
     where, offsets = field(detector, rows[0], pitch), []
@@ -130,7 +130,7 @@ def check(name, pitch, count, psf, folder):
         alone = np.full((2, len(where[0])), np.nan)
         alone[:, order] = found[0]
         offsets.append(alone)
-        # Without its tilt the image would lie elsewhere.
+        # Without the tilt, the image would be shifted.
         still = astrometry.wcs(detector, row["ra"], row["dec"], row["position_angle"])
         seen = Aim.from_exposure(fields.exposure(**row), detector).wcs
         moved = off(astrometry.sky_of_pixel(still, [100.0], [900.0]), astrometry.sky_of_pixel(seen, [100.0], [900.0]))
@@ -150,13 +150,13 @@ def test_positions_of_light_agree_with_the_headers_of_all_dithers(tmp_path):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["DET11", "DET23", "DET44"])
 def test_in_all_dithers_of_a_field(name, tmp_path):
-    """Through a PSF that changes over the detector."""
+    """The PSF changes over the detector."""
     detector = detectors.detector("nisp", name, MISSION)
     check(name, 220, 4, euclid.nisp_psf(detector, passbands.load("euclid_h"), MISSION, 4), tmp_path)
 
 
 def test_no_light_is_lost_where_the_optics_distort():
-    """Faint stars and galaxies in the corner of the field: what is drawn is what is expected."""
+    """Faint stars and galaxies have the same drawn light in the corner of the field, where the pixel area differs."""
     detector = detectors.detector("nisp", "DET11", MISSION)
     row = infrared.exposed(detector, band="euclid_h")
     psf = infrared.psf_of(detector, row["band"])
@@ -173,5 +173,5 @@ def test_no_light_is_lost_where_the_optics_distort():
         assert len(set(rows["expected"].to_pylist())) == 1
         corner, middle_light = rows["drawn"].to_numpy()
         assert corner == pytest.approx(middle_light, rel=1e-5)
-        # Wings beyond the frame and the PSF's planes are missed, of the star in the corner more.
+        # Wings beyond the frame and beyond the planes of the PSF are missing, more of them in the corner.
         assert one.noise_free.sum(dtype=float) == pytest.approx(rows["expected"].to_numpy().sum(), rel=6e-3)

@@ -1,4 +1,4 @@
-"""NISP-P at the extremes: the brightest star, nothing but full pixels, a hundred thousand sources."""
+"""NISP-P at the extremes: the brightest star, a frame of full pixels, a hundred thousand sources."""
 
 import tracemalloc
 
@@ -17,7 +17,7 @@ def flag(found):
 
 
 def test_a_star_of_ab_0():
-    """Full in the middle, where it has no signal; a signal without a bound elsewhere would be one of the converter."""
+    """Pixels in the middle are full at the first read and have no signal. Pixels that fill up later are flagged."""
     found = infrared.rendered(
         [0.0], [100.0], [100.0], detector=small("nisp", "DET22", 400), accuracy=DRAFT, truth=("saturation",)
     )
@@ -25,9 +25,9 @@ def test_a_star_of_ab_0():
     distance = np.hypot(*(np.indices(full.shape) - 100.0))
     assert full[distance < 40.0].all()
     assert not full[distance > 300.0].all()
-    # Full at the first read: no difference between groups, but that of the reads.
+    # These pixels are full at the first read, so the groups differ only by the noise of the reads.
     assert np.abs(signal[distance < 2.0]).max() < 60.0
-    # Full between two groups: the ramp does not fit.
+    # These pixels become full between two groups, so the ramp does not fit.
     between = full & (signal > 1e4)
     assert between.sum() > 500
     assert flag(found)[between].mean() > 0.95
@@ -38,7 +38,10 @@ def test_a_star_of_ab_0():
     ("choice", "off", "error"), [(0.0, (), 0.02), (1.0, (), 5e-3), (0.0, ("ramp_nonlinearity",), 5e-3)]
 )
 def test_the_level_of_saturation(choice, off, error):
-    """A pixel that is full at the ramp's end reads what SATURATE says; sooner, its ramp does not fit."""
+    """A pixel that is full at the end of the ramp has the signal SATURATE.
+
+    If it is full earlier, its ramp does not fit.
+    """
     quiet = dict.fromkeys(("ramp_cosmic_rays", "dark_map", "pixel_response", "output_gain", "ipc"), False)
     quiet |= dict.fromkeys(off, False)
     own = resolve(overrides={"nisp.nonlinearity_spread": (0.0, ""), "nisp.nonlinearity_of_signal": (choice, "")})
@@ -47,7 +50,7 @@ def test_the_level_of_saturation(choice, off, error):
         found = infrared.rendered(sky=part * 1.3e5 / (76 * 1.454), forced=quiet, mission=own)
         signals[part], flags[part] = np.median(found.science), flag(found).mean()
     level = dict((key, value) for key, value, _ in headers.science_cards(found))["SATURATE"]
-    # What bends a ramp adds to the mean of its squared differences.
+    # Non-linearity of the ramp adds to the mean of its squared differences.
     assert signals[1.0] == pytest.approx(level, rel=error)
     assert flags[0.1] < 0.01
     assert flags[1.5] == 1.0
@@ -56,7 +59,10 @@ def test_the_level_of_saturation(choice, off, error):
 
 @pytest.mark.parametrize("count", [5_000, pytest.param(100_000, marks=pytest.mark.nightly)])
 def test_memory_does_not_grow_with_the_sources(count):
-    """On 2040 x 2040 pixels, or as densely on fewer: bytes a pixel of what is held at once, and a kB a source."""
+    """The peak memory is at most 160 bytes per pixel and 4 kB per source, in addition to 100 MB.
+
+    The short test has fewer pixels with the same density of sources.
+    """
     side = 2040 if count > 50_000 else 456
     rng = np.random.default_rng(1)
     x, y, mags = rng.uniform(0, side, count), rng.uniform(0, side, count), rng.uniform(20.0, 25.0, count)

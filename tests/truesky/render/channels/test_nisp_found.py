@@ -1,4 +1,4 @@
-"""A file of NISP-P as one sees it who knows no more than its header: what sep finds in it, and where."""
+"""Sources that sep finds in a file of NISP-P, using only its header."""
 
 import numpy as np
 import sep
@@ -16,11 +16,11 @@ SIDE, PITCH = 448, 32
 
 
 def written(folder):
-    """Stars of 17.5 to 20.5 mag on a lattice, each at its place in a pixel: (rendered, HDUs of its file with TPV)."""
+    """Render stars of 17.5 to 20.5 mag on a lattice at random subpixel positions; return them and the HDUs with TPV."""
     rng = np.random.default_rng(1)
     rows, columns = np.indices((SIDE // PITCH, SIDE // PITCH)).reshape(2, -1) * PITCH + PITCH / 2
     x, y = (at + rng.uniform(-0.5, 0.5, len(rows)) for at in (columns, rows))
-    # Of hot pixels a dark would tell.
+    # No hot pixels, because an observer would know them from a dark.
     cold = resolve(overrides={"nisp.hot_pixels": (0.0, "")})
     found = infrared.rendered(
         rng.uniform(17.5, 20.5, len(x)), x, y, detector=small("nisp", "DET22", SIDE), mission=cold
@@ -32,7 +32,7 @@ def written(folder):
 
 
 def test_sources_are_found_where_headers_say(tmp_path):
-    """All stars, through the header of the signal; nothing else but what its quality flags."""
+    """The stars are at the positions of the header. The quality masks nearly all other detections."""
     found, units = written(tmp_path)
     header, signal, flag = units[0].header, units[1], units[2].data.astype(bool)
     image = (signal.data.astype(float) - header["BIAS"]) * header["GAIN"]
@@ -48,13 +48,13 @@ def test_sources_are_found_where_headers_say(tmp_path):
     mine = np.isfinite(off)
     assert len(set(which[mine])) >= len(exact) - 2
     assert (~mine).sum() < 0.05 * len(exact)
-    # On the sky: through the header against the exposure's own projection.
+    # Sky positions through the header agree with the projection of the exposure.
     system = Aim.from_exposure(fields.exposure(**infrared.exposed(found.detector)), found.detector).wcs
     assert signal.header["CTYPE1"] == "RA---TPV"
     seen, there = WCS(signal.header).all_pix2world(x[mine], y[mine], 0), system.all_pix2world(exact[which[mine]], 0).T
     east = (seen[0] - there[0]) * np.cos(np.radians(there[1])) * 3.6e6
     north = (seen[1] - there[1]) * 3.6e6
-    # Coma moves what a window sees that is wider than the PSF's; pixels as large as the image leave 30 mas of the place
-    # within them.
+    # Coma shifts the centroid in a window that is wider than the PSF. Pixels are as large as the image, so the centroid
+    # depends on the position within a pixel by 30 mas.
     assert np.hypot(np.median(east), np.median(north)) < 20.0
     assert max(1.48 * np.median(np.abs(offset - np.median(offset))) for offset in (east, north)) < 40.0

@@ -1,4 +1,4 @@
-"""NISP-P: what a file holds, what its pixels are, and the extremes that can be asked for."""
+"""NISP-P: content of a file, values of its pixels, and extreme settings."""
 
 from functools import cache
 
@@ -36,7 +36,7 @@ def one():
 
 
 def test_the_file(tmp_path):
-    """Signal and its quality, each in the border of reference pixels, which are 0; the sky is where it is drawn."""
+    """Signal and quality have a border of reference pixels, which are 0; the world coordinates include the border."""
     found = one()
     _, writers = fits_files.products(found, ("ramp", "sky"))
     (science,) = (path for path in writers if path.endswith("science.fits"))
@@ -50,10 +50,10 @@ def test_the_file(tmp_path):
     assert (header["READMODE"], header["NG"], header["NR"], header["ND"]) == ("MACC", 4, 16, 4)
     assert (header["FRTIME"], header["EXPTIME"]) == (pytest.approx(1.454), pytest.approx(87.24))
     assert header["ELAPTIME"] == pytest.approx(76 * 1.454)
-    # What reading adds to the signal, and the noise of one of its reads.
+    # Noise that the readout adds to the signal, and noise of one read.
     assert (header["RDNOISE"], header["FRNOISE"]) == (pytest.approx(7.0, abs=0.2), 13.0)
     assert header["RDNDRAWN"] == header["RDNOISE"]
-    # Of the signal; its quality has no noise.
+    # The signal has the keywords of the readout; the quality has no noise.
     signal, quality = ({key: value for key, value, _ in unit.cards} for unit in read[1:])
     assert {key: signal[key] for key in ("GAIN", "RDNOISE", "SATURATE", "EXPTIME")} == {
         key: header[key] for key in ("GAIN", "RDNOISE", "SATURATE", "EXPTIME")
@@ -79,24 +79,24 @@ def test_the_file(tmp_path):
         if path.endswith(f"{content}.fits")
     )
     assert groups.data.shape == (4, 96, 96)
-    # Read as the signal is, without its border; the third axis counts groups.
+    # The groups have the keywords of the signal, but no border. The third axis counts groups.
     of_groups = {key: value for key, value, _ in groups.cards}
     for key in ("GAIN", "BIAS", "FRNOISE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"):
         assert of_groups[key] == header[key]
     assert "REFPIX" not in of_groups
     assert {"GAIN", "NG", "CTYPE3"} & {key for key, *_ in sky.cards} == set()
-    # Whoever reads it names the planes: astropy bends two axes only.
+    # A reader has to select two axes, because astropy supports distortions of two axes only.
     place = WCS(fits.Header(groups.cards), naxis=2)
     assert WCS(fits.Header([card for card in groups.cards if "_ORDER" not in card[0]])).naxis == 3
     sky_place = WCS(fits.Header(sky.cards))
     np.testing.assert_array_equal(place.all_pix2world([[5.0, 60.0]], 0), sky_place.all_pix2world([[5.0, 60.0]], 0))
-    # Above the level of its reset a pixel's charge grows.
+    # The charge of a pixel grows above the level of its reset.
     assert (np.diff(np.median(found.maps["ramp"].astype(float), axis=(1, 2))) > 5.0).all()
 
 
 @pytest.mark.parametrize(("kind", "noise"), [("photometric", 7.0), ("spectroscopic", 9.0)])
 def test_the_signal_is_as_noisy_as_was_measured(kind, noise):
-    """In the dark, by the estimator; e- (Kubik et al. 2025, NISP detectors on ground)."""
+    """The signal in the dark has the measured noise, e- (Kubik et al. 2025, NISP detectors on ground)."""
     own, rng = resolve(), np.random.default_rng(1)
     shape = ramp.Mode(*(int(own.value(f"nisp.macc.{kind}.{part}")) for part in ("groups", "reads", "drops")))
     rate, read_noise = own.value("nisp.dark_current"), own.value("nisp.read_noise", "electron")
@@ -108,7 +108,7 @@ def test_the_signal_is_as_noisy_as_was_measured(kind, noise):
 
 
 def test_detectors_are_no_worse_than_is_required():
-    """Bad pixels in all; what charge leaves; light that is seen, by the quantum efficiency and its cutoff."""
+    """Check the fraction of bad pixels, the persistence, and the passbands against quantum efficiency and cutoff."""
     own = resolve()
     assert own.value("nisp.dead_pixels") + own.value("nisp.hot_pixels") <= own.value("nisp.bad_pixels")
     for name in ("euclid_y", "euclid_j", "euclid_h"):
@@ -127,24 +127,24 @@ def test_reference_pixels_may_have_a_level():
 
 
 def test_a_pixel_is_sky_dark_and_noise():
-    """Of the mean and the width of the signal, in electrons."""
+    """The mean and the width of the signal, in electrons, agree with sky, dark current and noise."""
     detector = small("nisp", "DET22", 256)
     found = infrared.rendered(
         detector=detector, forced={"ramp_cosmic_rays": False, "dark_map": False, "pixel_response": False}
     )
     signal = infrared.electrons(found)
-    # The estimator itself is low by half an electron, rounding adds half an ADU's width.
+    # The estimator is low by half an electron, and rounding to ADU adds to the width.
     assert signal.mean() == pytest.approx(87.24, abs=1.0)
-    # Photons weigh less in the last group: the estimator's variance is a little above that of Poisson.
+    # Photons in the last group have less weight, so the variance of the estimator is slightly above Poisson noise.
     assert signal.std() == pytest.approx(np.hypot(found.scene.pixel_noise, 1.92 * 12**-0.5), rel=0.08)
     assert found.scene.pixel_noise == pytest.approx(np.hypot(6.9, np.sqrt(87.24 + 1.75)), rel=0.01)
 
 
 def test_stars_are_as_bright_as_the_catalogue_says():
-    """Without noise in the ramp: 0.01 mag of what is drawn, above the signal of pixels without light."""
+    """Without noise in the ramp, signals above dark pixels agree with the drawn light within 0.01 mag."""
     mags, x, y = [17.0, 17.5, 18.0, 18.5], [24.3, 72.1, 23.8, 71.6], [24.9, 25.2, 71.4, 72.2]
     drawn = infrared.rendered(mags, x, y, forced={**QUIET, "ramp_nonlinearity": False}, sky=0.0)
-    # The estimator expects the noise of reads: without it every faint pixel is low by an electron.
+    # The estimator assumes the noise of reads. Without it, the signal of all faint pixels is low by an electron.
     signal = infrared.electrons(drawn)
     signal -= np.median(signal)
     for column, row in zip(x, y, strict=True):
@@ -154,7 +154,7 @@ def test_stars_are_as_bright_as_the_catalogue_says():
 
 
 def test_charge_stays_through_inter_pixel_capacitance():
-    """The signal of a star with and without it: as much in all, less in its brightest pixel."""
+    """With capacitance, the signal of a star has the same sum and a lower peak."""
     forced = {**QUIET, "ramp_nonlinearity": False}
     bright = [
         infrared.electrons(infrared.rendered([18.0], [48.0], [48.0], forced={**forced, "ipc": on}, sky=0.0))
@@ -165,7 +165,7 @@ def test_charge_stays_through_inter_pixel_capacitance():
 
 
 def test_dark():
-    """600 s: the drops between groups are as many as these take; hot pixels stand out."""
+    """The number of drops between groups follows from the exposure time of 600 s."""
     found = infrared.rendered(kind="dark", seconds=600.0, sky=0.0, forced={"ramp_cosmic_rays": False})
     header = dict((key, value) for key, value, _ in found.readout.cards)
     assert (header["NG"], header["NR"], header["ND"]) == (4, 16, 122)
@@ -174,14 +174,14 @@ def test_dark():
 
 
 def test_flats():
-    """Each LED in the band that sees it."""
+    """A flat is bright if the band contains the wavelength of the LED."""
     for lamp, band, bright in ((2, "euclid_y", True), (5, "euclid_h", True), (1, "euclid_h", False)):
         found = infrared.rendered(kind="flat", lamp=lamp, band=band, sky=0.0)
         assert (np.median(infrared.electrons(found)) > 1e4) == bright
 
 
 def test_both_orders_of_non_linearity():
-    """On the ramp, whose charge counts over 76 frames, more is lost than on the signal, which is of 60."""
+    """The ramp loses more than the signal, because its charge counts over 76 frames instead of 60."""
     light, found = 100.0 * 1.3, {}
     linear = infrared.electrons(infrared.rendered(sky=light, forced={**QUIET, "ramp_nonlinearity": False})).mean()
     for choice in (0.0, 1.0):
@@ -201,10 +201,10 @@ def test_any_ramp(numbers):
     found = infrared.rendered([20.0], [48.0], [48.0], mission=own, seconds=seconds, truth=("cosmic_rays",))
     names = [extension.name for extension in found.readout.extensions]
     assert names == ["DET22.SCI"] + ["DET22.CHI2"] * (numbers[0] > 2)
-    # Two groups have no quality, and the header says so.
+    # Two groups give no quality, as the header states.
     cards = {key: (value, text) for key, value, text in found.readout.cards}
     assert ("no quality" in cards["QUALLIM"][1]) == (numbers[0] == 2)
-    # Of all numbers of groups as few good pixels are flagged.
+    # Few good pixels are flagged, whatever the number of groups is.
     hits = found.maps["cosmic_rays"] > 0
     if numbers[0] > 2:
         assert found.readout.extensions[1].data[4:-4, 4:-4][~hits].mean() < 0.02
@@ -220,7 +220,7 @@ def test_without_read_noise():
 def test_all_pixels_full():
     found = infrared.rendered(sky=1e5, truth=("saturation",))
     assert (found.maps["saturation"] == 1).all()
-    # A ramp that stands still has no signal, and no sign that it is one.
+    # A constant ramp has no signal, and nothing shows that its pixel is full.
     assert abs(np.median(infrared.electrons(found))) < 2.0
     assert found.readout.extensions[1].data[4:-4, 4:-4].mean() < 0.02
 
@@ -229,7 +229,7 @@ def test_a_pixel_that_sees_nothing():
     blind = resolve(overrides={"nisp.dead_pixels": (0.0, ""), "nisp.prnu": (0.0, ""), "nisp.dark_columns": (40.0, "")})
     found = infrared.rendered(sky=50.0, mission=blind, forced={"ramp_cosmic_rays": False, "dark_map": False})
     signal = infrared.electrons(found)
-    # Columns that see nothing from some row on: with IPC of their neighbours.
+    # Dark columns detect no light from some row on, except what capacitance couples from their neighbours.
     dark = signal < 0.1 * 50.0 * 87.24
     assert 0.02 < dark.mean() < 0.5
     assert np.median(signal[~dark]) == pytest.approx(50.0 * 87.24, rel=0.02)
@@ -248,7 +248,7 @@ def test_nothing_shines():
 
 
 def test_cosmic_rays_are_flagged():
-    """As many hits as the facts say: 2.6 a second and cm2; most of them do not look like a ramp."""
+    """There are 2.6 hits per second and cm2, as in the mission. The ramps of most hit pixels do not fit."""
     found = infrared.rendered(detector=small("nisp", "DET22", 512), truth=("cosmic_rays",))
     hits, flag = found.maps["cosmic_rays"], found.readout.extensions[1].data[4:-4, 4:-4]
     expected = 2.6 * (512 * 18e-4) ** 2 * 110.5

@@ -1,4 +1,4 @@
-"""How bright stars are when they are measured in NISP-P's images, and the faintest that are found in four of them."""
+"""Photometry of stars in images of NISP-P, and the faintest stars that four images detect."""
 
 import numpy as np
 import pytest
@@ -17,17 +17,20 @@ from truesky.render.sky import diffuse_light
 
 SIDE = 192
 DETECTOR = small("nisp", "DET23", SIDE)
-# Radius of the aperture, of the ring that tells the sky, pixels.
+# Radii of the aperture and of the ring in which the sky is measured, pixels.
 APERTURE, RING = 5.0, (9.0, 14.0)
-# That in which the mission wants 80 % of a point's light, arcsec; limits of the depth, AB.
+# Circles in which the mission requires 80 % of the light of a point source, arcsec; limits of the depth, AB.
 CIRCLES = {"euclid_y": 0.62, "euclid_j": 0.63, "euclid_h": 0.70}
 DEPTH, REQUIRED = 24.4, 24.0
-# Electrons of dark current from which on a pixel is left out.
+# Pixels with more electrons of dark current are left out.
 HOT = 20.0
 
 
 def undone(one):
-    """Electrons of the light, nan where a pixel is blind or its ramp does not fit: by who knows the detector."""
+    """Return the electrons of the light, with all known effects undone.
+
+    Blind pixels and pixels whose ramp does not fit are NaN.
+    """
     scene, applied = one.scene, {d.name for d in one.decisions if d.applied}
 
     def fixed(effect):
@@ -39,7 +42,7 @@ def undone(one):
     bend = ramp_nonlinearity.apply(
         np.zeros(found.shape), *ramp_nonlinearity.EFFECT.parameters(scene), fixed(ramp_nonlinearity.EFFECT)
     )[3]
-    # Of N electrons a frame the last group lacks b N^2 times the mean of its frames' squares, the first its own.
+    # If N electrons arrive per frame, a group lacks b N^2 times the mean square of the numbers of its frames.
     squares = [np.mean(np.arange(end - mode.reads + 1, end + 1.0) ** 2) for end in (mode.frames, mode.reads)]
     part = (squares[0] - squares[1]) / mode.integration_frames**2
     linear = found.copy()
@@ -51,7 +54,7 @@ def undone(one):
             response, *pixel_response.EFFECT.parameters(scene), fixed(pixel_response.EFFECT)
         )
     if "chromatic_response" in applied:
-        # Of light of flat f_nu: what the colour of a star changes stays.
+        # This is the response for light of flat f_nu. Its dependence on the colour of a star remains.
         _, even, *strength = chromatic_response.EFFECT.parameters(scene)
         maps = chromatic_response.draw_maps(found.shape, *strength, fixed(chromatic_response.EFFECT))
         response *= 1.0 + even[0] * maps[0] + even[1] * maps[1]
@@ -62,14 +65,14 @@ def undone(one):
 
 
 def coupled(image):
-    """As pixels show it of which neighbours see some."""
+    """Return an image after inter-pixel capacitance."""
     side, diagonal = (MISSION.value(f"nisp.ipc.{key}", "") for key in ("side", "diagonal"))
     kernel = np.array([[diagonal, side, diagonal], [side, 1 - 4 * (side + diagonal), side], [diagonal, side, diagonal]])
     return ndimage.convolve(image, kernel)
 
 
 def circles(image, x, y, radius=APERTURE):
-    """Light inside above the ring's mean; pixels of both."""
+    """Return the light inside a circle above the mean of a ring, and the numbers of pixels of both."""
     flux = sep.sum_circle(image, x, y, radius, subpix=11)[0]
     ring = sep.sum_circann(image, x, y, *RING, subpix=11)[0]
     inside, around = np.pi * radius**2, np.pi * (RING[1] ** 2 - RING[0] ** 2)
@@ -77,14 +80,14 @@ def circles(image, x, y, radius=APERTURE):
 
 
 def by_psf(image, one, x, y, light, sky):
-    """Fluxes [n] that the PSF's image at the true places fits best, and their noise; light : about so much, e-."""
+    """Fit the PSF image at the true positions; return fluxes [n] and their noise. `light` is a rough flux (e-)."""
     noise = one.scene.pixel_noise
     out = []
     for column, row in zip(x, y, strict=True):
         x0, y0 = round(column) - HALF, round(row) - HALF
         box = image[y0 : y0 + 2 * HALF + 1, x0 : x0 + 2 * HALF + 1] - sky
         shape = coupled(model(one.psf, column - x0, row - y0))
-        # Weighted by the noise of the pixels, the star's own with it.
+        # The weights contain the noise of the pixels, including the noise of the star.
         weight = np.where(np.isfinite(box), 1 / (noise**2 + light * np.maximum(shape, 0.0)), 0.0)
         norm = (weight * shape**2).sum()
         out.append(((weight * shape * np.nan_to_num(box)).sum() / norm, norm**-0.5))
@@ -92,15 +95,15 @@ def by_psf(image, one, x, y, light, sky):
 
 
 def measured(band, mags, number):
-    """Measured less true magnitudes of stars in an aperture and by their PSF, [2, n]; and the noise expected, mag."""
+    """Return measured minus true magnitudes [2, n], by aperture and by PSF, and the expected noise of both (mag)."""
     x, y = nominal.lattice(SIDE, 32, number)
-    # Rays are flagged: two of a hundred stars are lost.
+    # Pixels hit by cosmic rays are flagged, so 2 % of the stars are lost.
     one = infrared.rendered(np.resize(mags, len(x)), x, y, DETECTOR, band=band, mjd=infrared.MJD + number)
     rows, image = truth_table.truth(one), undone(one)
     x, y, true = (rows[name].to_numpy() for name in ("x", "y", "expected"))
     bad = ~np.isfinite(image)
     reference = coupled(one.noise_free.astype(float))
-    # Where the stars' wings are not.
+    # Sky level in pixels without wings of stars.
     sky = float(np.nanmedian(image[reference < 0.5]))
     found, inside, around = circles(np.where(bad, sky, image), x, y)
     counted = circles(reference, x, y)[0] / true
@@ -125,7 +128,7 @@ def check(band, numbers):
 
 
 def test_stars_are_as_bright_as_the_catalogue_says():
-    """In an aperture, and by their PSF; S/N > 100; with all effects, by who knows the detector."""
+    """Stars have S/N > 100 in an aperture and by their PSF; all effects are on, and the detector is known."""
     check("euclid_h", (1, 2))
 
 
@@ -139,27 +142,28 @@ def test_stars_of_every_band(band):
 
 
 def sky_of(band):
-    """Of a field of mean zodiacal light, 30 deg from the ecliptic at quadrature."""
+    """Return the sky rate of a field with mean zodiacal light, 30 deg from the ecliptic at quadrature."""
     own = diffuse_light.thermal_sky(DETECTOR, band, MISSION)
     return diffuse_light.sky_rate(own, 53.1, -27.8, infrared.MJD, MISSION)
 
 
 def spread(values):
-    """rms of all but outliers."""
+    """Return the standard deviation without outliers, from the median deviation."""
     return 1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values)))
 
 
 def depth(band, detector, pitch=7):
-    """AB magnitude of a point of S/N 5 in the mean of four dithers: (in the mission's circle, by its PSF).
+    """Return AB magnitudes of S/N 5 in the mean of four dithers: in the mission's circle, and by the PSF.
 
-    The light of stars of a magnitude, over the scatter of images of places without any, of as many exposures.
+    The signal is the light of a star of given magnitude. The noise is the scatter over empty positions in four
+    exposures.
     """
     radius, images = CIRCLES[band] / 0.3, []
     for number in range(1, 5):
         date = infrared.MJD + number
         one = infrared.rendered([DEPTH], [30.3], [40.8], detector, band=band, sky=sky_of(band), mjd=date)
         image = undone(one) - coupled(one.noise_free.astype(float))
-        # From dither to dither other pixels see a place.
+        # Each dither observes a position with different pixels.
         images.append(np.roll(image - np.nanmedian(image), (5 * number, -3 * number), (0, 1)))
     stack = np.nan_to_num(np.nanmean(images, axis=0))
     x, y = (at + 2 * HALF for at in nominal.lattice(detector.nx - 4 * HALF, pitch))
@@ -190,5 +194,5 @@ def test_faint_stars_are_seen_in_a_stack_of_four(band):
 @pytest.mark.nightly
 @pytest.mark.parametrize("band", CIRCLES)
 def test_faint_stars_are_seen_all_over_a_detector(band):
-    """Of another detector."""
+    """The detector differs from the other tests."""
     check_depth(band, small("nisp", "DET41", 1024))

@@ -1,4 +1,4 @@
-"""NISP-S: what a file holds, where light of a source lies, which sources count, and what cannot be asked for."""
+"""NISP-S: content of a file, positions of the light, selection of sources, and invalid settings."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,7 +32,7 @@ def one():
 
 
 def test_the_file(tmp_path):
-    """Slope of 16 bits and chi^2 of 8, each in the border of reference pixels; the grism is named."""
+    """The slope has 16 bits and chi^2 8 bits, both with a border of reference pixels. The header names the grism."""
     found = one()
     _, writers = fits_files.products(found, ())
     (science,) = (path for path in writers if path.endswith("science.fits"))
@@ -50,7 +50,7 @@ def test_the_file(tmp_path):
         pytest.approx(np.hypot(13.0 * 8**-0.5, 6.7), abs=0.05),
     )
     np.testing.assert_array_equal(read_back.frame(tmp_path / "science.fits").data, found.science)
-    # Of thirteen degrees of freedom and noise of reads that is correlated; cosmic rays and bright pixels beyond.
+    # chi^2 has 13 degrees of freedom, and the noise of reads is correlated. Cosmic rays and bright pixels increase it.
     quality = read[2].data[4:-4, 4:-4][found.maps["cosmic_rays"] == 0]
     assert 10.0 < quality.mean() < 16.0
     assert quality.max() > 30
@@ -58,7 +58,7 @@ def test_the_file(tmp_path):
 
 
 def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
-    """Of a star in the middle of a strip: nearly all of its first order, and of the others what is on it."""
+    """The light of the first order of a star in the middle of the strip is complete, and lies on its trace."""
     found = one()
     detector, row = strip(), fields.exposure(**spectroscopic.exposed(strip()))
     total = 10 ** (-0.4 * (18.0 - row.zero_point)) * TIME
@@ -76,11 +76,11 @@ def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
 
 
 def test_first_orders_of_sources_outside_the_detector_fall_on_it():
-    """250 px before its first column: farther than images are read."""
+    """The star is 250 pixels before the first column, outside the margin of images."""
     beside = spectroscopic.rendered([18.0], [-250.0], [48.0])
     assert len(beside.sources) == 1
     assert beside.noise_free.sum() > 1e3
-    # Of order 2 so far on the other side that first and zeroth miss it.
+    # This star is far on the other side: only its second order reaches the detector.
     second = spectroscopic.rendered([16.0], [-1200.0], [48.0])
     assert second.noise_free.sum() > 1e3
     assert len(spectroscopic.rendered([16.0], [5000.0], [48.0]).sources) == 0
@@ -96,7 +96,7 @@ def test_margin_contains_the_first_order_and_spectra_are_searched_up_to_any_orde
 
 
 def wheel_errors(rows, seed):
-    """[n] deg, by the direction of the first order of each exposure."""
+    """Return the wheel errors [n] (deg), from the direction of the first order of each exposure."""
     found = []
     for row in rows:
         (first,) = (trace for trace in CHANNEL.dispersion.traces(row, strip(), MISSION, seed) if trace.order == 1)
@@ -127,7 +127,7 @@ def test_spectra_are_drawn_where_the_seed_s_wheel_puts_them():
     row = spectroscopic.exposed(strip())
     stars, seeds = infrared.tables(strip(), row, [16.0], [290.2], [48.0]), (SEED, SEED + 1)
     drawn = [fields.rendered(row, strip(), stars, MISSION, DRAFT, seed).noise_free for seed in seeds]
-    # 250 pixels along the spectrum.
+    # Mean rows 250 pixels along the spectrum.
     found = [np.average(np.arange(96), weights=light[:, 530:550].sum(axis=1)) for light in drawn]
     turned = np.concatenate([wheel_errors([fields.exposure(**row)], seed) for seed in seeds])
     assert abs(turned[1] - turned[0]) > 0.05
@@ -135,7 +135,7 @@ def test_spectra_are_drawn_where_the_seed_s_wheel_puts_them():
 
 
 def test_turned_grisms_darken_the_side_that_they_are_turned_to():
-    """10 % at 0.385 deg of a tilt of 4 deg, nothing without one; sources only."""
+    """A tilt of 4 deg dims sources by 10 % at 0.385 deg from the centre. Without a tilt, nothing is dimmed."""
     (top, bottom) = (detectors.detector("nisp", name, MISSION) for name in ("DET12", "DET42"))
     x, y = np.full(2, 1000.0), np.array([0.0, 2039.0])
     for grism, angle, loses in (("RGS000", 0.0, 0), ("RGS000", -4.0, -1), ("RGS180", 184.0, -1), ("RGS180", 180.0, 0)):
@@ -163,14 +163,14 @@ def test_the_paper_s_selection_is_one_value_of_a_parameter():
     [(0.9e-16, 0.0, 0.0, 0), (1.1e-16, 0.0, 0.0, 1), (0.8e-16, 0.2, 0.0, 1), (1.1e-16, 0.0, 3.0, 0)],
 )
 def test_a_line_is_as_bright_as_it_is_seen(flux, kappa, a_v, chosen):
-    """H alpha at 1.6 um, magnified by 1.56, and behind dust that leaves 0.6 of it; the galaxy is fainter than 23."""
+    """H alpha at 1.6 um is magnified by 1.56, or dimmed to 60 % by dust. The galaxy is fainter than 23 mag."""
     own = resolve(overrides={"env.solar_system.density": (0.0, "deg-2"), "nisp.spectra.selection": (1.0, "")})
     body = {"z_obs": 16000.0 / 6564.614 - 1.0, "flux_halpha": flux, "kappa": kappa, "a_v": a_v}
     assert len(spectroscopic.rendered([23.2], [300.0], [48.0], mission=own, body=body).sources) == chosen
 
 
 def test_capacitance_between_pixels_or_none():
-    """As the mission says: of a bright star's light its neighbours see a part."""
+    """With the capacitance of the mission, a part of the light of a bright star is in neighbouring pixels."""
     none = resolve(overrides={"env.solar_system.density": (0.0, "deg-2"), "nisp.ipc_spectroscopic": (0.0, "")})
     peaks = [
         infrared.electrons(spectroscopic.rendered([16.0], [300.0], [48.0], forced=QUIET, mission=own)).max()
@@ -201,7 +201,7 @@ def test_light_of_a_source_does_not_depend_on_neighbours_or_their_order():
 
 
 def test_layers_of_orders_add_up_to_the_frame():
-    """One star whose first order is on the strip, one whose second is."""
+    """The strip contains the first order of one star, and the second order of another."""
     layers = ("order_1", "order_0", "order_2", "order_m1")
     mags, x, y = [18.0, 16.0], [300.0, -1100.0], [30.0, 60.0]
     found = spectroscopic.rendered(mags, x, y, truth=layers)
@@ -213,7 +213,7 @@ def test_layers_of_orders_add_up_to_the_frame():
 
 
 def test_a_star_s_spectrum_is_where_the_star_is_on_the_day():
-    """300 mas/yr to the north, ten years after 2015.5: ten rows or columns away, the trace with it."""
+    """A proper motion of 300 mas/yr shifts the star and its trace by ten pixels in the ten years since 2015.5."""
     row = spectroscopic.exposed(strip())
     body, none, points, f_nu = infrared.tables(strip(), row, [18.0], [290.2], [30.6])
     moving = points.append_column("pm_ra", pa.array([0.0])).append_column("pm_dec", pa.array([300.0]))
@@ -236,7 +236,7 @@ def test_image_types():
 
 
 def test_a_planetary_nebula_is_at_five_places_and_its_light_in_lines():
-    """Along its trace the brightest column has several times the light of the usual one, more than of a white dwarf."""
+    """The ratio of the brightest to the median column of the trace is 1.5 times larger than for a white dwarf."""
     whole, contrast = strip(nx=1400, ny=300), []
     body, points = fields.galaxies([], []), fields.stars([], [])
     for name in ("sed", "mag_h", "a_v"):
@@ -276,7 +276,7 @@ def test_impossible_spectra_are_refused(change, said):
 
 
 def test_a_star_of_ab_2_in_order_0_fills_its_pixels():
-    """Other pixels are not saturated: half of the strip is as dark as without the star."""
+    """Pixels of order 0 are saturated, but less than half of the strip is."""
     found = spectroscopic.rendered([2.0], [1400.0], [48.0], truth=("saturation", "order_0"))
     (row,) = (row for row in truth_table.spectra(found).to_pylist() if row["order"] == 0)
     column, line = (round(row[f"{axis}_first"] / 2 + row[f"{axis}_last"] / 2) for axis in "xy")

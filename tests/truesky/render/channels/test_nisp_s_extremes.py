@@ -1,4 +1,4 @@
-"""NISP-S at the extremes: the brightest star, the largest galaxy, lines at the passband's edge, redshifts, turns."""
+"""NISP-S at the extremes: the brightest star, the largest galaxy, lines at band edges, redshifts, turned grisms."""
 
 import time
 import tracemalloc
@@ -25,7 +25,7 @@ def rows(found):
 
 
 def whole(found):
-    """Whether a frame is finite and has all the light that is told of."""
+    """Check that a frame is finite and contains the light that its truth table lists."""
     assert np.isfinite(infrared.electrons(found)).all()
     assert np.isfinite(found.noise_free).all()
     assert found.noise_free.min() > -1e-3 * found.scene.pixel_noise - 1e-4 * found.noise_free.max()
@@ -34,7 +34,7 @@ def whole(found):
 
 
 def electrons(mag, detector):
-    """Of a source of an AB magnitude, all of its first order."""
+    """Return the electrons in the whole first order of a source of an AB magnitude."""
     row = spectroscopic.exposed(detector)
     return 10 ** (-0.4 * (mag - row["zero_point"])) * TIME
 
@@ -48,13 +48,13 @@ def test_a_star_of_ab_2_in_order_0(angle):
     whole(found)
     (zeroth,) = (row for row in rows(found) if row["order"] == 0)
     assert 0.01 < zeroth["expected"] / electrons(2.0, detector) < 0.03
-    # What the PSF has beyond the frame is not on it.
+    # The wings of the PSF beyond the frame are not drawn.
     assert 0.9 < zeroth["drawn"] / zeroth["expected"] <= 1.0
     assert found.maps["order_0"].sum(dtype=float) == pytest.approx(zeroth["drawn"], rel=1e-5)
 
 
 def test_a_galaxy_of_half_a_minute_with_lines():
-    """Wider than the largest stamp: bounded in time and memory, its light where it belongs."""
+    """The galaxy is wider than the largest stamp: time and memory stay bounded, and the light is in place."""
     detector, column = strip(nx=1300, ny=1200), dict.fromkeys(colours.GALAXY_COLUMNS, 0.0)
     column |= {
         "kind": 0, "z_obs": 1.3, "mag_r01": 14.0, "abs_mag_r01": -22.0, "frac_1": 1.0, "sed_1": 8,
@@ -68,9 +68,9 @@ def test_a_galaxy_of_half_a_minute_with_lines():
     tracemalloc.stop()
     whole(found)
     (first,) = (row for row in rows(found) if row["order"] == 1)
-    # Of a disc, 0.4 % is farther than five half-light radii.
+    # 0.4 % of the light of a disc is outside five half-light radii.
     assert 0.98 < first["drawn"] / first["expected"] <= 1.0
-    # Of its scale length, 60 px: the rows beyond the largest stamp have their light.
+    # The scale length is 60 pixels. Rows beyond the largest stamp have the expected light.
     y = np.linspace(300.0, 600.0, 400) * 1.6783469900166605 / (30.0 / detector.pixel_scale)
     rows_beyond = float(np.trapezoid(y * k1(y), y)) / np.pi
     high = round(first["y_first"] + first["y_last"]) // 2 + 300
@@ -82,7 +82,7 @@ def test_a_galaxy_of_half_a_minute_with_lines():
 
 @pytest.mark.parametrize("edge", ["first", "last"])
 def test_a_line_leaves_the_passband_by_and_by(edge):
-    """Its light on the frame falls to nothing where the passband does, and nowhere else."""
+    """The light of a line decreases to zero with the response at the edge of the passband."""
     ends = BAND.wavelength[BAND.response > 1e-3 * BAND.response.max()]
     waves = ends[0] + np.linspace(60.0, -60.0, 4) if edge == "first" else ends[-1] + np.linspace(-60.0, 60.0, 4)
     light, detector = [], strip(nx=700, ny=64)
@@ -98,7 +98,7 @@ def test_a_line_leaves_the_passband_by_and_by(edge):
 
 
 def electrons_of(wavelength):
-    """For each erg s-1 cm-2 of a line."""
+    """Return the electrons per erg s-1 cm-2 of a line."""
     return TIME * 9926.0 * float(np.interp(wavelength, BAND.wavelength, BAND.response)) * wavelength / 1.986e-8
 
 
@@ -117,7 +117,7 @@ def test_any_redshift(z):
 
 
 def test_a_grism_that_is_turned_by_30_deg():
-    """The trace climbs by a third of its length: all of its light lies along it."""
+    """All light of the first order lies along the tilted trace."""
     found = spectroscopic.rendered([17.0], [290.0], [200.0], strip(nx=640, ny=400), angle=30.0)
     whole(found)
     (first,) = (row for row in rows(found) if row["order"] == 1)

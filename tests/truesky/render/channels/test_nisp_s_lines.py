@@ -1,4 +1,4 @@
-"""Lines on noisy frames: measured without a bias, as well as noise lets them be, and resolved."""
+"""Lines on noisy frames: their fluxes are unbiased, and their errors agree with the noise."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ SKY = 1.09
 
 
 def many(detector, seed):
-    """Lines of 1e-16 to 1e-15 erg s-1 cm-2 of galaxies of many sizes and redshifts, and where they are."""
+    """Return lines of 1e-16 to 1e-15 erg s-1 cm-2 in galaxies of many sizes and redshifts, and their positions."""
     rng, at = np.random.default_rng(seed), spectral_lines.grid(detector, STEP)
     n = at.shape[1]
     at = at + rng.uniform(-0.5, 0.5, at.shape)
@@ -23,13 +23,16 @@ def many(detector, seed):
 
 
 def pulls(detector, seed, images, grism="RGS000", angle=0.0):
-    """[n] Errors of measured fluxes in terms of what they should be; images : of the same lines, each with its noise"""
+    """Return the errors [n] of measured fluxes in units of the expected errors.
+
+    `images` is the number of images of the same lines with independent noise.
+    """
     lines, at = many(detector, seed)
     columns = {"grism": grism, "angle": angle, "sky": SKY}
     path = spectral_lines.trace(detector, grism, angle)
     places = spectral_lines.undispersed(path, lines.wavelength, at)
     noisy, without = (spectral_lines.exposure(lines, places, detector, on, **columns) for on in (True, False))
-    # Of the sky by all orders.
+    # Rate of the sky in all orders.
     sky = SKY + noisy.scene.sky_change.mean() / TIME
     noise = Noise(sky + noisy.scene.dark_rate, (detector.ny, detector.nx), np.random.default_rng(seed))
     flux, error = spectral_lines.measured(noisy, without, at, noise, images)
@@ -58,7 +61,10 @@ WAVELENGTH, FLUX, RADIUS = 16000.0, 2e-16, 0.25
 
 
 def double_gaussian():
-    """(share of the core, its sigma, that of the wings) at a wavelength, arcsec: of the mission's EE50 and EE80."""
+    """Return (fraction of the core, its sigma, sigma of the wings) of a double Gaussian at a wavelength, arcsec.
+
+    The widths follow from the EE50 and EE80 of the mission.
+    """
     ee50, ee80 = (
         np.interp(
             WAVELENGTH, (13670.0, 17690.0), [MISSION.value(f"nisp.euclid_{band}.psf.{name}", "arcsec") for band in "jh"]
@@ -78,13 +84,13 @@ def double_gaussian():
 
 
 def image_of_line(scale=0.3, samples=10, side=40):
-    """[side samples, side samples] Light of a disc's line in a pixel that is anywhere: nothing of the renderer's."""
+    """Return the light of a disc's line in pixels at [side samples, side samples] positions, without the renderer."""
     k = 2.0 * np.pi * np.fft.fftfreq(side * samples, scale / samples)
     square = k[:, None] ** 2 + k[None] ** 2
     core, sigma, wing = double_gaussian()
     pixel = np.sinc(k * scale / (2.0 * np.pi))
     seen = core * np.exp(-0.5 * square * sigma**2) + (1.0 - core) * np.exp(-0.5 * square * wing**2)
-    # Of an exponential disc; along the dispersion as wide as the line; a pixel, and what its neighbours see of it.
+    # Factors: exponential disc, width of the line along the dispersion, pixel, and inter-pixel capacitance.
     seen *= (1.0 + square * (RADIUS / 1.678) ** 2) ** -1.5
     speed = float(velocity_dispersion(np.array([-20.0]), np.array([WAVELENGTH / spectral_lines.HALPHA - 1.0]))[0])
     width = scale / 13.4 * WAVELENGTH * speed / 299792.5
@@ -95,17 +101,17 @@ def image_of_line(scale=0.3, samples=10, side=40):
 
 
 def expected(sky):
-    """Signal over noise of a line in one exposure of so many e- a second, its background fitted with it.
+    """Return the S/N of a line in one exposure with a sky of `sky` e- per second; the background is fitted.
 
-    The outputs drift slowly, so that their noise in neighbouring pixels does not average out: white noise of as much in
-    a pixel would leave a tenth more.
+    The outputs drift slowly, so their noise does not average out over neighbouring pixels. White noise of the same
+    variance per pixel would give a tenth more.
     """
     energy = PLANCK_ERG_S * LIGHT_ANGSTROM_S / WAVELENGTH
     area = MISSION.value("plm.collecting_area", "cm2")
     light = FLUX * area * TIME * float(np.interp(WAVELENGTH, BAND.wavelength, BAND.response)) / energy * image_of_line()
     noise, found = Noise(sky, (2040, 2040), np.random.default_rng(SEED)), []
     middle, half = len(light) // 2, 10 * spectral_lines.HALF
-    # Of where a line may lie in a pixel some places.
+    # The line may lie anywhere in a pixel: average over some positions.
     for y, x in np.ndindex(5, 5):
         box = (np.s_[middle - half + 2 * i : middle + half + 2 * i + 1 : 10] for i in (y - 2, x - 2))
         own = light[tuple(box)]
@@ -114,9 +120,9 @@ def expected(sky):
 
 
 def sequence(detector, seed, images):
-    """Signal over noise of a line in each exposure of a sequence: the mean of many alike, over their scatter.
+    """Return the S/N of a line in each exposure of a sequence (mean over scatter of many equal lines), and as expected.
 
-    images : of each exposure, with noise of their own
+    `images` is the number of images per exposure with independent noise.
     """
     found, noise = [], None
     for number, (grism, angle) in enumerate(SEQUENCE):
@@ -135,7 +141,7 @@ def sequence(detector, seed, images):
 
 
 def enough(found, wanted):
-    """Of four exposures; each of them as a noise calculation has it."""
+    """Check the S/N of four exposures against the requirement, and against the calculated noise."""
     total = float((found**2).sum() ** 0.5)
     print("S/N of four", total, "each", found, "by calculation", wanted, 2.0 * wanted)
     assert total >= 3.5
@@ -143,9 +149,9 @@ def enough(found, wanted):
 
 
 def test_a_line_is_seen_as_well_as_is_required():
-    """2e-16 erg s-1 cm-2 at 1.6 um, of a source of half an arcsecond, in the sequence of four.
+    """The line has 2e-16 erg s-1 cm-2 at 1.6 um, in a source of half an arcsecond; there are four exposures.
 
-    A strip as wide as a detector: its outputs drift as theirs.
+    The strip is as wide as a detector, so that its outputs drift in the same way.
     """
     enough(*sequence(strip(nx=2040, ny=90), SEED, 4))
 

@@ -1,4 +1,4 @@
-"""How detectors are read: what stands in a file of several arrays, and what is found again in it."""
+"""Readout of detectors: content of a file of several arrays, and reading it back."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ TRUTH = ("noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation")
 
 
 def ramp(found, scene, detector, system):
-    """A slope, a flag, the quality of the fit and the groups: what a detector read up the ramp delivers."""
+    """Return the arrays of a detector that is read up the ramp: slope, flag, quality of the fit, and groups."""
     found = scene.layout.assemble(found)
     slope = np.rint(np.clip(found, 0.0, 65535.0)).astype(np.uint16)
     flag = (slope > np.median(slope)).astype(np.uint8)
@@ -42,7 +42,7 @@ MODE = replace(
 
 
 def put(one, folder, truth=(), rice=False):
-    """Content -> file."""
+    """Write the files of a rendered detector, and return content -> file."""
     rows, writers = fits_files.products(one, truth, rice)
     for path, write in writers.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""VIS as a whole: what a star, a galaxy, the zodiacal light and flats give is what was published or follows."""
+"""VIS as a whole: stars, a galaxy, the zodiacal light and flats agree with published or derived values."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ SIDE = 64
 
 
 def rendered(mission=MISSION, mag=20.0, body=None, x=SIDE / 2, y=SIDE / 2):
-    """One source (or points) of a nominal exposure."""
+    """Render one source (or several points) in a nominal exposure."""
     detector = small("vis", "3-4", SIDE)
     ra, dec, angle = pointing.boresight_for(detector, 53.1, -27.8, 0.0)
     exposed = {
@@ -42,7 +42,7 @@ def rendered(mission=MISSION, mag=20.0, body=None, x=SIDE / 2, y=SIDE / 2):
 
 
 def test_stars_saturate_at_the_published_magnitude():
-    """Nine of them, wherever on a pixel they fall."""
+    """Nine stars are at different positions within a pixel."""
     x, y = (10.0 + 20.0 * i + i / 3 - 1 / 3 for i in np.mgrid[:3, :3])
     one = rendered(mag=20.0, x=x.ravel(), y=y.ravel())
     peaks = [one.noise_free[round(b) - 2 : round(b) + 3, round(a) - 2 : round(a) + 3].max()
@@ -55,7 +55,7 @@ def test_stars_saturate_at_the_published_magnitude():
     ("ladder", "least", "most"), [(None, 18.4, 22.6), (("REQ", "DES", "BLT", "CBE", "SIM"), 10, 25)]
 )
 def test_signal_to_noise_of_a_weak_lensing_galaxy_is_as_required(ladder, least, most):
-    """Exponential, r_e = 0.3", I_E = 24.5, in an aperture of 1.3", four exposures."""
+    """The galaxy is exponential with r_e = 0.3" and I_E = 24.5, in an aperture of 1.3" and four exposures."""
     mission = resolve(ladder=ladder) if ladder else MISSION
     one = rendered(mission, 24.5, {"disk_half_light_radius": 0.3})
     y, x = np.mgrid[:SIDE, :SIDE] - SIDE / 2
@@ -66,7 +66,7 @@ def test_signal_to_noise_of_a_weak_lensing_galaxy_is_as_required(ladder, least, 
 
 
 def flats(level, side, forced, seconds=10.0):
-    """Two flats of the same detector, electrons above the biases' mean of each column."""
+    """Return two flats of the same detector, in electrons above the column means of the biases."""
     mission = resolve(overrides={"vis.flat.signal": (level, "electron"), "vis.flat.illumination": (0.0, ""),
                                  "vis.flat.gradient": (0.0, "")})  # fmt: skip
     scene = Scene(mission, "vis", seconds, 0.25, 0.0, small("vis", "3-4", side))
@@ -98,7 +98,7 @@ def test_photon_transfer_gives_back_gain_and_read_noise():
 
 
 def test_the_curvature_of_photon_transfer_is_the_predicted_one():
-    """Brighter-fatter takes from the variance, non-linearity squeezes it."""
+    """The brighter-fatter effect reduces the variance, and so does non-linearity."""
     level = 1.2e5
     forced = OFF | dict.fromkeys(("brighter_fatter", "nonlinearity", "crosstalk", "parallel_cti", "serial_cti"), True)
     a, b = flats(level, 768, forced)

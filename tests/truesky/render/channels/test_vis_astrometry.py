@@ -1,4 +1,4 @@
-"""Where sources are: in the truth table, in the drawn light, and where a detection program finds them."""
+"""Positions of sources: in the truth table, in the drawn light, and as a detection program finds them."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,11 +24,11 @@ from truesky.request.accuracy import SURVEY
 BAND = passbands.load("euclid_vis")
 SMALL = small("vis", "3-4", 256)
 MAS = 1e-3 / 0.1
-# Samples a pixel of finer drawings; the second odd, for a pixel's average to lie in its middle.
+# Samples per pixel of finer drawings. The second is odd, so that the mean over a pixel is at its centre.
 OVER, FINE = 10, 11
 # Samples across galsim's pupil.
 PUPIL = 256
-# Of the window that sep weighs with, pixels, rms.
+# Standard deviation of the window of sep, pixels.
 WINDOW = 1.2
 
 
@@ -36,7 +36,7 @@ WINDOW = 1.2
 
 
 def sky_of(header, x, y):
-    """Pixels, 0-based -> ra, dec, deg: FITS paper II and the SIP convention, written out, in extended precision."""
+    """Return ra, dec (deg) of 0-based pixels by FITS paper II and the SIP convention, in extended precision."""
     value = {keyword: content for keyword, content, _ in header}
     u, v = (np.asarray(p, np.longdouble) + 1 - np.longdouble(value[f"CRPIX{i}"]) for i, p in ((1, x), (2, y)))
     if value["CTYPE1"].endswith("-SIP"):
@@ -60,7 +60,7 @@ def sky_of(header, x, y):
 
 
 def separation(ra, dec, ra1, dec1):
-    """Great circle, mas, by the haversine."""
+    """Return the great-circle distance (mas) by the haversine formula."""
     turn = np.pi / np.longdouble(180)
     ra, dec, ra1, dec1 = (np.asarray(angle, np.longdouble) * turn for angle in (ra, dec, ra1, dec1))
     half = np.sin((dec1 - dec) / 2) ** 2 + np.cos(dec) * np.cos(dec1) * np.sin((ra1 - ra) / 2) ** 2
@@ -71,7 +71,7 @@ def separation(ra, dec, ra1, dec1):
     ("name", "ra", "dec"), [("1-1", 53.1, -27.8), ("3-4", 0.01, 66.5), ("6-6", 200.0, 89.5), ("6-1", 310.0, -89.9)]
 )
 def test_the_truth_table_tells_where_sources_are(name, ra, dec):
-    """x, y through the header of the file are the catalogue's ra, dec, over a whole detector, to 0.01 mas."""
+    """The header converts x, y to ra, dec of the catalogue within 0.01 mas, over a whole detector."""
     detector = detectors.detector("vis", name, MISSION)
     pointed = pointing.boresight_for(detector, ra, dec, 33.0)
     system = astrometry.wcs(detector, *pointed)
@@ -95,7 +95,7 @@ def test_the_truth_table_tells_where_sources_are(name, ra, dec):
 
 @cache
 def alone():
-    """A star on a small frame."""
+    """Return a star on a small frame."""
     return nominal.rendered(SMALL, 20.0, 127.3, 126.8, forced=nominal.off(*nominal.COSMIC_RAYS))
 
 
@@ -103,11 +103,11 @@ def alone():
 
 
 def oversampled(detector, column, row, side, strength):
-    """A star of flat f_nu at a pixel position by galsim's own optics, drawn 10 times finer than the pixels.
+    """Draw a star of flat f_nu at a pixel position with the optics of galsim, 10 times finer than the pixels.
 
-    returns : [side, side] its light on the pixels about round(column), round(row)
+    The result is the light [side, side] on the pixels around round(column), round(row).
     """
-    # Half a sample of the fine grid from the pixel's border: the middle of the star is in the middle of a sample.
+    # Half width and half height of a detector, arcsec.
     half_x, half_y = 409.6 / 2, 413.2 / 2
     place = [
         (position - (n - 1) / 2) * detector.pixel_scale * (-1 if detector.upside_down else 1)
@@ -144,14 +144,14 @@ def oversampled(detector, column, row, side, strength):
 
 
 def centroid(stamp, x, y):
-    """Under a Gaussian of 0.3" about the place, pixels."""
+    """Return the centroid (pixels) under a Gaussian of 0.3" at a position."""
     rows, columns = np.mgrid[: stamp.shape[0], : stamp.shape[1]]
     weighted = stamp * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 3.0**2))
     return np.array([(weighted * columns).sum(), (weighted * rows).sum()]) / weighted.sum()
 
 
 def drawn_stars(detector, columns, rows):
-    """Noise-free stars as an exposure would draw them."""
+    """Return noise-free stars, drawn as in an exposure."""
     columns, rows = np.asarray(columns, float), np.asarray(rows, float)
     psf = replace(euclid.vis_psf(detector, BAND, MISSION), intra_pixel=0.05)
     n = len(columns)
@@ -163,7 +163,7 @@ def drawn_stars(detector, columns, rows):
 
 
 def differences(detector, columns, rows, side=41):
-    """Centroids of drawn stars less those of galsim's, mas."""
+    """Return centroids of drawn stars minus centroids of stars by galsim, mas."""
     image, half, out = drawn_stars(detector, columns, rows), side // 2, []
     for x, y in zip(columns, rows, strict=True):
         x0, y0 = round(x) - half, round(y) - half
@@ -191,7 +191,10 @@ def test_light_lies_where_galsim_puts_it_all_over_a_detector(name):
 
 
 def tabulated_offset(one):
-    """The windowed centroid of the PSF, drawn 11 times finer than the pixels, less its chief ray, pixels."""
+    """Return the offset (pixels) of the windowed centroid of the PSF from its chief ray.
+
+    The PSF is drawn 11 times finer than the pixels.
+    """
     weights = transfer.basis_weights(one.psf, one.sources.photons, one.sources.column, one.sources.row)
     scale = one.psf.pixel_scale / FINE
     fine = transfer.profile_of(one.psf, weights.mean(axis=0)).drawImage(
@@ -202,7 +205,7 @@ def tabulated_offset(one):
 
 
 def residuals(detector, pitch, mag, number=1):
-    """Positions by sep's windowed centroid less the truth's and the PSF's offset, [2, n] mas; S/N [n]."""
+    """Return positions by sep minus truth and PSF offset [2, n] (mas), and S/N [n]."""
     x, y = nominal.lattice(detector.nx, pitch, number)
     inside = y < detector.ny - pitch / 2
     forced = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE, "nonlinearity")
@@ -228,7 +231,7 @@ def test_sep_finds_stars_to_three_mas():
 
 @pytest.mark.nightly
 def test_sep_finds_stars_all_over_a_detector():
-    """One offset for all of them: what the PSF's centroid does across the detector is in the residuals."""
+    """All stars get the same offset, so residuals include changes of the PSF's centroid across the detector."""
     found, clear = residuals(detectors.detector("vis", "1-1", MISSION), 128, 19.4)
     print(f"{found.shape[1]} stars: rms {np.sqrt(np.mean(found**2)):.3f} mas, S/N above {clear.min():.0f}")
     assert found.shape[1] > 800

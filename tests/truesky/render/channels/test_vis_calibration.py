@@ -1,4 +1,4 @@
-"""Calibration as an observer does it: master biases and flats made of frames, and what is left in a science frame."""
+"""Calibration by an observer: master biases and flats from frames, and the residuals of a science frame."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ FRAMES, BLOCK = 20, 64
 
 
 def raw(detector, kind, number, seconds, sky=nominal.SKY, forced=None):
-    """Electrons above the converter's zero, quadrants with their overscan; and the exposure."""
+    """Return the quadrants with overscan, in electrons above the zero of the converter, and the exposure."""
     sky = 0.0 if kind == "bias" else sky
     one = nominal.rendered(
         detector, [], [], [], kind=kind, number=number, seconds=seconds, sky=sky, forced=forced, truth=("cosmic_rays",)
@@ -24,7 +24,7 @@ def raw(detector, kind, number, seconds, sky=nominal.SKY, forced=None):
 
 
 def combined(frames):
-    """Mean of what lies within four deviations (of the median's) of the median: no cosmic ray is left."""
+    """Return the mean of values within four standard deviations of the median, which excludes cosmic rays."""
     stack = np.stack(frames)
     middle = np.median(stack, axis=0)
     spread = 1.4826 * np.median(np.abs(stack - middle), axis=0)
@@ -39,35 +39,35 @@ def linearised(frame, one):
 
 @cache
 def masters(detector):
-    """Bias, quadrants; flat [ny, nx], 1 in the mean."""
+    """Return the master bias (quadrants), and the master flat [ny, nx] with mean 1."""
     bias = combined([raw(detector, "bias", i, 0.0)[0] for i in range(1, FRAMES + 1)])
     flats = []
     for i in range(1, FRAMES + 1):
         frame, one = raw(detector, "flat", 100 + i, 10.0)
-        # What the open shutter let in besides is known; the lamp's unevenness is the calibration unit's own.
+        # The light of the sky through the open shutter is known. The unevenness of the lamp is divided out below.
         flats.append((linearised(frame - bias, one) - one.scene.sky_electrons).astype(np.float32))
     level, *pattern = calibration_lamp.EFFECT.parameters(one.scene)
     return bias, combined(flats) / (level * illumination.apply(np.ones(flats[0].shape), *pattern))
 
 
 def calibrated_science(detector, sky, number, rays=False):
-    """A science frame, NaN where it is spoilt, and what it should be, e- [ny, nx]."""
+    """Return a calibrated science frame, NaN in spoilt pixels, and the expected electrons [ny, nx]."""
     bias, flat = masters(detector)
     forced = None if rays else nominal.off(*nominal.COSMIC_RAYS)
     frame, one = raw(detector, "science", 200 + number, nominal.TIME, sky, forced)
     found = linearised(frame - bias, one) / np.where(flat > 0.7, flat, np.nan)
     expected = np.full(found.shape, one.scene.sky_electrons)
-    # Of the maps those that the header has: the others are not in the image.
+    # Only effects in the header act on the image.
     applied = {decision.name for decision in one.decisions if decision.applied}
     for part in (pixel_area.EFFECT, illumination.EFFECT, illumination.SHUTTER):
         if part.name in applied:
             expected = part.apply(expected, *part.parameters(one.scene))
-    # What the header says of the dark current: where it is not noticed there is none.
+    # The header gives the dark current, or 0 if it is negligible.
     (dark,) = (value for keyword, value, _ in headers.science_cards(one) if keyword == "DARKRATE")
     expected += dark * nominal.TIME
     if rays:
         found = calibrated.without_hits(found, one.maps["cosmic_rays"])
-    # Hot pixels are known to the darks.
+    # Hot pixels are known from darks.
     return np.where(found > expected + 10 * np.sqrt(expected), np.nan, found), expected
 
 
@@ -77,11 +77,12 @@ def block_means(values):
 
 
 def check(detector):
-    """Every block of 64 pixels within 0.3 %.
+    """Check that every block of 64 pixels is within 0.3 % of its expected level.
 
-    At the nominal sky a block of one frame scatters by 0.14 % of shot and read noise, and the largest of 256 by three
-    times that: in the mean of a field's four dithers, whose noise is half, what calibration leaves shows. At a bright
-    sky one frame tells. Cosmic rays leave half of a block, and in one frame at the nominal sky its noise alone is seen.
+    At the nominal sky, shot and read noise scatter the blocks of one frame by 0.14 %, and the largest of 256 deviations
+    is three times larger. The mean of four dithers has half this noise, so that errors of the calibration are visible.
+    At a bright sky, one frame is enough. Cosmic rays leave half of a block, so one frame at the nominal sky shows only
+    noise.
     """
     for sky, frames, rays in ((nominal.SKY, 4, False), (9.0, 1, False), (nominal.SKY, 1, True), (9.0, 1, True)):
         taken = [calibrated_science(detector, sky, number, rays) for number in range(frames)]

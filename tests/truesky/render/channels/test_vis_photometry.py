@@ -1,4 +1,4 @@
-"""How bright stars are when a photometer measures them, and what the effects that it does not undo take."""
+"""Photometry of stars in VIS images, and the losses by effects that the photometry does not undo."""
 
 from dataclasses import replace
 
@@ -15,16 +15,16 @@ from truesky.render.camera import detectors
 from truesky.render.drawing import transfer
 from truesky.render.products import truth_table
 
-# Radius of the aperture, of the ring that tells the sky, arcsec.
+# Radius of the aperture, and radii of the ring in which the sky is measured, arcsec.
 APERTURE, RING = 1.3, (2.2, 3.0)
 CTI = ("parallel_cti", "serial_cti")
 BODY = {"disk_half_light_radius": 0.3}
-# Samples a pixel of the drawn PSF.
+# Samples per pixel of the drawn PSF.
 FINE = 5
 
 
 def in_aperture(image, x, y, scale):
-    """Electrons inside the aperture above the ring's mean; pixels of both."""
+    """Return the electrons inside the aperture above the mean of the ring, and the numbers of pixels of both."""
     circle = sep.sum_circle(image, x, y, APERTURE / scale, subpix=11)[0]
     ring, _, _ = sep.sum_circann(image, x, y, RING[0] / scale, RING[1] / scale, subpix=11)
     inside, around = (np.pi * (outer**2 - inner**2) / scale**2 for inner, outer in ((0.0, APERTURE), RING))
@@ -32,7 +32,7 @@ def in_aperture(image, x, y, scale):
 
 
 def correction(one):
-    """What of a star's light is counted: the model PSF of each star, drawn by galsim."""
+    """Return the measured fraction of the light of a star, from the mean model PSF drawn by galsim."""
     weights = transfer.basis_weights(one.psf, one.sources.photons, one.sources.column, one.sources.row)
     fine = transfer.profile_of(one.psf, weights.mean(axis=0)).drawImage(
         nx=801, ny=801, scale=one.psf.pixel_scale / FINE, method="no_pixel", dtype=float
@@ -42,7 +42,7 @@ def correction(one):
 
 
 def photometry(one):
-    """Measured less true magnitude of every star, and the noise that is expected of it, mag."""
+    """Return measured minus true magnitudes of all usable stars, and their expected noise (mag)."""
     applied = {decision.name for decision in one.decisions if decision.applied}
     image = calibrated.electrons(one.raw, one.scene, nominal.SEED, applied)
     bad = ~np.isfinite(image)
@@ -63,7 +63,7 @@ def stars(detector, pitch, mags, forced, mission=MISSION, number=1):
 
 
 def test_isolated_stars_are_as_bright_as_the_catalogue_says():
-    """Linearised, without charge transfer's and cosmic rays' part; S/N > 200."""
+    """The images are linearised, without charge transfer and cosmic rays. The stars have S/N > 200."""
     forced, detector = nominal.off(*nominal.COSMIC_RAYS, *CTI), small("vis", "3-4", 256)
     mags = [18.5, 19.0, 19.5, 20.0]
     found = [photometry(stars(detector, 64, mags, forced, number=number)) for number in (1, 2)]
@@ -74,11 +74,11 @@ def test_isolated_stars_are_as_bright_as_the_catalogue_says():
 
 
 def test_losses_by_charge_effects_are_those_of_the_benchmark():
-    """Charge transfer with old traps and brighter-fatter dim a star by the sum of benchmarks/effects.py."""
+    """Charge transfer with old traps and brighter-fatter dim a star by the losses in benchmarks/effects.py."""
     old = resolve(overrides={"vis.cti.age": (10.0, "")})
     detector = small("vis", "3-4", 256)
     quiet = nominal.off(*nominal.COSMIC_RAYS)
-    # The same noise: the calibrator's photometry of both.
+    # Both renderings have the same noise.
     without = stars(detector, 64, 20.0, quiet | nominal.off(*nominal.CHARGE), old)
     through = stars(detector, 64, 20.0, quiet | dict.fromkeys(nominal.CHARGE, True), old)
     (before, noise), (after, _) = photometry(without), photometry(through)
@@ -95,7 +95,7 @@ def test_losses_by_charge_effects_are_those_of_the_benchmark():
 
 
 def test_signal_to_noise_of_weak_lensing_galaxies_is_as_stated():
-    """Of I_E = 24.5 and r_e = 0.3", in a stack of four: the noise that their fluxes scatter by is the expected one.
+    """Galaxies have I_E = 24.5 and r_e = 0.3" in a stack of four. Their fluxes scatter by the expected noise.
 
     Sample of 240 galaxies or more; significance 6e-5 of the mean (4 standard errors), 0.03 of the scatter (10 %).
     """
@@ -111,7 +111,7 @@ def test_signal_to_noise_of_weak_lensing_galaxies_is_as_stated():
         stack.append(calibrated.electrons(one.raw, one.scene, nominal.SEED, applied) - diffuse)
     image = np.mean(stack, axis=0)
     bad = ~np.isfinite(image)
-    # An aperture 1.3" across.
+    # The aperture is 1.3" across.
     flux, blind = (sep.sum_circle(part, x, y, 6.5)[0] for part in (np.where(bad, 0.0, image), bad.astype(float)))
     true = sep.sum_circle(one.noise_free.astype(float), x, y, 6.5)[0].mean()
     pixel = one.scene.pixel_noise**2 + one.scene.value("gain", "electron / adu") ** 2 / 12
@@ -119,7 +119,7 @@ def test_signal_to_noise_of_weak_lensing_galaxies_is_as_stated():
     seen = flux[blind == 0]
     assert len(seen) > 240
     assert seen.mean() == pytest.approx(true, abs=4 * noise / np.sqrt(len(seen)))
-    # The scatter of so many is known to 4.5 %.
+    # The scatter of 240 values is uncertain by 4.5 %.
     assert seen.std() == pytest.approx(noise, rel=0.1)
     assert true / noise == pytest.approx(20.5, rel=0.1)
 

@@ -11,14 +11,17 @@ from truesky.render.drawing.kernels import fourier
 from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes, sersic
 
-# Samples a pixel of the series; A that share one PSF of galsim's; wavelengths that are laid at a time.
+# Samples per pixel of the series; angstroms that share one PSF in galsim; wavelengths per batch.
 FINE, BLOCK, TOGETHER = 3, 40.0, 512
-# Tight, but for steep bulges, whose transforms have no end.
+# High accuracy, except for steep bulges, whose transforms do not end.
 TIGHT = galsim.GSParams(folding_threshold=1e-4, maxk_threshold=1e-4, kvalue_accuracy=1e-7, maximum_fft_size=16384)
 
 
 def weights_at(through, source, shape):
-    """[b] for each of a PSF's wavelengths the weights of its planes, at a source's place; the nearest of a frame's."""
+    """Return [b] weights of the planes for each wavelength of a PSF, at the position of a source.
+
+    Positions outside the frame are replaced by the nearest position on it.
+    """
     column, row = (np.clip(at, 0.0, n - 1.0) for at, n in ((source.column, shape[1]), (source.row, shape[0])))
     return [
         transfer.basis_weights(through, part[None], column, row)[0] for part in np.eye(len(through.planes.wavelength))
@@ -29,7 +32,8 @@ def weights_at(through, source, shape):
 class Seen:
     """A PSF on a periodic frame.
 
-    planes : complex[p, rows, columns] transforms of its planes, with the pixel;  fx, fy : cycles a pixel
+    `planes` contains the transforms of its planes, including the pixel, complex[p, rows, columns]. The unit of `fx` and
+    `fy` is cycles per pixel.
     """
 
     through: model.Psf
@@ -51,9 +55,9 @@ class Seen:
 
 
 def series(source, spectrum, orders, seen):
-    """The frame of the only source by the Fourier series of its light, wavelength by wavelength: periodic, [ny, nx].
+    """Return the periodic frame [ny, nx] of a single source, from the Fourier series of all wavelengths.
 
-    spectrum : [w] electrons, at the orders' wavelengths
+    `spectrum` contains electrons [w] at the wavelengths of the orders.
     """
     ny, nx = seen.shape
     own = [np.tensordot(part, seen.planes, 1) for part in weights_at(seen.through, source, seen.shape)]
@@ -67,7 +71,7 @@ def series(source, spectrum, orders, seen):
 
 
 def _laid(source, spectrum, part, seen):
-    """[b] transforms of the light of an order, seen through each PSF."""
+    """Return the transforms [b] of the light of an order, one for each PSF."""
     fx, fy, nodes = seen.fx, seen.fy, seen.through.planes.wavelength
     some = np.flatnonzero(spectrum * part.response)
     x, y = part.trace.offsets(float(source.column[0]), float(source.row[0]), part.wavelength[some])
@@ -83,7 +87,7 @@ def _laid(source, spectrum, part, seen):
 
 
 def profile(source, fx, fy):
-    """[rows, columns] transform of the only galaxy."""
+    """Return the transform [rows, columns] of a single galaxy."""
     shapes = source.shapes.take(source.shape)
     form = galaxy_shapes.forms(shapes, source.jacobian)
     row, weights = sersic.interpolation_weights(shapes.sersic_index)
@@ -100,14 +104,14 @@ def profile(source, fx, fy):
 
 
 def by_galsim(source, spectrum, order, through, shape, side=48, step=0.1):
-    """The frame of the only source, one order, by galsim's drawImage at every `step` of a pixel along the trace.
+    """Return the frame of a single source and order, drawn by galsim at every `step` of a pixel along the trace.
 
-    through : a PSF of many wavelengths; what lies within a step is at the mean of its light
-    side    : of the images that are added, pixels
+    `through` is a PSF of many wavelengths; the light within a step is at its mean position. The added images have
+    `side` pixels per side.
     """
     (ny, nx), waves, electrons = shape, order.wavelength, spectrum * order.response
     x, y = order.trace.offsets(float(source.column[0]), float(source.row[0]), waves)
-    # As wide as the images.
+    # The planes are cut to the size of the images.
     whole, wide = (n * through.planes.samples // 2 for n in (through.side, side))
     middle = np.s_[whole - wide : whole + wide + 1]
     planes = np.array(
@@ -134,7 +138,7 @@ def by_galsim(source, spectrum, order, through, shape, side=48, step=0.1):
 
 
 def _through(source, plane, samples):
-    """The only source of unit flux through a PSF's plane and a pixel, as galsim has it, pixels."""
+    """Return a single source of unit flux through a plane of a PSF and a pixel, by galsim in units of pixels."""
     parts = [model.galsim_profile(plane, 1.0 / samples, exact=True), galsim.Pixel(1.0)]
     if source.shape[0] >= 0:
         body = galaxy_shapes.profile(source.shapes, int(source.shape[0]), 1e-6)
@@ -143,6 +147,6 @@ def _through(source, plane, samples):
 
 
 def placed(source, column, row):
-    """The only source elsewhere, of one unit of its spectrum."""
+    """Return a single source at another position, with one unit of its spectrum."""
     moved = source.take(np.array([0]))
     return replace(moved, column=np.array([column]), row=np.array([row]), electrons=np.ones(1))

@@ -1,4 +1,4 @@
-"""Spectra as drawn for a survey against galsim at every tenth of a pixel, through a PSF of nine wavelengths."""
+"""Spectra with survey settings agree with galsim at every tenth of a pixel and a PSF of nine wavelengths."""
 
 from functools import cache
 
@@ -15,20 +15,20 @@ from truesky.request.accuracy import REFERENCE, SURVEY
 WAVES = np.arange(float(FIRST), LAST + 1.0)
 NOISE, HIGH, SEED = 28.0, 96, 20_611
 SETTINGS = draw.settings_for(SURVEY)
-# Grism, tilt as it is asked for, source, electrons of its first order, A of the band from its first that it shines in.
+# Grism, requested tilt, source, electrons of its first order, first wavelength with light (A from that of the band).
 STAR, DISC, COMPACT, STEEP, EDGE, FAINT = range(6)
 CASES = [
     ("RGS000", 0.0, STAR, 4e5, 0), ("RGS180", 4.0, DISC, 4e4, 1700), ("RGS000", -4.0, COMPACT, 6e3, 3400),
     ("RGS000", 4.0, STEEP, 6e4, 5100), ("RGS000", 0.0, EDGE, 2e4, 2500), ("RGS180", 4.0, STAR, 5e4, 5100),
     ("RGS000", -4.0, FAINT, 3e3, 800), ("RGS180", 0.0, COMPACT, 2e4, 4200), ("RGS000", -4.0, STEEP, 2e4, 1200),
 ]  # fmt: skip
-# Of a spectrum that is compared, A: a quarter of the band, or as much as takes a second.
+# Lengths of the compared spectra, A: a quarter of the band, or a range that takes a second.
 LONG, SHORT = 1700, 240
 
 
 @cache
 def sources():
-    """A star and galaxies: a disc, a compact one, a steep bulge, one on edge, one small and faint."""
+    """Return a star and galaxies: a disc, a compact one, a steep bulge, one edge-on, and a small and faint one."""
     some = scenes.sources(scenes.NISP, SEED, galaxies=5, stars=1).take(np.array([5, 0, 1, 2, 3, 4]))
     known = {
         "bulge_fraction": (0.0, 0.4, 0.9, 0.1, 0.2), "bulge_radius": (0.3, 0.15, 0.35, 0.2, 0.1),
@@ -46,7 +46,10 @@ def trace(grism, tilt, number):
 
 
 def spectrum(electrons, first, length):
-    """[w] Electrons: a continuum and two lines within some of the band, as bright as if it shone in all of it."""
+    """Return electrons [w] of a continuum and two lines in a part of the band.
+
+    They are as bright as if the whole band contained `electrons`.
+    """
     here = (FIRST + first <= WAVES) & (FIRST + first + length > WAVES)
     light = np.where(here, (WAVES / 15000.0) ** -1.5, 0.0)
     light *= electrons / len(WAVES)
@@ -57,11 +60,11 @@ def spectrum(electrons, first, length):
 
 
 def compared(case, length, number=1, settings=SETTINGS, nodes=SETTINGS.nodes):
-    """(largest error of a pixel, and the brightest pixel) of an order of a case; but for the first, of 2 % of it."""
+    """Return (largest error of a pixel, brightest pixel) of an order of a case; only first orders have all light."""
     grism, tilt, which, electrons, first = case
     path, light, source = trace(grism, tilt, number), spectrum(electrons, first, length), one(sources(), which)
     reached = path.offsets(0.0, 0.0, WAVES[light > 0.0])
-    # So that the light is in the middle of a frame.
+    # The light is in the middle of the frame.
     wide = int(np.ptp(reached[0])) + HIGH
     source = fine.placed(
         source, *(0.5 * n + 0.37 - float(o.mean()) for n, o in zip((wide, HIGH), reached, strict=True))
@@ -94,12 +97,12 @@ def test_a_piece_of_a_first_order_is_as_galsim_draws_it(case):
     "case", [CASES[1], CASES[2], *(pytest.param(c, marks=pytest.mark.nightly) for c in CASES[3:5])]
 )
 def test_zeroth_orders_are_as_galsim_draws_them(case):
-    """All of the band within ten pixels, where the PSF changes by half from the first to the last of them."""
+    """The whole band is within ten pixels, and the PSF changes by half over the band."""
     within(*compared((*case[:3], 50.0 * case[3], 0), len(WAVES), 0))
 
 
 @pytest.mark.parametrize("accuracy", [SURVEY, REFERENCE])
 def test_a_star_s_zeroth_order_is_as_galsim_draws_it(accuracy):
-    """The brightest that there are, nearly as sharp as the PSF."""
+    """The order is the brightest possible, and nearly as sharp as the PSF."""
     settings = draw.settings_for(accuracy)
     within(*compared((*CASES[0][:3], 2e7, 0), len(WAVES), 0, settings, settings.nodes))

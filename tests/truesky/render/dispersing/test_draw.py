@@ -1,4 +1,4 @@
-"""Spectra on the detector: against the Fourier series of every wavelength, and what must be kept."""
+"""Spectra on the detector agree with Fourier series of all wavelengths, and conserve light and positions."""
 
 from dataclasses import replace
 
@@ -16,7 +16,10 @@ FINE = draw.Settings(edge=1e-9, faint=0.0, along=3)
 
 @pytest.mark.parametrize(("slope", "sag", "along"), [(0.0, 0.0, 1), (0.07, 1.5, 1), (-0.07, -1.5, -1)])
 def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
-    """A galaxy and a star, along and against the rows, bent by what NISP's traces are: in one PSF for 110 A."""
+    """A galaxy and a star agree if wavelengths in blocks of 110 A share a PSF.
+
+    The traces run along and against the rows, and are as curved as traces of NISP.
+    """
     through = psf()
     path = trace((300.0 if along < 0 else -10.0, along * 512.0), slope, sag=4.0 * sag)
     path.y[2, 0] = -4.0 * sag
@@ -34,13 +37,13 @@ def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
         assert slow.sum() > 0.9 * spectrum.sum()
         assert fast.sum() == pytest.approx(slow.sum(), rel=1e-5)
         assert np.abs(fast - slow).max() < 3e-3 * slow.max()
-        # Of a block the PSF is that of its middle, which at its ends is 0.4 % narrower or wider.
+        # A block has the PSF of its middle, which is 0.4 % narrower or wider than the PSF at its ends.
         assert np.abs(fast - slow).mean() < 3e-3 * slow.mean()
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.07])
 def test_orders_share_images_and_are_drawn_as_from_their_own(slope, monkeypatch):
-    """An order that is bent within a few pixels, beside a straight one: its stamps are sheared as the other's."""
+    """An order that is curved within a few pixels shares the sheared stamps of a straight order."""
     bent, straight = trace((-70.0, 5.0, 2.0, -1.0), -0.03, 0, 1.0), trace((-10.0, 512.0), slope)
     orders, made, planes = [order(straight), order(bent, 0.2)], [], images.planes
     monkeypatch.setattr(images, "planes", lambda *which: made.append(which[1]) or planes(*which))
@@ -74,7 +77,7 @@ def placed(seed, i, column, row, galaxies=4, stars=1):
 
 
 def continuum_and_line(line=0.0, every=20):
-    """One electron every so many A, and a line at 1.5 um."""
+    """Return a continuum with a mean of one electron per A, in one of `every` bins, and a line at 1.5 um."""
     spectrum = np.zeros(len(WAVES))
     spectrum[::every] = every
     spectrum[int(15000 - FIRST)] += line
@@ -84,7 +87,7 @@ def continuum_and_line(line=0.0, every=20):
 @pytest.mark.parametrize("slope", [0.0, 0.07])
 @pytest.mark.parametrize("i", [0, 1, 4])
 def test_spectra_are_the_series_of_every_wavelength(i, slope):
-    """A first order of 64 pixels; galaxies and a star."""
+    """The first order is 64 pixels long. The sources are galaxies and a star."""
     source, through, short = placed(8, i, 47.3, 33.6), psf(), trace((-10.0, 64.0), slope)
     spectrum = continuum_and_line(3000.0)
     shape = (72, 160)
@@ -108,7 +111,7 @@ def test_laying_keeps_the_total_and_the_mean_of_a_line():
         samples = -20 + np.arange(400)
         assert laid.sum() == pytest.approx(electrons.sum(), rel=1e-13)
         assert (laid[0] * samples).sum() == pytest.approx((electrons * places).sum(), rel=1e-12)
-        # A spline of degree 5 broadens by 6 / 12 of a sample squared, and by nothing else.
+        # A spline of degree 5 adds 6 / 12 of a squared sample to the second moment, and nothing else does.
         spread = (electrons * places**2).sum() + 0.5 * electrons.sum()
         assert (laid[0] * samples**2).sum() == pytest.approx(spread, rel=1e-12)
 
@@ -121,7 +124,7 @@ def test_shares_of_the_nodes_sum_to_one_and_are_one_at_each():
 
 
 def test_all_light_of_an_order_is_on_a_frame_that_holds_it():
-    """But for what the PSF has outside its planes; and a tally says so."""
+    """Only light outside the planes of the PSF is missing, and the tally contains the drawn light."""
     source, through = placed(8, 1, 140.0, 60.0), psf()
     spectrum = continuum_and_line()
     orders = [order(trace((-60.0, 120.0), 0.03)), order(trace((-70.0, 3.0, 1.0, -0.5), order=0), 0.1)]
@@ -136,7 +139,7 @@ def test_all_light_of_an_order_is_on_a_frame_that_holds_it():
 
 
 def test_light_below_zero_is_taken_off():
-    """Of a response that changes sign: what is drawn of the one part less what is of the other."""
+    """A response with both signs gives the drawing of its positive part minus the drawing of its negative part."""
     source, through, spectrum = placed(8, 1, 60.3, 50.6), psf(), continuum_and_line().astype(np.float32)[None]
     response, found = np.sin(np.linspace(0.0, 9.0, len(WAVES))), []
     for own in (response, np.maximum(response, 0.0), np.maximum(-response, 0.0)):
@@ -172,7 +175,7 @@ def test_orders_outside_the_detector_or_below_the_noise_are_not_drawn():
 
 
 def test_a_line_lies_where_its_wavelength_does():
-    """Centroids of a narrow line, drawn with and without, at many places: 0.01 pixel."""
+    """The centroid of a narrow line agrees within 0.01 pixel with an undispersed image, at many positions."""
     through, rng = psf(), np.random.default_rng(7)
     off = []
     for _ in range(12):
@@ -198,7 +201,7 @@ def test_a_line_lies_where_its_wavelength_does():
 
 
 def draw_of_all(source, through, column, row):
-    """Centroid of the same source undispersed at a place, in the light of its line."""
+    """Return the centroid of the same source without dispersion, in the light of its line."""
     still = placed_at(source, column, row)
     flat = [order(trace((0.0, 1e-6)))]
     spectrum = np.zeros((1, len(WAVES)), np.float32)

@@ -1,4 +1,4 @@
-"""Arcs of strong lenses and trails of moving bodies are spread out as the points that they are made of."""
+"""Spectra of arcs of strong lenses and of trails of moving bodies are sums of spectra of points."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from truesky.render.camera.pointing import boresight_for
 from truesky.render.dispersing import draw
 from truesky.render.sources.lensed_arcs import Picture
 
-# A slope along rows, and a line on a continuum.
+# A first order with a slope along rows, and a short zeroth order with 2 % of the light.
 ORDERS = (order(trace(slope=0.07)), order(trace((900.0, 10.0), order=0), 0.02))
 SHAPE, NOISE = (96, 640), 1000.0
 SETTINGS = draw.Settings(edge=0.001, faint=0.0)
@@ -34,7 +34,7 @@ def frame(sources, settings=SETTINGS):
 
 
 def points(like, columns, rows, electrons):
-    """Of the same light in all, at other places."""
+    """Return points with the light of one source at other positions."""
     n = len(columns)
     some = like.take(np.zeros(n, np.int64))
     return replace(
@@ -43,7 +43,10 @@ def points(like, columns, rows, electrons):
 
 
 def check(extended, alike, beyond, settings=SETTINGS):
-    """To 1 % of the peak, and of the light but for wings that faint points leave out; a point is something else."""
+    """An extended source agrees with its points within 1 % of the peak, but not with a single point.
+
+    Faint points lack wings, so the sums of light agree only within 1 %.
+    """
     found, wanted = frame(extended, settings), frame(alike, settings)
     assert abs(found.sum() / wanted.sum() - 1.0) < 0.01
     assert np.abs(found - wanted).max() < 0.01 * wanted.max()
@@ -52,7 +55,7 @@ def check(extended, alike, beyond, settings=SETTINGS):
 
 
 def test_a_trail_is_its_points():
-    """23 px along a diagonal: its line is a streak, not a spot."""
+    """The trail is 23 pixels along a diagonal, so its line is a streak instead of a spot."""
     body, trail = source(), np.array([19.0, 13.0])
     part = (np.arange(60) + 0.5) / 60 - 0.5
     alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(60, 1e6 / 60))
@@ -60,7 +63,7 @@ def test_a_trail_is_its_points():
 
 
 def test_a_trail_of_a_thousand_pixels_is_its_points():
-    """Longer than the largest stamp: in pieces."""
+    """The trail is longer than the largest stamp, so it is drawn in pieces."""
     body, trail = source(), np.array([998.0, 40.0])
     part = (np.arange(1000) + 0.5) / 1000 - 0.5
     alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(1000, 1e3))
@@ -73,7 +76,7 @@ def test_an_arc_is_its_pixels():
     light = np.exp(-0.5 * ((np.hypot(x, y) - 4.0) / 1.0) ** 2) * (1.2 + np.cos(np.arctan2(y, x) - 0.7))
     light /= light.sum()
     body = source()
-    # Columns of a picture run to the east; the world frame's first axis points west.
+    # Columns of a picture run to the east, but the first axis of the world frame points to the west.
     across, up = np.linalg.solve(body.jacobian[0], scale * np.stack([-x.ravel(), y.ravel()]))
     alike = points(body, body.column + across, body.row + up, 1e6 * light.ravel())
     arc = replace(body, picture=np.array([0]), pictures=(Picture.from_sky_image(light.astype(np.float32), scale),))

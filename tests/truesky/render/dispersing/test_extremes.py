@@ -1,4 +1,4 @@
-"""Spectra at the extremes: no dispersion, next to none, one wavelength, all light beside the frame, a crowd."""
+"""Spectra at the extremes: hardly any dispersion, one wavelength, all light outside the frame, a crowd."""
 
 import tracemalloc
 from dataclasses import replace
@@ -18,7 +18,7 @@ SETTINGS = replace(draw.settings_for(SURVEY), min_size=64)
 
 
 def some(i=1):
-    """A galaxy, or the star (4), in the middle of a small frame."""
+    """Return a galaxy, or the star (4), in the middle of a small frame."""
     return fine.placed(one(scenes.sources(scenes.NISP, 8, galaxies=4, stars=1), i), 64.3, 63.8)
 
 
@@ -33,7 +33,7 @@ def total(orders, spectrum=FLAT, i=1):
 @pytest.mark.parametrize("length", [0.0, 1e-300, 1e-12, 1e-3, -1e-9, -0.5, 0.9])
 @pytest.mark.parametrize("i", [1, 4])
 def test_light_that_is_not_spread_is_an_image(length, i):
-    """As bright as it is, where it is, whatever little the dispersion."""
+    """With hardly any dispersion, flux and position are the same as in an undispersed image."""
     frame = total([order(trace((0.0, length)))], i=i)
     assert frame.sum() == pytest.approx(1e4, rel=0.02)
     wanted = total([order(trace((0.5 * length, 1e-6)))], i=i)
@@ -69,7 +69,7 @@ def test_all_orders_beside_the_frame(away):
 
 
 def test_a_trace_that_is_long_costs_no_more_than_the_frame():
-    """A hundred thousand pixels, of which the frame has 128."""
+    """The trace is 100 000 pixels long, of which 128 are on the frame."""
     tracemalloc.start()
     frame = total([order(trace((-5e4, 1e5)))], FLAT * 1e3)
     _, peak = tracemalloc.get_traced_memory()
@@ -83,7 +83,7 @@ def test_a_trace_that_is_long_costs_no_more_than_the_frame():
     [(2500, DRAFT), pytest.param(50_000, SURVEY, marks=pytest.mark.nightly)],
 )
 def test_a_crowd_takes_the_memory_of_a_frame(count, settings):
-    """Fifty thousand sources; of the cheap version, as many on a twentieth of the sky."""
+    """The nightly test has 50 000 sources. The short test has the same density on a twentieth of the frame."""
     rng, shape = np.random.default_rng(1), (2040, 2040 * count // 50_000)
     crowd = scenes.sources(scenes.NISP, 5, galaxies=count * 9 // 10, stars=count // 10)
     crowd.column[:], crowd.row[:] = rng.uniform(0, shape[1], len(crowd)), rng.uniform(0, shape[0], len(crowd))

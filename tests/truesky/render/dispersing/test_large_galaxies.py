@@ -1,4 +1,4 @@
-"""Stamps are as large as their light asks for: of bright steep galaxies, of faint ones, of those that none holds."""
+"""Stamps are as large as the light requires, for bright steep galaxies, faint ones, and ones larger than any stamp."""
 
 from dataclasses import replace
 from functools import cache
@@ -22,7 +22,7 @@ SETTINGS = replace(draw.settings_for(SURVEY), nodes=3)
 
 
 def galaxy(radius, index, fraction, column, row):
-    """A galaxy of half-light radii in arcsec, of a Sersic index and a part of its light in the bulge."""
+    """Return a galaxy with given half-light radii (arcsec), Sersic index, and fraction of light in the bulge."""
     found = one(scenes.sources(scenes.NISP, 8, galaxies=1, stars=0), 0)
     known = {
         "bulge_fraction": fraction, "bulge_radius": radius, "disk_radius": radius, "sersic_index": index,
@@ -35,7 +35,7 @@ def galaxy(radius, index, fraction, column, row):
 
 @cache
 def steep():
-    """(a galaxy of 2 arcsec and n = 4, its spectrum of an electron, the only order, the series of every wavelength)."""
+    """Return (galaxy of 2 arcsec and n = 4, its spectrum of one electron, its order, the series of all wavelengths)."""
     shape, spectrum = (320, 288), np.zeros(COUNT)
     spectrum[::40] = 1.0 / len(spectrum[::40])
     source, orders = galaxy(2.0, 4.0, 1.0, 144.3, 159.7), [order(trace((-32.0, 64.0), 0.03))]
@@ -48,14 +48,14 @@ def test_aliased_light_of_large_galaxies_is_within_the_accuracy(electrons):
     source, spectrum, orders, wanted = steep()
     light = (electrons * spectrum).astype(np.float32)[None]
     found = drawn(source, lambda _: light, orders, psf(), wanted.shape, NOISE, SETTINGS)
-    # The series is periodic, too: as far out as its own images are no light.
+    # The series is also periodic, so only pixels far from the light of its periodic images are compared.
     error = np.abs(found - electrons * wanted)[60:-60, 40:-40]
     print("pixel", error.max(), "e-", error.max() / found.max(), "of the peak")
     assert error.max() < 0.02 * NOISE
 
 
 def test_faint_galaxies_on_the_smallest_stamp_are_within_the_accuracy():
-    """Errors of pixels are within the accuracy "survey", and the missing light is that of the PSF outside the stamp."""
+    """Errors of pixels are within the accuracy "survey", and only light of the PSF outside the stamp is missing."""
     spectrum, source = np.full((1, COUNT), 2e3 / COUNT, np.float32), galaxy(0.5, 1.0, 0.0, 60.0, 60.0)
     orders, through, frames = [order(trace((-32.0, 512.0)))], psf(), []
     for least in (SETTINGS.min_size, 128):
@@ -87,7 +87,7 @@ def test_an_invisible_large_galaxy_has_the_smallest_stamp():
 
 
 def test_a_coarse_frame_is_refined_as_its_spline():
-    """Against scipy's, to half a unit, in all pixels of a frame that is no whole number of coarse ones."""
+    """The frame agrees with scipy within half a unit, although its size is not a multiple of coarse pixels."""
     rng, frame = np.random.default_rng(2), np.full((21, 35), 7, np.int64)
     coarse = rng.integers(-(10**6), 10**6, (9, 12))
     added = spreading.add_refined(coarse, 4, frame)
@@ -99,7 +99,7 @@ def test_a_coarse_frame_is_refined_as_its_spline():
 
 @pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
 def test_large_galaxies_agree_with_their_undispersed_images(index, fraction):
-    """Each of two lines, 100 pixels apart, is the image of a galaxy of 15 arcsec without a grism."""
+    """Each of two lines, 100 pixels apart, equals the image of a galaxy of 15 arcsec without a grism."""
     electrons, shape, source = 2e6, (260, 700), galaxy(15.0, index, fraction, 180.4, 130.2)
     at = np.rint(NODES[[0, 2]]).astype(int)
     spectrum = np.zeros((1, COUNT), np.float32)

@@ -1,4 +1,4 @@
-"""Emission lines of galaxies as drawn for a survey: against every wavelength by itself, through a PSF of more nodes."""
+"""Emission lines of galaxies with survey settings agree with series of all wavelengths and a PSF of more nodes."""
 
 from dataclasses import replace
 from functools import cache
@@ -14,7 +14,7 @@ from truesky.render.dispersing import draw
 from truesky.request.accuracy import SURVEY
 
 WAVES = np.arange(float(FIRST), LAST + 1.0)
-# No setting was chosen on these galaxies.
+# The seed was not used to choose settings.
 SEED, NOISE, SIDE, MIDDLE = 190_611, 28.0, 96, 48.0
 TURNS = (("RGS000", 0.0), ("RGS180", 4.0), ("RGS000", -4.0), ("RGS180", 0.0))
 SETTINGS = draw.settings_for(SURVEY)
@@ -27,20 +27,20 @@ def first_order(grism, tilt):
 
 @cache
 def seen():
-    """Through a PSF of five wavelengths."""
+    """Return a PSF of five wavelengths on the frame."""
     return fine.Seen.of(psf(5), (SIDE, SIDE))
 
 
 @cache
 def galaxies(count):
-    """Of 20 to 24 mag: half-light radii of 0.2" to 1.5"."""
+    """Return galaxies of 20 to 24 mag with half-light radii of 0.2" to 1.5"."""
     some = scenes.sources(scenes.NISP, SEED, galaxies=60 * count, stars=0)
     mag = scenes.magnitudes(some, scenes.NISP)
     return some.take(np.flatnonzero((mag > 20.0) & (mag < 24.0))[:count])
 
 
 def halpha(rng):
-    """[w] electrons of H alpha between the lines of nitrogen, of some width anywhere in the band; and where it is."""
+    """Return electrons [w] of H alpha between the lines of nitrogen, at a random wavelength, and this wavelength."""
     centre, width = rng.uniform(FIRST + 200.0, LAST - 200.0), rng.uniform(1e-4, 7e-4)
     spectrum = np.zeros(len(WAVES))
     ratio = rng.uniform(0.05, 0.6)
@@ -52,13 +52,13 @@ def halpha(rng):
 
 
 def at_middle(source, trace, centre, rng, middle=MIDDLE):
-    """The source where its line falls onto the middle of a small frame."""
+    """Return the source at a position from which its line falls onto the middle of a small frame."""
     x, y = trace.offsets(0.0, 0.0, np.array([centre]))
     return fine.placed(source, *(middle + rng.uniform(-0.5, 0.5) - float(offset[0]) for offset in (x, y)))
 
 
 def line(frame, middle):
-    """(flux in 17 x 9 pixels, centroid along and across under a Gaussian weight) about a place."""
+    """Return (flux in 17 x 9 pixels, centroid along and across under a Gaussian weight) near a position."""
     rows, columns = np.indices(frame.shape)
     column, row = middle
     weight = np.exp(-0.5 * (((columns - column) / 4.0) ** 2 + ((rows - row) / 2.0) ** 2))
@@ -73,7 +73,7 @@ def frame(source, spectrum, trace, shape=(SIDE, SIDE), settings=SETTINGS):
 
 
 def held(count, turns=TURNS):
-    """[n, 3] of each line: error of its flux, and of its place along and across, pixels."""
+    """Return the errors [n, 3] of lines: relative flux, and position along and across (pixels)."""
     found, rng, some = [], np.random.default_rng(SEED), galaxies(count)
     for i in range(count):
         grism, tilt = turns[i % len(turns)]
@@ -87,7 +87,7 @@ def held(count, turns=TURNS):
 
 
 def within(found):
-    """Fluxes and places along the dispersion."""
+    """Check fluxes, and positions along and across the dispersion."""
     flux, along, across = np.abs(found).T
     print("flux rms, largest; along, across largest:", np.sqrt((flux**2).mean()), flux.max(), along.max(), across.max())
     assert along.max() < 0.01
@@ -97,7 +97,7 @@ def within(found):
 
 
 def test_lines_have_their_flux_and_lie_at_their_wavelength():
-    """Forty galaxies, the grisms as they are turned in a sequence."""
+    """There are forty galaxies, with the angles of the grisms in a sequence."""
     within(held(40))
 
 
@@ -110,7 +110,7 @@ def test_lines_of_many_galaxies():
 
 @pytest.mark.parametrize(("block", "error"), [(1.0, 1e-6), (SETTINGS.block, 5e-6)])
 def test_a_line_and_a_continuum_apart_are_the_two_together(block, error):
-    """On stamps of one size: but for what shares one PSF, 1e-6 of the light in any pixel; single precision in all."""
+    """Stamps have one size. Pixels differ by rounding in single precision, and by blocks that share a PSF."""
     rng, settings = np.random.default_rng(SEED), replace(SETTINGS, min_size=96, edge=0.1, block=block)
     for i, (grism, tilt) in enumerate(TURNS):
         trace = first_order(grism, tilt)

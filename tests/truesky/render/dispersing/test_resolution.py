@@ -1,4 +1,4 @@
-"""Resolving powers of the grisms: the width of a line, measured on the image of a source of half an arcsecond."""
+"""Resolving powers of the grisms, from the width of a line of a source of half an arcsecond."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from truesky.render.psf import euclid
 from truesky.request.accuracy import SURVEY
 
 SIDE, MIDDLE, PHASES = 64, 32.0, 8
-# FWHM of the source, arcsec; a Gaussian's half-light radius is half of it.
+# FWHM of the source, arcsec. The half-light radius of a Gaussian is half of its FWHM.
 WIDE = 0.5
 
 
 def source(gaussian):
-    """Of a FWHM, or a disc of as large a half-light radius."""
+    """Return a Gaussian of this FWHM, or a disc with the same half-light radius."""
     some = scenes.sources(scenes.NISP, 4, galaxies=1, stars=0)
     known = {
         "bulge_radius": 0.5 * WIDE, "disk_radius": 0.5 * WIDE, "bulge_fraction": float(gaussian), "sersic_index": 0.5,
@@ -30,7 +30,10 @@ def source(gaussian):
 
 
 def width(path, wavelength, gaussian, psf):
-    """FWHM of a line along the dispersion, A: on images of many phases, one as finely sampled as all together."""
+    """Return the FWHM (A) of a line along the dispersion.
+
+    Images at many phases of a pixel together give a finely sampled profile.
+    """
     first, count = int(path.first), int(path.last - path.first) + 1
     spectrum = np.zeros((1, count), np.float32)
     spectrum[0, int(wavelength) - first] = 1000.0
@@ -63,5 +66,5 @@ def test_lines_are_resolved_as_required(grism, tilt):
     found = [[wave / width(path, wave, gaussian, psf) for wave in waves] for gaussian in (True, False)]
     print(grism, np.round(found))
     assert np.min(found) > least
-    # Of what is published of the gratings (REQ 480 red, 400 blue at the middle), not twice as much.
+    # Powers are close to the published ones of the gratings (REQ 480 red, 400 blue in the middle).
     assert np.max(found) < 3.0 * least

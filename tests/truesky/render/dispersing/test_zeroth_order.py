@@ -1,4 +1,4 @@
-"""The zeroth order: its light lies where its polynomial says, as wide as that, in all the colours that it has."""
+"""The zeroth order: position and width of the light follow its polynomial, and its colours are correct."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,7 +20,7 @@ STILL = trace((0.0, 1e-6))
 
 
 def moments(image):
-    """(centroid, second moments) along and across."""
+    """Return the centroid, and the second moments: along, across, mixed."""
     rows, columns = np.indices(image.shape)
     total = image.sum()
     centre = np.array([(image * part).sum() / total for part in (columns, rows)])
@@ -30,7 +30,7 @@ def moments(image):
 
 @cache
 def grey():
-    """The PSF of the band's middle at every wavelength: no colour moves or widens what is drawn through it."""
+    """Return the PSF of the middle of the band for all wavelengths, so that colours do not shift or widen images."""
     own = psf()
     middle = np.repeat(own.planes.images[1:2], len(own.planes.images), axis=0)
     return replace(own, planes=replace(own.planes, images=middle))
@@ -44,9 +44,12 @@ def frame(source, path, spectrum, through):
 @pytest.mark.parametrize(("grism", "tilt"), [("RGS000", 0.0), ("RGS180", 4.0), ("RGS000", -4.0), ("BGS000", 0.0)])
 @pytest.mark.parametrize("red", [False, True])
 def test_its_place_and_width_are_the_polynomial_s(grism, tilt, red):
-    """Against the same light at one place: the mean of the polynomial over the photons, and their scatter."""
+    """The position is the mean of the polynomial over the photons. Its scatter adds to the width.
+
+    The reference is the same light without dispersion.
+    """
     own = next(part for part in traces.traces(grism, tilt, DETECTOR, MISSION) if part.order == 0)
-    # The blue grism's polynomial, in the light of the red one's PSF.
+    # The polynomial of the blue grism is also used with the band and the PSF of the red one.
     path = replace(own, first=float(FIRST), last=float(LAST))
     spectrum = 3e3 / len(WAVES) * (WAVES / 15000.0) ** (4.0 if red else -4.0)
     x, y = path.offsets(0.0, 0.0, WAVES)
@@ -54,7 +57,7 @@ def test_its_place_and_width_are_the_polynomial_s(grism, tilt, red):
     x, y = path.offsets(float(source.column[0]), float(source.row[0]), WAVES)
     mean = [np.average(part, weights=spectrum) for part in (x, y)]
     wide = moments(frame(source, path, spectrum, grey()))
-    # Pixels are too wide for the PSF: moments of what lies at one place vary with where in a pixel that is.
+    # Pixels undersample the PSF, so moments of an undispersed image depend on its position within a pixel.
     phases = [
         moments(
             frame(
@@ -78,7 +81,10 @@ def test_its_place_and_width_are_the_polynomial_s(grism, tilt, red):
 
 
 def test_colours_change_within_a_pixel():
-    """A PSF is shared by a step in wavelength: eight pixels of the first order are a tenth of its band, of this all."""
+    """A block of wavelengths shares a PSF.
+
+    Eight pixels are a tenth of the band in the first order, but the whole band in this order.
+    """
     own = next(part for part in traces.traces("RGS000", 0.0, DETECTOR, MISSION) if part.order == 0)
     x, _ = own.offsets(0.0, 0.0, WAVES)
     source = fine.placed(one(galaxies(4), 1), MIDDLE - float(x.mean()), MIDDLE)

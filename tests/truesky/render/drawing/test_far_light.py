@@ -1,4 +1,4 @@
-"""Wings of bright stars beyond the PSF's plane: against Airy's pattern, the pupil's own transform, and the light."""
+"""Wings of bright stars beyond the PSF's plane agree with the Airy pattern and the pupil, and keep the light."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ PARTS = sub_bands.sub_bands(passbands.load("euclid_vis"))
 EQUAL = np.full(len(PARTS), 1.0 / len(PARTS))
 NOISE = 12.7
 ARCSEC = np.pi / 648000
-# A star of 6 mag in a nominal exposure.
+# Electrons of a star of 6 mag in a nominal exposure.
 BRIGHT = 5e10
 
 
@@ -35,32 +35,32 @@ def of_pupil(blur=0.034, pixel_scale=0.1, parts=PARTS):
 
 @pytest.fixture(scope="module")
 def vis():
-    # As in other tests, so that they share the planes.
+    # Other tests use the same detector, so that they share the planes.
     return psf_of(small("vis", "3-4", 256))
 
 
 def shone(psf, side, column, row, electrons=BRIGHT, least=0.0):
-    """What `add` adds to an empty frame, electrons."""
+    """Return the electrons that `add` adds to an empty frame."""
     frame = np.zeros((side, side), np.int64)
     far_light.add(frame, far_light.Star(column, row, electrons, None, SIDE, least, psf.edges))
     return frame / FIXED_POINT
 
 
 def off_spikes(psf, dx, dy, clear):
-    """Pixels more than `clear` from the middle of every spike."""
+    """Return a mask of pixels more than `clear` from the middle of every spike."""
     along = [np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in psf.edges.bars[:, 0]]
     return np.min(along, axis=0) > clear
 
 
 @pytest.mark.parametrize("wavelength", [5500.0, 9000.0])
 def test_the_ring_is_airy_s(wavelength):
-    """Two circles: the mean of an obscured Airy pattern over its rings."""
+    """The light of the two circles is the mean of an obscured Airy pattern over its rings."""
     own = replace(of_pupil(), wavelength=np.array([[wavelength]]))
     clear = np.pi * (600.0**2 - 197.5**2)
     airy = galsim.Airy(lam=wavelength / 10, diam=1.2, obscuration=197.5 / 600.0)
     radius = np.linspace(20.0, 60.0, 40001)
     mean = np.mean([airy.xValue(r, 0.0) * r**3 for r in radius])
-    # In pixels of 0.1"; the bars leave less of the light, and none of the edges.
+    # The factor 0.1 converts pixels to arcsec. The bars reduce the area of the pupil, but not the edges of the circles.
     ours = spikes.ring_light(own, np.ones(1)) * own.area / clear * 0.1
     assert ours == pytest.approx(mean, rel=0.01)
 
@@ -68,7 +68,10 @@ def test_the_ring_is_airy_s(wavelength):
 @pytest.mark.nightly
 @pytest.mark.parametrize("bar", [0, 1, 2])
 def test_a_spike_is_the_pupil_s_transform(bar):
-    """Along a spike the transform of the pupil is that of its projection; neighbouring edges beat, and are averaged."""
+    """Along a spike, the transform of the pupil is the transform of its projection.
+
+    Neighbouring edges interfere, so the light is averaged.
+    """
     own = of_pupil(blur=0.0, pixel_scale=0.02)
     turn, step, along = own.bars[bar, 0], 0.25, 1.0
     axis, other = np.arange(-602.0, 602.1, step), np.arange(-602.0, 602.1, along)
@@ -90,13 +93,16 @@ def test_a_spike_is_the_pupil_s_transform(bar):
 
 
 def test_wings_are_those_of_the_mission_database(vis):
-    """The embedded pupil's azimuthal mean, at 1", where bars shine as much as circles that are as long."""
+    """The azimuthal mean of the embedded pupil at 1" agrees with the database.
+
+    There, bars contribute as much light as circles of the same length.
+    """
     own = of_pupil()
     circles = (
         2 * np.pi * (MISSION.value("plm.aperture_diameter", "mm") / 2 + MISSION.value("plm.pupil.stop_radius", "mm"))
     )
     bars = 2 * own.bars[:, 2].sum()
-    # Of light in a pixel, at ten pixels; per square arcsec.
+    # Fraction of the light per square arcsec, ten pixels from the star.
     strength = spikes.ring_light(own, EQUAL) / 10.0**3 / 0.1**2 * (circles + bars) / circles
     assert strength == pytest.approx(MISSION.value("vis.psf.wing_strength"), rel=0.03)
     frame = shone(vis, 1401, 700.0, 700.0)
@@ -109,10 +115,10 @@ def test_wings_are_those_of_the_mission_database(vis):
 
 
 def test_no_light_is_lost_beyond_the_plane(vis):
-    """The plane has what the pupil sends there: outside lies the rest of all light."""
+    """The plane contains the light that the pupil sends there, and the rest of the light is outside."""
     side = 3000
     light = shone(vis, side, side / 2, side / 2).sum() / BRIGHT
-    # What the frame does not show of r^-3 around a square, and of the spikes, whose fringes leave a half of r^-2.
+    # Light outside the frame: r^-3 outside a square, and the spikes, whose fringes leave half of r^-2.
     beyond = spikes.ring_light(vis.edges, EQUAL) * 4 * np.sqrt(2) / (side / 2)
     wavelength = vis.edges.wavelength.mean() * 1e-7
     for turn, _, length in vis.edges.bars:
@@ -125,7 +131,7 @@ def test_no_light_is_lost_beyond_the_plane(vis):
 
 
 def test_the_frame_has_no_seam(vis):
-    """Between spikes the mean light of a 6 mag star falls as r^-3, through the border of its plane."""
+    """Between spikes, the mean light of a 6 mag star falls as r^-3 across the border of its plane."""
     field = replace(small("vis", "3-4", 1200), nx=1200, ny=1200)
     source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, 600.3, 599.8)
     image = stamps.draw(source, np.array([SIDE]), vis, 1200, 1200)
@@ -136,9 +142,9 @@ def test_the_frame_has_no_seam(vis):
     for inner, outer in ((150, 200), (200, 250), (250, 300), (300, 360), (360, 420), (420, 560)):
         here = clear & (radius >= inner) & (radius < outer)
         assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.06)
-    # Nor holes in the sky, where the plane ends or its transform had put light of elsewhere.
+    # There are no holes in the sky where the plane ends, or where aliased light was removed.
     assert image.min() > -1e-3 * NOISE
-    # A spike goes on as it was.
+    # A spike continues across the border.
     turn = vis.edges.bars[2, 0]
     out = np.arange(225, 285)
     along = [image[round(599.8 + r * np.cos(turn)), round(600.3 - r * np.sin(turn))] for r in out]
@@ -148,7 +154,7 @@ def test_the_frame_has_no_seam(vis):
 
 @pytest.mark.parametrize("length", [30.0, 94.0])
 def test_the_frame_of_a_trail_has_no_seam(vis, length):
-    """A moving body's light is a star's along its trail, without holes where planes of its pieces end."""
+    """A moving body has the light of stars along its trail, without holes where the planes of its pieces end."""
     side, middle, angle = 1000, (500.3, 499.8), 0.4
     field = replace(small("vis", "3-4", side), nx=side, ny=side)
     source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, *middle)
@@ -161,7 +167,7 @@ def test_the_frame_of_a_trail_has_no_seam(vis, length):
     assert size[0] > SIDE
     image = stamps.draw(moving, size, vis, side, side)
     assert image.min() > -1e-3 * NOISE
-    # Independent of pieces: stars at rest, each with its share.
+    # The reference has no pieces: it consists of stars at rest with equal shares.
     along = np.arange(-0.5, 0.5, 1 / 16) + 1 / 32
     y, x = np.mgrid[:side, :side]
     law, clear = np.zeros((side, side)), np.ones((side, side), bool)
@@ -176,7 +182,7 @@ def test_the_frame_of_a_trail_has_no_seam(vis, length):
 
 
 def test_a_trail_s_spikes_are_no_comb(vis):
-    """A spike smeared along a trail is even: four times as many points draw the same."""
+    """A spike smeared along a trail is smooth, and equals the sum of many points."""
     side, x, y, trail, points = 300, 150.3, -290.2, np.array([60.0, 10.0]), 100
     even, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
     far_light.add(even, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, trail))
@@ -184,7 +190,7 @@ def test_a_trail_s_spikes_are_no_comb(vis):
         far_light.add(
             many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
         )
-    # A spike's table ends 40 pixels from its middle: there a point more or less is a step.
+    # The table of a spike ends 40 pixels from its middle. There, one point more or less makes a step.
     wrong = np.abs(even / many - 1.0)
     assert np.quantile(wrong, 0.99) < 0.03
     assert wrong.max() < 0.1
@@ -200,7 +206,7 @@ def test_a_trail_s_spikes_are_no_comb(vis):
     ],
 )
 def test_a_line_of_light_is_many_points(vis, x, y, trail):
-    """In the squares' borders, outside them and on the trail's own line: as points closer than any fringe draw it."""
+    """A trail equals points that are closer than any fringe, in borders of squares, outside, and on its line."""
     side, points = 200, int(np.hypot(*trail))
     line, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
     far_light.add(line, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, np.array(trail)))
@@ -216,10 +222,10 @@ def test_a_line_of_light_is_many_points(vis, x, y, trail):
 
 
 def test_a_trail_is_unfolded_as_its_points_are(vis):
-    """A piece's share of light that belongs elsewhere, from its lines and from points closer than any fringe."""
+    """The aliased light of a piece is the same from lines as from points that are closer than any fringe."""
     size, corner, trail, points = 640, 160, np.array([50.0, 30.0]), 60
     along, inner = (np.arange(points) + 0.5) / points - 0.5, SIDE / 2 - 2.0
-    # The corner that has most of it.
+    # The corner contains most of the aliased light.
     x, y = 260.2 + along * trail[0], 259.7 + along * trail[1]
     level = BRIGHT / points * spikes.ring_light(vis.edges, EQUAL)
     pixels = np.arange(corner)
@@ -242,11 +248,14 @@ def test_a_trail_is_unfolded_as_its_points_are(vis):
 
 
 def test_the_time_a_bright_trail_takes_is_foreseen(vis):
-    """It goes with the frame, the trail, and its pieces' stamps; exposures that would take hours are refused by it."""
+    """The time depends on the frame, the trail, and the stamps of its pieces.
+
+    Exposures that would take hours are refused because of this prediction.
+    """
     field = replace(small("vis", "3-4"), nx=4096, ny=4096)
     source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), 1e10, 2048.0, 2048.0)
     sizes = np.array([640])
-    # CPU s that were measured on a full detector.
+    # CPU times (s) that were measured on a full detector.
     for length, took in ((94.0, 3.3), (470.0, 16.3), (1880.0, 63.6)):
         moving = replace(source, trail=length * np.array([[1.0, 0.3]]))
         assert took / 2 < cost.seconds(moving, sizes, vis, 4096, 4096) < 2 * took
@@ -255,7 +264,7 @@ def test_the_time_a_bright_trail_takes_is_foreseen(vis):
 
 
 def test_colours_differ(vis):
-    """The ring goes with the wavelength: a red star's is brighter."""
+    """The ring is proportional to the wavelength, so a red star has a brighter ring."""
     red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
     red[-1], blue[0] = 1.0, 1.0
     ratio = spikes.ring_light(vis.edges, red) / spikes.ring_light(vis.edges, blue)
@@ -278,7 +287,7 @@ def drawn(sources, psf, side):
 
 
 def test_only_bright_points_shine_so_far(vis):
-    """Others are drawn as they were, bit by bit."""
+    """Fainter stars are drawn bit by bit as without far light."""
     faint = stars([200.0, 90.0, 310.5], [200.0, 400.0, 11.0], [1e3, 1e5, 5e6], 512)
     np.testing.assert_array_equal(drawn(faint, vis, 512), drawn(faint, replace(vis, edges=None), 512))
     sizes, shape = np.array([SIDE, SIDE, 384, SIDE]), np.array([-1, 0, -1, -1])
@@ -293,7 +302,7 @@ def test_a_frame_is_the_sum_of_its_stars_in_any_order(vis):
     np.testing.assert_array_equal(whole, turned)
     parts = [drawn(stars([x], [y], [e], 1000), vis, 1000) for x, y, e in zip(column, row, electrons, strict=True)]
     np.testing.assert_allclose(whole, sum(parts), rtol=1e-12, atol=1e-5)
-    # The last has its stamp below the frame, and shines there nevertheless.
+    # The stamp of the last star is outside the frame, but its far light reaches it.
     assert parts[2][:200].min() > 1.0
 
 
@@ -306,7 +315,7 @@ def test_light_is_drawn_down_to_the_noise(vis):
 
 
 def test_the_farthest_pixel_of_a_frame_is_lit(vis):
-    """To its corner, however the distance is rounded."""
+    """Light reaches the farthest corner, however the distance is rounded."""
     for x, y in ((132.7667590299948, 168.83949347535636), (-40.3, -70.2), (108.82925776227592, 122.95520170604388)):
         frame = np.zeros((100, 100), np.int64)
         far_light.add(frame, far_light.Star(x, y, 1e13, None, 32, 0.0, vis.edges))
@@ -314,13 +323,13 @@ def test_the_farthest_pixel_of_a_frame_is_lit(vis):
 
 
 def spike(away, bar=2, middle=128.0):
-    """A place so many pixels from the middle of a frame, one of whose spikes goes through it."""
+    """Return a position `away` pixels from the middle of a frame, from which a spike passes through the middle."""
     turn = of_pupil().bars[bar, 0]
     return middle + away * np.sin(turn), middle - away * np.cos(turn)
 
 
 def test_spikes_reach_as_far_as_they_are_noticed(vis):
-    """Where a star's brightest spike is said to have sunk to a level the spike that is drawn has."""
+    """At the predicted distance, the brightest spike of a star has the given level."""
     least = 0.1 * NOISE
     electrons = np.array([1e8, 1e9, 1e11])
     far = spikes.reach(vis.edges, electrons, least)
@@ -329,7 +338,7 @@ def test_spikes_reach_as_far_as_they_are_noticed(vis):
     for bright, away in zip(electrons[:2], far[:2], strict=True):
         middle = bright * spikes.spike_light(vis.edges, EQUAL, 5000.0)[:, :, 0]
         here = round(away / 8.0)
-        # Over some fringes.
+        # The mean covers several fringes.
         assert middle[:, here - 25 : here + 26].mean(axis=1).max() == pytest.approx(least, rel=0.15)
 
 
@@ -345,14 +354,14 @@ def test_spikes_of_a_star_far_from_the_detector_show(vis):
     assert law.max() > 0.5 * NOISE
     assert law[:, 100:156].max(axis=0).min() > 0.5 * NOISE
     np.testing.assert_allclose(one.noise_free, law, atol=0.1 * NOISE)
-    # And one whose spikes miss the detector changes nothing that is noticed.
+    # A star whose spikes miss the detector adds no noticeable light.
     beside = rendered(field, [bright], [128.0 + away], [128.0], forced=off(*COSMIC_RAYS))
     assert beside.noise_free.max() < 0.1 * NOISE
 
 
 @pytest.mark.parametrize("away", [500.0, 1400.0])
 def test_a_star_beside_the_detector_shines_in(away):
-    """Its stamp of 51" ends before the frame does: an exposure draws its light nevertheless, from up to 145"."""
+    """The stamp of 51" ends outside the frame, but an exposure draws light of stars up to 145" away."""
     field = small("vis", "3-4", 256)
     found = rendered(field, [5.0], [-away], [200.0], forced=off(*COSMIC_RAYS))
     law = 10 ** (0.4 * (found.zero_point - 5.0)) * TIME * spikes.ring_light(found.psf.edges, EQUAL)

@@ -1,4 +1,4 @@
-"""Sources through NISP's PSF, five samples a pixel: against galsim and the Fourier series, and beyond its planes."""
+"""Sources through NISP's PSF with five samples per pixel agree with galsim and Fourier series, and keep far light."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from truesky.render.psf import euclid, spikes
 from truesky.request.accuracy import SURVEY
 
 MISSION = resolve()
-# A pixel's noise of estimated signals, and magnitudes of 1 e-/s.
+# Noise of the estimated signal of a pixel, and magnitudes of 1 e-/s.
 NOISE = 12.0
 BANDS = {"euclid_y": 25.00, "euclid_h": 25.11}
 SIDE = euclid.NISP.side
@@ -40,20 +40,20 @@ def psf(band):
 
 
 def sample(band, count, seed):
-    """Galaxies and stars, 17 to 26 mag, a fifth of them stars."""
+    """Return galaxies and stars of 17 to 26 mag, a fifth of them stars, and the scene."""
     scene = scenes.Scene("nisp", 2040, 2040, 0.3, 87.24, BANDS[band], NOISE, 0, 0)
     stars = max(count // 5, 2)
     return scenes.sources(scene, seed, galaxies=count - stars, stars=stars), scene
 
 
 def chosen(band, psf, number, side):
-    """(one of sixty, its own PSF, the scene)."""
+    """Return (one of sixty sources, its PSF, the scene)."""
     some, scene = sample(band, 60, 4711)
     return scenes.centred_source(some, number, side), scenes.psf_of_source(psf, some, number), scene
 
 
 def held(band, psf, count, seed, side):
-    """Errors of sources as drawn for a survey, against the better of two references."""
+    """Return errors of sources with survey settings, relative to the better of two references."""
     some, scene = sample(band, count, seed)
     found = []
     for i in range(len(some)):
@@ -68,7 +68,7 @@ def held(band, psf, count, seed, side):
 
 
 def within(found):
-    """Largest errors [n, 5] of flux, position (mas), R2, ellipticity, and of a pixel in its noise."""
+    """Check the largest errors [n, 5]: flux, position (mas), R2, ellipticity, and pixel in units of its noise."""
     magnitude, position, r2, ellipticity, pixel = found.max(axis=0)
     assert magnitude < 1e-4 * 1.0857
     assert position < 0.03
@@ -79,7 +79,7 @@ def within(found):
 
 @pytest.mark.nightly
 def test_sixty_sources_are_as_galsim_draws_them(band, psf):
-    """Of a seed that no setting was chosen on."""
+    """The seed was not used to choose settings."""
     found = held(band, psf, 60, 4711, 256)
     print(band, len(found), "largest", found.max(axis=0), "rms", np.sqrt((found**2).mean(axis=0)))
     assert len(found) >= 55
@@ -94,14 +94,14 @@ def test_a_few_sources_are_as_galsim_draws_them(band, psf):
 
 @pytest.mark.parametrize(("band", "number"), [("euclid_y", 40), ("euclid_h", 4)], indirect=["band"])
 def test_what_is_left_out_does_not_fold_onto_shapes(band, psf, number):
-    """Round discs, whose transform falls through what may be left out where it folds onto low frequencies."""
+    """The discs are round: their transform becomes negligible at frequencies that fold onto low ones."""
     one, own, scene = chosen(band, psf, number, 128)
     drawn = scenes.draw_sources(one, own, scene, settings_for(SURVEY), 128)
     within(np.array([errors.errors(drawn, references.image_by_series(one, own, 128), scene, one)]))
 
 
 def test_a_star_s_light_has_no_seam_where_its_plane_ends(band, psf):
-    """Between spikes it falls as r^-3, through the border of its plane; along a spike as r^-2."""
+    """Between spikes, the light falls as r^-3 across the border of its plane; along a spike, as r^-2."""
     side = 900
     field = replace(small("nisp", "DET23", side), nx=side, ny=side)
     source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, 450.3, 449.8)
@@ -116,7 +116,7 @@ def test_a_star_s_light_has_no_seam_where_its_plane_ends(band, psf):
         here = clear & (radius >= inner) & (radius < outer)
         assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.08), (inner, outer)
     assert image.min() > -1e-3 * NOISE
-    # The optics' transform on this side of the border, straight bars on that.
+    # The transform of the optics is inside the border, and straight bars are outside.
     along, across = dy * np.cos(turns[2]) - dx * np.sin(turns[2]), np.abs(dx * np.cos(turns[2]) + dy * np.sin(turns[2]))
     line = spikes.spike_light(psf.edges, np.full(8, 1 / 8), 200.0)[2]
     steps = spikes.LONG * np.arange(len(line)), spikes.STEP * np.arange(line.shape[1])

@@ -1,6 +1,6 @@
-"""Galaxies larger than the largest stamp: their light far from the centre against their profile, summed in real space.
+"""Outskirts of galaxies larger than the largest stamp agree with sums over their profile in real space.
 
-The profile is integrated along the line of sight here, and spread by the PSF sum by sum: nothing of the drawing's.
+The profile is integrated along the line of sight here, and convolved with the PSF by sums, without code of the drawing.
 """
 
 from dataclasses import replace
@@ -35,9 +35,9 @@ HALF = stamp_sizes.SIZES[-1] // 2
 
 
 def disk(u, v, inclination):
-    """Light of an inclined disc of scale length 1 and flux 1, by points along the line of sight."""
+    """Return the light of an inclined disc of scale length 1 and flux 1, by points along the line of sight."""
     cosine, sine = np.cos(np.radians(inclination)), np.sin(np.radians(inclination))
-    # Where the middle plane is, and how far along the line there is light.
+    # Position of the middle plane, and extent of the light, along the line of sight.
     middle = -v * sine * cosine / (cosine**2 + (0.2 * DISK_SCALE_HEIGHT) ** 2)
     wide = min(20.0 * DISK_SCALE_HEIGHT / max(cosine, 1e-6), 50.0)
     s = np.asarray(middle)[..., None] + wide * np.linspace(-1.0, 1.0, 1601)
@@ -48,7 +48,7 @@ def disk(u, v, inclination):
 
 
 def profile(shape, jacobian, dx, dy):
-    """Of unit flux, a pixel at pixels from the middle."""
+    """Return the light per pixel of a profile of unit flux, at pixels from the middle."""
     west, north = jacobian[0, 0] * dx + jacobian[0, 1] * dy, jacobian[1, 0] * dx + jacobian[1, 1] * dy
     beta = np.radians(90.0 + shape["position_angle"])
     along, across = west * np.cos(beta) + north * np.sin(beta), north * np.cos(beta) - west * np.sin(beta)
@@ -69,7 +69,7 @@ def profile(shape, jacobian, dx, dy):
 
 
 def kernel_of(psf, step):
-    """(x, y, share) of the PSF in squares of `step` pixels."""
+    """Return (x, y, fraction of light) of the PSF in squares of `step` pixels."""
     if psf.planes is None:
         half = 25 * step
         x, y = np.meshgrid(*[np.arange(-half, half + 1, step)] * 2)
@@ -90,7 +90,10 @@ def kernel_of(psf, step):
 
 
 def drawn_and_expected(camera, psf, shape, mag, place, step, points=6):
-    """(of a small frame some pixels, and what they should hold, electrons); place : its middle from the galaxy's."""
+    """Return some pixels of a small frame, their expected electrons, and the size of the stamp.
+
+    `place` is the position of the middle of the frame relative to the galaxy.
+    """
     detector = small(camera, "3-4" if camera == "vis" else "R22_S11", SIDE)
     electrons = BRIGHT[camera] * 10 ** (-0.4 * mag)
     column, row = SIDE / 2 - place[0] + 0.3, SIDE / 2 - place[1] - 0.2
@@ -102,7 +105,7 @@ def drawn_and_expected(camera, psf, shape, mag, place, step, points=6):
     neglected = stamp_sizes.neglected_flux(source.electrons, NOISE[camera], how)
     image = stamps.draw(source, sizes, psf, SIDE, SIDE, neglected=neglected)
     x, y = np.random.default_rng(3).integers(0, SIDE, (2, points))
-    # And the brightest: a ridge.
+    # One of the pixels is the brightest, on a ridge.
     x[0], y[0] = np.unravel_index(image.argmax(), image.shape)[::-1]
     kx, ky, share = kernel_of(psf, step)
     found = [
@@ -118,7 +121,7 @@ def shape_of(fraction, radius, index, ratio, inclination, angle):
     }  # fmt: skip
 
 
-# Any that the table of galaxies allows, and slimmer ones, as bright as a galaxy may be.
+# Shapes that the table of galaxies allows, and thinner ones.
 LARGE = st.builds(
     shape_of,
     st.sampled_from([0.0, 1.0]),
@@ -128,7 +131,7 @@ LARGE = st.builds(
     st.sampled_from([0.0, 90.0]) | st.floats(0.0, 90.0),
     st.sampled_from([0.0, 57.0]) | st.floats(0.0, 179.0),
 )
-# In the stamp, on its border, in its corner, next to it, far out.
+# Positions in the stamp, on its border, in its corner, next to it, and far outside.
 PLACES = st.sampled_from([(500.0, 300.0), (HALF, 0.0), (-HALF, 200.0), (HALF, -HALF), (0.0, 1500.0), (1900.0, -700.0)])
 EDGE_ON = shape_of(0.0, 60.0, 1.0, 1.0, 90.0, 57.0)
 SLIM = shape_of(1.0, 30.0, 1.0, 0.15, 0.0, 57.0)
@@ -151,7 +154,10 @@ def check(found, expected, noise, size):
     ],
 )
 def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
-    """Through the optics' own PSF; where streaks of 100 and of 1.3 sigma were that came in at the opposite edge."""
+    """The PSF is the PSF of the optics.
+
+    Light aliased at the opposite edge once gave streaks of 100 and of 1.3 sigma here.
+    """
     psf = nominal.psf_of(small("vis", "3-4", SIDE))
     found, expected, size = drawn_and_expected("vis", psf, shape, mag, place, 3)
     check(found, expected, NOISE["vis"], size)
@@ -163,10 +169,10 @@ def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
 @example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 5.9), 6.0, (HALF, 0.0), "vis")
 def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
     found, expected, size = drawn_and_expected(camera, psf_of(camera), shape, mag, place, 1)
-    # What a smaller stamp does not hold is below what the settings leave out.
+    # Light outside a smaller stamp is below the limit of the settings, which adds to the error.
     share = 0.1 if size == stamp_sizes.SIZES[-1] else 0.2
-    # The largest stamps are followed only as far as memory holds them: an edge-on disc may ring by 2e-10 of its light.
-    # At a corner into which its ridge runs it rings by up to 5.93e-10 (angles by tenths of a degree): known to fail.
+    # Memory limits the size of stamps, so an edge-on disc may ring by 2e-10 of its light. At a corner that its ridge
+    # enters, it rings by up to 5.93e-10 (for angles in steps of 0.1 deg), which is known to fail.
     least = max(share * NOISE[camera], 2e-10 * BRIGHT[camera] * 10 ** (-0.4 * mag))
     np.testing.assert_allclose(found, expected, rtol=4e-3, atol=least)
 
@@ -188,7 +194,7 @@ def test_many_large_galaxies_are_drawn_to_their_outskirts(shape, mag, place, cam
 @example(6.2, 0.02, 0.0, None)
 @example(1.0, 1.0, 57.0, 90.0)
 def test_aliased_light_of_a_stamp_is_the_sum_of_all_periodic_images(index, ratio, angle, inclination):
-    """For a bulge, or for an inclined disc; thin galaxies are the difficult ones."""
+    """The galaxy is a bulge or an inclined disc. Thin galaxies are the difficult ones."""
     side, electrons, disc = 512, 1e8, inclination is not None
     shape = shape_of(0.0 if disc else 1.0, 12.0 if disc else 24.0, index, ratio, inclination or 0.0, angle)
     detector = small("vis", "3-4", side)
@@ -214,7 +220,7 @@ def test_aliased_light_of_a_stamp_is_the_sum_of_all_periodic_images(index, ratio
 
 @given(st.integers(1, 60), st.sampled_from([4, 8]), st.floats(-4.0, 4.0), st.floats(-40.0, 40.0))
 def test_samples_on_nodes_keep_what_any_quartic_sees(half, block, curve, slope):
-    """Of a sample spread over a pixel: its mean on the nodes is its mean on the sky."""
+    """A sample spread over a pixel has the same mean on the nodes as on the sky."""
     shares = outskirts._shares(2 * half + 1, block, SAMPLES)
     nodes = block * (np.arange(shares.shape[1]) - shares.shape[1] // 2)
     seen = np.linspace(-0.5, 0.5, 2001)
@@ -231,7 +237,7 @@ def test_samples_on_nodes_keep_what_any_quartic_sees(half, block, curve, slope):
 @example(0.0, 0.0, 1.0 / 32.0)
 @example(3.0, 0.2, 0.03)
 def test_the_disc_in_real_space(inclination, u, v):
-    """An independent quadrature; closed forms face-on and edge-on."""
+    """The table agrees with an independent quadrature, also face-on and edge-on."""
     table, across = outskirts.surface_disk(round(inclination, 1))
     found = outskirts._from_table(table, np.arcsinh(u), np.arcsinh(v / across))
     cosine, sine = (f(np.radians(round(inclination, 1))) for f in (np.cos, np.sin))
@@ -242,13 +248,13 @@ def test_the_disc_in_real_space(inclination, u, v):
 
     ends = sorted({-40.0, 40.0, *np.clip([-v * sine / max(cosine, 1e-3) + a for a in (-2.0, 0.0, 2.0)], -40.0, 40.0)})
     whole = sum(quad(light, a, b, limit=400, epsabs=0.0, epsrel=1e-8)[0] for a, b in pairwise(ends))
-    # Where a disc seen face-on has its cusp, no galaxy is drawn from the table: it lies in the stamp.
+    # The cusp of a face-on disc is in the stamp, so galaxies are not drawn from the table there.
     rel = 9e-3 if inclination < 5.0 and np.hypot(u, v) < 0.2 else 5e-3
     assert found == pytest.approx(whole / (4 * np.pi * DISK_SCALE_HEIGHT), rel=rel, abs=1e-9)
 
 
 def test_all_light_is_somewhere():
-    """Of a galaxy on the middle of a frame, what lies beyond the frame's sides is missing and no more."""
+    """A galaxy in the middle of a frame lacks only the light outside the frame."""
     shape = shape_of(1.0, 40.0, 2.0, 0.5, 0.0, 20.0)
     detector = small("lsstcam", "R22_S11", 3000)
     system, drawn = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), np.zeros(1)
@@ -256,7 +262,7 @@ def test_all_light_is_somewhere():
     with mock.patch.object(outskirts, "from_galaxy", wraps=outskirts.from_galaxy) as made:
         image = stamps.draw(source, stamp_sizes.SIZES[-1:], psf_of("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
     made.assert_called_once()
-    # Of the frame every third pixel of every third row.
+    # Sum over every third pixel of every third row of the frame.
     middles = np.meshgrid(np.arange(-1499, 1500, 3), np.arange(-1499, 1500, 3))
     inside = 9.0 * profile(shape, source.jacobian[0], *middles).sum()
     assert image.sum() == pytest.approx(1e9 * inside, rel=1e-4)
@@ -265,7 +271,7 @@ def test_all_light_is_somewhere():
 
 
 def test_what_shows_is_looked_for_as_far_as_it_does():
-    """A galaxy beside the frame is drawn if its outskirts are noticed there."""
+    """A galaxy outside the frame is drawn if its outskirts are visible on the frame."""
     shapes = galaxy_shapes.shapes(galaxies(0.0, 0.0, **EDGE_ON))
     for mag, seen in ((10.0, True), (22.0, False)):
         electrons = np.array([BRIGHT["vis"] * 10 ** (-0.4 * mag)])

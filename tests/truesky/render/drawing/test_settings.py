@@ -1,4 +1,4 @@
-"""Settings of drawing: what an accuracy promises is held, by galaxies and stars of any magnitude."""
+"""Settings of drawing meet the promised accuracy, for galaxies and stars of any magnitude."""
 
 import csv
 from dataclasses import replace
@@ -18,7 +18,7 @@ from truesky.render.psf import euclid, model, seeing
 from truesky.request import accuracy
 from truesky.request.accuracy import DRAFT, PRESETS, QUICKLOOK, REFERENCE, SURVEY
 
-# As good as it gets: nothing but the stamp is left out, and that is large.
+# The best settings: only light outside a large stamp is left out.
 FULL = Settings(edge=1e-7, aliased=1e-9, floor=0.0, min_size_arcsec=25.6, positions=9)
 SIDE = 256
 
@@ -41,7 +41,7 @@ def test_more_is_asked_for_more_is_taken():
 
 @pytest.fixture(scope="module")
 def sample():
-    """Galaxies and stars of 14.5 to 26 mag, of a seed of its own, each with its image at its best."""
+    """Return galaxies and stars of 14.5 to 26 mag of a separate seed, each with its most accurate image."""
     some, full = scenes.stratified_sample(VIS, 58, 1), scene_psf(VIS)
     out = []
     for i in range(len(some)):
@@ -52,7 +52,7 @@ def sample():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_neglected_light_is_within_the_promised_limit(preset, sample):
-    """This includes bright stars, whose spikes exceed the mean PSF at the edge of a stamp."""
+    """The limit also holds for bright stars, whose spikes exceed the mean PSF at the edge of a stamp."""
     wanted, settings = PRESETS[preset], settings_for(PRESETS[preset])
     for one, own, image in sample:
         found = errors.errors(scenes.draw_sources(one, own, VIS, settings, SIDE), image, VIS, one)
@@ -65,7 +65,7 @@ def test_neglected_light_is_within_the_promised_limit(preset, sample):
 
 
 def test_a_quicklook_is_half_of_the_work_of_a_draft():
-    """Pixels of stamps, and samples through planes of the PSF."""
+    """The work is the number of pixels of stamps, and of samples through planes of the PSF."""
     some, found = scenes.sources(VIS, 1), []
     for wanted in (QUICKLOOK, DRAFT):
         settings = settings_for(wanted)
@@ -88,7 +88,7 @@ def test_planes_of_fewer_colours_are_means_of_neighbours():
     weights = transfer.basis_weights(less, photons, at, at)[0]
     assert weights[:2] == pytest.approx([0.6, 0.4])
     assert len(weights) == transfer.plane_count(less) == 2 + len(whole.planes.powers)
-    # A source whose light is as flat as the sub-bands has the same PSF.
+    # A source with equal light in all sub-bands has the same PSF.
     flat = np.full((1, 8), 0.125)
     both = [transfer.image_of(one.planes, transfer.basis_weights(one, flat, at, at)[0]) for one in (less, whole)]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-4, atol=1e-9)
@@ -97,7 +97,7 @@ def test_planes_of_fewer_colours_are_means_of_neighbours():
 
 
 def test_the_rim_is_the_brightest_pixel_farther_out():
-    """Of a star on its largest stamp, too, but for its colour."""
+    """The rim also agrees with a star on its largest stamp, except for the colour of the star."""
     full = replace(scene_psf(VIS), edges=None)
     one = scenes.centred_source(scenes.stratified_sample(VIS, 3, 1), 8, SIDE)
     star = scenes.draw_sources(one, full, VIS, FULL, SIDE) / one.electrons[0]
@@ -106,7 +106,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
         assert star[away >= r].max() == pytest.approx(full.rim[r], rel=0.5)
     assert (np.diff(full.rim) <= 0).all()
     assert (full.rim >= full.surface - 1e-12)[20:].all()
-    # Spikes: several times the mean.
+    # Spikes are several times brighter than the mean.
     assert full.rim[48] > 4.0 * full.surface[48]
     ground = seeing.moffat_psf(0.7, 3.0, 0.2)
     np.testing.assert_allclose(ground.rim[8:200], ground.surface[8:200], rtol=0.1)
@@ -114,7 +114,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
 
 @pytest.mark.parametrize(("scene", "file"), [(VIS, "psf_positions.csv"), (NISP, "psf_positions_nisp.csv")])
 def test_psf_errors_between_positions_are_those_of_the_table(scene, file):
-    """Against the optics computed at the place of a star."""
+    """Errors are relative to the optics computed at the position of a star."""
     table = {row["positions"]: row for row in rows(file) if row["nearest"] == 0}
     at = positions.make_optics(scene)
     star, planes = positions.draw_star(at, np.random.default_rng(8)), scene_psf(scene, 9).planes
@@ -127,7 +127,7 @@ def test_psf_errors_between_positions_are_those_of_the_table(scene, file):
 
 
 def test_a_row_counts_the_error_of_its_psf():
-    """No row promises more than the stars say of its positions and colours."""
+    """No row promises smaller errors than stars have with its positions and colours."""
     table = accuracy.rows()
     kinds = [(int(row["positions"]), int(row["colours"])) for row in table]
     found = positions.largest_errors(7, 4, list(dict.fromkeys(kinds)))

@@ -66,7 +66,7 @@ def test_a_stamp_is_what_galsim_draws(camera, name, kind):
 @pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("vis", "2-4"), ("lsstcam", "R01_S20")])
 @pytest.mark.parametrize("angle", [10.0, 60.0, 125.0])
 def test_position_angle_from_end_to_end(camera, name, angle):
-    """A slim galaxy's axis, measured on the frame and put on the sky by the header alone."""
+    """The header alone converts the axis of a thin galaxy, measured on the frame, to the sky."""
     detector, system, psf = scene(camera, name, angle=-35.0)
     source = one_source(detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7)
     image = drawn(source, psf, accuracy=REFERENCE)
@@ -79,7 +79,7 @@ def test_position_angle_from_end_to_end(camera, name, angle):
 
 @pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("vis", "2-4"), ("lsstcam", "R22_S11")])
 def test_shear_from_end_to_end(camera, name):
-    """A round galaxy behind a mass to its north-east lies along north-west."""
+    """A round galaxy behind a mass to its north-east is stretched along north-west."""
     detector, system, psf = scene(camera, name, angle=110.0)
     image = drawn(one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE)
     centre, second = moments(image)
@@ -89,7 +89,7 @@ def test_shear_from_end_to_end(camera, name):
 
 
 def test_neighbouring_orientations_show_the_same_sky():
-    """Two VIS detectors, one upside down: the same galaxy on each, one picture turned by 180 deg."""
+    """Two VIS detectors, one upside down, show the same galaxy. One image is rotated by 180 deg."""
     images = []
     for name in ("2-3", "2-4"):
         detector = small("vis", name)
@@ -106,11 +106,11 @@ def test_neighbouring_orientations_show_the_same_sky():
     st.sampled_from([DRAFT, SURVEY]),
 )
 def test_no_light_is_lost(kind, x, y, electrons, accuracy):
-    # A frame that holds what is drawn beyond the stamps, too.
+    # The frame also contains the light that is drawn beyond the stamps.
     detector, system, psf = scene("lsstcam", "R22_S11", n=640)
     source = one_source(detector, system, electrons, x + 240, y + 240, **KINDS[kind])
     image = drawn(source, psf, n=640, accuracy=accuracy)
-    # Each pixel is rounded to 2^-20 electrons: the faintest all to nothing.
+    # Each pixel is rounded to 2^-20 electrons, so the faintest sources vanish.
     assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() > -1e-3 * image.max()
 
@@ -120,7 +120,10 @@ def test_no_light_is_lost(kind, x, y, electrons, accuracy):
     ("index", "radius"), [(2.5, 0.5), pytest.param(4.0, 0.4, marks=pytest.mark.nightly), (6.2, 0.2)]
 )
 def test_light_beyond_the_stamp_is_where_it_belongs(camera, sizes, index, radius):
-    """The light inside circles is that of a stamp that holds the frame, and of the closed form where no PSF matters."""
+    """The light inside circles is the same as with a stamp larger than the frame.
+
+    Beyond the stamp, where the PSF does not matter, it agrees with the closed form.
+    """
     detector, system, psf = scene(camera, {"vis": "3-4", "lsstcam": "R22_S11"}[camera], n=512)
     shape = {"bulge_fraction": 1.0, "bulge_sersic_index": index, "bulge_half_light_radius": radius}
     source = one_source(detector, system, 1e6, 255.7, 256.4, **shape, bulge_axis_ratio=1.0)
@@ -218,9 +221,9 @@ def test_sizes_follow_flux_noise_and_accuracy():
     assert (sizes(accuracy=REFERENCE) >= base).all()
     assert (sizes(accuracy=DRAFT) <= base).all()
     assert (sizes(1e12) <= stamp_sizes.SIZES[-1]).all()
-    # A Moffat goes on as far as it shows; a point never needs more than the PSF's own planes.
+    # A Moffat profile extends as far as it is visible. A point never needs more than the planes of the PSF.
     assert (sizes(1e12)[sources.shape < 0] > model.SIDE).any()
-    # (How they look counts for nothing here.)
+    # (The values of the planes do not matter here.)
     nothing = np.zeros((1, 3, 3), np.float32)
     psf = replace(psf, planes=Planes(np.array([7000.0]), nothing, nothing[:0], (1.0, 1.0)))
     assert (sizes(1e12)[sources.shape < 0] <= model.SIDE).all()
@@ -273,7 +276,7 @@ def test_focal_plane_jacobian_has_the_sign_used_by_stamps():
 
 @pytest.mark.parametrize(("size", "electrons", "side"), [(64, 1e3, 1024), (2048, 1e3, 256), (2048, 1e9, 256)])
 def test_memory_is_what_was_predicted(size, electrons, side):
-    """Compiled code's own buffers are not seen: they are no larger than the stamps."""
+    """Buffers of compiled code are not measured, but they are not larger than the stamps."""
     detector = small("vis", "3-4")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))
     source = one_source(detector, system, electrons, disk_half_light_radius=1.0)
@@ -291,7 +294,7 @@ def test_memory_is_what_was_predicted(size, electrons, side):
 
 
 def test_every_scene_that_a_task_takes_has_room():
-    """A whole detector with its 5,000 sources, the largest stamp among them in double precision, beside the rest."""
+    """A whole detector with 5,000 sources fits in memory, with the largest stamp in double precision and all else."""
     for nx, ny in ((4096, 4132), (4072, 4000)):
         electrons = np.full(5000, 1e3)
         electrons[0] = 1e11
@@ -300,7 +303,7 @@ def test_every_scene_that_a_task_takes_has_room():
 
 
 def test_what_is_drawn_through_was_counted_before(monkeypatch):
-    """Pixels of stamps, and of the PSF's planes on their grids: of many, of few, of bright ones."""
+    """Pixels of stamps and of PSF planes on their grids are counted, with large and small stamps and bright sources."""
     sources, psf = many(60), psf_of("lsstcam")
     sources.electrons[:3] = 1e9
     sizes = np.where(np.arange(60) % 7 == 0, 96, 48)
@@ -326,7 +329,10 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
 
 
 def test_seconds_follow_the_stamps():
-    """Nine times the pixels: in proportion, whatever the machine; the planes, of one size each, are the rest."""
+    """Stamps have nine times more pixels, and take proportionally more time on any machine.
+
+    The time for planes, which have one size each, is the rest.
+    """
     sources, psf = many(400), psf_of("lsstcam")
     spent, predicted = [], []
     for size in (64, 192):
@@ -340,5 +346,5 @@ def test_seconds_follow_the_stamps():
             best = min(best, time.process_time() - start)
         spent.append(best)
     assert 4 < predicted[1] / predicted[0] < 10
-    # Only a wrong power of the sizes shows through what else a machine does.
+    # Other processes disturb the times, so only a wrong power of the size would be detected.
     assert spent[1] / spent[0] == pytest.approx(predicted[1] / predicted[0], rel=0.6)

@@ -1,4 +1,4 @@
-"""Spiral arms and knots in exposures: galsim draws the same picture; places are on the sky, in any band."""
+"""Spiral arms and knots in exposures agree with galsim, and have the same sky positions in all bands."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ from truesky.request.structure import Arms, Stamps
 
 NOISE = 12.0
 DISCS = DiscStructure(Arms(least_radius=0.5), 1)
-# One knot that is most of what there is to see.
+# A single knot has most of the visible structure.
 KNOT = DiscStructure(Arms(contrast=0.0, knots=0.5, number=1, least_radius=0.5), 1)
 SPIRAL = {"disk_half_light_radius": 1.4, "bulge_fraction": 0.2, "bulge_half_light_radius": 0.4}
 
@@ -34,7 +34,7 @@ SPIRAL = {"disk_half_light_radius": 1.4, "bulge_fraction": 0.2, "bulge_half_ligh
 @pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("lsstcam", "R22_S11")])
 @pytest.mark.parametrize("electrons", [2e4, 3e7])
 def test_a_sheared_spiral_is_what_galsim_draws(camera, name, electrons):
-    """A face-on disc, for galsim has no thick image: sheared, magnified, on a turned detector."""
+    """The disc is face-on, because galsim has no thick images. It is sheared, magnified, and on a rotated detector."""
     detector, psf = small(camera, name, 256), psf_of(camera)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     shape = {**SPIRAL, "position_angle": 25.0, "kappa": 0.1, "gamma1": 0.15, "gamma2": -0.1}
@@ -55,14 +55,14 @@ def test_a_sheared_spiral_is_what_galsim_draws(camera, name, electrons):
 
 @pytest.mark.parametrize("inclination", [30.0, 80.0])
 def test_structure_is_as_thick_as_its_disc(inclination):
-    """Through an inclined disc the transform falls as galsim's inclined disc does over one without thickness."""
+    """The thickness of a disc reduces its transform by the same factor as in inclined discs of galsim."""
     detector = small("vis", "2-3")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     source = one_source(detector, system, inclination=inclination, position_angle=90.0, disk_half_light_radius=1.2)
     (picture,) = disc_structure.add_structure(source, source.shapes, DISCS).pictures
     k = np.random.default_rng(1).uniform(-8, 8, (2, 50))
     thick, thin = arcs.transform(picture, np.eye(2), *k), arcs.transform(replace(picture, thick=None), np.eye(2), *k)
-    # A position angle of 90 deg: the major axis lies east-west.
+    # The position angle of 90 deg puts the major axis along east-west.
     flat, deep = (
         galsim.InclinedExponential(inclination * galsim.degrees, half_light_radius=1.2, scale_h_over_r=height)
         for height in (1e-5, 0.1)
@@ -74,7 +74,7 @@ def test_structure_is_as_thick_as_its_disc(inclination):
 
 
 def with_structure(channel, discs, body=None, **options):
-    """A galaxy in the middle of a small detector, and where; elsewhere on it where it is moved."""
+    """Render a galaxy on a small detector, in the middle unless the pointing is changed; return it and its position."""
     points = field(channel)[3]
     detector = small("vis", "3-4", SIDE) if channel == "VIS" else small("lsstcam", "R22_S11", SIDE)
     system = wcs(detector, *(field(channel)[1][name] for name in ("ra", "dec", "position_angle")))
@@ -84,7 +84,7 @@ def with_structure(channel, discs, body=None, **options):
 
 
 def offset(found, smooth, place):
-    """(east, north) arcsec of the knot, from what it adds."""
+    """Return the offset (east, north) of the knot in arcsec, from the light that it adds."""
     more = found.noise_free.astype(float) - smooth.noise_free
     centre, _ = moments(np.where(more > 0.3 * more.max(), more, 0.0))
     at, up = sky_of_pixel(found.wcs, centre[:1], centre[1:])
@@ -92,7 +92,7 @@ def offset(found, smooth, place):
 
 
 def in_h(discs, place):
-    """The same galaxy in H, on a detector of NISP that looks elsewhere."""
+    """Render the same galaxy in H, on a detector of NISP with another pointing."""
     detector, (ra, dec) = small("nisp", "DET22", 128), place
     row = infrared.exposed(detector)
     turned = dict(zip(("ra", "dec", "position_angle"), boresight_for(detector, ra, dec, 71.0), strict=True))
@@ -117,7 +117,7 @@ def test_a_knot_is_at_the_same_place_in_every_band_and_dither():
     ground = [with_structure("EXT", discs)[0] for discs in (KNOT, None)]
     np.testing.assert_allclose(offset(*ground, with_structure("EXT", None)[1]), at, atol=0.06)
     infra = [in_h(discs, place) for discs in (KNOT, None)]
-    # NISP's headers have the windowed centroid of a star.
+    # Headers of NISP give the windowed centroid of a star.
     np.testing.assert_allclose(offset(*infra, place), at, atol=0.06)
 
 
@@ -148,7 +148,7 @@ def blob(ratio):
 
 
 def test_shear_moves_a_knot_as_it_moves_the_sky():
-    """theta = A^-1 beta, in (east, north)."""
+    """The knot moves by theta = A^-1 beta, in (east, north)."""
     lens = {"kappa": 0.1, "gamma1": 0.12, "gamma2": 0.08}
     found, place = with_structure("VIS", KNOT)
     at = offset(found, with_structure("VIS", None)[0], place)
@@ -171,7 +171,7 @@ def test_flux_and_half_light_radius_of_the_image_stay():
 
 
 def test_one_row_of_truth_and_nothing_else_changes():
-    """A galaxy is a profile in the truth; of small discs nothing changes, bit by bit; costs know of the rest."""
+    """The truth has one row for the galaxy, and small discs are unchanged, bit by bit; costs include the structure."""
     found, smooth = (with_structure("VIS", discs)[0] for discs in (DISCS, None))
     rows, plain = (truth_table.truth(one).drop(["stamp", "drawn"]) for one in (found, smooth))
     assert rows.equals(plain)

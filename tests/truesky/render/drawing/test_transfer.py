@@ -1,4 +1,4 @@
-"""What passes PSF and pixels: every frequency that counts once, in the right place; far ones left out harmlessly."""
+"""Transfer by PSF and pixels: each relevant frequency once, at the right place; others are left out harmlessly."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from truesky.render.sources import galaxy_shapes, source_list
 
 
 def planes_psf(widths=(0.09, 0.13), place=0.0):
-    """Gaussians by wavelength, in planes; `place`: how much wider on the right side of the detector."""
+    """Return a PSF of Gaussians by wavelength; `place` sets how much wider they are on the right of the detector."""
     axis = (np.arange(129 * SAMPLES) - 129 * SAMPLES // 2) * 0.1 / SAMPLES
     r2 = axis[:, None] ** 2 + axis**2
     images = [np.exp(-0.5 * r2 / w**2) for w in widths]
@@ -27,7 +27,10 @@ def planes_psf(widths=(0.09, 0.13), place=0.0):
 
 
 def test_places_on_a_detector_are_in_units_of_its_own_sides():
-    """One of 200 columns and 100 rows: -1 and 1 at its borders, 0 in its middle; beyond the border that is held."""
+    """The detector has 200 columns and 100 rows. Its borders are at -1 and 1, and its middle is at 0.
+
+    Positions beyond a border have the value of the border.
+    """
     psf = replace(planes_psf().planes, half=(99.5, 49.5), powers=((1, 0, 0), (0, 1, 0)))
     column, row = np.array([-0.5, 99.5, 199.5, 149.5, 300.0]), np.array([99.5, 49.5, -0.5, 74.5, -40.0])
     found = transfer.basis_weights(replace(planes_psf(), planes=psf), None, column, row)
@@ -45,12 +48,12 @@ def test_a_grid_holds_each_frequency_once(size, reach):
     x, y = np.meshgrid(*[np.arange(-most - 1, most + 2)] * 2)
     wanted = (np.hypot(x, y) * step <= reach) & (x % size <= size // 2)
     assert sorted(zip(ix, iy, strict=True)) == sorted(zip(x[wanted], y[wanted], strict=True))
-    # Runs are consecutive, stay in one half plane, and tell where their samples lie.
+    # Runs are consecutive, stay in one half plane, and contain the positions of their samples.
     for (first, left, up), after in zip(grid.runs[:-1], grid.runs[1:, 0], strict=True):
         assert (ix[first:after] == np.arange(left, left + after - first)).all()
         assert (iy[first:after] == up).all()
         assert left % size + (after - first) - 1 <= size // 2
-    # No sample of a piece lies nearer than its inner edge, and they come in order.
+    # All samples of a piece are outside its inner edge, and pieces are in order of this edge.
     assert (np.diff(grid.inner) >= 0).all()
     for p, inner in enumerate(grid.inner):
         first, last = grid.runs[grid.pieces[p], 0], grid.runs[grid.pieces[p + 1], 0]
@@ -68,7 +71,7 @@ def test_planes_are_the_transform_of_the_psf_s_image():
 
 
 def test_psf_in_planes_and_as_a_profile_draw_the_same_image():
-    """Colour and place by weights against one image made of them, many together against each alone."""
+    """Weights for colour and position agree with one image made of them, and many sources with each alone."""
     psf, n = planes_psf(place=0.5), 20
     rng = np.random.default_rng(3)
     form = galaxy_shapes.shapes(galaxies(rng.random(n), rng.random(n), inclination=50.0, disk_half_light_radius=0.3))
@@ -90,7 +93,7 @@ def test_psf_in_planes_and_as_a_profile_draw_the_same_image():
 
 @pytest.mark.parametrize("index", [1.0, 4.0])
 def test_what_is_left_out_is_below_its_floor(index):
-    """Samples beyond the reach of a source, however small, change no pixel by more than was allowed."""
+    """Samples beyond the reach of a source, however small it is, change no pixel by more than allowed."""
     detector = small("vis", "3-4")
     system = astrometry.wcs(detector, 10.0, 20.0, 0.0)
     source = one_source(
@@ -115,7 +118,10 @@ def test_max_transfer_is_an_upper_limit_of_the_seeing_disc_s_transform():
 @pytest.mark.parametrize("beta", [2.5, 3.0])
 @pytest.mark.parametrize("size", [32, 40, 64])
 def test_wings_that_come_in_are_not_in_the_middle(size, beta):
-    """Behind an atmosphere, against a stamp that none reach: nine tenths of them are where the stamp ends."""
+    """Aliased wings of a seeing disc are near the border of the stamp: less than a tenth is in the middle.
+
+    The reference is a stamp so large that it has no aliased wings.
+    """
     detector, seeing = small("lsstcam", "R22_S11"), moffat_psf(0.7, beta, 0.2)
     source = one_source(detector, astrometry.wcs(detector, 10.0, 20.0, 0.0), 1e9, 80.0, 80.0)
     image, whole = (stamps.draw(source, np.array([n]), seeing, 160, 160) for n in (size, 1024))
@@ -130,7 +136,7 @@ def test_wings_that_come_in_are_not_in_the_middle(size, beta):
 
 @pytest.mark.parametrize("shear", [0.0, 0.07, -0.3])
 def test_a_sheared_spectrum_is_the_series_at_sheared_frequencies(shear):
-    """Of a plane that fills its period, and of one that does not."""
+    """The image fills its period, or is smaller."""
     rng = np.random.default_rng(3)
     for side, period in ((9, 16), (11, 11)):
         image = rng.random((side, side))

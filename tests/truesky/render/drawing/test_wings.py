@@ -1,4 +1,4 @@
-"""Light beyond stamps: as far as it goes, from sources on the frame and beside it."""
+"""Light beyond stamps is drawn as far as it matters, from sources on the frame and outside it."""
 
 from dataclasses import replace
 
@@ -27,12 +27,15 @@ SETTINGS = settings.Settings(edge=0.01, aliased=1e-4, floor=3e-4, min_size_arcse
 
 @pytest.fixture(scope="module")
 def vis():
-    """The telescope's PSF, whose planes end."""
+    """Return the PSF of the telescope, whose planes have a limited size."""
     return euclid.vis_psf(detectors.detector("vis", "3-4", MISSION), BAND, MISSION, 1)
 
 
 def found(psf, galaxy=None, star=None):
-    """(sources, sizes, image, drawn) of a small detector with a galaxy of 1e6 and a star of 1e5 electrons on pixels."""
+    """Return (sources, sizes, image, drawn) of a small detector with a galaxy and a star on given pixels.
+
+    The galaxy has 1e6 electrons, and the star 1e5.
+    """
     detector = small("vis", "3-4", SIDE)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     body, points = (
@@ -50,7 +53,7 @@ def found(psf, galaxy=None, star=None):
 
 
 def test_light_of_a_galaxy_outside_the_frame_reaches_the_frame():
-    """Where its stamp leaves the frame there is no step, and no end."""
+    """The light neither jumps nor ends when the stamp leaves the frame."""
     light, on_stamp = [], []
     for column in (-382.0, -383.0, -384.0, -385.0, -386.0, -387.0, -388.0):
         _, sizes, image, drawn = found(psf_of("vis"), (column, 100.0))
@@ -70,12 +73,12 @@ def test_a_star_s_wings_come_from_beside_the_frame(vis):
         assert image.sum() > (100.0 if column > -100 else 0.1)
         assert (drawn > 0) == (column > -0.5 * sizes)
     assert len(found(vis, star=(-300.0, 100.0))[0]) == 0
-    # Behind an atmosphere all of them are on the stamp.
+    # Behind an atmosphere, the stamp contains all wings.
     assert len(found(psf_of("vis"), star=(-60.0, 100.0))[0]) == 0
 
 
 def crowd(n, seed, margin):
-    """Galaxies and stars on and around a frame."""
+    """Return galaxies and stars on and around a frame."""
     rng = np.random.default_rng(seed)
     shapes = galaxy_shapes.shapes(
         galaxies(
@@ -97,7 +100,7 @@ def touching_frame(some, sizes, psf):
 
 @given(st.integers(0, 1000), st.sampled_from(["vis", "seeing"]))
 def test_whom_nobody_names_brings_no_light(vis, seed, kind):
-    """As far as a galaxy's light is drawn, and a point's wings: the others may be left out, bit by bit."""
+    """Sources that are not selected may be left out, bit by bit: neither galaxies nor wings of points add light."""
     some, psf = crowd(40, seed, 1200.0), vis if kind == "vis" else psf_of("vis")
     sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, NOISE, SETTINGS)
     here = touching_frame(some, sizes, psf)
@@ -105,7 +108,7 @@ def test_whom_nobody_names_brings_no_light(vis, seed, kind):
 
 
 def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
-    """A frame of a field is what a larger one has there, to what its accuracy allows."""
+    """A frame agrees with the same part of a larger frame, within the promised accuracy."""
     margin = 304
     some = crowd(500, 3, 300.0)
     some.electrons[some.shape < 0] = 2e5
@@ -118,7 +121,7 @@ def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
     for border in (missing[:8], missing[-8:], missing[:, :8], missing[:, -8:]):
         assert abs(border.mean()) < 0.1 * SURVEY.background * NOISE
     assert np.abs(missing).max() < SURVEY.background * NOISE
-    # What stamps alone bring misses more than that.
+    # Stamps alone would miss more light than that.
     touching = selection.overlaps_frame(some.column, some.row, sizes, SIDE, SIDE)
     less = ours - stamps.draw(some.take(touching), sizes[touching], vis, SIDE, SIDE)
     assert less[:8].mean() > 0.1 * SURVEY.background * NOISE

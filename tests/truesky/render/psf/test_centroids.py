@@ -1,4 +1,4 @@
-"""Centroids of PSFs: against shifted Gaussians, and against what is measured of stars as they are drawn."""
+"""Centroids of PSFs agree with shifted Gaussians, and with measurements of drawn stars."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from truesky.render.psf.centroids import offsets
 
 
 def shifted(x, y, sigma=0.9, samples=3, side=24):
-    """A Gaussian beside the middle, pixels."""
+    """Return a Gaussian at an offset (pixels) from the middle."""
     axis = (np.arange(side * samples + 1) - side * samples // 2) / samples
     one = np.exp(-0.5 * ((axis - x) ** 2 + (axis[:, None] - y) ** 2) / sigma**2)
     return (one / one.sum()).astype(np.float32)
@@ -31,7 +31,7 @@ def psf_of(*planes, drift=(), samples=3):
 
 @pytest.mark.parametrize(("samples", "error"), [(3, 0.014), (5, 0.005)])
 def test_half_of_the_light_of_a_gaussian(samples, error):
-    """Of any width: not in steps of the samples."""
+    """The diameter is correct for any width, not only for multiples of the sample spacing."""
     for sigma in np.linspace(0.5, 1.5, 23):
         found = centroids._half_light_diameter(shifted(0.0, 0.0, sigma, samples=samples), samples)
         assert found == pytest.approx(2.0 * sigma * np.sqrt(2.0 * np.log(2.0)), rel=error)
@@ -51,7 +51,7 @@ def test_centroid_with_an_even_number_of_samples_is_the_shift():
 
 
 def test_of_colours_and_places_it_is_between():
-    """Two wavelengths that lie apart, and a change across the detector."""
+    """Two wavelengths have different centroids, and the PSF changes across the detector."""
     drift = shifted(0.05, 0.0) - shifted(0.0, 0.0)
     psf = psf_of(shifted(0.1, 0.0), shifted(-0.1, 0.0), drift=(drift,))
     weights = transfer.basis_weights(
@@ -68,9 +68,9 @@ def test_of_a_round_disc_it_is_nothing():
 
 
 def test_stars_are_found_where_truth_has_them():
-    """Of the light of VIS alone, by the windowed centroid of SourceExtractor: 5 mas beside the chief ray, to 1 mas.
+    """Windowed centroids of noise-free VIS stars are 5 mas from the chief ray, as predicted within 1 mas.
 
-    Pixels sample its light coarsely: by 1 mas from star to star.
+    Pixels sample the light coarsely, so centroids scatter by 1 mas from star to star.
     """
     x, y = nominal.lattice(300, 100)
     quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)

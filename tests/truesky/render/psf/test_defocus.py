@@ -1,4 +1,4 @@
-"""VIS out of focus: rings instead of points, by a sum over the pupil and by geometry."""
+"""VIS out of focus: images are rings, in agreement with a sum over the pupil and with geometric optics."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def at(nm):
 
 
 def image(nm, place=(0.4, -0.6)):
-    """Diffracted light of a place in the field, without any blur."""
+    """Return the diffracted light at a position in the field, without any blur."""
     mission = at(nm)
     own = euclid.wavefront(*place, "vis", mission)
     return diffraction.diffraction_image(own, diffraction.optics_of(10 * WAVELENGTH, SAMPLING, mission, 2048), SIDE)
@@ -33,7 +33,7 @@ def test_in_focus_it_is_the_psf_of_science_exposures():
 
 @pytest.mark.parametrize("nm", [-300.0, 300.0])
 def test_it_is_a_sum_over_the_pupil(nm):
-    """Fraunhofer's integral, summed directly: no transform, and Noll's polynomials as they are printed."""
+    """Fraunhofer's integral is summed directly, without a transform, and with Noll's polynomials as printed."""
     mission, n = resolve(), 1500
     a = euclid.wavefront(0.4, -0.6, "vis", mission)
     axis = (np.arange(n) + 0.5) / n * 2.04 - 1.02
@@ -46,7 +46,7 @@ def test_it_is_a_sum_over_the_pupil(nm):
     clear = diffraction.pupil(600 * x, 600 * y, 600 * 2.04 / n, mission)
     field = clear * np.exp(2j * np.pi * wave / WAVELENGTH)
     angle = np.radians((np.arange(SIDE) - SIDE // 2) * SAMPLING / 3600)
-    # Of a sample in the pupil the light goes to angle theta with the phase 2 pi x theta / lambda.
+    # Light of a sample x in the pupil reaches the angle theta with the phase 2 pi x theta / lambda.
     turned = np.exp(2j * np.pi * np.outer(angle, axis * 0.6) / (WAVELENGTH * 1e-9))
     power = np.abs(turned @ field @ turned.T) ** 2
     step, sample = 0.6 * 2.04 / n, np.radians(SAMPLING / 3600)
@@ -56,21 +56,21 @@ def test_it_is_a_sum_over_the_pupil(nm):
 
 
 def test_a_ring_is_as_large_as_rays_make_it():
-    """Of a wavefront W = a sqrt(3) (2 r^2 - 1) the slope at the rim is 4 sqrt(3) a over the radius."""
+    """A wavefront W = a sqrt(3) (2 r^2 - 1) has the slope 4 sqrt(3) a over the radius at the rim."""
     light = image(300.0, (0.0, 0.0))
     y, x = np.mgrid[:SIDE, :SIDE] - SIDE // 2
     r = np.hypot(x, y) * SAMPLING
-    # With what the field has of it.
+    # The field adds to the wavefront.
     nm = euclid.wavefront(0.0, 0.0, "vis", at(300.0))[4]
     rim = np.degrees(4 * np.sqrt(3) * nm * 1e-9 / 0.6) * 3600
     profile = np.array([light[(r >= low) & (r < low + 0.1)].mean() for low in np.arange(0.0, 1.5, 0.1)])
-    # Half of the ring's brightness is passed at the rim.
+    # At the rim, the light falls to half of the ring's brightness.
     edge = np.arange(0.05, 1.5, 0.1)[np.flatnonzero(profile > 0.5 * profile[3:7].mean())[-1]]
     assert edge == pytest.approx(rim, abs=0.1)
 
 
 def test_on_either_side_of_the_focus_the_pupil_is_upside_down():
-    """Three bars and a stop off the middle: the shadows on one side are those on the other, turned by half a turn."""
+    """The pupil has three bars and a stop off its centre. The shadows rotate by half a turn through the focus."""
     mission, one, other = at(0.0), *(np.zeros(5) for _ in range(2))
     one[4], other[4] = 300.0, -300.0
     optics = diffraction.optics_of(10 * WAVELENGTH, SAMPLING, mission, 2048)

@@ -1,4 +1,4 @@
-"""Two Gaussians of given radii: their light, and spectra through them."""
+"""A PSF of two Gaussians with given radii: its light, and spectra through it."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_half_and_four_fifths_of_the_light_are_within_the_radii(ee50, ratio, cor
 
 
 def test_known_widths():
-    """Of EE50 and EE80 in Y, J and H: arcsec."""
+    """The radii are EE50 and EE80 in Y, J and H, arcsec."""
     for radii, wanted in (((0.148, 0.370), (0.097, 0.410)), ((0.168, 0.448), (0.110, 0.497)),
                           ((0.206, 0.565), (0.134, 0.627))):  # fmt: skip
         assert double_gaussian.widths(*radii, CORE) == pytest.approx(wanted, abs=2e-3)
@@ -67,7 +67,7 @@ def test_the_core_is_a_value_of_the_mission():
 
 @pytest.mark.parametrize("key", ["spectra.psf", "spectra.selection", "ipc_spectroscopic", "nonlinearity_of_signal"])
 def test_switches_are_0_or_1(key):
-    """Half of a choice is neither."""
+    """There is no value between the two choices."""
     with pytest.raises(BadInput, match=f"nisp.{key} = 0.3 is not a whole number"):
         resolve(overrides={f"nisp.{key}": (0.3, "")})
     for value in (0.0, 1.0):
@@ -84,17 +84,17 @@ def test_the_planes_have_the_radii_of_their_wavelengths():
         assert image.sum() == pytest.approx(1.0, abs=1e-6)
         for part, light, slope in (("50", 0.5, 0.085), ("80", 0.8, 0.284)):
             radius = GAUSSIANS.value(f"nisp.spectra.ee{part}", "arcsec") + slope * (wavelength - 15_000.0) / 1e4
-            # A ring of samples holds 5 % of the light at the most.
+            # A ring of samples contains at most 5 % of the light.
             assert image[away < radius].sum() == pytest.approx(light, abs=0.03)
 
 
 def test_spectra_keep_flux_and_width_of_the_double_gaussian():
-    """One parameter selects the PSF; the profile across a star's spectrum is that of the Gaussians in a pixel."""
+    """One parameter selects the PSF. The profile across a star's spectrum is that of the Gaussians in a pixel."""
     missions = resolve(overrides=NO_BODIES), GAUSSIANS
     default, gaussian = (spectroscopic.rendered([18.0], [300.0], [48.0], mission=own) for own in missions)
     assert gaussian.noise_free.sum() == pytest.approx(default.noise_free.sum(), rel=0.01)
     assert not np.allclose(gaussian.noise_free, default.noise_free, rtol=0.05, atol=1.0)
-    # About 1.5 um.
+    # These columns are near 1.5 um.
     light = gaussian.noise_free[:, 300:310].sum(axis=1, dtype=float)
     rows, widths = np.arange(len(light)), double_gaussian.widths(0.184, 0.490, CORE)
     middle = np.average(rows, weights=light)

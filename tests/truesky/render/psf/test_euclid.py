@@ -1,4 +1,4 @@
-"""The Euclid PSF against published optics and galsim's diffraction; the seeing disc against its formula."""
+"""The Euclid PSF agrees with published optics and galsim's diffraction; the seeing disc agrees with its formula."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def vis():
 
 
 def test_the_pupil_has_the_published_area():
-    """9926 cm2, and 0.8776 of the 1.2 m disc."""
+    """The area is 9926 cm2, which is 0.8776 of a disc of 1.2 m."""
     step = 1.0
     axis = np.arange(-605, 606, step)
     x, y = np.meshgrid(axis, axis)
@@ -55,7 +55,7 @@ def test_the_wavefront_is_small_and_low(x, y):
 
 
 def test_wavefront_error_over_the_field():
-    """34-51 nm rms on a 3 x 3 grid."""
+    """The published errors on a 3 x 3 grid are 34 to 51 nm rms."""
     grid = [np.linalg.norm(euclid.wavefront(x, y, "vis", MISSION)) for x in (-0.7, 0, 0.7) for y in (-0.7, 0, 0.7)]
     assert 25 < min(grid) < max(grid) < 65
 
@@ -65,7 +65,7 @@ def plane(nm, wavelength):
 
 
 def test_diffraction_is_galsims():
-    """galsim.OpticalPSF of the same pupil and aberrations: an independent transform."""
+    """galsim.OpticalPSF has the same pupil and aberrations, and an independent transform."""
     n, nm, wavelength = 1024, euclid.wavefront(0.5, -0.3, "vis", MISSION), 700.0
     step = 1200.0 / n
     axis = (np.arange(n) - n / 2 + 0.5) * step
@@ -81,15 +81,15 @@ def test_diffraction_is_galsims():
     ours = plane(nm, 10 * wavelength)
     inner = slice(256 - 40, 256 + 41)
     assert np.abs(ours - theirs)[inner, inner].max() < 0.01 * theirs.max()
-    # Galsim folds the far wings back and lights edge samples fully.
+    # galsim folds the far wings back, and treats samples at the edge of the pupil as clear.
     assert ours[inner, inner].sum() == pytest.approx(theirs[inner, inner].sum(), rel=1e-2)
 
 
 @pytest.mark.parametrize("wavelength", [5500.0, 7000.0, 9000.0])
 def test_wings_hold_what_edges_diffract(wavelength):
-    """Beyond a large angle lies lambda P / (2 pi^2 A angle), P and A perimeter and area of the pupil.
+    """The light beyond a large angle is lambda P / (2 pi^2 A angle), with perimeter P and area A of the pupil.
 
-    Perimeter: stop, central stop, and both sides of three bars, cut short by the stops.
+    The perimeter consists of the stop, the central stop, and both sides of three bars, which the stops shorten.
     """
     axis = np.arange(-605, 606, 1.0)
     x, y = np.meshgrid(axis, axis)
@@ -112,7 +112,7 @@ def test_a_part_of_the_light_is_a_part_of_the_whole():
 
 @pytest.mark.parametrize("blur", [(0.0, 0.0), (0.01**2, 0.02**2), (0.04**2, 0.045**2), (0.2**2, 0.1**2)])
 def test_blur_is_a_gaussian_in_fourier_space(blur):
-    """arcsec2 along x and y; against the product of transforms, of the light as diffracted."""
+    """The blur (arcsec2 along x and y) multiplies the transform of the diffracted light."""
     nm, n = euclid.wavefront(0.6, 0.3, "vis", MISSION), 768
     optics, weights = diffraction.optics_of(5500.0, SAMPLING, MISSION, n), euclid._blur_weights(blur, SAMPLING)
     found = euclid._blur_image(diffraction.diffraction_image(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
@@ -129,7 +129,7 @@ def test_blur_is_a_gaussian_in_fourier_space(blur):
     [(5500, 0.108, 0.132, 0.153, 0.28), (7000, 0.129, 0.147, 0.164, 0.23), (9000, 0.160, 0.173, 0.186, 0.17)],
 )
 def test_widths_by_wavelength(wavelength, optics, diffused, pixelated, peak):
-    """FWHM of optics and jitter, then diffusion, then the pixel; fraction of light in the central pixel."""
+    """Check the FWHM of optics and jitter, then with diffusion, then with the pixel; and light in the central pixel."""
     image = galsim.Image(plane(np.zeros(12), wavelength), scale=SAMPLING)
     focal = galsim.InterpolatedImage(image, pad_factor=2)
     steps = [focal, galsim.Gaussian(sigma=0.025)]
@@ -147,7 +147,7 @@ def test_widths_by_wavelength(wavelength, optics, diffused, pixelated, peak):
 
 def test_the_psf_is_as_wide_as_measured(vis):
     assert vis.fwhm == pytest.approx(0.164, abs=0.005)
-    # 92 % of the light within 1.3" across, 4.5 % outside 2.6".
+    # 92 % of the light is within a diameter of 1.3", and 4.5 % is outside 2.6".
     at = np.interp(0.65 / 0.1, np.arange(len(vis.outside)), vis.outside)
     assert 1 - at == pytest.approx(0.93, abs=0.015)
     assert 1 - at == pytest.approx(MISSION.value("vis.psf.encircled_1arcsec3"), abs=0.015)
@@ -155,7 +155,10 @@ def test_the_psf_is_as_wide_as_measured(vis):
 
 
 def test_blue_light_spreads_wider_in_the_silicon(vis):
-    """Against light that spreads as at 800 nm: a Gaussian of 0.32 pixel times the wavelength to the power of -0.35."""
+    """Diffusion is a Gaussian of 0.32 pixel at 800 nm. Its width is proportional to lambda^-0.35.
+
+    The reference has the same diffusion at all wavelengths.
+    """
     even = euclid.vis_psf(
         detector("vis", "3-4", MISSION), BAND, MISSION.with_overrides({"vis.diffusion_slope": (0.0, "")})
     )
@@ -168,9 +171,9 @@ def test_blue_light_spreads_wider_in_the_silicon(vis):
 
 
 def test_detectors_are_not_equally_thick():
-    """Charge diffuses wider in one than in another: what the planes are blurred by."""
+    """The width of charge diffusion, by which the planes are blurred, differs between detectors."""
     names = [f"{row}-{column}" for row in range(1, 7) for column in range(1, 7)]
-    # Of this one the length is the mission's.
+    # This detector has the diffusion length of the mission.
     assert euclid._blur_variances(detector("vis", "3-4", MISSION), 8000.0, MISSION)[0] == pytest.approx(
         0.032**2 + 0.025**2
     )
@@ -200,7 +203,7 @@ def test_ellipticity_is_small(vis):
 
 
 def test_a_detector_upside_down_sees_the_psf_turned(vis):
-    """The optics do not turn with the detector."""
+    """The optics do not rotate with the detector."""
     upright = euclid.vis_psf(replace(detector("vis", "3-4", MISSION), rotation=0.0), BAND, MISSION)
     draw = {"nx": 65, "ny": 65, "scale": 0.05, "method": "no_pixel", "dtype": float}
     turned, straight = (p.profile.drawImage(**draw).array for p in (vis, upright))

@@ -1,4 +1,4 @@
-"""A PSF of the user's own in place of ours: drawn as galsim draws it, read by galsim.des, refused by name."""
+"""PSF files of the user are drawn as by galsim and read as by galsim.des. Errors name the file."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from truesky.request.accuracy import REFERENCE
 from truesky.request.from_toml import from_table
 
 BAND, GROUND = passbands.load("euclid_vis"), passbands.load("lsst_r")
-# Samples of the cubes, arcsec.
+# Sample spacing of the cubes, arcsec.
 STEP = 0.05
 CARDS = {"CDELT1": STEP, "CDELT2": STEP, "CUNIT1": "arcsec"}
 COLOURS = {"CRVAL3": 500.0, "CDELT3": 100.0, "CUNIT3": "nm"}
@@ -38,7 +38,7 @@ def cube(path, planes, **cards):
 
 
 def gaussian(*sigmas, side=161, x=0.0, y=0.0, stretch=1.0):
-    """Planes of unit flux of Gaussians, sigma in arcsec, about (x, y) arcsec from the middle."""
+    """Return planes of unit flux with Gaussians, sigma in arcsec, at (x, y) arcsec from the middle."""
     v, u = (np.mgrid[:side, :side] - (side - 1) / 2) * STEP
     planes = [np.exp(-0.5 * (((u - x) / s) ** 2 + ((v - y) / s / stretch) ** 2)) for s in sigmas]
     return np.array([plane / plane.sum() for plane in planes])
@@ -53,7 +53,7 @@ def star(psf, detector, column=80.3, row=77.6, photons=None):
 def test_a_cube_of_one_plane(tmp_path):
     detector = small("vis", "2-3")
     psf = from_file.read(cube(tmp_path / "a.fits", gaussian(0.12, stretch=1.4, x=0.03)[0]), detector, BAND)
-    # A Gaussian's share of a pixel is known.
+    # The fraction of a Gaussian in a pixel is known.
     edges = np.arange(161) - 0.5
     x, y = (np.diff(ndtr((edges - middle) / sigma)) for middle, sigma in ((80.3 + 0.3, 1.2), (77.6, 1.2 * 1.4)))
     theirs = 1e5 * y[:, None] * x
@@ -73,7 +73,7 @@ def test_the_pixel_may_be_in_it(tmp_path):
 
 @pytest.mark.parametrize("how", ["axis", "cards"])
 def test_colours_are_interpolated_between_planes(tmp_path, how):
-    """sigma^2 goes linearly with wavelength: so does the second moment of whatever colour."""
+    """sigma^2 is linear in wavelength, and so is the second moment of any colour."""
     waves = np.array([500.0, 600.0, 700.0, 800.0, 900.0, 1000.0])
     variance = 0.01 + 1e-5 * (waves - 500)
     cards = COLOURS if how == "axis" else {"CUNIT3": "nm", **{f"WAVE{i + 1}": w for i, w in enumerate(waves)}}
@@ -93,10 +93,10 @@ def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
     other, _ = moments(star(turned, small("vis", "2-4")))
     np.testing.assert_allclose(centre - (80.3, 77.6), (3.0, 1.0), atol=0.01)
     np.testing.assert_allclose(other - (80.3, 77.6), (-3.0, -1.0), atol=0.01)
-    # As wide as if it lay in the middle: sigma and pixel.
+    # The widths are the same as for a centred PSF: sigma and pixel.
     width = 2.3548 * np.hypot(0.15, 0.1 / 12**0.5)
     assert (upright.fwhm, turned.fwhm) == pytest.approx((width, width), rel=0.02)
-    # The chief ray's place may be told.
+    # The file may contain the position of the chief ray.
     centred = cube(tmp_path / "b.fits", gaussian(0.15, x=0.3, y=0.1), CRPIX1=81.0 + 6, CRPIX2=81.0 + 2)
     found, _ = moments(star(from_file.read(centred, small("vis", "2-3"), BAND), small("vis", "2-3")))
     np.testing.assert_allclose(found, (80.3, 77.6), atol=0.01)
@@ -106,7 +106,7 @@ def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
 
 
 def psfex(path, degree=2, samples=0.65, side=33, **cards):
-    """What PSFEx would write of a Moffat that changes across a detector of 160 pixels."""
+    """Write a PSFEx file of a Moffat profile that changes across a detector of 160 pixels."""
     y, x = np.mgrid[:side, :side] - side // 2
     terms = [(i, j) for j in range(degree + 1) for i in range(degree + 1 - j)]
     basis = []
@@ -132,9 +132,10 @@ def psfex(path, degree=2, samples=0.65, side=33, **cards):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize(("column", "row"), [(80.3, 77.6), (30.1, 120.4), (131.7, 25.2)])
 def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
-    """Position by position, and without another pixel: of a small body, as sharp as pixels show.
+    """A small body and a star agree with galsim at each position, without an additional pixel.
 
-    The interpolant rings at frequencies that three samples a pixel do not hold; in galsim's star they are seen.
+    The interpolant rings at frequencies above the limit of three samples per pixel. The star of galsim contains them,
+    so its tolerance is larger.
     """
     path, detector = psfex(tmp_path / "a.psf", degree), small("lsstcam", "R22_S11")
     psf, sigma = from_file.read(path, detector, GROUND), 0.6
@@ -155,7 +156,7 @@ def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
 
 
 def test_galaxies_through_a_psfex_file(tmp_path):
-    """galsim's own convolution, with no pixel besides."""
+    """The reference is a convolution by galsim without an additional pixel."""
     path, detector = psfex(tmp_path / "a.psf", 1), small("lsstcam", "R22_S11")
     psf = from_file.read(path, detector, GROUND)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
@@ -198,7 +199,7 @@ def test_bad_files_are_refused_by_name(tmp_path, case):
     assert "\n" not in str(refused.value)
 
 
-# ------------------------------------------------------------------------------------------------ by the request
+# ------------------------------------------------------------------------------------------------ requests
 
 POINTING = {
     "channel": "EXT", "camera": "lsstcam", "band": "lsst_r", "ra": 53.117, "dec": -27.808, "mjd": 60905.0,
@@ -227,7 +228,7 @@ def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
 
 
 def test_of_a_set_each_exposure_has_one(tmp_path):
-    """At random, and the same whatever else is exposed."""
+    """The choice is random, and does not depend on other exposures."""
     names = [f"{i}_{{detector}}.psf" for i in range(3)]
     table = {"name": "x", "seed": 1, "area": {"cone": {"ra": 53.117, "dec": -27.808, "radius": 0.1}}}
     pointings = [{**POINTING, "mjd": 60905.0 + 0.1 * i} for i in range(60)]
@@ -251,7 +252,7 @@ def test_of_a_set_each_exposure_has_one(tmp_path):
 
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])
 def test_an_exposure_is_drawn_through_it(tmp_path, monkeypatch, channel):
-    """Wider than ours, by the request's file alone."""
+    """The PSF of the request's file is wider than the default PSF."""
     path = cube(tmp_path / "a.fits", gaussian(0.5)[0])
     task, exposed, body, points = field(channel)
     monkeypatch.setattr(

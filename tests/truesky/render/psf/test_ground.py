@@ -1,4 +1,4 @@
-"""Turbulent air and optics: against galsim's, across a detector, with colour, and far from bright stars."""
+"""The PSF of air and optics agrees with galsim, across detectors, with colour, and far from bright stars."""
 
 from dataclasses import replace
 from functools import cache
@@ -30,7 +30,7 @@ CASES = {
 
 
 def bare(camera, **overrides):
-    """Without aureole and spider."""
+    """Return a mission without aureole and spider."""
     own = {"psf.aureole": (0.0, ""), "pupil.vane_width": (0.0, "mm"), **overrides}
     return resolve(overrides={f"ext.{camera}.{key}": value for key, value in own.items()})
 
@@ -48,7 +48,7 @@ def psf_of(camera="lsstcam", positions=9, mission=None, air=AIR):
 
 
 def shape_of(image, step, width=0.5):
-    """(size, e1, e2, x, y) under a Gaussian window, arcsec."""
+    """Return (size, e1, e2, x, y) under a Gaussian window, arcsec."""
     y, x = (np.mgrid[: len(image), : len(image)] - len(image) // 2) * step
     light = image * np.exp(-0.5 * (x**2 + y**2) / width**2)
     light = light / light.sum()
@@ -75,7 +75,7 @@ def test_a_seeing_has_its_fried_length(wide, wave, outer):
 
 
 def test_air_refracts_as_published():
-    """Filippenko 1982, Table 1, sec z = 2: 4000 A against 5000 A, 2 km up at 600 mm Hg."""
+    """The reference is Filippenko 1982, Table 1, sec z = 2: 4000 A against 5000 A, 2 km up at 600 mm Hg."""
     height = 8400.0 * np.log(760.0 / 600.0)
     blue, green = np.sqrt(3.0) * atmosphere.refraction(np.array([4000.0, 5000.0]), height)
     assert blue - green == pytest.approx(1.10, abs=0.01)
@@ -85,7 +85,7 @@ def test_air_refracts_as_published():
     "camera", ["hsc", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("decam", "lsstcam", "megacam"))]
 )
 def test_the_whole_of_it_is_galsim_s(camera):
-    """Atmosphere, obscured pupil and aberrations of one wavelength, but for where the centroid lies."""
+    """Atmosphere, obscured pupil and aberrations of one wavelength agree, except for the place of the centroid."""
     detector, telescope = detector_of(camera), aberrations.Telescope.from_mission(f"ext.{camera}", MISSION)
     wave, nm = 6200.0, ground._wavefront(detector, 0.5, -0.8, MISSION)
     fried = atmosphere.fried_length(0.7, wave, telescope.outer)
@@ -115,14 +115,14 @@ def test_the_whole_of_it_is_galsim_s(camera):
     found, wanted = shape_of(ours, step), shape_of(theirs, step)
     assert found[0] == pytest.approx(wanted[0], rel=5e-4)
     np.testing.assert_allclose(found[1:3], wanted[1:3], atol=2e-5)
-    # The light's centroid is at the source's place, whatever coma does.
+    # The centroid of the light is at the position of the source, also with coma.
     assert np.hypot(*found[3:]) < 2e-3
     assert np.hypot(*at) > 2e-3
 
 
 @pytest.mark.parametrize(("positions", "size", "ellipticity"), [(1, 0.02, 0.01), (4, 1e-4, 1e-4), (9, 5e-5, 2e-5)])
 def test_it_changes_across_a_detector_as_the_optics_do(positions, size, ellipticity):
-    """Against the PSF of a detector whose middle is there."""
+    """The reference is the PSF of a detector with its centre at this position."""
     mission, whole = bare("lsstcam"), detector_of("lsstcam")
     psf = psf_of(positions=positions, mission=mission)
     there = replace(whole, x=whole.x + 0.6 * whole.nx * 0.1, y=whole.y - 0.8 * whole.ny * 0.1)
@@ -142,7 +142,7 @@ def test_it_changes_across_a_detector_as_the_optics_do(positions, size, elliptic
 
 
 def test_blue_light_is_wider_and_lifted_towards_the_zenith():
-    """FWHM as lambda^-0.3; the centroids of wavelengths lie where refraction puts them, the mean in the middle."""
+    """The FWHM is proportional to lambda^-0.3. Refraction displaces the centroids relative to their mean."""
     air = replace(AIR, slope=-0.3, tan_zenith_distance=0.66, zenith=np.radians(30.0), height=2700.0)
     psf = psf_of("decam", 1, bare("decam", **{"psf.wavefront_scale": (0.0, "")}), air)
     waves, step = psf.planes.wavelength, 0.2637 / psf.planes.samples
@@ -160,13 +160,13 @@ def test_blue_light_is_wider_and_lifted_towards_the_zenith():
     ]
     slope = np.polyfit(np.log(waves), np.log(wide), 1)[0]
     assert slope == pytest.approx(-0.3, abs=0.02)
-    # In red bands fewer wavelengths do.
+    # Red bands need fewer wavelengths.
     assert len(psf_of("lsstcam", air=replace(AIR, slope=-0.3)).planes.wavelength) == 4
     assert len(psf_of("lsstcam").planes.wavelength) == 1
 
 
 def test_the_air_s_ellipticity_is_the_exposure_s():
-    """The same whichever detector sees it, another in another exposure; of the size that the database gives."""
+    """The ellipticity is the same on all detectors of an exposure. It varies between exposures as in the mission."""
 
     def row(mjd):
         return ExposureRow(1, "EXT", "lsstcam", "lsst_r", "science", 10.0, -20.0, 0.0, mjd, 30.0, 1.0, 0.7, 28.0, "x")
@@ -198,7 +198,7 @@ def test_a_profile_is_chosen_by_a_number():
     assert [psf.planes is None for psf in (round_, moffat, air)] == [True, True, False]
     for psf in (round_, moffat, air):
         assert psf.fwhm == pytest.approx(np.hypot(0.9, 0.6 * 0.2), rel=0.03)
-    # Light beyond 3": none, Moffat's, and the air's with the aureole's.
+    # Light beyond 3": none, a Moffat profile, and air with an aureole.
     beyond = [float(psf.outside[15]) for psf in (round_, moffat, air)]
     assert beyond[0] < 1e-9
     assert 0.002 < beyond[1] < 0.01 < beyond[2] < 0.04
@@ -211,7 +211,7 @@ def test_a_seeing_finer_than_a_pixel_is_refused():
 
 
 def test_seeing_that_turbulence_cannot_cause_is_refused_before_rendering():
-    """Waves of two metres at most have no air of half an arcsec."""
+    """With an outer scale of two metres, no air causes a seeing of half an arcsec."""
     calm = resolve(overrides={"ext.lsstcam.psf.outer_scale": (2.0, "m")})
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
     for found in (seeing.check, lambda wide, *others: ground.atmospheric_psf(ground.Air(wide), *others, 1)):
@@ -223,18 +223,21 @@ def test_seeing_that_turbulence_cannot_cause_is_refused_before_rendering():
 
 @pytest.mark.parametrize("wide", [4.0, 9.5])
 def test_the_worst_seeing_has_its_width(wide):
-    """Of what is wider than the core in which a FWHM is looked for; its PSFEx model has more than a sample."""
+    """The FWHM is correct although the star is wider than the core in which the FWHM is searched.
+
+    Its PSFEx model has more than one sample.
+    """
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
     psf = ground.atmospheric_psf(ground.Air(wide), detector, band, MISSION, 1)
     assert psf.fwhm == pytest.approx(psf.profile.calculateFWHM(), rel=5e-3)
-    # Spikes are as narrow as in any seeing.
+    # Spikes have the same width in any seeing, so the FWHM agrees only roughly.
     assert psf.fwhm == pytest.approx(wide, rel=0.04)
     planes, _ = to_psfex.psfex_planes(psf)
     assert planes.shape[-1] > 100
 
 
 def test_the_brightest_star_has_no_seam_and_no_hole():
-    """Sirius in LSST: rings, aureole and spikes go on beyond the plane, and nowhere is less than nothing."""
+    """Rings, aureole and spikes of Sirius in LSST continue beyond the plane, and no pixel is negative."""
     detector = replace(small("lsstcam", "R22_S11"), nx=700, ny=700)
     band, electrons = passbands.load("lsst_r"), 30.0 * 10 ** (0.4 * (28.36 + 1.0))
     psf = ground.atmospheric_psf(AIR, detector, band, MISSION, 1)
@@ -246,14 +249,14 @@ def test_the_brightest_star_has_no_seam_and_no_hole():
     amplitude, core = psf.edges.aureole
     r2 = x**2 + y**2
     law = electrons * (amplitude / (r2 + core) + spikes.ring_light(psf.edges, np.full(8, 1 / 8)) / r2**1.5)
-    # Away from the spikes, which lie along the diagonals.
+    # These pixels are away from the spikes, which run along the diagonals.
     off = (np.abs(np.abs(x) - np.abs(y)) > 60) & (r2 > 60**2)
     ratio = image[off] / law[off]
     far = np.sqrt(r2[off])
     for near, wide in ((60, 100), (100, 128), (128, 180), (180, 340)):
         some = (far >= near) & (far < wide)
         assert np.median(ratio[some]) == pytest.approx(1.0, abs=0.05 if near >= 100 else 0.2)
-    # Twice the light of the aureole in the spikes, and no step where the plane ends.
+    # Spikes are brighter than the aureole, and there is no step where the plane ends.
     diagonal = image[350 + np.arange(60, 340), 350 + np.arange(60, 340)]
     assert (diagonal > 1.02 * law[350 + np.arange(60, 340), 350 + np.arange(60, 340)]).mean() > 0.9
     across = image[340:360, 350:].mean(axis=0)[100:200]
@@ -262,7 +265,10 @@ def test_the_brightest_star_has_no_seam_and_no_hole():
 
 @pytest.mark.parametrize(("camera", "name"), [("decam", "N4"), ("lsstcam", "R22_S11"), ("megacam", "ccd04")])
 def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
-    """Whichever way the camera and its detector are turned; and an altazimuth's spider turns with it."""
+    """The direction is correct for any rotation of camera and detector.
+
+    The spider of an altazimuth mount rotates with the zenith.
+    """
     detector = detectors.detector(camera, name, MISSION)
     found = []
     for zenith in (-40.0, 75.0):

@@ -1,4 +1,4 @@
-"""NISP's PSF against the widths that the mission database has of it, and against what is required of it."""
+"""NISP's PSF has the widths in the mission database, and fulfils the requirements."""
 
 from dataclasses import replace
 
@@ -19,37 +19,37 @@ from truesky.render.drawing import stamps
 from truesky.render.psf import euclid, sub_bands
 
 MISSION, REQUIRED = resolve(), resolve(ladder=("REQ", "CBE", "BLT", "DES", "SIM"))
-# arcsec: FWHM of the optics; FWHM, EE50 and EE80 of a pixel's light, of galsim's diffraction with 70 nm.
+# FWHM of the optics; FWHM, EE50 and EE80 with the pixel, from diffraction by galsim with 70 nm; arcsec.
 WIDTHS = {
     "euclid_y": (0.179, 0.320, 0.210, 0.430),
     "euclid_j": (0.231, 0.322, 0.232, 0.496),
     "euclid_h": (0.299, 0.358, 0.259, 0.599),
 }
-# One of every row and column.
+# One detector of every row and column.
 SOME = ("DET12", "DET24", "DET31", "DET43")
 
 
 def _means(image, count):
-    """Each sample replaced by the mean over so many about it, in both directions."""
+    """Replace each sample by the mean over `count` samples around it, in both directions."""
     return uniform_filter(image, count) if count else image
 
 
 def widths(psf):
-    """FWHM, EE50 and EE80 of the optics, and with the pixel, arcsec."""
+    """Return FWHM, EE50 and EE80 of the optics, and the same with the pixel, arcsec."""
     out, most = [], 30
     fine = [
         psf.profile.drawImage(nx=n + 2 * most, ny=n + 2 * most, scale=scale, method="no_pixel", dtype=float)
         for n, scale in ((141, 0.01), (241, 0.02))
     ]
     for pixels in (0.0, 1.0):
-        # What a pixel of 0.3 arcsec collects is the mean over its samples in both directions.
+        # The light in a pixel of 0.3 arcsec is the mean over its samples in both directions.
         core, wide = (
             galsim.Image(
                 _means(one.array, round(0.3 * pixels / one.scale))[most:-most, most:-most].copy(), scale=one.scale
             )
             for one in fine
         )
-        # The unit is the light of the whole sky.
+        # Fractions refer to the light on the whole sky.
         centre = wide.FindAdaptiveMom().moments_centroid
         ee50, ee80 = (wide.calculateHLR(flux=1.0, flux_frac=part, center=centre) for part in (0.5, 0.8))
         out += [core.calculateFWHM(center=core.FindAdaptiveMom().moments_centroid), ee50, ee80]
@@ -61,7 +61,7 @@ def widths(psf):
     params=[pytest.param(band, marks=[] if band == "euclid_h" else [pytest.mark.nightly]) for band in WIDTHS],
 )
 def found(request):
-    """Of a band, the widths on some detectors; of H, by day, on half of them."""
+    """Return a band, and the widths on some detectors; only H is tested every day, on half of them."""
     band, some = passbands.load(request.param), SOME[::2] if request.param == "euclid_h" else SOME
     return request.param, np.array(
         [widths(euclid.nisp_psf(detector("nisp", d, MISSION), band, MISSION, 1)) for d in some]
@@ -69,7 +69,10 @@ def found(request):
 
 
 def test_the_wavefront_has_its_size():
-    """70 nm in the mean over the field, nowhere a third more; low orders without piston, tip or tilt."""
+    """The wavefront error is 70 nm in the mean over the field, and nowhere a third more.
+
+    Its low orders have no piston, tip or tilt.
+    """
     axis = np.linspace(-1.0, 1.0, 11)
     some = np.array([euclid.wavefront(x, y, "nisp", MISSION) for x in axis for y in axis])
     rms = np.linalg.norm(some, axis=1)
@@ -77,7 +80,7 @@ def test_the_wavefront_has_its_size():
     assert rms.max() < 1.33 * MISSION.value("nisp.psf.wavefront_rms", "nm")
     assert some.shape[1] == 12
     assert (some[:, :4] == 0).all()
-    # The field is not the same everywhere.
+    # The wavefront changes over the field.
     assert some.std(axis=0).max() > 4.0
 
 
@@ -97,7 +100,7 @@ def test_every_detector_is_as_required(found):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", WIDTHS)
 def test_the_whole_field_is_as_required_and_as_wide_as_its_parts(name):
-    """Centres and corners of all detectors."""
+    """The widths of all detectors are measured."""
     band, each = passbands.load(name), []
     for d in detectors("nisp", MISSION):
         each.append(widths(euclid.nisp_psf(d, band, MISSION, 1)))
@@ -109,7 +112,7 @@ def test_the_whole_field_is_as_required_and_as_wide_as_its_parts(name):
 
 
 def test_the_planes_hold_the_light_and_the_last_frequency():
-    """Nothing beyond what is looked at: the optics reach 1.84 cycles a pixel in Y."""
+    """Higher frequencies have no light: the optics pass up to 1.84 cycles per pixel in Y."""
     psf = euclid.nisp_psf(detector("nisp", "DET23", MISSION), passbands.load("euclid_y"), MISSION, 1)
     planes = psf.planes
     assert (planes.samples, psf.side) == (euclid.NISP.samples, 256)
@@ -134,7 +137,7 @@ def test_a_detector_upside_down_sees_the_optics_turned():
 
 @pytest.mark.parametrize("name", [pytest.param("euclid_y", marks=pytest.mark.nightly), "euclid_h"])
 def test_eight_sub_bands_are_as_good_as_many(name):
-    """R2 and ellipticity of blue and red stars, and the light in 1", against 32 sub-bands."""
+    """R2 and ellipticity of blue and red stars, and the light in 1", agree with 32 sub-bands."""
     band, d, sampled = passbands.load(name), detector("nisp", "DET12", MISSION), euclid.NISP
     core = replace(sampled, transform=sampled.core_transform, side=sampled.core_side)
     nm, scale = euclid.wavefront(-0.3, 0.7, "nisp", MISSION), d.pixel_scale / sampled.samples
@@ -162,7 +165,7 @@ def test_eight_sub_bands_are_as_good_as_many(name):
     "name", [pytest.param(band, marks=[] if band == "euclid_h" else [pytest.mark.nightly]) for band in WIDTHS]
 )
 def test_stars_are_found_where_they_are(name):
-    """sep's windowed positions over all places within a pixel, in the middle and in a corner of a detector."""
+    """Windowed positions by sep are averaged within a pixel, in the middle and in a corner of a detector."""
     d = detector("nisp", "DET11", MISSION)
     psf = euclid.nisp_psf(d, passbands.load(name), MISSION, 9)
     system = wcs(d, *boresight_for(d, 10.0, 20.0, 0.0))

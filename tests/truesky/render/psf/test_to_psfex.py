@@ -1,4 +1,4 @@
-"""The PSF that is written beside an image: what galsim's reader of PSFEx makes of it is what was drawn."""
+"""The PSF file that is written with an image: galsim reads the PSF that was drawn."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ MISSION = resolve()
 
 
 def shape_of(image, column, row):
-    """(size, e1, e2) of a star's pixels about its place."""
+    """Return (size, e1, e2) of the pixels of a star around its position."""
     x, y = round(column), round(row)
     _, second = moments(image[y - 8 : y + 9, x - 8 : x + 9])
     (xx, xy), (_, yy) = second
@@ -30,7 +30,7 @@ def shape_of(image, column, row):
 
 
 def cut(camera, name, n=300):
-    """The middle of a detector."""
+    """Return the middle of a detector."""
     return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n)
 
 
@@ -43,7 +43,7 @@ def cut(camera, name, n=300):
     ],
 )
 def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, strength):
-    """Size within 1 %, ellipticity within 0.005, everywhere on the detector, whose PSF changes."""
+    """Sizes agree within 1 % and ellipticities within 0.005, everywhere on a detector with a variable PSF."""
     mission = resolve(overrides={f"ext.{camera}.psf.wavefront_scale": (strength, "")})
     whole = detectors.detector(camera, name, mission)
     air = ground.Air(0.7, (0.02, -0.01), -0.3)
@@ -65,7 +65,7 @@ def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, s
         assert theirs.max() == pytest.approx(ours.max(), rel=0.03)
         found.append(mine)
     assert np.abs(np.ptp(found, axis=0)).max() > 1e-4
-    # It is a PSF of one's own as well.
+    # The file can also be used as a PSF file of the user.
     back = from_file.read(path, whole, passbands.load(band))
     assert back.fwhm == pytest.approx(psf.fwhm, rel=0.01)
 

@@ -25,14 +25,14 @@ def night(camera, band):
 
 
 def brightness(camera, band, ra, dec, mjd):
-    """AB mag / arcsec2."""
+    """Return the sky brightness, AB mag / arcsec2."""
     zero_point, own = night(camera, band)
     rate = night_sky.sky_rate(own, ra, dec, mjd, MISSION)
     return zero_point - 2.5 * np.log10(rate / SCALES[camera] ** 2)
 
 
 def dates(site, ra, dec):
-    """Times in a month at which a field is nearly at its highest, and neither Sun nor Moon are up."""
+    """Return times in a month at which a field is nearly at its highest, and neither Sun nor Moon is up."""
     times = 60900.0 + np.arange(0.0, 30.0, 0.02)
     high = site.altitude(ra, dec, times)
     suns = [equatorial(observatory.sun_longitude(float(t)), 0.0) for t in times]
@@ -50,7 +50,7 @@ def dates(site, ra, dec):
     ],
 )
 def test_a_dark_zenith_far_from_the_ecliptic_has_its_level(camera, band, dark):
-    """Northern cameras, too."""
+    """The level is also correct for cameras in the north."""
     site = night(camera, band)[1].site
     fields = [(ra, site.latitude) for ra in range(0, 360, 15)]
     found = [brightness(camera, band, ra, dec, t) for ra, dec in fields for t in dates(site, ra, dec)]
@@ -65,7 +65,7 @@ def test_measured_levels_are_taken_as_they_are():
 
 
 def test_airglow_grows_with_airmass_and_is_dimmed():
-    """Krisciunas & Schaefer 1991, eq. 3 and 2: at an airmass of 2 a layer is 1.85 times as thick."""
+    """By Krisciunas & Schaefer 1991, eq. 3 and 2, a layer is 1.85 times as thick at an airmass of 2."""
     _, own = night("lsstcam", "lsst_y")
     site = own.site
     ra, dec = 100.0, -60.0
@@ -83,7 +83,7 @@ def test_airglow_grows_with_airmass_and_is_dimmed():
 
 
 def test_moonlight_is_krisciunas_and_schaefer_s():
-    """Their scattering, in V, of a Moon as they give it: brighter than dark sky by what they tell."""
+    """The reference is their scattering of moonlight in V, and the brightness of the sky that they give."""
     _, own = night("lsstcam", "lsst_g")
     own = replace(own, extinction=0.172)
     site = own.site
@@ -105,7 +105,7 @@ def test_moonlight_is_krisciunas_and_schaefer_s():
         )
         theirs = scattering * illuminance * 10 ** (-0.0688 * moon) * (1 - 10 ** (-0.0688 * field))
         assert found == pytest.approx(theirs, rel=1e-3)
-    # A full Moon at 60 deg: some 3 mag brighter in V than 21.6; the less the redder.
+    # A full Moon at 60 deg brightens the sky by about 3 mag from 21.6 in V, and less in redder bands.
     full = 60925.76 + np.arange(-1.0, 1.0, 0.02)
     mjd = float(full[np.argmax([observatory.moon_altitude(t, site) for t in full])])
     ra, dec, _ = (float(x) for x in observatory.moon_position(mjd))

@@ -1,4 +1,4 @@
-"""Sun, Moon and fields above an observatory: against astropy; night, and what a field is taken as that is not up."""
+"""Sun, Moon and fields above an observatory agree with astropy. Surveys wait for the night, if a field rises."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_altitudes_and_zenith_are_astropy_s(site):
         assert separation(ra, dec, body.ra.deg, body.dec.deg).max() < 0.5
         moon = get_body("moon", times, place).transform_to(frame)
         assert np.abs(moon.alt.deg - observatory.moon_altitude(times.mjd, site)).max() < 0.5
-    # Full on 7 September 2025, new on 21 September.
+    # The Moon is full on 7 September 2025, and new on 21 September.
     days = times.mjd[[np.argmin(phase), np.argmax(phase)]]
     assert abs(days[0] - 60925.76) < 1.3
     assert phase.min() < 15.0 < 165.0 < phase.max()
@@ -64,12 +64,12 @@ def test_surveys_wait_for_the_night(start):
     assert observatory.airmass_and_zenith(53.1, -27.8, found, LSST)[0] <= 2.0
     ra, dec, _ = observatory.moon_position(found)
     assert observatory.moon_altitude(found, LSST) < 0.0 or separation(53.1, -27.8, ra, dec) > 30.0
-    # The pole star is never seen from there.
+    # The pole star never rises there.
     assert observatory.next_dark_time(30.0, 89.0, start, LSST) == start
 
 
 def test_a_field_that_never_rises_is_not_waited_for(monkeypatch):
-    """400 days of each of a survey's exposures would be looked through in vain."""
+    """The search would look through 400 days in vain, for each exposure of a survey."""
     looked = []
     monkeypatch.setattr(
         observatory, "_is_dark", lambda ra, dec, mjd, site: looked.append(mjd) or np.zeros(len(mjd), bool)
@@ -77,7 +77,7 @@ def test_a_field_that_never_rises_is_not_waited_for(monkeypatch):
     assert observatory.next_dark_time(30.0, 80.0, 60000.3, LSST) == 60000.3
     assert observatory.next_dark_time(30.0, -60.0, 60000.3, CFHT) == 60000.3
     assert looked == []
-    # One that does is, whether it is high or just high enough.
+    # Fields that rise are searched, whether they are high or just high enough.
     for dec in (-30.0, 29.0):
         observatory.next_dark_time(30.0, dec, 60000.3, LSST)
         assert looked

@@ -1,4 +1,4 @@
-"""Thermal light: Planck's law by astropy, and what a warmer telescope does to a band."""
+"""Thermal light follows Planck's law by astropy, and a warmer telescope increases the light in a band."""
 
 import astropy.units as u
 import numpy as np
@@ -40,7 +40,7 @@ def test_the_level_is_the_mission_s():
 
 @pytest.mark.parametrize("body", ["telescope", "instrument"])
 def test_a_warmer_body_shines_more_by_its_part(body):
-    """Half of the light is each's; at the red end of H, 2.02 um, Wien's law says how much more."""
+    """Each body gives half of the light. At the red end of H, 2.02 um, Wien's law gives its growth."""
     key = f"nisp.thermal.{body}_temperature"
     before = MISSION.value(key, "K")
     for warmer in (2.0, 10.0, -10.0):

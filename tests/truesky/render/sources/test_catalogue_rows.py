@@ -1,4 +1,4 @@
-"""What a task reads: everything near, what is bright farther out, and how far that is all there is."""
+"""Rows that a task reads: all nearby sources, bright ones farther out, and the limit of completeness."""
 
 from dataclasses import asdict, dataclass, field
 
@@ -27,14 +27,14 @@ from truesky.request.accuracy import SURVEY
 BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
 MARGIN = MISSION.value("survey.selection_margin", "arcsec")
 FARTHER = stamp_sizes.reach(DETECTOR.pixel_scale) - MARGIN
-# A giant: in LSST 8e7 electrons, its light far above the noise a few minutes of arc away.
+# A giant galaxy: 8e7 electrons in LSST, with light far above the noise a few arcmin away.
 GIANT = {"disk_half_light_radius": 20.0, "bulge_half_light_radius": 15.0, "bulge_fraction": 1.0,
          "bulge_sersic_index": 4.0}  # fmt: skip
 
 
 @dataclass
 class Catalogue:
-    """Rows that lie in cells, seen within so many deg of them."""
+    """Rows that lie in cells. They are seen at most `bent` deg away."""
 
     rows: pa.Table
     cells: np.ndarray
@@ -58,7 +58,7 @@ class Catalogue:
 
 
 def place():
-    """A place such that what is seen 3 minutes of arc north of the detector lies in cells that are not needed."""
+    """Return a task that does not need the cells 3 arcmin north of its detector."""
     for dec in np.arange(-28.0, -27.0, 0.01):
         task = {"ra": 53.1, "dec": dec, "radius": (DETECTOR.half_diagonal + MARGIN) / 3600}
         if sky.cell_at([53.1], [dec + 190.0 / 3600], 8)[0] not in selection.cells_of_task(task, 0.0):
@@ -72,7 +72,10 @@ def limits_of(exposed, detector, band="euclid_vis", mission=MISSION):
 
 
 def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
-    """A detector with one galaxy so many arcsec north of its centre, as a task reads it, or as it stands."""
+    """Render a detector with one galaxy `distance` arcsec north of its centre.
+
+    The galaxy is read as by a task; if `found` is false, it is taken directly.
+    """
     task = {"detector": "R22_S11", **place()}
     ra, dec, angle = pointing.boresight_for(DETECTOR, task["ra"], task["dec"], 0.0)
     exposed = {**field_of("EXT")[1], "ra": ra, "dec": dec, "position_angle": angle}
@@ -104,7 +107,7 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
 
 
 def test_sources_beyond_the_reach_or_too_faint_do_not_change_the_image():
-    # No source shines up to this distance.
+    # No source is visible up to this distance.
     far = selection.FARTHEST + DETECTOR.half_diagonal + 1.0
     empty = rendered(far, found=False)
     assert len(empty.sources) == 0
@@ -116,7 +119,7 @@ def test_sources_beyond_the_reach_or_too_faint_do_not_change_the_image():
 
 
 def test_where_the_catalogue_ends_is_said():
-    """With the needed cells alone nothing is refused, but the giant beyond them is not known."""
+    """If the catalogue has only the needed cells, nothing is refused, but the giant outside them is missing."""
     one = rendered(190.0, drawn=lambda task: set(selection.cells_of_task(task, 0.0)))
     assert len(one.sources) == 0
     assert MARGIN <= one.complete_margin_arcsec < 190.0 - DETECTOR.half_diagonal
@@ -124,7 +127,7 @@ def test_where_the_catalogue_ends_is_said():
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(0, 0.05), st.floats(0, 1), st.floats(0, 6.28))
 def test_sources_are_found_however_they_are_deflected(ra, dec, deflection, where, direction):
-    """Seen at the circle's edge or inside it, truly as far out as the deflection allows."""
+    """The source is seen inside the circle or at its edge. Its true position is at most the deflection away."""
     task = {"ra": ra, "dec": dec, "radius": 0.1}
     distance = where * (task["radius"] + deflection)
     b = np.radians(dec)
@@ -152,7 +155,7 @@ def test_completeness_ends_before_the_first_cell_that_is_missing(ra, dec, farthe
 
 
 def test_the_bound_on_what_shows_holds():
-    """Whatever the profile, a source below the bound is below the edge at that distance."""
+    """A source below the limit is below the edge at that distance, for any profile."""
     settings = settings_for(SURVEY)
     least = stamp_sizes.min_noticeable_electrons(MARGIN, 0.2, 40.0, settings)
     for index in (0.5, 1.0, 4.0, 6.0):
@@ -178,11 +181,11 @@ def test_a_frame_that_no_source_shows_in_reads_none(dark):
 
 
 def test_bright_stars_are_read_up_to_the_visible_length_of_their_spikes():
-    """Eighteen minutes of arc: one of them, and none where there are no spikes or no light."""
+    """Spikes are visible for 18 arcmin: one star is read, and none if there are no spikes or no light."""
     detector, task = small("vis", "3-4"), place()
     exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
     spikes = limits_of(exposed, detector).spikes
-    # A star of 11.2 mag where those of all magnitudes end (3.4 minutes of arc), in a nominal exposure.
+    # In a nominal exposure, the limit is 11.2 mag at 3.4 arcmin, up to which all stars are read.
     assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(11.2, abs=0.3)
     rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
     light = fluxes(rows, "euclid_vis", np.array([1.5, 0.5]) * spikes)
@@ -207,7 +210,7 @@ def test_bright_stars_are_read_up_to_the_visible_length_of_their_spikes():
 
 @dataclass
 class Whole:
-    """A catalogue's rows of one file."""
+    """Rows of a catalogue with one file."""
 
     table: pa.Table
     cells: list
@@ -228,7 +231,7 @@ class Whole:
 
 @pytest.mark.parametrize(("farther", "seen"), [(0.0, 0), (300.0, 1)])
 def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
-    """A lens 200" beyond the circle, and what lies behind it, however faint."""
+    """A lens is 200" outside the circle. The galaxy behind it is read, although it is faint."""
     task = place()
     where = task["ra"], task["dec"] + task["radius"] + 200.0 / 3600
     cells = sky.cell_at([where[0]], [where[1]], 8)
@@ -248,7 +251,7 @@ def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
 
 
 def test_rows_shared_by_several_exposures_are_read_once():
-    """Of two bands, three circles, several limits and columns, the sources that a filter of the whole finds."""
+    """Queries with several bands, circles, limits and columns return the same sources as a filter of all rows."""
     rng = np.random.default_rng(3)
     task = place()
     ra, dec = (task[name] + rng.uniform(-0.8, 0.8, 400) for name in ("ra", "dec"))
@@ -290,7 +293,7 @@ def test_rows_shared_by_several_exposures_are_read_once():
 
 @dataclass
 class Files:
-    """A catalogue's files, or its fluxes': each of some cells."""
+    """Files of a catalogue or of its fluxes, each with some cells."""
 
     columns: tuple
     cells: dict
@@ -310,7 +313,7 @@ class Files:
 
 @pytest.mark.parametrize(("channel", "camera", "name"), [("VIS", "vis", "3-4"), ("EXT", "lsstcam", "R22_S11")])
 def test_large_galaxies_are_read_and_drawn_up_to_their_visible_radius(channel, camera, name):
-    """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
+    """A galaxy of 7 mag and two arcmin is drawn from a third of a degree away. A small or a faint one is not."""
     detector, task = small(camera, name), place()
     exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
     band = "euclid_vis" if channel == "VIS" else "lsst_r"
@@ -371,7 +374,7 @@ def test_a_product_depends_on_distant_sources_that_may_be_visible():
 
 @given(st.floats(-89.9, 89.9), st.floats(-5000.0, 5000.0), st.floats(-5000.0, 5000.0), st.floats(51544.5, 70000.0))
 def test_stars_move_along_great_circles(dec, east, north, mjd):
-    """As astropy carries them (without parallax and radial velocity); one whose motion is not known stays."""
+    """Positions agree with astropy (without parallax and radial velocity). Stars without a known motion stay."""
     from astropy import units as u
     from astropy.coordinates import SkyCoord
     from astropy.time import Time
@@ -389,7 +392,7 @@ def test_stars_move_along_great_circles(dec, east, north, mjd):
         obstime=Time(2015.5, format="jyear"),
     ).apply_space_motion(Time(mjd, format="mjd"))
     apart = sky.separation(found["ra"].to_numpy()[:1], found["dec"].to_numpy()[:1], there.ra.deg, there.dec.deg)
-    # astropy's path is straight in space: a millionth of its length beside the circle's.
+    # The path of astropy is straight in space, which differs from the circle by a millionth of its length.
     assert 3.6e6 * apart[0] < 0.1
     assert found.schema.equals(rows.schema)
     assert catalogue_rows.apply_proper_motion(stars([10.0], [dec]), mjd).equals(stars([10.0], [dec]))

@@ -1,4 +1,4 @@
-"""Spiral arms and knots: light is moved about on a disc, by the galaxy's own random numbers."""
+"""Spiral arms and knots: the light of a disc is redistributed, by random numbers of the galaxy."""
 
 from dataclasses import replace
 
@@ -20,14 +20,14 @@ SIDE = 192
 
 
 def smooth(side=SIDE):
-    """(exponential disc on a picture's pixels, radius in scale lengths)."""
+    """Return (exponential disc on the pixels of a picture, radius in scale lengths)."""
     at = (np.arange(side) - 0.5 * (side - 1)) * (2 * REACH / side)
     radius = np.hypot(at, at[:, None])
     return np.exp(-radius) * (2 * REACH / side) ** 2 / (2 * np.pi), radius
 
 
 def half_light(image, radius):
-    """Radius of the circle that holds half of the light of a disc of flux 1, some of which lies beyond the image."""
+    """Return the radius of the circle with half of the light of a disc of flux 1, partly outside the image."""
     order = np.argsort(radius, axis=None)
     grown = np.cumsum(image.ravel()[order], dtype=float)
     return np.interp(0.5, grown, radius.ravel()[order])
@@ -42,7 +42,7 @@ def arms(seed, wanted, bulge=0.1, side=SIDE):
     st.integers(0, 10**6), st.floats(0.0, 2.0), st.floats(0.0, 0.5), st.integers(20, 1000), st.floats(0.0, 0.49),
 )  # fmt: skip
 def test_flux_and_half_light_radius_stay(seed, contrast, knots, number, bulge):
-    """Of few knots that have half of the light, too; and no place is darker than dark."""
+    """This also holds for a few knots with half of the light, and no pixel is negative."""
     found, (disc, radius) = arms(seed, Arms(contrast, knots, number), bulge), smooth()
     assert abs(found.sum()) < 1e-6
     assert (disc + found).min() > -1e-9
@@ -51,7 +51,7 @@ def test_flux_and_half_light_radius_stay(seed, contrast, knots, number, bulge):
 
 
 def test_it_is_there():
-    """Arms of the contrast that is asked for: the brightest tenth of a circle over its mean; knots above them."""
+    """Arms have the requested contrast: the brightest tenth of a circle over its mean. Knots are brighter."""
     disc, radius = smooth()
     ring = (radius > 1.5) & (radius < 2.0)
     for contrast in (0.4, 0.8, 1.5):
@@ -62,7 +62,7 @@ def test_it_is_there():
 
 
 def test_arms_are_logarithmic_spirals_of_ten_to_thirty_degrees():
-    """The strongest spiral of a ring's Fourier transform over angle and log radius: its pitch is that of the arms."""
+    """The pitch follows from the strongest spiral in the Fourier transform of a ring over angle and log radius."""
     radii, angles = np.exp(np.linspace(np.log(1.0), np.log(3.4), 64)), np.linspace(0, 2 * np.pi, 128, endpoint=False)
     disc, _ = smooth(384)
     at = (np.arange(384) - 191.5) * (2 * REACH / 384)

@@ -1,4 +1,4 @@
-"""Moving bodies of the user's own: tables in three formats, drawn as ours are; what is wrong is said in a line."""
+"""Moving bodies of the user: tables in three formats are drawn like built-in bodies; errors have one line."""
 
 import gzip
 import os
@@ -46,7 +46,10 @@ def written(path, values):
 
 
 def test_a_table_of_our_own_population_is_drawn_as_ours(tmp_path):
-    """In each format, with a column more: the same places, motions and light; of another day, nothing."""
+    """Positions, motions and light are the same in each format, and another day has no bodies.
+
+    The table has an additional column.
+    """
     ours = solar_system.population(*PLACE, 0.1, DAY, MISSION, 1)
     assert len(ours.ids) > 100
     detector = small("vis", "3-4")
@@ -75,13 +78,13 @@ def test_a_body_is_where_the_table_says_when_it_says(tmp_path):
     body = ephemerides.read(written(tmp_path / "one.csv", values), "one").on_day(DAY)
     hours = 24 * (0.25 - 0.5)
     np.testing.assert_allclose(body.positions_after(hours), np.array(equatorial([359.99], [-3.0])), atol=1e-9)
-    # Ten hours later, 360" east and 180" south.
+    # Ten hours later, the body is 360" east and 180" south.
     wanted = equatorial([359.99 + 0.1 / np.cos(np.radians(3.0))], [-3.05])
     np.testing.assert_allclose(body.positions_after(hours + 10.0), np.array(wanted), atol=1e-6)
 
 
 def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
-    """One bright body in the middle of the detector, where ours would have none."""
+    """One bright body of the table is in the middle of the detector; built-in bodies are missing."""
     detector = small("vis", "3-4", 256)
     ra, dec, angle = nominal.pointing(detector)
     centre = astrometry.centre(detector, astrometry.wcs(detector, ra, dec, angle))
@@ -93,14 +96,14 @@ def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
     assert len(one.sources) == 1
     length = np.hypot(*one.sources.trail[0]) * 0.1
     assert length == pytest.approx(60.0 * nominal.TIME / 3600, rel=1e-3)
-    # It begins in the middle.
+    # The trail begins in the middle.
     begin = one.sources.column[0] - one.sources.trail[0, 0] / 2, one.sources.row[0] - one.sources.trail[0, 1] / 2
     assert begin == pytest.approx((127.5, 127.5), abs=0.01)
     assert one.noise_free[:, 100:].sum() > 1e5
 
 
 def test_bright_bodies_shine_around_corners(tmp_path):
-    """One on the detector and one beside it: as points along their trails, with all of their light."""
+    """A body on the detector and one outside it contribute as points along their trails, with all their light."""
     detector = small("vis", "3-4", 256)
     ra, dec, angle = nominal.pointing(detector)
     system = astrometry.wcs(detector, ra, dec, angle)
@@ -128,7 +131,7 @@ def test_bright_bodies_shine_around_corners(tmp_path):
 
 @pytest.mark.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)])
 def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
-    """As a star does that stands where it is in the middle of the exposure, far from either."""
+    """Far from the body, its light equals the light of a star at its position in the middle of the exposure."""
     detector = small("vis", "3-4", 256)
     system = astrometry.wcs(detector, *nominal.pointing(detector))
     lon, lat = ecliptic(*astrometry.sky_of_pixel(system, np.array([127.5]), np.array([-away])))
@@ -139,7 +142,7 @@ def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
     found = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{away}").on_day)
     star = nominal.rendered(detector, [5.0], [127.5], [-away], forced=quiet)
     assert found.sources.trail_length == pytest.approx([rate * nominal.TIME / 360.0], rel=1e-3, abs=0.01)
-    # Where no spikes are; it is bluer than the star.
+    # The median excludes spikes. The body is bluer than the star.
     law = np.median(star.noise_free, axis=1)
     assert law.min() > 1.0
     np.testing.assert_allclose(np.median(found.noise_free, axis=1), law, rtol=0.05)
@@ -170,7 +173,7 @@ def test_what_is_no_table_is_refused(tmp_path):
     plain = written(tmp_path / "plain.fits", values).read_bytes()
     rows = f"NAXIS2  = {len(values['mjd']):20d}"
     assert rows.encode() in plain
-    # Packed: cut short, and of more bytes than fit into memory.
+    # Compressed files: one is truncated, and one contains more bytes than fit into memory.
     half = gzip.compress(plain)[:-4000]
     promising = plain.replace(rows.encode(), f"NAXIS2  = {10**9:20d}".encode())
     for name, data in (("a.csv", b"mjd,lon\n1,2,3\n"), ("b.parquet", b"PAR1 and no more"), ("c.fits", b"SIMPLE"),
@@ -203,7 +206,7 @@ def test_a_column_that_is_there_twice_is_refused(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_body_has_one_row_a_day(tmp_path, kind):
-    """An ephemeris by the hour would draw each body in every one of them."""
+    """An hourly ephemeris would draw each body once per row."""
     hours = np.arange(0.0, 48.0, 6.0)
     one = {**{key: np.full(len(hours), 1.0) for key in ephemerides.KEYS}, "mjd": DAY + hours / 24.0}
     daily = [0, 4]
@@ -216,7 +219,7 @@ def test_a_body_has_one_row_a_day(tmp_path, kind):
         few = {key: np.asarray(column)[daily] for key, column in {**one, "name": names}.items()}
         file = written(tmp_path / f"daily-{names[0]}.{kind}", few)
         assert ephemerides.read(file, f"daily of {names[0]}").day.tolist() == [DAY, DAY + 1]
-    # Others beside it, whose rows it stands between.
+    # The rows of a body may be separated by rows of other bodies.
     three = {**{key: [1.0] * 3 for key in ephemerides.KEYS}, "name": ["Ceres", "Pallas", "Ceres "]}
     with pytest.raises(BadInput, match=r"name of row 3 is 'Ceres', which already has a row for MJD 1 \(1 of 3 rows"):
         ephemerides.read(written(tmp_path / f"between.{kind}", three), "between")
@@ -250,7 +253,7 @@ def test_names_without_end_are_refused(tmp_path):
 
 
 def test_parquet_with_too_many_columns_is_refused(tmp_path):
-    """Parquet files of users are read by a separate process with limits."""
+    """A separate process with limits reads Parquet files of users."""
     names = [*ephemerides.KEYS, *(f"c{i}" for i in range(6000))]
     file = tmp_path / "wide.parquet"
     pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), file)
@@ -287,7 +290,7 @@ def test_a_table_that_no_worker_can_hold_is_refused(tmp_path, monkeypatch, kind)
 
 
 def test_file_format_is_recognised_by_content_not_by_name(tmp_path):
-    """FITS under any name, packed as well."""
+    """FITS files are recognised under any name, also if they are compressed."""
     values = columns(solar_system.population(*PLACE, 0.1, DAY, MISSION, 1))
     plain = written(tmp_path / "bodies.fits", values)
     expected = ephemerides.read(plain, "plain").rows
@@ -318,7 +321,7 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     path.write_text(demo + '\n[solar_system]\nbodies = "bodies.csv"\n', encoding="utf-8")
     request = parse(path)
     assert request.bodies == tmp_path / "bodies.csv"
-    # A dark one of another day sees none.
+    # A dark exposure on another day does not need bodies.
     kinds = (("VIS", "science", DAY + 0.3), ("EXT", "science", DAY + 90.0), ("VIS", "dark", DAY + 90.0))
     rows = [fields.exposure(channel=channel, image_type=kind, mjd=mjd) for channel, kind, mjd in kinds]
     exposed = pa.Table.from_pylist([asdict(row) for row in rows])
@@ -326,7 +329,7 @@ def test_a_request_names_it(tmp_path, monkeypatch):
         keys.ephemeris_files(request.bodies, exposed)
     request.bodies.write_bytes(b"")
     with monkeypatch.context() as patch:
-        # Whoever runs the tests may read everything.
+        # The user who runs the tests may have access to all files, so the refusal is simulated.
         patch.setattr(os, "open", forbidden)
         with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: Permission denied"):
             keys.ephemeris_files(request.bodies, exposed)
@@ -345,23 +348,23 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)]
 )
 def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
-    """What it leaves as it passes the detector goes with the time that it takes across."""
+    """The light that a body leaves on the detector is proportional to the time it takes to cross it."""
     detector = small("vis", "3-4", 256)
     system = astrometry.wcs(detector, *nominal.pointing(detector))
     lon, lat = (float(x) for x in ecliptic(*astrometry.centre(detector, system)))
-    # In the middle when a tenth of the exposure is over: the middle of its trail lies elsewhere.
+    # The body is in the middle after a tenth of the exposure, so the middle of its trail is elsewhere.
     when = 60906.0 + 0.1 * nominal.TIME / 86400.0
     values = {"mjd": [when], "lon": [lon], "lat": [lat], "east": [rate * np.cos(turn)], "north": [rate * np.sin(turn)]}
     file = written(tmp_path / "fast.parquet", {**values, "mag": [12.0]})
     quiet = nominal.off(*nominal.COSMIC_RAYS)
     one = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{rate}").on_day)
     assert len(one.sources) == 1
-    # What is far from the detector is cut off.
+    # Parts far from the detector are cut off.
     (length,), (trail,) = one.sources.trail_length, one.sources.trail
     whole = rate * nominal.TIME / 360.0
     reach = 10.0 * (detector.half_diagonal + 204.8)
     assert length == pytest.approx(min(0.1 * whole, reach) + min(0.9 * whole, reach), rel=1e-2)
-    # Electrons of a pixel of the trail, times what of it lies on a square: it begins there, or crosses it.
+    # Electrons per pixel of the trail, times its length in a square, in which it begins or which it crosses.
     bright = nominal.TIME * 10 ** (0.4 * (one.zero_point - 12.0)) / whole
     assert one.sources.electrons[0] / length == pytest.approx(bright, rel=0.03)
     half = 28.0 * length / np.abs(trail).max()
@@ -373,7 +376,7 @@ def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
 
 
 def test_a_body_comes_near_on_its_way():
-    """Of trails past a place those are found that come within the circle, wherever their middles are."""
+    """Trails are found if they come within the circle, wherever their middles are."""
     rng, n, reach = np.random.default_rng(1), 4000, 0.3
     lon, lat, angle = 70.0 + rng.uniform(-2, 2, n), rng.uniform(-2, 2, n), rng.uniform(0, 2 * np.pi, n)
     rate = 10.0 ** rng.uniform(2, 5, n)
@@ -391,7 +394,7 @@ def test_a_body_comes_near_on_its_way():
     sure = np.abs(away - reach) > 1e-3
     np.testing.assert_array_equal(np.isin(bodies.ids, found.ids)[sure], (away < reach)[sure])
     assert 100 < len(found) < 1000
-    # No more of a trail is kept than the circle is wide, as bright as the whole.
+    # At most the part of a trail within the circle is kept, as bright per length as the whole.
     kept = found.trail_length * detector.pixel_scale / 3600.0
     assert kept.max() <= 2.01 * reach
     light = found.electrons / found.trail_length * rate[found.ids]

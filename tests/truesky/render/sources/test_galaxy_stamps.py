@@ -1,4 +1,4 @@
-"""Galaxies of a library: a stamp of a profile is drawn as the profile; what is no library is refused by its name."""
+"""Galaxies of a library: a stamp of a profile is drawn like the profile, and invalid libraries are refused."""
 
 from dataclasses import replace
 
@@ -18,13 +18,13 @@ from truesky.render.sources import galaxy_shapes, galaxy_stamps
 from truesky.render.sources.galaxy_stamps import GalaxyStamps
 from truesky.request.structure import Stamps
 
-# (Sersic index, axis ratio, deg from the columns towards the rows) of stamps of 12 pixels half-light radius.
+# (Sersic index, axis ratio, deg from the columns towards the rows) of stamps with a half-light radius of 12 pixels.
 KINDS = [(1.0, 0.6, 20.0), (1.0, 1.0, 0.0), (2.0, 0.8, 110.0), (1.0, 0.3, 75.0)]
 RADIUS = 12.0
 
 
 def stamp(index, ratio, angle, side=192):
-    """As galsim draws it, without a PSF but the stamp's pixels."""
+    """Return a drawing by galsim, without a PSF except the pixels of the stamp."""
     body = galsim.Sersic(index, half_light_radius=RADIUS * np.sqrt(ratio))
     turned = body.shear(q=ratio, beta=angle * galsim.degrees)
     return turned.drawImage(nx=side, ny=side, scale=1.0, dtype=float).array
@@ -48,7 +48,7 @@ def stamps(path, seed=1, **wanted):
 
 
 def rows(stamp, **columns):
-    """Galaxies with the column that names a stamp."""
+    """Return galaxies with a column of stamp numbers."""
     found = galaxies(np.full(len(stamp), 10.0), np.full(len(stamp), 20.0), **columns)
     return found.append_column("stamp", pa.array(stamp, pa.int32()))
 
@@ -60,7 +60,7 @@ def test_a_library_is_measured(cube):
     apart = np.degrees(found.angle) - [angle for *_, angle in KINDS]
     assert np.abs((apart + 90.0) % 180.0 - 90.0)[[0, 2, 3]].max() < 0.2
     np.testing.assert_allclose(found.images.sum(axis=(1, 2)), 1.0, rtol=1e-5)
-    # The bulge is the most concentrated.
+    # The stamp of a bulge is the most concentrated.
     assert found.inner.argmax() == 2
 
 
@@ -72,7 +72,7 @@ def test_a_library_is_measured(cube):
     ],
 )
 def test_a_stamp_of_a_profile_is_drawn_as_the_profile(cube, number, body, monkeypatch):
-    """In place, flux, size, orientation and shear; a stamp has pixels of a twelfth of the radius."""
+    """Position, flux, size, orientation and shear agree. The pixels of a stamp are a twelfth of the radius."""
     body |= {"bulge_sersic_index": 2.0, "position_angle": 35.0, "kappa": 0.05, "gamma1": 0.1, "gamma2": 0.07}
     direct, _ = with_structure("VIS", None, body)
 
@@ -91,14 +91,14 @@ def test_a_stamp_of_a_profile_is_drawn_as_the_profile(cube, number, body, monkey
     (centre, second), (at, wanted) = (moments(image) for image in bright)
     np.testing.assert_allclose(centre, at, atol=0.02)
     np.testing.assert_allclose(second, wanted, atol=0.015 * np.trace(wanted))
-    # A galaxy that names none is drawn as ever, bit by bit.
+    # A galaxy without a stamp number is drawn as a profile, bit by bit.
     monkeypatch.setattr("tests.truesky.render.drawing.test_structure.galaxies", galaxies)
     np.testing.assert_array_equal(with_structure("VIS", None, body, stamps=stamps(cube))[0].science, direct.science)
     assert images[0].shape == (SIDE, SIDE)
 
 
 def test_a_stamp_lies_along_the_row_s_position_angle(cube):
-    """Its major axis, whichever way it lies in the file, and as long as the row says."""
+    """The major axis has the position angle and the length in the row, whatever its direction in the file is."""
     table = rows([0, 2, 3], position_angle=[10.0, 80.0, 140.0], disk_half_light_radius=[1.0, 2.0, 0.5])
     number, found = galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), stamps(cube))
     assert number.tolist() == [0, 1, 2]
@@ -107,7 +107,7 @@ def test_a_stamp_lies_along_the_row_s_position_angle(cube):
         along = own.radius[which] * np.array([np.cos(own.angle[which]), np.sin(own.angle[which])])
         west, north = picture.matrix @ along
         assert np.hypot(west, north) == pytest.approx(radius, rel=1e-6)
-        # North through east.
+        # The angle counts from north through east.
         assert np.degrees(np.arctan2(-west, north)) % 180.0 == pytest.approx(angle, abs=1e-4)
 
 
@@ -121,7 +121,7 @@ def test_the_nearest_in_shape_are_drawn_by_the_galaxy_s_identifier(tmp_path):
     number, found = galaxy_stamps.assign_pictures(table, shape, wanted)
     assert number[-1] == -1
     which = [int(np.argmax([np.array_equal(p.image, image) for image in wanted.library.images])) for p in found]
-    # Eight of them, all nearly as round as the disc is seen, about as often.
+    # Eight stamps are used about equally often. They are nearly as round as the inclined disc.
     assert set(which) == set(range(8, 16)) or set(which) == set(range(9, 16)) | {7}
     assert np.bincount(which)[min(which) :].min() > 15
     some = np.arange(0, n, 7)
@@ -130,7 +130,7 @@ def test_the_nearest_in_shape_are_drawn_by_the_galaxy_s_identifier(tmp_path):
     assert all(np.array_equal(*pair) for pair in pairs)
     _, other = galaxy_stamps.assign_pictures(table, shape, replace(wanted, seed=2))
     assert any(not np.array_equal(a.image, b.image) for a, b in zip(found, other, strict=True))
-    # Where it is not asked for, those that name a stamp have one alone.
+    # Unless the nearest stamps are requested, only galaxies with a stamp number have a picture.
     assert not galaxy_stamps.assign_pictures(table, shape, stamps(path))[1]
 
 

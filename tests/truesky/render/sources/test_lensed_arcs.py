@@ -6,7 +6,7 @@ from truesky.render.sources.lensed_arcs import Picture
 
 @pytest.mark.parametrize("along", [0, 1])
 def test_half_of_the_light_of_a_stretched_picture(along):
-    """Of a line of pixels along one axis half lies in its inner half, whatever a step along the other is."""
+    """Half of the light of a line along one axis is in its inner half, whatever the step along the other axis is."""
     image = np.zeros((41, 41), np.float32)
     image[20, :] = 1.0 / 41
     picture = Picture(image if along == 0 else image.T, np.diag([-0.05, 0.02]))
@@ -14,7 +14,7 @@ def test_half_of_the_light_of_a_stretched_picture(along):
 
 
 def test_half_of_the_light_of_a_sheared_picture():
-    """Steps along rows and columns that are neither alike nor square, pixel by pixel."""
+    """Steps along rows and columns differ and are not orthogonal. The reference sums the pixels."""
     rng = np.random.default_rng(3)
     image = rng.random((30, 50)).astype(np.float32)
     image /= image.sum()

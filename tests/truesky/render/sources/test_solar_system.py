@@ -1,4 +1,4 @@
-"""Bodies of the Solar System: how many there are, how they move, and the trails they leave."""
+"""Bodies of the Solar System: their numbers, their motions and their trails."""
 
 from types import MappingProxyType
 
@@ -29,18 +29,18 @@ SIDE = 256
 
 
 def test_counts_and_motions_are_the_mission_s():
-    """Sample of all within two degrees; significance 6e-7 of numbers (5 standard errors), 1e-4 of the law of rates."""
+    """Sample of all bodies within 2 deg; significance 6e-7 of numbers (5 standard errors), 1e-4 of the law of rates."""
     found = solar_system.population(*ECLIPTIC, 1.0, DAY, MISSION, 1)
     assert len(np.unique(found.ids)) == len(found.ids)
     assert set(kind_from_id(found.ids)) == {solar_system.KIND}
     inside = np.abs(found.lat) < 1.0
-    # The volume of a strip about the ecliptic, within what was drawn around it.
+    # Bodies in a strip along the ecliptic, within the radius of the sample.
     chosen = inside & (sky.separation(*equatorial(found.lon, found.lat), *ECLIPTIC) < 2.0)
     lat = np.linspace(-1.0, 1.0, 2001)
     width = 2.0 * np.sqrt(4.0 - lat**2)
     expected = np.trapezoid(solar_system.density(lat, MISSION) * width, lat)
     assert chosen.sum() == pytest.approx(expected, abs=5 * np.sqrt(expected))
-    # 60 deg-2 at 15 deg down to I_E = 24.5, 0.3 dex a magnitude.
+    # 60 deg-2 at 15 deg down to I_E = 24.5, with a slope of 0.3 dex per magnitude.
     assert solar_system.density(15.0, MISSION) * 10 ** (-0.3 * 1.5) == pytest.approx(60.0)
     assert solar_system.density(90.0, MISSION) == solar_system.density(-60.0, MISSION)
     assert np.mean(found.mag < 25.0) == pytest.approx(10**-0.3, abs=0.02)
@@ -76,7 +76,7 @@ def test_they_shine_like_the_sun():
 
 @pytest.mark.parametrize("line", [(0.0, 0.0), (5.0, 0.0), (40.0, -25.0), (-150.0, 90.0)])
 def test_a_trail_is_a_row_of_points(line):
-    """As many as make no difference."""
+    """The number of points is so large that more points make no difference."""
     detector = small("vis", "3-4", SIDE)
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, 10.0, 20.0, 0.0))
     point = one_source(detector, system, 1e5)
@@ -103,7 +103,7 @@ def test_a_trail_is_a_row_of_points(line):
 
 
 def crowded(overrides=MappingProxyType({})):
-    """A small frame on the ecliptic where bodies are dense."""
+    """Render a small frame on the ecliptic with a high density of bodies."""
     few = {"env.solar_system.density": (3e3, "deg-2"), "env.solar_system.fast_rate_max": (61.0, "arcsec / h")}
     mission = resolve(overrides=few | dict(overrides))
     detector = small("vis", "3-4", SIDE)
@@ -124,17 +124,17 @@ def test_trails_are_in_the_image_and_in_its_truth():
     assert len(truth) > 3
     length = np.hypot(truth["trail_x"], truth["trail_y"])
     assert set(truth["method"].to_pylist()) == {truth_table.TRAIL}
-    # 10 to 60 arcsec an hour: the fast ones are no faster here.
+    # Rates are 10 to 60 arcsec per hour. Fast bodies are no faster in this mission.
     hours, scale = 560.0 / 3600.0, 0.1
     assert length.min() > 9.9 * hours / scale
     assert length.max() < 61.6 * hours / scale
     x, y = np.asarray(truth["x"]), np.asarray(truth["y"])
     lon, lat = ecliptic(*astrometry.sky_of_pixel(one.wcs, x, y))
     end = ecliptic(*astrometry.sky_of_pixel(one.wcs, x + truth["trail_x"], y + truth["trail_y"]))
-    # Along the ecliptic, eastward.
+    # Trails run eastward along the ecliptic.
     assert (end[0] > lon).mean() > 0.9
     assert np.median(np.abs(end[1] - lat)) < 0.02 / 3600
-    # What fell onto the frame, and wings beyond stamps.
+    # The frame contains the drawn light, and wings beyond stamps.
     assert one.noise_free.sum(dtype=float) == pytest.approx(np.sum(truth["drawn"]), rel=0.05)
     assert np.sum(truth["drawn"]) > 0
     quiet = crowded({"env.solar_system.density": (0.0, "deg-2")})

@@ -1,4 +1,4 @@
-"""Spectra of sources: their own, of one photon that the band detects."""
+"""Spectra of sources, normalised to one photon that the band detects."""
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +15,7 @@ SUN = np.linspace(2.0, 1.0, COUNT)
 
 
 def galaxies():
-    """One with a line, one quasar, one more."""
+    """Return a galaxy with a line, a quasar, and another galaxy."""
     columns = {name: [0.0] * 3 for name in colours.GALAXY_COLUMNS}
     columns |= {
         "id": [1, 2, 3], "kind": [0, 2, 1], "z_obs": [1.3, 2.0, 0.4], "abs_mag_r01": [-20.0] * 3, "mag_r01": [22.0] * 3,

@@ -17,7 +17,7 @@ HITS = 0.02
 
 
 def system(shift=(0.0, 0.0), ra=10.0, dec=-20.0, side=2 * SIDE, stretch=1.0):
-    """A plain projection whose header is wrong by a shift (pixels) and a stretch (factor)."""
+    """Return a simple projection whose header is wrong by a shift (pixels) and a stretch (factor)."""
     out = WCS(naxis=2)
     out.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     out.wcs.crval = [ra, dec]
@@ -27,7 +27,7 @@ def system(shift=(0.0, 0.0), ra=10.0, dec=-20.0, side=2 * SIDE, stretch=1.0):
 
 
 def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
-    """Isolated stars on a jittered lattice."""
+    """Return isolated stars on a jittered lattice."""
     per = int(np.ceil(np.sqrt(n)))
     step = (side - 80) / per
     x, y = (axis.ravel()[:n] for axis in np.meshgrid(*[40 + step * (np.arange(per) + 0.5)] * 2))
@@ -39,7 +39,7 @@ def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
 
 
 def known(x, y, mag, seconds=SECONDS):
-    """Reference data of these points, as from the tables of a lake."""
+    """Return reference data of points, as from the tables of a lake."""
     n = len(x)
     ra, dec = system().all_pix2world(x, y, 0)
     electrons = seconds * 10 ** (-0.4 * (mag - ZERO_POINT))
@@ -48,7 +48,7 @@ def known(x, y, mag, seconds=SECONDS):
 
 
 def light(of, side=2 * SIDE, fwhm=FWHM / SCALE, round_=1.0):
-    """Expected e- of points, each a Gaussian averaged over pixels; round_ is the ratio of height to width."""
+    """Return expected e- of points, each a Gaussian averaged over pixels; `round_` is the ratio of height to width."""
     out = np.zeros((side, side))
     sigma = np.sqrt(max(fwhm**2 - 0.7, 0.2)) / 2.3548
     edge = np.arange(-24, 26) - 0.5
@@ -63,7 +63,7 @@ def light(of, side=2 * SIDE, fwhm=FWHM / SCALE, round_=1.0):
 
 
 def hit(rng, image, part=HITS):
-    """Tracks of eight pixels along rows, 1,500 e- each."""
+    """Add tracks of eight pixels along rows, with 1,500 e- each."""
     out, n = image.copy(), int(part * image.size / 8)
     for y, x in zip(rng.integers(0, image.shape[0], n), rng.integers(0, image.shape[1] - 8, n), strict=True):
         out[y, x : x + 8] += 1500.0
@@ -71,9 +71,10 @@ def hit(rng, image, part=HITS):
 
 
 def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise=NOISE, zero_point=ZERO_POINT):
-    """A raw file of four quadrants with pre- and overscan.
+    """Write a raw file of four quadrants with prescan and overscan, and return its path.
 
-    electrons : counted in each pixel;  shift : of the header's WCS;  told, read : gain of the header, and the true one
+    `electrons` contains the counted electrons of each pixel. `shift` is the error of the header's WCS. `told` is the
+    gain in the header, and `read` is the true gain.
     """
     cards = {
         "CHANNEL": "VIS", "IMAGETYP": "science", "EXPTIME": SECONDS, "PIXSCALE": SCALE, "PSFFWHM": FWHM,
@@ -98,12 +99,12 @@ def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise
 
 
 def image(data, cards, name=""):
-    """A unit of a file."""
+    """Return a unit of a FITS file."""
     return images.Image(data, tuple((key, value, "") for key, value in cards.items()), name)
 
 
 def placed(place, x=0, y=0):
-    """WCS cards of pixels that begin at an offset in an array."""
+    """Return WCS cards of pixels that begin at an offset in an array."""
     cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
     for i in (0, 1):
         cards |= {f"CRVAL{i + 1}": float(place.wcs.crval[i]), f"CRPIX{i + 1}": float(place.wcs.crpix[i]) + (x, y)[i]}
@@ -112,7 +113,7 @@ def placed(place, x=0, y=0):
 
 
 def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0, **wrong):
-    """Context of a VIS frame, and its stars; wrong are arguments of vis_file."""
+    """Return the context of a VIS frame, and its stars; `wrong` contains arguments of `vis_file`."""
     rng = np.random.default_rng(3) if rng is None else rng
     of = scene(rng) if of is None else of
     expected = light(of, round_=stretched) * bright + sky * SECONDS
@@ -122,7 +123,7 @@ def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0
 
 
 def ramp_file(path, chi2, channel="NISP-S", border=4):
-    """A ramp's signal, level sky, and its chi^2."""
+    """Write the signal of a ramp, a constant sky, and its chi^2."""
     ny, nx = chi2.shape
     cards = {
         "CHANNEL": channel, "IMAGETYP": "science", "EXPTIME": 549.6, "ELAPTIME": 573.0, "PIXSCALE": 0.3, "NG": 15,
@@ -141,5 +142,5 @@ def ramp_file(path, chi2, channel="NISP-S", border=4):
 
 
 def verdicts(check, of):
-    """Verdicts by quantity."""
+    """Return verdicts by quantity."""
     return {row.quantity: row.verdict for row in check.run(of)}

@@ -41,7 +41,7 @@ def whole(flat_sky):
 
 
 def off(figures):
-    """Names of checks that do not pass."""
+    """Return the names of checks that do not pass."""
     return {check.name for check in checks.evaluate(figures, 2.0) if not check.passes}
 
 
@@ -60,7 +60,7 @@ def test_every_row_is_measured(whole):
 
 
 def test_the_mean_sky_is_as_observed(whole):
-    """In 1.7 deg2 the tolerance is that of the list plus two Poisson errors."""
+    """In 1.7 deg2, the tolerance is the value of the list plus two Poisson errors."""
     results = checks.evaluate(whole, 2.0)
     assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
     # Numbers quoted from memory are not binding, but most of them must pass.
@@ -69,7 +69,7 @@ def test_the_mean_sky_is_as_observed(whole):
 
 
 def test_a_lake_is_compared(flat, tmp_path, capsys):
-    """The command publishes the same figures as those of the rows themselves."""
+    """The command publishes the same figures as the rows themselves give."""
     rows = mean_sky.rows(flat, 0, 2)
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 0), {}),))
     publish.make_version(tmp_path, plan, lambda root, facts: Output(rows))
@@ -89,7 +89,7 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def patch(flat_sky):
-    """Sky of a lake with eight cells, and the cell of each galaxy."""
+    """Return the sky of a lake with eight cells, and the cell of each galaxy."""
     rows = flat_sky
     cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     part = rows.filter(pa.array(cell < 2 * FEW))
@@ -105,7 +105,7 @@ def failed(seen, cell):
 
 
 def columns(seen, **changed):
-    """A sky with some columns multiplied (fluxes) or shifted (other columns)."""
+    """Return a sky with some columns multiplied (fluxes) or shifted (other columns)."""
     return replace(seen, rows={**seen.rows, **{name: change(seen.rows[name]) for name, change in changed.items()}})
 
 
@@ -174,19 +174,19 @@ def wide_colours(flat):
 
 
 def idle_halos(flat):
-    """No halo quenches galaxies."""
+    """Remove the quenching of galaxies by halos."""
     law = replace(flat.halo_shares.law, highest=0.0)
     shares = quenching.shares(law, flat.population.masses, flat.population.halos.matching.occupation)
     return replace(flat, halo_shares=shares)
 
 
 def hole(flat):
-    """No galaxies from z = 2.3."""
+    """Remove the galaxies from z = 2.3 on."""
     return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, max_distance=3844.0)))
 
 
 def far_quasars(flat):
-    """No galaxies below z = 6."""
+    """Remove galaxies beyond z = 6, and quasars between z = 0.3 and 6."""
     return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
 
 

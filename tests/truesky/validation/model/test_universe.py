@@ -1,6 +1,6 @@
 """The simulated universe against its expectations: a few cells in each run, everything at night.
 
-A few cells contain few structures, so tolerances are those of the list plus two errors of the blocks.
+A few cells contain few structures, so tolerances are the values of the list plus two errors of the blocks.
 """
 
 import json
@@ -21,7 +21,7 @@ from truesky.validation.model import universe as measured
 
 @pytest.fixture(scope="module")
 def seen(drawn):
-    """The drawn sky as the validation measures it."""
+    """Return the drawn sky as the validation measures it."""
     first = np.array(drawn.places[::4]) // 4
     deepest = 2 * (sky.MAX_ORDER - GENERATION_ORDER) + 2
 
@@ -72,7 +72,7 @@ def test_a_figure_that_is_off_fails():
     bad = {"sigma_8": 0.81, "log_i_21.75": 3.9}
     assert failed({**good, "log_i_21.75_error": 0.0}) == []
     assert [name for name, _ in failed({**bad, "log_i_21.75_error": 0.03})] == ["sigma_8", "log_i_21.75"]
-    # The error of the fraction of emitters is that of their number.
+    # The error of the fraction of emitters equals the error of their number.
     counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
     (check,) = checks.evaluate(counted)
     assert check.passes
@@ -81,7 +81,7 @@ def test_a_figure_that_is_off_fails():
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Pixels of 27 arcmin in blocks of 54 deg2."""
+    """Use pixels of 27 arcmin in blocks of 54 deg2."""
     monkeypatch.setattr(clustering, "DEPTH", 4)
 
 

@@ -18,7 +18,7 @@ BAND = "euclid_vis"
 
 
 def lake(root, files=2, **wrong):
-    """A lake of as many frames of one field; wrong : of made.vis_file, of the last of them."""
+    """Make a lake with `files` frames of one field; `wrong` are arguments of `made.vis_file` for the last frame."""
     root.mkdir(parents=True, exist_ok=True)
     root = layout.resolve_lake(root)
     rng = np.random.default_rng(8)
