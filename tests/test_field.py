@@ -321,7 +321,7 @@ def test_frame_contains_the_light_of_its_sources(image):
 
 
 def test_background_agrees_with_prediction(image):
-    """The mean of empty pixels, at least a fifth of all, agrees within 5 standard errors (significance 6e-7)."""
+    """The sample is at least a fifth of the pixels; its mean agrees within 5 standard errors (significance 6e-7)."""
     empty = (image.noise_free < 0.05 * np.sqrt(image.variance)) & ~image.bad
     assert empty.mean() > 0.2
     pixels = (image.electrons - image.noise_free - image.delayed)[empty]
