@@ -305,16 +305,16 @@ def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayL
 
     Parameters
     ----------
-    r : float array
+    r : float array, any shape
         Radius.
-    half_light : float array
+    half_light : float array, any shape
         Half-light radius in the unit of `r`.
-    sersic : float array
+    sersic : float array, any shape
         Sersic index.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Fraction of the total light, 0 to 1.
 
     References
@@ -334,16 +334,16 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
 
     Parameters
     ----------
-    fraction : float array
+    fraction : float array, any shape
         Fraction of the flux in the bulge.
-    ratio : float array
+    ratio : float array, any shape
         Bulge radius / disc radius.
-    sersic : float array
+    sersic : float array, any shape
         Sersic index of the bulge.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Half-light radius of the disc / half-light radius of bulge and disc together.
     """
     # The radius of bulge and disc together is between the two radii, so the result is between 1 and 1 / ratio.

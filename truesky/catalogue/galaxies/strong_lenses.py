@@ -236,12 +236,12 @@ def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
     ----------
     lens : Lens
         The lens.
-    east, north : float array
+    east, north : float array, any shape
         Positions of the rays in the image relative to the lens, arcsec.
 
     Returns
     -------
-    east, north : float array
+    east, north : float array, broadcast shape of the arguments
         Deflection, arcsec. The position minus the deflection is the place of the ray in the source plane.
 
     References
@@ -267,12 +267,12 @@ def magnification(lens: Lens, east: Float, north: Float) -> Float:
     ----------
     lens : Lens
         The lens.
-    east, north : float array
+    east, north : float array, any shape
         Positions of the images relative to the lens, arcsec.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         1 / (1 - 2 kappa), where kappa is the convergence; negative for mirrored images, infinite on the critical curve.
     """
     along, across = _to_axes(lens.angle, east, north)

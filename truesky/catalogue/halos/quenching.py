@@ -150,14 +150,14 @@ def quenched_central(law: Quenching, z: Float, log_mass: Float) -> Float:
     ----------
     law : Quenching
         Parameters of the quenched fractions.
-    z : float array
+    z : float array, any shape
         Redshift.
-    log_mass : float array
+    log_mass : float array, any shape
         log10 M_200m / (Msun/h) of the halo.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Fraction, 0 to 1.
     """
     x = (log_mass - (law.central_mass + law.central_z * z)) / law.central_width
@@ -171,16 +171,16 @@ def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float)
     ----------
     law : Quenching
         Parameters of the quenched fractions.
-    z : float array
+    z : float array, any shape
         Redshift.
-    log_mass : float array
+    log_mass : float array, any shape
         log10 M_200m / (Msun/h) of the halo.
-    radius : float array
+    radius : float array, any shape
         Distance from the centre of the halo in units of R_200m.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Fraction, 0 to 1.
     """
     max_share = np.clip(law.satellite + law.satellite_rate * (log_mass - _PIVOT), *law.satellite_limits)

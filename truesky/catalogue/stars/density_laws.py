@@ -126,14 +126,14 @@ def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, az
         Density law of a component.
     sun : Sun
         Position of the Sun in the Milky Way.
-    radius, height : float array
+    radius, height : float array, any shape
         Galactocentric cylindrical coordinates R and z, pc, broadcast against each other.
-    azimuth : float array
+    azimuth : float array, any shape
         Angle from the Sun's direction, rad, positive towards positive Galactic longitudes; only bars use it.
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Relative density, never negative.
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)

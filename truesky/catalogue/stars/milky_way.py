@@ -298,16 +298,16 @@ def cylindrical(
     ----------
     galaxy : MilkyWay
         Model of the Milky Way with the position of the Sun.
-    lon, lat : float array
+    lon, lat : float array, any shape
         Galactic longitude and latitude, deg.
-    distance : float array
+    distance : float array, any shape
         Distance from the Sun, pc; broadcast against `lon` and `lat`.
 
     Returns
     -------
-    radius, height : float array
+    radius, height : float array, broadcast shape of the arguments
         Distance from the axis of the Milky Way, and height above its plane, pc.
-    azimuth : float array
+    azimuth : float array, broadcast shape of the arguments
         Angle from the direction of the Sun, rad, positive towards positive Galactic longitudes.
     """
     l_rad, b_rad = np.radians(lon), np.radians(lat)

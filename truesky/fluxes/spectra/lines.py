@@ -119,7 +119,7 @@ def velocity_dispersion(abs_mag_r01: npt.ArrayLike, z_obs: npt.ArrayLike) -> Flo
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Velocity dispersion in km/s, limited to 50 to 400.
 
     References
@@ -160,7 +160,7 @@ def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str
 
     Returns
     -------
-    float array
+    float array, broadcast shape of the arguments
         Observed wavelength in A. The refraction of air is that at the observed wavelength, not at the emitted one.
 
     Raises

@@ -87,7 +87,7 @@ class Site:
 
         Returns
         -------
-        float array
+        float array, broadcast shape of the arguments
             Altitude in degrees, negative below the horizon. The error is 0.2 deg, because precession and nutation
             since 2000 are neglected.
         """
