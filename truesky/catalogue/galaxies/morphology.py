@@ -334,16 +334,16 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
 
     Parameters
     ----------
-    fraction : float array, any shape
+    fraction : float array, shape (n,)
         Fraction of the flux in the bulge.
-    ratio : float array, any shape
+    ratio : float array, shape (n,)
         Bulge radius / disc radius.
-    sersic : float array, any shape
+    sersic : float array, shape (n,)
         Sersic index of the bulge.
 
     Returns
     -------
-    float array, broadcast shape of the arguments
+    float array, shape (n,)
         Half-light radius of the disc / half-light radius of bulge and disc together.
     """
     # The radius of bulge and disc together is between the two radii, so the result is between 1 and 1 / ratio.
