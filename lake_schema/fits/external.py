@@ -13,15 +13,18 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
 
 from lake_schema import user_files
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.texts import spelling
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    from astropy.io import fits
 
 # Default number of rows in a batch.
 _ROWS_PER_BATCH = 65_536
@@ -62,6 +65,16 @@ def read_numbers(path: Path, kind: str) -> dict[str, Float]:
     """
     with _open_hdus(path, kind) as hdus:
         return _number_columns(_first_table(path, hdus))
+
+
+def column_names(path: Path, kind: str) -> list[str]:
+    """Return the names of the columns of the first binary table in a FITS file.
+
+    `kind` is the type of file, a key of `user_files.MAX_BYTES`. Raise BadInput if the file is cut short, too large or
+    not FITS, or has no table.
+    """
+    with _open_hdus(path, kind) as hdus:
+        return [str(name) for name in _first_table(path, hdus).columns.names]
 
 
 def read_batches(
@@ -105,18 +118,19 @@ def read_batches(
         columns_by_name = {column.name: column for column in hdu.columns}
         if missing := [name for name in dict.fromkeys(columns) if name not in columns_by_name]:
             has = ", ".join(map(str, columns_by_name))[:300]
-            raise BadInput(f"{path}: has no column {', '.join(missing)}; it has {has}")
+            absent = ", ".join(f"{name}{spelling.suggestion(name, columns_by_name)}" for name in missing)
+            raise BadInput(f"{path}: has no column {absent}; it has {has}")
         for name in columns:
             _refuse_no_numbers(path, hdu, columns_by_name, name)
         column_units = {name: str(columns_by_name[name].unit) for name in columns if columns_by_name[name].unit}
         text_values = {name: _text_column(path, hdu, name) for name in text_columns if name in columns_by_name}
         for first in range(0, len(hdu.data), rows_per_batch):
             batch = slice(first, first + rows_per_batch)
-            numbers = {name: _native_numbers(hdu.data[name][batch], columns_by_name[name].null) for name in columns}
-            yield (
-                {**numbers, **{name: _decode_texts(stored[batch]) for name, stored in text_values.items()}},
-                column_units,
-            )
+            numbers = {name: _native_numbers(hdu, columns_by_name[name], batch) for name in columns}
+            texts = {
+                name: _decode_texts(stored[batch], columns_by_name[name].null) for name, stored in text_values.items()
+            }
+            yield {**numbers, **texts}, column_units
 
 
 def read_table(path: Path, kind: str) -> Any:
@@ -164,18 +178,33 @@ def _text_column(path: Path, hdu: Any, name: str) -> Array:
     return np.asarray(stored)
 
 
-def _decode_texts(values: Array) -> Array:
+def _decode_texts(values: Array, null: int | None) -> Array:
+    """Return texts, or whole numbers in which TNULL (`null`) is masked."""
     if values.dtype.kind == "S":
         return np.asarray(np.char.decode(values, "ascii"))
-    return values.astype(values.dtype.newbyteorder("="))
+    numbers = values.astype(values.dtype.newbyteorder("="))
+    return numbers if null is None else np.ma.masked_equal(numbers, null)
 
 
-def _native_numbers(values: Any, null: int | None) -> Array:
-    numbers = np.array(values)
+def _native_numbers(hdu: Any, column: Any, batch: slice) -> Array:
+    """Return the rows `batch` of a column of numbers, with NaN for missing values (stored integers that are TNULL)."""
+    numbers = np.array(hdu.data[column.name][batch])
+    missing = _missing_rows(hdu, column, numbers, batch)
     numbers = numbers.astype(np.int8 if numbers.dtype.kind == "b" else numbers.dtype.newbyteorder("="))
-    if numbers.dtype.kind in "iu" and null is not None and (numbers == null).any():
-        return np.where(numbers == null, np.nan, numbers.astype(np.float64))
-    return numbers
+    return np.where(missing, np.nan, numbers.astype(np.float64)) if missing.any() else numbers
+
+
+def _missing_rows(hdu: Any, column: Any, numbers: Array, batch: slice) -> Array:
+    """Return True for the rows `batch` of a column whose value is missing (TNULL).
+
+    `numbers` are the values of the column in these rows after scaling.
+    """
+    if column.null is None:
+        return np.zeros(len(numbers), bool)
+    # TNULL is a stored value. Only unsigned integers (TZERO without TSCAL) are compared after the shift by TZERO,
+    # because astropy writes TNULL in this way.
+    stored = numbers if numbers.dtype.kind in "iu" else hdu.data.view(np.ndarray)[column.name][batch]
+    return np.asarray(stored == column.null)
 
 
 def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
@@ -243,6 +272,8 @@ def read_planes(
         If the file is cut short, too large or not FITS, has no such array or one with too many pixels, or contains
         compressed images only.
     """
+    from astropy.io import fits
+
     with _open_hdus(path, kind) as hdus:
         for hdu in hdus:
             planes = None
@@ -260,7 +291,7 @@ def read_planes(
 
 
 def _number_columns(hdu: Any) -> dict[str, Float]:
-    columns = {}
+    columns, every_row = {}, slice(None)
     for column in hdu.columns:
         if any(letter in str(column.format) for letter in "PQA"):
             continue
@@ -268,8 +299,7 @@ def _number_columns(hdu: Any) -> dict[str, Float]:
         if values.dtype.kind not in "fiu" or values.ndim != 1:
             continue
         numbers = values.astype(np.float64)
-        if values.dtype.kind in "iu" and column.null is not None:
-            numbers[values == column.null] = np.nan
+        numbers[_missing_rows(hdu, column, values, every_row)] = np.nan
         columns[str(column.name)] = numbers
     return columns
 
@@ -281,6 +311,9 @@ def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
     BadInput is raised in place of every exception in the body that is not a LakeError, because astropy raises many
     types of exceptions for damaged files.
     """
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyUserWarning
+
     with user_files.open_file(path, kind) as stream:
         try:
             with warnings.catch_warnings():
@@ -301,6 +334,8 @@ def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
 
 
 def _first_table(path: Path, hdus: fits.HDUList) -> Any:
+    from astropy.io import fits
+
     for hdu in hdus:
         if isinstance(hdu, fits.BinTableHDU):
             if not hdu.header["NAXIS1"]:

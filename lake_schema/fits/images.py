@@ -8,16 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
 
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import write
 from lake_schema.fits.write import MAX_BYTES
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    from astropy.io import fits
 
 # Number of rows of an image per compressed tile. With one row per tile, astropy takes twice as long to write and three
 # times as long to read.
@@ -71,11 +73,15 @@ def _card_line(keyword: str, value: Any, comment: str, value_text: str) -> str:
     Lines are cached, because most cards occur in many images. `value_text` is the repr of the value: as part of the
     cache key, it distinguishes values that compare equal, such as 0.0 and -0.0.
     """
+    from astropy.io import fits
+
     return f"{str(fits.Card(keyword, value, comment)).rstrip()}\n"
 
 
 def cards_from_text(lines: str) -> tuple[Card, ...]:
     """Return the header cards in a text from `cards_to_text`: keyword, value and comment of each line."""
+    from astropy.io import fits
+
     return tuple((card.keyword, card.value, card.comment) for card in map(fits.Card.fromstring, lines.splitlines()))
 
 
@@ -97,6 +103,8 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
     BadInput
         If there are no images, or an image or a card cannot be stored in FITS.
     """
+    from astropy.io import fits
+
     if not images:
         raise BadInput(f"{path}: a FITS file must have at least one image")
     make_hdu = [_compressed_hdu if rice and _has_integers(image) else image_hdu for image in images]
@@ -135,6 +143,8 @@ def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
     The checksums detect any single changed byte, but may miss exchanged bytes. For a file of a published table,
     `Version.sidecar_path` compares the sha256 instead.
     """
+    from astropy.io import fits
+
     with write.errors_as_damaged(path):
         # Turn RuntimeWarnings into errors: astropy emits them if damaged scaling keywords make values overflow.
         warnings.simplefilter("error", RuntimeWarning)
@@ -159,6 +169,8 @@ def primary_hdu(image: Image) -> fits.PrimaryHDU:
 
     Raise BadInput if the data are not numbers in two or three dimensions, or FITS cannot store a card.
     """
+    from astropy.io import fits
+
     hdu = fits.PrimaryHDU(data=None if image.data is None else _check_array(image.data))
     return _add_cards(hdu, image)
 
@@ -168,10 +180,14 @@ def image_hdu(image: Image) -> fits.ImageHDU:
 
     Raise BadInput if the data are not numbers in two or three dimensions, or FITS cannot store a card.
     """
+    from astropy.io import fits
+
     return _add_cards(fits.ImageHDU(data=None if image.data is None else _check_array(image.data)), image)
 
 
 def _compressed_hdu(image: Image) -> fits.BinTableHDU:
+    from astropy.io import fits
+
     data = _check_array(np.asarray(image.data))
     tile = (*(1 for _ in data.shape[:-2]), min(_ROWS_PER_TILE, data.shape[-2]), data.shape[-1])
     hdu = _add_cards(fits.CompImageHDU(data=data, compression_type="RICE_1", tile_shape=tile), image)
@@ -193,6 +209,9 @@ def _is_empty_primary(hdu: Any) -> bool:
 
 
 def _add_cards(hdu: Any, image: Image) -> Any:
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyUserWarning
+
     for keyword, value, comment in image.cards:
         if keyword.upper() in STRUCTURE:
             raise BadInput(f"FITS card {keyword} is set by the writer")

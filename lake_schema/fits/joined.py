@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from astropy.io import fits
-
 from lake_schema.errors import BadInput
 from lake_schema.fits import images, write
 from lake_schema.fits.images import STRUCTURE, Card, Image
@@ -67,6 +65,8 @@ def join(
 def _joined_hdus(
     files: Sequence[tuple[str, Path]], cards: Sequence[Card], common_keywords: set[str], kept_keywords: set[str]
 ) -> Iterator[Any]:
+    from astropy.io import fits
+
     yield images.primary_hdu(Image(None, tuple(cards)))
     for name, file in files:
         with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
@@ -124,6 +124,8 @@ def _first_cards(file: Path) -> dict[str, Card]:
     This is usually the primary header. If it has structural cards only and the first image is compressed, it is the
     header of the first image.
     """
+    from astropy.io import fits
+
     with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
         skip_primary = len(hdus) > 1 and write.is_compressed(hdus[1]) and not _cards_except(hdus[0], set())
         return {card[0]: card for card in _cards_except(hdus[int(skip_primary)], set())}

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy.io import fits
 
 from lake_schema.arrays import Array
 from lake_schema.fits import images
 from lake_schema.fits import write as fits_file
 from lake_schema.fits.images import Card
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    from astropy.io import fits
 
 # Name, code of the FITS type, unit ("" for none) and values of a column.
 ColumnData = tuple[str, str, str, Array]
@@ -37,16 +41,22 @@ def write(
     shape : tuple of int, optional
         Shape (ny, nx) of that image; by default its header has NAXIS = 0.
     """
+    from astropy.io import fits
+
     objects = fits.BinTableHDU.from_columns([_column(*column) for column in columns], name="LDAC_OBJECTS")
     fits_file.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), _header(cards, shape or ()), objects]))
 
 
 def _column(name: str, code: str, unit: str, values: Array) -> fits.Column:
+    from astropy.io import fits
+
     return fits.Column(name, code, array=values, **({"unit": unit} if unit else {}))
 
 
 def _header(image_cards: Sequence[Card], shape: tuple[int, ...]) -> fits.BinTableHDU:
     """Return the table LDAC_IMHEAD, which contains the header of an image as one text of 80 characters per card."""
+    from astropy.io import fits
+
     structure: tuple[Card, ...] = (
         ("SIMPLE", True, ""), ("BITPIX", -32 if shape else 8, ""), ("NAXIS", len(shape), ""),
         *((f"NAXIS{i}", n, "") for i, n in enumerate(reversed(shape), start=1)),

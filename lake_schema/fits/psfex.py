@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 
 from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput
@@ -41,6 +40,8 @@ def write(
     BadInput
         If no polynomial in two coordinates has n coefficients.
     """
+    from astropy.io import fits
+
     degree = round((np.sqrt(8 * len(planes) + 1) - 3) / 2)
     if (degree + 1) * (degree + 2) // 2 != len(planes):
         raise BadInput(f"{path}: {len(planes)} planes do not fit a polynomial in two coordinates")

@@ -12,12 +12,13 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
-
-from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
+from typing import IO, TYPE_CHECKING, Any
 
 from lake_schema.errors import BadInput, Damaged, LakeError
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    from astropy.io import fits
 
 # Largest number of bytes of the data of a file that is read. truesky writes much smaller files, so a header that gives
 # more is a mistake or an attack.
@@ -47,6 +48,8 @@ def write_one_by_one(path: Path, hdus: Iterable[Any]) -> None:
 
     `hdus` may be a generator; its first element must be the primary unit. The file is replaced in one rename.
     """
+    from astropy.io import fits
+
     with _open_atomically(path) as stream:
         for number, hdu in enumerate(hdus):
             _add_checksums(hdu)
@@ -103,6 +106,8 @@ def errors_as_damaged(path: Path) -> Iterator[None]:
 
     Use it for files that truesky wrote. Exceptions of truesky itself (LakeError) pass unchanged.
     """
+    from astropy.utils.exceptions import AstropyUserWarning
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)

@@ -6,14 +6,12 @@ region touches never miss a cell, but may return a few cells just outside.
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.lazy_healpy import healpy
 
 MAX_ORDER = 29
 # Smallest triple product of the unit vectors to three consecutive vertices of a polygon that healpy accepts. A smaller
@@ -24,14 +22,6 @@ _MIN_TRIPLE_PRODUCT = 1e-10
 _CELLS_PER_RADIUS = 4
 # Safety margin of distances (deg), larger than any rounding error.
 _ROUNDING_DEG = 1e-9
-
-
-@cache
-def _healpy() -> Any:
-    # Import healpy at the first use only, because the import takes longer than reading a small table.
-    import healpy
-
-    return healpy
 
 
 def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
@@ -94,7 +84,7 @@ def cell_at(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
         Nested cell numbers. OutOfRange is raised if a coordinate is not finite, or |dec| > 90.
     """
     ra_deg, dec_deg = check_positions(ra, dec)
-    return np.asarray(_healpy().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
+    return np.asarray(healpy.ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
 
 
 def cell_area(order: int) -> float:
@@ -104,13 +94,13 @@ def cell_area(order: int) -> float:
 
 def cell_centre(order: int, cell: int) -> tuple[float, float]:
     """Return ra, dec (deg) of the centre of a nested HEALPix cell."""
-    ra, dec = _healpy().pix2ang(1 << order, cell, nest=True, lonlat=True)
+    ra, dec = healpy.pix2ang(1 << order, cell, nest=True, lonlat=True)
     return float(ra), float(dec)
 
 
 def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
     """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested HEALPix cells of one order."""
-    ra, dec = _healpy().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
+    ra, dec = healpy.pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
@@ -193,7 +183,7 @@ def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
 
 def cell_radius(order: int) -> float:
     """Return the largest distance (deg) between the centre and a corner of any HEALPix cell of an order."""
-    return float(np.degrees(_healpy().max_pixrad(1 << order)))
+    return float(np.degrees(healpy.max_pixrad(1 << order)))
 
 
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
@@ -221,9 +211,9 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     (ra_deg,), (dec_deg,) = check_positions([ra], [dec])
     if not 0.0 <= radius <= 180.0:
         raise OutOfRange("radius", radius, 0.0, 180.0)
-    centre = _healpy().ang2vec(ra_deg, dec_deg, lonlat=True)
+    centre = healpy.ang2vec(ra_deg, dec_deg, lonlat=True)
     fine = min(order + 3, MAX_ORDER)
-    fine_cells = _healpy().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
+    fine_cells = healpy.query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
     centre_cell = cell_at([ra], [dec], order)
     return np.unique(np.concatenate([parent(fine_cells, fine, order), centre_cell]))
 
@@ -280,7 +270,7 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
     candidates = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
     # For most cells, the distance of the centre from the circle decides whether the circle touches the cell. For cells
     # on its edge, the distances of the centres of finer cells decide.
-    cell_centres_xyz = _healpy().pix2vec(1 << order, candidates, nest=True)
+    cell_centres_xyz = healpy.pix2vec(1 << order, candidates, nest=True)
     cos_distance = sum(centres[:, i, None] * cell_centres_xyz[i] for i in range(3))
     inside_limit = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
     touched = cos_distance >= inside_limit[:, None]
@@ -301,7 +291,7 @@ def _finer_centres(cells: Int, order: int, finer: int) -> Float:
     """
     finer_count = 1 << 2 * (finer - order)
     inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(finer_count)
-    return np.array(_healpy().pix2vec(1 << finer, inside, nest=True))
+    return np.array(healpy.pix2vec(1 << finer, inside, nest=True))
 
 
 def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
@@ -331,10 +321,10 @@ def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise BadInput(f"a polygon must have at least 3 vertices (ra, dec), got shape {corners.shape}")
     ra, dec = check_positions(corners[:, 0], corners[:, 1])
-    vectors = _healpy().ang2vec(ra, dec, lonlat=True)
+    vectors = healpy.ang2vec(ra, dec, lonlat=True)
     _refuse_not_convex(vectors)
     fine = min(order + 3, MAX_ORDER)
-    inside = _healpy().query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
+    inside = healpy.query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
     return np.unique(parent(inside, fine, order))
 
 
@@ -379,9 +369,9 @@ def cells_in_box(west: float, east: float, south: float, north: float, order: in
     reach = cell_radius(fine)
     low, high = max(dec[0] - reach, -90.0), min(dec[1] + reach, 90.0)
     # `query_strip` takes colatitudes, which increase to the south, so the northern limit comes first.
-    strip = _healpy().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
-    fine_cells = _healpy().ring2nest(1 << fine, strip)
-    lon, lat = _healpy().pix2ang(1 << fine, fine_cells, nest=True, lonlat=True)
+    strip = healpy.query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
+    fine_cells = healpy.ring2nest(1 << fine, strip)
+    lon, lat = healpy.pix2ang(1 << fine, fine_cells, nest=True, lonlat=True)
     # Largest extent of a cell in right ascension from its centre (deg). It is 360 for cells near a pole, which may
     # contain all meridians.
     widest = np.cos(np.radians(np.minimum(np.abs(lat) + reach, 90.0)))
@@ -465,13 +455,13 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
     """
     first, _ = cell_range(order, cell)
     index = np.sort(rng.integers(0, 1 << (2 * (MAX_ORDER - order)), n, dtype=np.int64)) | np.int64(first)
-    ra, dec = _healpy().pix2ang(1 << MAX_ORDER, index, nest=True, lonlat=True)
+    ra, dec = healpy.pix2ang(1 << MAX_ORDER, index, nest=True, lonlat=True)
     return index, ra, dec
 
 
 def positions_of_indices(index: npt.ArrayLike) -> tuple[Float, Float]:
     """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested HEALPix cells of order 29."""
-    ra, dec = _healpy().pix2ang(1 << MAX_ORDER, np.asarray(index, np.int64), nest=True, lonlat=True)
+    ra, dec = healpy.pix2ang(1 << MAX_ORDER, np.asarray(index, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
@@ -530,7 +520,7 @@ TO_GALACTIC = np.array(
 
 def ring_index(order: int, cell: int) -> int:
     """Return the number in HEALPix RING ordering of the cell with a number in NESTED ordering."""
-    return int(_healpy().nest2ring(1 << order, cell))
+    return int(healpy.nest2ring(1 << order, cell))
 
 
 def border_cells(order: int, cell: int, fine: int) -> Int:
@@ -553,7 +543,7 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
-    within = _healpy().xyf2pix(side, x[rim], y[rim], 0, nest=True)
+    within = healpy.xyf2pix(side, x[rim], y[rim], 0, nest=True)
     return np.sort((np.int64(cell) << (2 * (fine - order))) + within)
 
 
@@ -574,7 +564,7 @@ def margin_cells(order: int, cell: int, fine: int) -> Int:
     int64 array, shape (n,)
         Nested cells of order `fine`, sorted.
     """
-    neighbours = _healpy().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
+    neighbours = healpy.get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
     neighbours = np.unique(neighbours[neighbours >= 0]).astype(np.int64)
     outside: Int = neighbours[parent(neighbours, fine, order) != cell]
     return outside

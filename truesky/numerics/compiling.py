@@ -1,85 +1,59 @@
-"""Compile functions with numba, and keep their machine code in the project's cache on disc.
+"""Decorators for functions that numba compiles.
 
-A function is compiled once per machine and version of the source files. Numba by itself would compile it again for each
-copy of the package.
+Numba is imported when a compiled function is first called, because its import takes half a second. Most commands import
+modules with compiled functions that they never call.
 """
 
 from __future__ import annotations
 
-import os
+import functools
+import threading
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from lake_schema import instruction_set
-from truesky.numerics import cache
-
-# Set the environment variables of numba before it is imported, because it reads them only once. Child processes inherit
-# the variables.
-instruction_set.limit_numba()
-_MACHINE_CODE = cache.machine_code_dir()
-os.environ["NUMBA_CACHE_DIR"] = str(_MACHINE_CODE)
-
-import numba  # noqa: E402
-from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-_PACKAGE = Path(__file__).parents[1]
-_CONFIG: Any = numba.config
-# Classes that choose the folder of a function's machine code; numba uses the first that is applicable. Those after
-# PackageCacheLocator are for functions of users, and for machines on which the cache cannot be written.
-#
 # The options of numba below affect the machine code. This file must therefore be part of the hash that names the folder
 # of the machine code. The hash covers all files with the text truesky.numerics.compiling.
-_LOCATORS = f"{__name__}.PackageCacheLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_LOCK = threading.RLock()
 
 
-class PackageCacheLocator(UserProvidedCacheLocator):
-    """Choose the folder in which numba keeps the machine code of a module of this package.
+class CompiledFunction:
+    """Function that numba compiles, or loads from the cache on disc, when it is first called.
 
-    By default numba names the folder by the absolute path of the module's file, so that each copy of the package would
-    be compiled again. Here it is named by the module's place in the package. The folder above is named by a hash of all
-    compiled modules, so that machine code of different versions is never mixed.
+    Compiled functions can call it, too.
+
+    Parameters
+    ----------
+    function : callable
+        The Python function.
+    options : dict of str to object
+        Options of numba.njit.
     """
 
-    def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
-        base: Any = super()
-        base.__init__(py_func, py_file)
-        self._cache_path = str(_MACHINE_CODE / ".".join(Path(py_file).relative_to(_PACKAGE).parent.parts))
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self._options = function, options
+        self._compiled: Callable[..., Any] | None = None
 
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
-        """Return the object that tells numba in which folder the machine code of a function is cached (a locator).
+    def __call__(self, *arguments: Any, **named_arguments: Any) -> Any:
+        return (self._compiled or self.load())(*arguments, **named_arguments)
 
-        Return None for a function outside this package, or if the folder cannot be written. Numba then tries its next
-        class of locators.
-        """
-        if not Path(py_file).is_relative_to(_PACKAGE):
-            return None
-        locator: Any = cls(py_func, py_file)
-        try:
-            locator.ensure_cache_path()
-        except OSError:
-            return None
-        return locator
+    def load(self) -> Callable[..., Any]:
+        """Return the function of numba, which the first call creates."""
+        # Several threads may call the function for the first time. Without the lock each would compile it.
+        with _LOCK:
+            if self._compiled is None:
+                from truesky.numerics import machine_code
 
-    def get_source_stamp(self) -> str:
-        """Return a constant, by which numba considers the machine code up to date.
+                self._compiled = machine_code.compile_function(self._function, **self._options)
+        return self._compiled
 
-        The name of the folder already depends on the contents of the source files.
-        """
-        return ""
-
-
-def _compile(function: Function, **options: Any) -> Function:
-    previous = _CONFIG.CACHE_LOCATOR_CLASSES
-    _CONFIG.CACHE_LOCATOR_CLASSES = _LOCATORS
-    try:
-        decorate: Any = numba.njit(cache=True, error_model="numpy", **options)
-        compiled: Function = decorate(function)
-    finally:
-        _CONFIG.CACHE_LOCATOR_CLASSES = previous
-    return compiled
+    @property
+    def _numba_type_(self) -> Any:
+        # Numba reads this attribute when it compiles a function that calls this one.
+        function: Any = self.load()
+        return function._numba_type_
 
 
 def jit(function: Function) -> Function:
@@ -91,7 +65,7 @@ def jit(function: Function) -> Function:
     # into which a function is inlined. Always inline it. Otherwise a process that compiles the caller would round
     # differently from a process that loads the caller from the cache.
     fast = {"reassoc", "contract", "nsz"}
-    return _compile(function, fastmath=fast, forceinline=True)
+    return cast(Function, CompiledFunction(function, {"fastmath": fast, "forceinline": True}))
 
 
 def exact_jit(function: Function) -> Function:
@@ -99,4 +73,4 @@ def exact_jit(function: Function) -> Function:
 
     It is compiled when it is first called. It releases the GIL, so that other threads run at the same time.
     """
-    return _compile(function, nogil=True)
+    return cast(Function, CompiledFunction(function, {"nogil": True}))

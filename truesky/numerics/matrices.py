@@ -20,6 +20,9 @@ from lake_schema.arrays import Array, Float
 _FEW_TERMS = 8
 # Smallest number of elements of a large result.
 _LARGE_SIZE = 1 << 18
+# Products with at most this number of terms in all sums together also use array operations of numpy: they are fast, and
+# numba need not be imported.
+_FEW_TERMS_IN_ALL = 1 << 16
 # Smallest number of columns of a product for which it is faster to add multiples of rows of the second factor than to
 # compute products of rows and columns.
 _WIDE_COLUMNS = 16
@@ -41,7 +44,8 @@ def matmul(a: npt.ArrayLike, b: npt.ArrayLike) -> Any:
     if matrix_a.shape[-1] <= _FEW_TERMS and not is_large:
         out = _multiply_arrays(matrix_a, matrix_b)
     else:
-        out = _multiply_compiled(matrix_a.reshape(-1, matrix_a.shape[-1]), matrix_b).reshape(
+        multiply = _accumulate if matrix_a.size * matrix_b.shape[1] <= _FEW_TERMS_IN_ALL else _multiply_compiled
+        out = multiply(matrix_a.reshape(-1, matrix_a.shape[-1]), matrix_b).reshape(
             *matrix_a.shape[:-1], matrix_b.shape[-1]
         )
     out = out[..., 0] if b_is_vector else out
@@ -55,6 +59,12 @@ def _multiply_arrays(matrix_a: Array, matrix_b: Array) -> Float:
     for k in range(matrix_a.shape[-1]):
         out += np.multiply(matrix_a[..., :, k, None], matrix_b[..., k, None, :], dtype=np.float64)
     return out
+
+
+def _accumulate(matrix_a: Array, matrix_b: Array) -> Float:
+    terms = np.multiply(matrix_a[:, :, None], matrix_b, dtype=np.float64)
+    # Add 0 because a sum of terms -0 is 0, as in the other two functions, in which sums begin with 0.
+    return np.asarray(np.add.accumulate(terms, axis=1)[:, -1] + 0.0)
 
 
 def _multiply_compiled(matrix_a: Array, matrix_b: Array) -> Float:

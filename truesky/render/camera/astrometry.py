@@ -9,11 +9,10 @@ pixel centres.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from astropy.wcs import WCS, Sip
 
 from lake_schema import sky
 from lake_schema.arrays import Float
@@ -22,6 +21,10 @@ from truesky.numerics import matrices
 from truesky.render.camera import distortion, pointing, tpv
 from truesky.render.camera.detectors import Detector
 from truesky.render.camera.pointing import ARCSEC
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes a second.
+    from astropy.wcs import WCS, Sip
 
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
@@ -41,6 +44,8 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     WCS
         World coordinate system with the projection TAN or, if the optics distort, TAN-SIP.
     """
+    from astropy.wcs import WCS, Sip
+
     angle, turn = np.radians(position_angle), np.radians(detector.rotation)
     # The columns of `axes` are the directions (east, north) of the focal plane's x and y axes.
     axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -223,6 +228,8 @@ def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
     WCS
         World coordinate system of the shifted image; `system` is unchanged.
     """
+    from astropy.wcs import Sip
+
     out = system.deepcopy()
     out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
     if out.sip is not None:
@@ -241,6 +248,8 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
     BadInput
         If a necessary card is missing. The message names its keyword.
     """
+    from astropy.wcs import WCS, Sip
+
     values = {keyword: value for keyword, value, _ in header}
     try:
         system = WCS(naxis=2)

@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import SPACE_CAMERAS
+from truesky.request import instruments
+from truesky.request.instruments import GROUND_CHANNEL
 
 
 def ground_bands(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
@@ -13,9 +15,7 @@ def ground_bands(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
 
     The result is () for the cameras of Euclid and for an unknown camera.
     """
-    prefix = f"ext.{camera}."
-    keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
-    return () if camera in SPACE_CAMERAS else tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
+    return () if camera in SPACE_CAMERAS else instruments.band_names(GROUND_CHANNEL, camera, mission)
 
 
 def single_camera_bands(only_camera: str, *bands: str) -> Callable[[str, MissionConfiguration], tuple[str, ...]]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-
-from astropy.wcs import WCS
+from typing import TYPE_CHECKING
 
 from lake_schema import units
 from lake_schema.tables.exposures import ExposureRow
@@ -15,6 +14,9 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.channels.channel import Channel
 from truesky.render.effects.effect import Effect
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 
 @dataclass(frozen=True, slots=True)

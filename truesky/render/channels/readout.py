@@ -12,11 +12,10 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.special
-from astropy.wcs import WCS
+import scipy
 
 from lake_schema.arrays import Array, Float
 from lake_schema.fits.images import Card, Image
@@ -26,6 +25,9 @@ from truesky.render.effects.charge import ramp
 from truesky.render.effects.readout import adc
 from truesky.render.effects.readout import quadrants as layout
 from truesky.render.effects.scene import Frame, Scene
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,19 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from lake_schema.errors import BadInput
-from truesky.render.channels import ground, nisp_p, nisp_s, vis
 from truesky.render.channels.channel import Channel
 from truesky.render.effects.effect import Effect
 
-CHANNELS: Mapping[str, Channel] = {
-    "VIS": vis.CHANNEL,
-    "NISP-P": nisp_p.CHANNEL,
-    "NISP-S": nisp_s.CHANNEL,
-    "EXT": ground.CHANNEL,
-}
+
+def _vis() -> Channel:
+    from truesky.render.channels import vis
+
+    return vis.CHANNEL
+
+
+def _nisp_p() -> Channel:
+    from truesky.render.channels import nisp_p
+
+    return nisp_p.CHANNEL
+
+
+def _nisp_s() -> Channel:
+    from truesky.render.channels import nisp_s
+
+    return nisp_s.CHANNEL
+
+
+def _ground() -> Channel:
+    from truesky.render.channels import ground
+
+    return ground.CHANNEL
+
+
+class _Channels(Mapping[str, Channel]):
+    """Channels by name; the module of a channel is imported when the channel is first used.
+
+    A process thus imports only the effects of the channels that it plans or renders.
+    """
+
+    def __init__(self, functions: Mapping[str, Callable[[], Channel]]) -> None:
+        self._functions = functions
+
+    def __getitem__(self, name: str) -> Channel:
+        return self._functions[name]()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._functions
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._functions)
+
+    def __len__(self) -> int:
+        return len(self._functions)
+
+
+CHANNELS: Mapping[str, Channel] = _Channels({"VIS": _vis, "NISP-P": _nisp_p, "NISP-S": _nisp_s, "EXT": _ground})
 
 
 def find_channel(name: str, image_type: str, where: str) -> Channel:

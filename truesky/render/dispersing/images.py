@@ -30,8 +30,7 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
-import scipy.fft
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from truesky.numerics import matrices
@@ -198,7 +197,7 @@ def _bin_pixels(image: Float32, fold: int) -> Float32:
     count = -(-middle // fold)
     padded = np.pad(image, fold * count + fold // 2 - middle)
     for axis in (0, 1):
-        padded = uniform_filter1d(padded, fold, axis, mode="constant")
+        padded = scipy.ndimage.uniform_filter1d(padded, fold, axis, mode="constant")
     return np.asarray(padded.reshape(2 * count + 1, fold, 2 * count + 1, fold).sum(axis=(1, 3)))
 
 

@@ -11,7 +11,7 @@ Bernstein & Gruen 2014, PASP 126, 287 (the interpolant).
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Array, Float
 from truesky.numerics import matrices

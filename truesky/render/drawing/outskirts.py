@@ -18,9 +18,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
-from scipy.signal import fftconvolve
-from scipy.special import gammaincc, gammaln
+import scipy
 
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
@@ -169,7 +167,7 @@ def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights:
     half = int(np.ceil(farthest / block)) + 1 + len(cells) // 2
     unblurred = np.zeros((2 * half + 1, 2 * half + 1))
     _sample(light, disk, wide, float(half * block), float(half * block), float(block), unblurred)
-    return Outskirts(light, disk, wide, fftconvolve(unblurred, cells, mode="valid"), block)
+    return Outskirts(light, disk, wide, scipy.signal.fftconvolve(unblurred, cells, mode="valid"), block)
 
 
 @lru_cache(maxsize=16)
@@ -346,10 +344,10 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
     return out
 
 
-def _spline(values: Float, step: int) -> RectBivariateSpline:
+def _spline(values: Float, step: int) -> scipy.interpolate.RectBivariateSpline:
     """Return the bicubic spline through the values [n, n] at nodes `step` pixels apart, the first of which is at 0."""
     nodes = step * np.arange(len(values))
-    return RectBivariateSpline(nodes, nodes, values)
+    return scipy.interpolate.RectBivariateSpline(nodes, nodes, values)
 
 
 def slimness(light: Float, across: float) -> float:
@@ -478,7 +476,7 @@ def _light_outside_square(light: Float, across: float, half: float) -> float:
         n, inverse = 0.5 / light[POWER], light[BULGE_FORM : BULGE_FORM + 4].reshape(2, 2)
         edge = half / np.abs(matrices.matmul(matrices.inverse(inverse), ray)).max(axis=0)
         bulge_light = light[BULGE] * np.exp(_log_bulge_total(n)) / abs(float(matrices.determinant(inverse)))
-        total += bulge_light * float(gammaincc(2 * n, edge ** (1.0 / n)).mean())
+        total += bulge_light * float(scipy.special.gammaincc(2 * n, edge ** (1.0 / n)).mean())
     if light[DISK] > 0.0:
         inverse = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2)
         edge = half / np.abs(matrices.matmul(matrices.inverse(inverse), ray * [[1.0], [across]])).max(axis=0)
@@ -491,7 +489,7 @@ def _log_bulge_total(n: float) -> float:
 
     The light in the bulge's middle is 1. The exponent is p = 1 / (2 n), where n is the Sersic index.
     """
-    return float(np.log(2 * np.pi * n) + gammaln(2 * n))
+    return float(np.log(2 * np.pi * n) + scipy.special.gammaln(2 * n))
 
 
 @jit

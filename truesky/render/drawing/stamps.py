@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Array, Bool, Float, Int
 from truesky.render.drawing import arcs, far_light, outskirts, stamp_sizes, transfer, wings

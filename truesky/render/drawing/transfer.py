@@ -11,8 +11,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import scipy.fft
-from scipy.ndimage import maximum
+import scipy
 
 from lake_schema.arrays import Array, Float, Float32, Int
 from truesky.numerics import matrices
@@ -198,7 +197,7 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
         planes = _on_grid(list(middle * window[:, None] * window), samples, probe, psf.intra_pixel, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
-    rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
+    rings = np.asarray(scipy.ndimage.maximum(modulus, ring, np.arange(ring.max() + 1)), float)
     above_minimum = np.flatnonzero(rings > min_value)
     return rings[: above_minimum[-1] + 1]
 

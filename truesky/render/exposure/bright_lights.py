@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pyarrow as pa
-from astropy.wcs import WCS
 
 from lake_schema.arrays import Float
 from truesky.render.camera import astrometry
 from truesky.render.effects.scene import Lights
 from truesky.render.sources.source_list import Sources
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 # Ghosts and scattered light are computed for sources with more expected electrons per exposure than this.
 _MIN_ELECTRONS = 1e6

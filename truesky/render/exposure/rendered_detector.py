@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-from astropy.wcs import WCS
+from typing import TYPE_CHECKING, Any
 
 from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.tables.exposures import ExposureRow
@@ -18,6 +16,9 @@ from truesky.render.effects.scene import Scene
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import Accuracy
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 
 @dataclass(frozen=True, slots=True)

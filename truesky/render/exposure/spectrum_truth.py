@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+import scipy
 
 from lake_schema import units
 from lake_schema.arrays import Bool, Float, Int
@@ -347,7 +347,7 @@ def _image_area(light: Light, source: Int) -> Float:
     radius = galaxy_shapes.half_light(light.sources.shapes.take(light.sources.shape[source])) / scale
     # Effective area of the PSF, 1 / (sum of the squared pixels). The PSF is first averaged over all positions of the
     # source within a pixel.
-    pixel = uniform_filter(planes.images.mean(axis=0, dtype=float), planes.samples) * planes.samples**2
+    pixel = scipy.ndimage.uniform_filter(planes.images.mean(axis=0, dtype=float), planes.samples) * planes.samples**2
     point = planes.samples**2 / float((pixel**2).sum())
     # A galaxy is treated as a Gaussian with the second moments of an exponential disc, whose scale length is the
     # half-light radius / 1.678.

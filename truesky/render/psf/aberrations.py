@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import galsim
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Complex, Float
 from lake_schema.errors import OutOfRange
@@ -109,6 +108,8 @@ class TransferRatio:
         TransferRatio
             The ratio in the axes of the detector.
         """
+        import galsim
+
         step = 2.0 * telescope.radius / _ACROSS
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
         lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)

@@ -5,24 +5,21 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import gamma, j0, kv
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 # Radian per arcsec.
 _ARCSEC = np.pi / 180.0 / 3600.0
-# Factor by which (outer scale / Fried length)^(5/3) is multiplied in D / 2. D is the structure function of the phase of
-# light that has passed von Karman turbulence (Tokovinin 2002, eq. 8).
-_STRENGTH = (24.0 * gamma(1.2) / 5.0) ** (5.0 / 6.0) * gamma(11.0 / 6.0) / (2.0 ** (5.0 / 6.0) * np.pi ** (8.0 / 3.0))
-# Limit of x^(5/6) K_5/6(x) for x = 0, where K_5/6 is the modified Bessel function of the second kind, of order 5/6.
-_AT_ONE_PLACE = gamma(5.0 / 6.0) / 2.0 ** (1.0 / 6.0)
 # Smallest Fried length that is allowed (the worst seeing), divided by the outer scale of the turbulence. A seeing
 # outside the range raises OutOfRange.
 _SHORTEST = 1e-5
 # Largest Fried length that is allowed (the best seeing), divided by the outer scale of the turbulence.
 _LONGEST = 0.05
+# Half of the FWHM of the best seeing that is allowed, in units of wavelength / Fried length. It is the root that `fwhm`
+# finds for a Fried length of `_LONGEST` times the outer scale, with which scipy.optimize is not imported for checks.
+_SHARPEST = 0.2409324370068859
 # Upper limit, in Fried lengths, of the integral over distances in the pupil by which the FWHM of the seeing is
 # computed. At larger distances the air transmits practically nothing.
 _FARTHEST = 6.0
@@ -63,7 +60,17 @@ def transfer(distance: Float, fried: float, outer: float) -> Float:
     Tokovinin 2002, PASP 114, 1156, eq. 8.
     """
     x = np.maximum(2.0 * np.pi * np.abs(distance) / outer, 1e-12)
-    lost = _STRENGTH * (outer / fried) ** (5.0 / 3.0) * (_AT_ONE_PLACE - x ** (5.0 / 6.0) * kv(5.0 / 6.0, x))
+    # Factor by which (outer scale / Fried length)^(5/3) is multiplied in D / 2.
+    strength = (
+        (24.0 * scipy.special.gamma(1.2) / 5.0) ** (5.0 / 6.0)
+        * scipy.special.gamma(11.0 / 6.0)
+        / (2.0 ** (5.0 / 6.0) * np.pi ** (8.0 / 3.0))
+    )
+    # Limit of x^(5/6) K_5/6(x) for x = 0, where K_5/6 is the modified Bessel function of the second kind, of order 5/6.
+    at_one_place = scipy.special.gamma(5.0 / 6.0) / 2.0 ** (1.0 / 6.0)
+    lost = (
+        strength * (outer / fried) ** (5.0 / 3.0) * (at_one_place - x ** (5.0 / 6.0) * scipy.special.kv(5.0 / 6.0, x))
+    )
     return np.asarray(np.exp(-np.maximum(lost, 0.0)))
 
 
@@ -88,18 +95,19 @@ def fwhm(wavelength: float, fried: float, outer: float) -> float:
     passed = transfer(at, fried, outer) * at
     # The root r is half of the FWHM, in units of wavelength / Fried length: the surface brightness at the angle r is
     # half of that in the centre.
-    half = brentq(lambda r: float((passed * (j0(2.0 * np.pi * r * at / fried) - 0.5)).sum()), 0.02, 0.6, xtol=1e-9)
+    half = scipy.optimize.brentq(
+        lambda r: float((passed * (scipy.special.j0(2.0 * np.pi * r * at / fried) - 0.5)).sum()), 0.02, 0.6, xtol=1e-9
+    )
     return 2.0 * float(half) * wavelength * 1e-10 / fried / _ARCSEC
 
 
-@lru_cache(maxsize=256)
 def finest_seeing(wavelength: float, outer: float) -> float:
     """Return the smallest seeing (FWHM in arcsec) that this module can compute at a wavelength in Angstrom.
 
     It is the seeing through air whose Fried length is 0.05 times the outer scale of the turbulence. `outer` is this
     outer scale in m.
     """
-    return fwhm(wavelength, _LONGEST * outer, outer)
+    return 2.0 * _SHARPEST * wavelength * 1e-10 / (_LONGEST * outer) / _ARCSEC
 
 
 @lru_cache(maxsize=256)
@@ -126,14 +134,16 @@ def fried_length(seeing: float, wavelength: float, outer: float) -> float:
         If the Fried length would be outside 1e-5 to 0.05 times the outer scale.
     """
     ends = tuple(ratio * outer for ratio in (_SHORTEST, _LONGEST))
-    worst, best = fwhm(wavelength, ends[0], outer), finest_seeing(wavelength, outer)
+    worst, best = (fwhm(wavelength, end, outer) for end in ends)
     if not best <= seeing <= worst:
         raise OutOfRange("seeing, arcsec", seeing, best, worst)
     # `estimate` is the Fried length for an infinite outer scale. With a finite outer scale, the Fried length lies
     # between 0.4 and 1.02 times this value.
     estimate = 0.976 * wavelength * 1e-10 / (seeing * _ARCSEC)
     low, high = (max(ends[0], 0.4 * estimate), min(ends[1], 1.02 * estimate))
-    length = brentq(lambda fried: np.log(fwhm(wavelength, float(fried), outer) / seeing), low, high, rtol=1e-7)
+    length = scipy.optimize.brentq(
+        lambda fried: np.log(fwhm(wavelength, float(fried), outer) / seeing), low, high, rtol=1e-7
+    )
     return float(length)
 
 

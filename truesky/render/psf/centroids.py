@@ -13,7 +13,7 @@ Bertin & Arnouts 1996, and the manual of SourceExtractor (XWIN_IMAGE: window of 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import correlate1d
+import scipy
 
 from lake_schema.arrays import Array, Float
 from truesky.numerics import matrices
@@ -93,7 +93,7 @@ def _average_over_pixel(plane: Array, samples: int, axis: int) -> Float:
     """
     weights = np.full(samples + 1 - samples % 2, 1.0 / samples)
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
-    return np.asarray(correlate1d(np.asarray(plane, float), weights, axis))
+    return np.asarray(scipy.ndimage.correlate1d(np.asarray(plane, float), weights, axis))
 
 
 def _colour_count(psf: Psf) -> int:

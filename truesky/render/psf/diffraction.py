@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import galsim
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
@@ -125,6 +124,8 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
         sampled pupil has soft edges, which weaken light far from the centre; this is corrected. Because of single
         precision, the relative error per sample is 5e-4, and 5e-6 in the core.
     """
+    import galsim
+
     transmission, transform = optics.transmission, optics.transform
     side = transform if side is None else side
     lit = transmission > 0

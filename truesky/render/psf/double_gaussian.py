@@ -15,7 +15,7 @@ Serrano et al. 2024, section 4.2 (sum of two Gaussians, for NISP-S); c is assume
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
@@ -75,7 +75,7 @@ def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
     ends = (0.5 - (1.0 - part)) / part * (1.0 + 1e-9), 0.5
     if light_excess(ends[1]) >= 0.0:
         return core_width(0.5), core_width(0.5)
-    best_core = float(brentq(light_excess, *ends, xtol=1e-14))
+    best_core = float(scipy.optimize.brentq(light_excess, *ends, xtol=1e-14))
     return core_width(best_core), outer_width(best_core)
 
 

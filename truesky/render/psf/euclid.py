@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+import scipy
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import cache, matrices
+from truesky.numerics import cache, cache_labels, matrices
 from truesky.numerics.code_fingerprints import code_key
 from truesky.numerics.compiling import jit
 from truesky.render.camera.detectors import Detector, detectors
@@ -160,7 +160,7 @@ def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration,
     Psf
         The PSF.
     """
-    planes = _planes(NISP, detector, waves, mission, positions)
+    planes = _planes(NISP, detector, waves, mission, positions, "spectra")
     return model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
 
 
@@ -210,7 +210,7 @@ def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: Missio
     # have their correct mean over the sub-band.
     parts = sub_bands(band)
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
-    planes = _planes(sampling, detector, waves, mission, positions)
+    planes = _planes(sampling, detector, waves, mission, positions, band.name)
     psf = model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
     return replace(psf, edges=_edges(sampling, detector, band, mission))
 
@@ -252,12 +252,18 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
 
 
 def _planes(
-    camera_sampling: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
+    camera_sampling: Sampling,
+    detector: Detector,
+    waves: Float,
+    mission: MissionConfiguration,
+    positions: int,
+    light: str,
 ) -> Planes:
     """Return the images whose weighted sum is the PSF of a detector, at the wavelengths `waves` [w], Angstrom.
 
-    `positions` is the number of positions on the detector at which the PSF is computed, a key of DEGREES. The images
-    are computed once and then read from a cache on disc.
+    `positions` is the number of positions on the detector at which the PSF is computed, a key of DEGREES. `light` is
+    the name of the passband, or "spectra", by which forecasts find the images. They are computed once and then read
+    from a cache on disc.
     """
     section = detector.section
     nodes, powers = _nodes(positions), _powers(positions)
@@ -291,7 +297,8 @@ def _planes(
             ),
         }
 
-    arrays = cache.cached_arrays(f"{section}_psf", key, make)
+    label = cache_labels.label_psf(section, detector.name, light, positions, mission.parameters)
+    arrays = cache.cached_arrays(f"{section}_psf", key, make, label)
     axis_order = slice(None, None, -1 if detector.upside_down else 1)
     # PSF images are computed in the axes of the focal plane. For a detector that is mounted upside down, images are
     # rotated by 180 deg. The change of the PSF across the detector (drift) is a polynomial of the position (x, y). Both
@@ -459,7 +466,9 @@ def centre_wavefront(
         light = np.sum(
             [diffraction_image(coefficients, pupil_optics, side) for pupil_optics in optics], axis=0, dtype=float
         )
-        weighted = uniform_filter(light, camera_sampling.samples, mode="nearest") * window * window[:, None]
+        weighted = (
+            scipy.ndimage.uniform_filter(light, camera_sampling.samples, mode="nearest") * window * window[:, None]
+        )
         return np.asarray(np.array([(weighted * axis).sum(), (weighted * axis[:, None]).sum()]) / weighted.sum())
 
     tilted_nm, step = nm.copy(), 10.0

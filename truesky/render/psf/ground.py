@@ -25,9 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.fft
-from scipy.interpolate import make_interp_spline
-from scipy.ndimage import map_coordinates
+import scipy
 
 from lake_schema.arrays import Array, Complex, Float, Float32
 from lake_schema.errors import OutOfRange
@@ -374,7 +372,7 @@ def _spline(lags: Float, at: Float) -> Float:
     """
     inside = np.abs(at) <= lags[-1]
     out = np.zeros((len(at), len(lags)))
-    out[inside] = make_interp_spline(lags, np.eye(len(lags)), k=3)(at[inside])
+    out[inside] = scipy.interpolate.make_interp_spline(lags, np.eye(len(lags)), k=3)(at[inside])
     return out
 
 
@@ -474,5 +472,5 @@ def _outer_light(
         t, r = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
         on_spike = np.abs(t) < STEP * (line.shape[1] - 1)
         places = np.stack([np.abs(r[on_spike]) / LONG, np.abs(t[on_spike]) / STEP])
-        light[on_spike] += map_coordinates(line, places, order=1, mode="nearest")
+        light[on_spike] += scipy.ndimage.map_coordinates(line, places, order=1, mode="nearest")
     return pupil_edges, (light * step**2).astype(np.float32)

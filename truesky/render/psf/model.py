@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import galsim
 import numpy as np
-from scipy.ndimage import maximum, uniform_filter
+import scipy
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 from truesky.render.psf.spikes import Edges
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    import galsim
 
 # Number of samples of a PSF image per detector pixel: for VIS, for PSFs from files, and for analytic profiles. The
 # finest optical detail of VIS (lambda / D at 540 nm) is 2.8 samples wide.
@@ -165,6 +169,8 @@ def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim
     galsim.GSObject
         The PSF; its flux is the sum of the image.
     """
+    import galsim
+
     sampled = galsim.Image(np.asarray(image, float), scale=sampling)
     # A PSF is nearly 0 at the border of its image, so galsim need pad it only to twice its side. The step and the
     # largest frequency in Fourier space are given, since galsim would spend time on finding them.
@@ -235,7 +241,7 @@ def from_profile(
     total = np.bincount(ring[inside], image[inside])
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     square = np.maximum(*np.meshgrid(np.abs(grid), np.abs(grid)))
-    ring_max = np.asarray(maximum(image, square, np.arange(side // 2)))
+    ring_max = np.asarray(scipy.ndimage.maximum(image, square, np.arange(side // 2)))
     rim = np.maximum(np.maximum.accumulate(ring_max[::-1])[::-1], 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     fwhm = _width(profile, pixel_scale, has_pixel)
@@ -244,9 +250,11 @@ def from_profile(
 
 def _width(profile: galsim.GSObject, pixel_scale: float, has_pixel: bool) -> float:
     """Return the FWHM of a PSF averaged over pixels, arcsec; `has_pixel` is True if `profile` is already averaged."""
+    import galsim
+
     for samples in _FINE:
         core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / samples, method="no_pixel", dtype=float)
-        with_pixel = core.array if has_pixel else uniform_filter(core.array, samples)
+        with_pixel = core.array if has_pixel else scipy.ndimage.uniform_filter(core.array, samples)
         bright = with_pixel > 0.5 * with_pixel.max()
         # If the core (all samples above half of the maximum) lies in the middle of the image, coarser samples, which
         # cover a wider area, are not necessary.
@@ -276,6 +284,8 @@ def profile_spectrum(psf: Psf, size: int, reach: int) -> Array:
         The element [iy, ix] is the transform at the frequencies ix and iy along x and y, in units of 2 pi / size radian
         per pixel. Rows are in the order of the FFT: iy from 0 to `reach`, then from -`reach` to -1.
     """
+    import galsim
+
     profile = psf.profile.dilate(1.0 / psf.pixel_scale)
     image = galsim.ImageCD(galsim.BoundsI(0, reach, -reach, reach), scale=2 * np.pi / size)
     # The transform of a real image is determined by a half plane. galsim's public method drawKImage would compute the

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import galsim
-
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.passbands import Passband
@@ -44,6 +42,8 @@ def exposure_psf(
     Psf
         The PSF. For turbulent air, OutOfRange is raised if the seeing is not allowed (`ground.check`).
     """
+    import galsim
+
     section, scale = detector.section, detector.pixel_scale
     profile = mission.value(f"{section}.psf.profile")
     if profile == _GAUSSIAN:
@@ -121,6 +121,8 @@ def moffat_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
     Psf
         The PSF.
     """
+    import galsim
+
     # By default galsim truncates the profile where 1e-5 of the light remains, which is visible for bright stars.
     accuracy_settings = galsim.GSParams(xvalue_accuracy=1e-12)
     return model.from_profile(galsim.Moffat(beta=beta, fwhm=seeing, gsparams=accuracy_settings), pixel_scale)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import galsim
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.fits import psfex
@@ -52,6 +51,8 @@ def psfex_planes(psf: Psf) -> tuple[Float32, float]:
     image per term, by which the term is multiplied, in the order of PSFEx: 1, x, x^2 ..., y, x y .... The sum of the
     first image is 1. n is 1 for a PSF that is the same on the whole detector.
     """
+    import galsim
+
     samples = psf.planes.samples if psf.planes else _SAMPLES
     half = min(int(np.ceil(_HALF * psf.fwhm / psf.pixel_scale * samples)), _MAX_HALF)
     if psf.planes is None:

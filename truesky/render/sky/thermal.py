@@ -12,7 +12,7 @@ temperature, which includes the emissivity. The equation scales the level to oth
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
@@ -40,7 +40,7 @@ def brightness(band: Passband, temperature: float) -> float:
     if not 1.0 <= temperature <= 1000.0:
         raise OutOfRange("temperature", temperature, 1.0, 1000.0)
     occupied, weight = _spectrum(band, temperature)
-    return float(logsumexp(occupied, b=weight))
+    return float(scipy.special.logsumexp(occupied, b=weight))
 
 
 def _spectrum(band: Passband, temperature: float) -> tuple[Float, Float]:
@@ -101,7 +101,7 @@ def photons(section: str, name: str, band: Passband, mission: MissionConfigurati
     total = np.zeros(len(band.wavelength))
     for part, now in _body_levels(section, band, mission):
         occupied, weight = _spectrum(band, now)
-        total += part * np.exp(occupied - logsumexp(occupied, b=weight)) * weight
+        total += part * np.exp(occupied - scipy.special.logsumexp(occupied, b=weight)) * weight
     return np.asarray(_level(section, name, mission) * total)
 
 

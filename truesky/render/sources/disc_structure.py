@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.special import i0e
+import scipy
 
 from lake_schema.arrays import Float, Float32, Int
 from truesky.randomness import rng
@@ -229,7 +228,7 @@ def _pattern(
     minus 1; each disc has 0.7 to 1.1 times this value.
     """
     narrow = generator.uniform(*_NARROW)
-    mean = i0e(narrow)
+    mean = scipy.special.i0e(narrow)
     strength = contrast * generator.uniform(0.7, 1.1) / (1.0 / mean - 1.0)
     phase = angle - winding.angle(log_radius)
     ridge = np.exp(narrow * (np.cos(winding.arms * phase) - 1.0)) / mean
@@ -285,7 +284,7 @@ def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, st
     """
     ring = (radius / step).astype(np.int64).ravel()
     ring_light, smooth_light = (
-        gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth)
+        scipy.ndimage.gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth)
     )
     middles = (np.arange(len(ring_light)) + 0.5) * step
     light = light * np.interp(radius, middles, smooth_light / ring_light)

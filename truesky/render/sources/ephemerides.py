@@ -27,6 +27,7 @@ from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
+from lake_schema.external.mistakes import find_out_of_bounds
 from lake_schema.ids import GENERATION_ORDER, source_id
 from lake_schema.sky.ecliptic import equatorial
 from truesky.render.sources.solar_system import KIND, Population
@@ -74,14 +75,17 @@ def read(file: Path, sha256: str) -> Bodies:
 
     `sha256` is the checksum of the file, which selects the cached result; it is not checked. BadInput is raised if a
     column is missing, a value is out of bounds, there are more than 2^21 rows, or a name is missing or occurs twice on
-    a day. The message has the file, and the column and row of a wrong value.
+    a day. It has one message for each column and kind of mistake, with the file, the column and the first row.
     """
     values, names = _table(file)
-    for key, bounds in KEYS.items():
-        external_rows.check_bounds(file, key, values[key], bounds)
-    day = np.floor(values["mjd"]).astype(np.int64)
+    mistakes = find_out_of_bounds(file, values, KEYS)
+    day = np.floor(np.nan_to_num(values["mjd"])).astype(np.int64)
     if names is not None:
-        _refuse_duplicates(file, names, day)
+        try:
+            _refuse_duplicates(file, names, day)
+        except BadInput as error:
+            mistakes.add(error)
+    mistakes.refuse()
     hour = 24.0 * (values["mjd"] - day - 0.5)
     cell = sky.cell_at(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
     ids = source_id(KIND, cell, np.arange(len(day)), day)

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import galsim
 import numpy as np
 import pyarrow as pa
-from scipy.special import gammaincc, gammaincinv, gammaln
+import scipy
 
 from lake_schema.arrays import Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from truesky.numerics import matrices
 from truesky.render.sources import sersic
 from truesky.request.schema import MAX_SHEAR
+
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes half a second.
+    import galsim
 
 # Half-light radius of a face-on exponential disc in scale lengths, the solution of (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
@@ -199,6 +203,8 @@ def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
     galsim.GSObject
         The profile in arcsec, with u to the west and v to the north.
     """
+    import galsim
+
     fraction = float(shape.bulge_fraction[i])
     parts = []
     if fraction > 0:
@@ -212,6 +218,8 @@ def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 
 def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
+    import galsim
+
     # The shear of galsim preserves the area. Begin with a circle whose radius is the geometric mean of the axes.
     q = float(shape.bulge_axis_ratio[i])
     radius = float(shape.bulge_radius[i]) * np.sqrt(q)
@@ -223,10 +231,14 @@ def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 @lru_cache(maxsize=256)
 def _sersic(index: float) -> galsim.Sersic:
+    import galsim
+
     return galsim.Sersic(index, half_light_radius=1.0)
 
 
 def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
+    import galsim
+
     radius = float(shape.disk_radius[i])
     if radius < smallest:
         return galsim.DeltaFunction()
@@ -310,7 +322,7 @@ def flux_outside(shape: Shapes, radius: Float) -> Float:
     """
     stretch, n = _lensed_stretch(shape), shape.sersic_index
     bulge_radius, disk_radius = (np.maximum(r * stretch, 1e-6) for r in (shape.bulge_radius, shape.disk_radius))
-    bulge = gammaincc(2 * n, _b(n) * (radius / bulge_radius) ** (1 / n))
+    bulge = scipy.special.gammaincc(2 * n, _b(n) * (radius / bulge_radius) ** (1 / n))
     lengths = radius / disk_radius * EXPONENTIAL_RADIUS
     disk = (1 + lengths) * np.exp(-lengths)
     return np.asarray(shape.bulge_fraction * bulge + (1 - shape.bulge_fraction) * disk)
@@ -349,7 +361,9 @@ def real_space_profile(shape: Shapes, form: Forms) -> Float:
     has_area = [area > _NO_AREA for area in areas]
     areas = [np.where(valid, area, 1.0) for valid, area in zip(has_area, areas, strict=True)]
     middles = (
-        shape.bulge_fraction * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - gammaln(2 * n)) / areas[0],
+        shape.bulge_fraction
+        * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - scipy.special.gammaln(2 * n))
+        / areas[0],
         (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
     )
     inverse = [
@@ -396,7 +410,7 @@ def _b(index: Float) -> Float:
     """
     out = np.asarray(2 * index - 1 / 3 + 4 / (405 * index) + 46 / (25515 * index**2))
     low = index < _SERIES
-    out[low] = gammaincinv(2 * index[low], 0.5)
+    out[low] = scipy.special.gammaincinv(2 * index[low], 0.5)
     return out
 
 
@@ -409,5 +423,7 @@ def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Flo
     """
     r_e = np.maximum(half_light, 1e-6)[:, None]
     n, b = index[:, None], _b(index)[:, None]
-    log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])
+    log_norm = (
+        np.log(2 * np.pi * n) - 2 * n * np.log(b) + scipy.special.gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])
+    )
     return np.asarray(np.exp(-b * (radius[None, :] / r_e) ** (1 / n) - log_norm))

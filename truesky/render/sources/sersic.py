@@ -8,12 +8,10 @@ its upper bits.
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
-from scipy.interpolate import CubicSpline
-from scipy.special import gammainccinv, gammaln
+import scipy
 
 from lake_schema.arrays import Float, Float32, Int
-from truesky.numerics import cache
+from truesky.numerics import cache, cache_labels
 from truesky.numerics.code_fingerprints import code_key
 
 # Smallest and largest Sersic index, the range that galsim.Sersic accepts.
@@ -56,7 +54,8 @@ def table() -> Float32:
     Hamilton 2000 (logarithmic Hankel transform).
     """
     key = cache.content_key(code_key(__name__))
-    return cache.cached_arrays("sersic", key, lambda: {"transform": _make_table()})["transform"]
+    label = cache_labels.label_profiles()
+    return cache.cached_arrays("sersic", key, lambda: {"transform": _make_table()}, label)["transform"]
 
 
 def interpolation_weights(index: Float) -> tuple[Int, Float]:
@@ -101,8 +100,10 @@ def transform(index: float, log_k: Float) -> Float:
     log_r = (np.arange(_POINTS) - (_POINTS - 1) / 2) * step
     # Constant b_n of the Sersic profile: the incomplete gamma function of order 2n is the light inside a radius, which
     # must be half at radius 1.
-    b = float(gammainccinv(2 * index, 0.5))
-    log_flux = np.log(2 * np.pi * index) - 2 * index * np.log(b) + gammaln(2 * index)
+    b = float(scipy.special.gammainccinv(2 * index, 0.5))
+    log_flux = np.log(2 * np.pi * index) - 2 * index * np.log(b) + scipy.special.gammaln(2 * index)
     light = np.exp(log_r - b * np.exp(log_r / index) - log_flux)
     k = offset + log_r
-    return np.asarray(CubicSpline(k, 2 * np.pi * np.exp(-k) * scipy.fft.fht(light, step, 0.0, offset))(log_k))
+    return np.asarray(
+        scipy.interpolate.CubicSpline(k, 2 * np.pi * np.exp(-k) * scipy.fft.fht(light, step, 0.0, offset))(log_k)
+    )

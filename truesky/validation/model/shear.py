@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import healpy as hp
 import numpy as np
 
 from lake_schema.arrays import Float, Float32
+from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue.galaxies import lensing
 from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.matter import convergence, density_box, lightcone

@@ -16,7 +16,7 @@ from truesky.render.exposure import board_neighbours
 from truesky.render.planning import calibration_frames, ground_surveys, planned_exposures
 from truesky.render.products import raw_pointing
 from truesky.request.area import Area
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 # Parameters that rendering does not use: zero points are checked with them.
 WAITING = ("*.collecting_area", "*.throughput")

@@ -17,7 +17,7 @@ from truesky.render.channels import ground
 from truesky.render.planning import ground_surveys
 from truesky.render.products import read_back
 from truesky.request import schema
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 EXPOSED = {"position_angle": 33.0, "exposure_id": 12, "airmass": 1.25, "sky": 30.0}
 

@@ -223,7 +223,7 @@ def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
         plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))
     with pytest.raises(BadInput, match=r"psf.lsst_i: no exposure is taken in this band"):
         plan_exposures.plan(lake, asked(tmp_path, lsst_i="R22_S11.psf"))
-    with pytest.raises(BadInput, match=r"psf.lsst_r must be text, got 3"):
+    with pytest.raises(BadInput, match=r"psf.lsst_r must be text in quotes, got 3"):
         asked(tmp_path, lsst_r=3)
 
 

@@ -74,6 +74,14 @@ def test_a_seeing_has_its_fried_length(wide, wave, outer):
     assert atmosphere.fwhm(wave, atmosphere.fried_length(wide, wave, outer), outer) == pytest.approx(wide, rel=1e-5)
 
 
+@pytest.mark.parametrize(("wave", "outer"), [(3500.0, 20.0), (9000.0, 30.0)])
+def test_the_finest_seeing_is_that_of_the_longest_fried_length(wave, outer):
+    """The constant saves the import of scipy.optimize."""
+    expected = atmosphere.fwhm(wave, 0.05 * outer, outer)
+    assert atmosphere.finest_seeing(wave, outer) == pytest.approx(expected, rel=1e-15, abs=0.0)
+    assert atmosphere.fried_length(1.000001 * expected, wave, outer) == pytest.approx(0.05 * outer, rel=1e-4)
+
+
 def test_air_refracts_as_published():
     """The reference is Filippenko 1982, Table 1, sec z = 2: 4000 A against 5000 A, 2 km up at 600 mm Hg."""
     height = 8400.0 * np.log(760.0 / 600.0)

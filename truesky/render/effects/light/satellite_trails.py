@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange

@@ -21,7 +21,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from lake_schema.arrays import Int
 from lake_schema.errors import OutOfRange

@@ -25,7 +25,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from lake_schema.arrays import Bool, Float, Int, Int32
 from lake_schema.errors import OutOfRange
@@ -179,7 +179,7 @@ def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random
     """
     (ny, nx), total = shape, float(sum(density))
     shares = np.cumsum(density) / total if total > 0.0 else np.ones(len(density))
-    remaining = int(stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
+    remaining = int(scipy.stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
     while remaining > 0:
         rank, y, x, height, electrode = rng.random((min(remaining, _CHUNK_SIZE), 5)).T
         species = np.minimum(np.searchsorted(shares, rank, side="right"), len(density) - 1)
