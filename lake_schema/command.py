@@ -16,6 +16,9 @@ from typing import NoReturn
 
 from lake_schema.errors import BadInput, LakeError, one_line
 
+# Largest number of mistakes of one input that are printed.
+_MAX_MISTAKES = 100
+
 
 def run(name: str, body: Callable[[], int]) -> int:
     """Run the body of a command and return its exit status.
@@ -31,8 +34,8 @@ def run(name: str, body: Callable[[], int]) -> int:
     -------
     int
         The value that `body` returns, 2 if it raises BadInput, and 1 if it raises another LakeError, OSError or
-        MemoryError. For these, one line is printed on stderr. 1 is also returned, without a message, if the reader of
-        stdout has closed the pipe. Other exceptions are not caught.
+        MemoryError. For these, one line is printed on stderr, or one line for each mistake of a BadInput. 1 is also
+        returned, without a message, if the reader of stdout has closed the pipe. Other exceptions are not caught.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Print characters that the terminal's encoding lacks as escape sequences, instead of raising an error.
@@ -47,7 +50,7 @@ def run(name: str, body: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except BadInput as error:
-        return print_error(name, error, 2)
+        return _print_mistakes(name, error)
     except (LakeError, OSError, MemoryError) as error:
         return print_error(name, error, 1)
 
@@ -103,6 +106,14 @@ def limit_resource(name: str, limit: int) -> None:
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         resource.setrlimit(getattr(resource, name), (limit, limit))
+
+
+def _print_mistakes(name: str, error: BadInput) -> int:
+    for message in error.messages[:_MAX_MISTAKES]:
+        print_error(name, message, 2)
+    if (count := len(error.messages) - _MAX_MISTAKES) > 0:
+        print_error(name, f"and {count} more mistakes", 2)
+    return 2
 
 
 def print_error(name: str, error: object, code: int) -> int:

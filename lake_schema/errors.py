@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import ParamSpec, TypeVar, cast
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+
 # Maximum length of a message in characters. A message may quote input, which can be very long.
 _MAX_LENGTH = 1000
 
@@ -30,6 +37,118 @@ class BadInput(LakeError):
 
     The message names the argument, key, file, column or row.
     """
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Return one line for each mistake."""
+        return (str(self),)
+
+    def with_prefix(self, place: str) -> BadInput:
+        """Return an error whose lines begin with `place` and a colon, followed by the lines of this error."""
+        return bad_input(f"{place}: {message}" for message in self.messages)
+
+
+class BadInputs(BadInput):
+    """Several mistakes of a user's input, which were found together.
+
+    Parameters
+    ----------
+    messages : iterable of str
+        One line per mistake.
+    """
+
+    def __init__(self, messages: Iterable[str]) -> None:
+        self._messages = tuple(one_line(message) for message in messages)
+        super().__init__("; ".join(self._messages))
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Return one line for each mistake."""
+        return self._messages
+
+    def __reduce__(self) -> tuple[type[BadInputs], tuple[object, ...]]:
+        # By default, unpickling an exception calls the constructor with the joined message as its only argument.
+        return BadInputs, (self._messages,)
+
+
+def bad_input(messages: Iterable[str]) -> BadInput:
+    """Return an error for one mistake or for several. Equal messages are one mistake."""
+    distinct = tuple(dict.fromkeys(messages))
+    return BadInput(distinct[0]) if len(distinct) == 1 else BadInputs(distinct)
+
+
+class Mistakes:
+    """Collect the mistakes of an input in a `with` block, and raise all of them together at its end.
+
+    Values are read with the method `read`, which does not raise BadInput. A value with a mistake is replaced by None.
+    The block may store the values in records and test whether they are None, but must not use them otherwise.
+    """
+
+    def __init__(self) -> None:
+        self._errors: list[BadInput] = []
+
+    def __enter__(self) -> Mistakes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, BadInput) and self._errors:
+            self.add(error)
+            raise bad_input(self.messages) from None
+        # Another exception, which is not a mistake of the input, is more important.
+        if error is None:
+            self.raise_all()
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Return the lines of the collected mistakes, each once."""
+        return tuple(dict.fromkeys(message for error in self._errors for message in error.messages))
+
+    def add(self, error: BadInput) -> None:
+        """Add the mistakes of an error."""
+        self._errors.append(error)
+
+    def read(
+        self, reader: Callable[_Parameters, _Result], *arguments: _Parameters.args, **options: _Parameters.kwargs
+    ) -> _Result:
+        """Call a function and return its result. If it raises BadInput, add its mistakes and return None instead.
+
+        Parameters
+        ----------
+        reader : callable
+            Function that reads or checks a value.
+        *arguments, **options : object
+            Arguments of the function.
+
+        Returns
+        -------
+        object
+            Result of the function, or None after a mistake.
+        """
+        try:
+            return reader(*arguments, **options)
+        except BadInput as error:
+            self.add(error)
+            # The declared type is not the type of None, which is not used: the block ends with an error.
+            return cast(_Result, None)
+
+    def raise_all(self) -> None:
+        """Raise the only mistake, or all of them as one BadInputs; do nothing without mistakes."""
+        if len(self._errors) == 1:
+            raise self._errors[0]
+        if self._errors:
+            raise bad_input(self.messages)
+
+
+def refuse_mistakes(messages: Iterable[str]) -> None:
+    """Raise an error with a line for each mistake; do nothing without mistakes. Equal messages are one mistake."""
+    listed = list(messages)
+    if listed:
+        raise bad_input(listed)
 
 
 class OutOfRange(BadInput):

@@ -1,6 +1,6 @@
 """Compare two mission configurations (sets of the numbers of telescope, cameras and survey).
 
-The command is python -m lake_schema mission diff A B.
+The command is truesky mission diff A B.
 """
 
 from __future__ import annotations

@@ -13,15 +13,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.mission import bounds, detector_overrides, model
 from lake_schema.mission.camera_folder import Camera
 from lake_schema.mission.detector_overrides import DetectorPlace
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all_parameters
 from lake_schema.tables.mission import LADDER
+from lake_schema.texts import spelling
 
 __all__ = ["LADDER", "MissionConfiguration", "differences", "resolve"]
+
+# Remedy in the error message about an unknown parameter.
+_LISTING_HINT = "truesky mission list prints all names"
 
 Chosen = TypeVar("Chosen", Parameter, Model)
 
@@ -207,9 +211,9 @@ class MissionConfiguration:
             If a value is outside its allowed range.
         """
         chosen = dict(self._parameters_by_key)
-        for name, (value, unit) in overrides.items():
-            chosen[name] = _override_record(self._parameters_by_key, name, value, unit)
-            bounds.check_bounds(chosen[name], detector_overrides.split_name(name, self._parameters_by_key)[0])
+        with Mistakes() as mistakes:
+            for name, (value, unit) in overrides.items():
+                chosen[name] = mistakes.read(_override_record, self._parameters_by_key, name, value, unit)
         names = tuple(sorted({*self.overridden, *overrides}))
         configuration = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
         for name in names:
@@ -284,7 +288,8 @@ def resolve(
     }
     if duplicates := sorted(set(chosen) & set(chosen_models)):
         raise BadInput(f"mission parameter {duplicates[0]} is both a value and a model")
-    for parameter in chosen.values():
+    # The tests check the values of the package.
+    for parameter in chosen.values() if records is not None else camera_parameters:
         bounds.check_bounds(parameter, parameter.key)
     configuration = MissionConfiguration(
         tuple(chosen[key] for key in sorted(chosen)),
@@ -320,11 +325,12 @@ def _override_record(parameters: Mapping[str, Parameter], name: str, value: floa
     where = f"mission override {name}"
     key, _ = detector_overrides.split_name(name, parameters)
     if key not in parameters:
-        raise BadInput(f"{where}: the mission database has no such parameter")
+        suggestion = spelling.did_you_mean(name, parameters)
+        raise BadInput(f"{where}: the mission database has no such parameter: {suggestion or _LISTING_HINT}")
     if not math.isfinite(value):
         raise BadInput(f"{where} = {value} is not finite")
     parameter_unit = parameters[key].unit
-    return replace(
+    record = replace(
         parameters[key],
         key=name,
         status="SIM",
@@ -332,6 +338,8 @@ def _override_record(parameters: Mapping[str, Parameter], name: str, value: floa
         confidence="assumed",
         source="request",
     )
+    bounds.check_bounds(record, key)
+    return record
 
 
 def differences(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:

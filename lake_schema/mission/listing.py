@@ -1,6 +1,6 @@
 """List the parameters (numbers) and models (files) of the mission database.
 
-The command is python -m lake_schema mission list [PATTERN].
+The command is truesky mission list [PATTERN].
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from lake_schema.mission.bounds import bounds_of_parameter
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter, convert
+from lake_schema.texts import text_tables
 
 _HEAD = ("name", "value", "unit", "bounds", "may differ by", "status", "source")
 
@@ -112,10 +113,7 @@ def _bounds_in_unit(key: str, unit: str) -> tuple[float, float] | None:
 
 def align_columns(entries: Sequence[Entry]) -> Iterator[str]:
     """Yield a line of headings and one line per parameter or model, in aligned columns; no line ends in blanks."""
-    table = [_HEAD, *map(_format_fields, entries)]
-    widths = [max(len(row[i]) for row in table) for i in range(len(_HEAD))]
-    for row in table:
-        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+    yield from text_tables.format_table(_HEAD, [_format_fields(entry) for entry in entries])
 
 
 def _format_fields(entry: Entry) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 
@@ -131,10 +132,22 @@ def read_content(model: Model, folder: Path | None = None) -> bytes:
 @cache
 def _read_installed(file: str) -> bytes | None:
     package, _, path = file.rpartition(":")
+    if not package:
+        return _read_or_none(files("lake_schema.mission") / _FOLDER / path)
     try:
-        file_path = files(package).joinpath(path) if package else files("lake_schema.mission") / _FOLDER / path
-        return file_path.read_bytes()
-    except (OSError, ModuleNotFoundError):
+        # Find the package without importing it, because the import of a library takes longer than reading the file.
+        spec = find_spec(package)
+    except ModuleNotFoundError:
+        return None
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    contents = (_read_or_none(Path(folder) / path) for folder in folders)
+    return next((data for data in contents if data is not None), None)
+
+
+def _read_or_none(file: Traversable) -> bytes | None:
+    try:
+        return file.read_bytes()
+    except OSError:
         return None
 
 

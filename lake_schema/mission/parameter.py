@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import Protocol, TypeVar
-
-import astropy.units as u
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from lake_schema.errors import BadInput
 from lake_schema.tables import mission as table
+
+if TYPE_CHECKING:
+    import astropy.units as u
 
 # Allowed statuses of a record: REQ (required), DES (designed), BLT (built), CBE (current best estimate) and SIM
 # (simulated) (Serrano et al. 2024, the Mission Database).
@@ -32,6 +33,26 @@ _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confiden
 
 # Largest number of characters of an entry in a CSV file of the database.
 _MAX_LENGTH = 1000
+
+# Units of the parameters in the package. Their texts are not parsed again, because importing astropy.units takes half a
+# second.
+_SHIPPED_UNITS = frozenset((
+    "", "1 / (cm2 s)", "1 / (deg s)", "1 / electron", "1 / mm2", "1 / mm4", "1 / pix", "1 / s", "K", "adu", "arcmin",
+    "arcsec", "arcsec / h", "arcsec / mm", "arcsec / pix", "arcsec / um", "cm2", "d", "deg", "deg / s", "deg-2", "deg2",
+    "dex", "dex / mag", "eV", "electron", "electron / (s pix)", "electron / adu", "electron / um", "erg / (s cm2)", "h",
+    "km", "m", "m2", "mag", "mag / arcsec2", "mas", "mm", "mm / pix", "ms", "nm", "pix", "pix / electron", "s", "um",
+    "um / pix", "yr",
+))  # fmt: skip
+# Factors of frequent conversions, as astropy computes them.
+_FACTORS = {
+    ("1 / (cm2 s)", "cm-2 s-1"): 1.0,
+    ("arcmin", "deg"): 0.016666666666666666,
+    ("cm2", "m2"): 0.0001,
+    ("mm", "um"): 1000.0000000000001,
+    ("ms", "s"): 0.001,
+    ("um", "nm"): 999.9999999999999,
+    ("um / pix", "mm / pix"): 0.001,
+}
 
 Identity = tuple[str, str, int, float]
 Record = TypeVar("Record")
@@ -95,7 +116,7 @@ class Parameter:
         check_record(self, where)
         if not math.isfinite(self.value):
             raise BadInput(f"{where}: value = {self.value} must be finite")
-        parse_unit(self.unit, where)
+        _check_unit(self.unit, where)
 
     @property
     def identity(self) -> Identity:
@@ -130,6 +151,8 @@ def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
     Raise BadInput if the string is not a unit, or is a logarithmic unit such as mag(um). `where` is the name of the
     quantity, with which the message begins.
     """
+    import astropy.units as u
+
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):
@@ -140,9 +163,21 @@ def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
     return unit
 
 
+def _check_unit(text: str, where: str) -> None:
+    """Raise BadInput if a text is not a unit that `parse_unit` accepts. The message begins with `where`."""
+    if text not in _SHIPPED_UNITS:
+        parse_unit(text, where)
+
+
 @cache
 def _conversion_factor(unit: str, to: str) -> float | None:
     """Return the factor that converts a value from `unit` to the unit `to`, or None if they cannot be converted."""
+    if unit == to:
+        return 1.0
+    if (unit, to) in _FACTORS:
+        return _FACTORS[unit, to]
+    import astropy.units as u
+
     try:
         factor = float(parse_unit(unit).to(parse_unit(to)))
     except u.UnitsError:
@@ -174,8 +209,9 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     BadInput
         If a unit is unknown or the units are not convertible.
     """
-    parse_unit(unit, where)
-    parse_unit(to, where)
+    if (unit, to) not in _FACTORS:
+        _check_unit(unit, where)
+        _check_unit(to, where)
     factor = _conversion_factor(unit, to)
     if factor is None:
         raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}")

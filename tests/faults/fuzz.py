@@ -1,7 +1,7 @@
 """Run readers of user files on mutations of valid files, of their structure and of their bytes.
 
-A reader returns or raises a LakeError of one line, within bounds of time and memory, and writes nothing. Mutations are
-numbered: the same number of a target is the same input, on any machine.
+A reader returns or raises a LakeError of one line (for several mistakes, one line each), within bounds of time and
+memory, and writes nothing. Mutations are numbered: the same number of a target is the same input, on any machine.
 
     python -m tests.faults.fuzz [TARGET ...] [--runs 20000] [--first 0]
 
@@ -25,7 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lake_schema.errors import LakeError
+from lake_schema.errors import BadInput, LakeError
 from tests.faults import fuzz_targets
 
 MOST_SECONDS, MOST_BYTES, MOST_CHARACTERS = 10.0, 512 << 20, 2000
@@ -184,7 +184,8 @@ def judged(target, path):
         target.read(path)
     except LakeError as error:
         said = str(error)
-        if len(said.splitlines()) > 1 or len(said) > MOST_CHARACTERS:
+        mistakes = error.messages if isinstance(error, BadInput) else (said,)
+        if len(said.splitlines()) > len(mistakes) or max(map(len, mistakes)) > MOST_CHARACTERS:
             return f"says {len(said.splitlines())} lines, {len(said)} characters: {said[:200]!r}"
     except BaseException as error:
         calls = [f"{call.filename}:{call.lineno}" for call in traceback.extract_tb(error.__traceback__)]

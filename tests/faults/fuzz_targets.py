@@ -23,7 +23,7 @@ from tests import requests
 from tests.truesky.explore.test_hostile_sql import GOOD
 from tests.universe import plain_plan, plain_work
 from truesky.catalogue import dust_map
-from truesky.catalogue.external import mapping
+from truesky.catalogue.external import mapping, reading
 from truesky.catalogue.stars import bright_stars, from_catalogue
 from truesky.explore import guard
 from truesky.fluxes import passbands
@@ -34,8 +34,8 @@ from truesky.render.planning import ground_surveys
 from truesky.render.psf import from_file
 from truesky.render.sources import ephemerides, galaxy_stamps
 from truesky.request import area, files
+from truesky.request.exposures.observations import Observation
 from truesky.request.from_toml import parse
-from truesky.request.observations import Observation
 
 ROOT = Path(__file__).resolve().parents[2]
 RNG = np.random.default_rng(7)
@@ -178,7 +178,7 @@ def curve(form):
 
 
 def rows_of(columns):
-    return lambda path: [rows for rows in mapping.read([path], columns)]
+    return lambda path: [rows for rows in reading.read([path], columns)]
 
 
 @cache

@@ -11,7 +11,6 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from lake_schema import __main__ as lake_schema
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import publish
@@ -28,6 +27,7 @@ from truesky.catalogue import (
     export_galaxies,
     request_checks,
 )
+from truesky.commands import __main__ as truesky
 from truesky.commands import check, demo, report, submit
 from truesky.commands import run as whole
 from truesky.explore import __main__ as explore
@@ -64,8 +64,8 @@ OF_LAKE = {
     "coverage": lambda lake, good: coverage.main(["--lake", lake]),
     "export_gaia": lambda lake, good: export_gaia.main(["--lake", lake, "--out", f"{good}.csv"]),
     "export_galaxies": lambda lake, good: export_galaxies.main(["--lake", lake, "--out", f"{good}s", "--form", "fits"]),
-    **{name: (lambda lake, good, name=name: lake_schema.main([name, lake])) for name in ("verify", "gc", "describe")},
-    "mission diff": lambda lake, good: lake_schema.main(["mission", "diff", ",".join(LADDER), f"{lake}@{0:016}"]),
+    **{name: (lambda lake, good, name=name: truesky.main([name, lake])) for name in ("verify", "gc", "describe")},
+    "mission diff": lambda lake, good: truesky.main(["mission", "diff", ",".join(LADDER), f"{lake}@{0:016}"]),
     "demo": lambda lake, good: demo.main(["--out", lake, "--request", good]),
     "run": lambda lake, good: whole.main([good, "--lake", lake], pytest.fail),
     "report": lambda lake, good: report.main([lake]),
@@ -75,7 +75,7 @@ OF_REQUEST = {
     "request check": lambda path, new: check.main([path]),
     "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
     "run": lambda path, new: whole.main([path, "--lake", new], pytest.fail),
-    "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),
+    "mission diff": lambda path, new: truesky.main(["mission", "diff", path, ",".join(LADDER)]),
 }
 OF_TARGET = {
     "explore": lambda out, lake: explore.main(["SELECT 1", "--lake", lake, "--out", out]),

@@ -39,3 +39,63 @@ def test_unprintable_characters_are_escaped():
 def test_a_refusal_comes_back_from_another_process(refusal):
     back = pickle.loads(pickle.dumps(refusal))
     assert (type(back), str(back)) == (type(refusal), str(refusal))
+
+
+def read_with_mistakes():
+    with errors.Mistakes() as mistakes:
+        assert mistakes.read(int, "3") == 3
+        for problem in ("a is wrong", "b is wrong", "a is wrong"):
+            mistakes.add(errors.BadInput(problem))
+        assert mistakes.read(refuse, "c is wrong") is None
+        assert len(mistakes) == 3
+
+
+def test_mistakes_are_raised_together_at_the_end_of_the_block():
+    with pytest.raises(errors.BadInputs) as caught:
+        read_with_mistakes()
+    assert caught.value.messages == ("a is wrong", "b is wrong", "c is wrong")
+    assert str(caught.value) == "a is wrong; b is wrong; c is wrong"
+    assert caught.value.with_prefix("x").messages[1] == "x: b is wrong"
+    back = pickle.loads(pickle.dumps(caught.value))
+    assert (type(back), back.messages) == (errors.BadInputs, caught.value.messages)
+
+
+def refuse(problem):
+    raise errors.BadInput(problem)
+
+
+def refuse_after_a_mistake():
+    with errors.Mistakes() as mistakes:
+        mistakes.add(errors.BadInput("a is wrong"))
+        raise errors.BadInput("b is wrong")
+
+
+def test_a_refusal_inside_the_block_is_raised_with_the_mistakes_before_it():
+    with pytest.raises(errors.BadInputs) as caught:
+        refuse_after_a_mistake()
+    assert caught.value.messages == ("a is wrong", "b is wrong")
+
+
+def fail_after_a_mistake():
+    with errors.Mistakes() as mistakes:
+        mistakes.add(errors.BadInput("a is wrong"))
+        mistakes.read(lambda: 1 / 0)
+
+
+def test_a_single_mistake_keeps_its_kind_and_other_errors_pass():
+    with pytest.raises(errors.OutOfRange), errors.Mistakes() as mistakes:
+        mistakes.add(errors.OutOfRange("a", 3, 0, 1))
+    with pytest.raises(ZeroDivisionError):
+        fail_after_a_mistake()
+    with errors.Mistakes() as mistakes:
+        assert mistakes.messages == ()
+
+
+def test_a_list_of_messages_is_refused_with_each_message_once():
+    errors.refuse_mistakes([])
+    with pytest.raises(errors.BadInput) as single:
+        errors.refuse_mistakes(["a: wrong", "a: wrong"])
+    assert (type(single.value), str(single.value)) == (errors.BadInput, "a: wrong")
+    with pytest.raises(errors.BadInputs) as several:
+        errors.refuse_mistakes(["a: wrong\nvalue", "b: missing"])
+    assert several.value.messages == ("a: wrong value", "b: missing")

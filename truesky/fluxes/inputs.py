@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema.arrays import Array
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import read as lake_read
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.provenance import file_sha256
@@ -43,9 +43,10 @@ from truesky.fluxes.libraries.vega import spectrum_file, vega_magnitudes
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, lines
 from truesky.fluxes.spectra.continuum import dust_curves
-from truesky.numerics import cache
+from truesky.numerics import cache, cache_labels
 from truesky.numerics.code_fingerprints import code_key
 from truesky.request.files import Curves, UserCurves
+from truesky.request.toml_values import refuse_name
 
 # Prefixes of the request's keys for user files: passbands, galaxy templates, extinction laws and stars. For example,
 # "fluxes.passbands.NAME" is the file of the passband NAME.
@@ -129,16 +130,18 @@ def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[s
     BadInput
         If a passband has the name of a built-in one, or its file is not valid.
     """
-    user_passbands, origins = {}, {}
-    for name, curves in user_curves.passbands:
-        key = f"{FILTER_PREFIX}{name}"
-        location = curves.location or key
-        if name in passbands.names():
-            raise BadInput(f"{location}: truesky has a passband {name}: choose another name for this curve")
-        with _prefix_errors(location):
-            user_passbands[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
-            origins[key] = _user_origin(curves)
-    return user_passbands, origins
+    with Mistakes() as mistakes:
+        read_curves = {name: mistakes.read(_read_passband, name, curves) for name, curves in user_curves.passbands}
+    user_passbands = {name: band for name, (band, _) in read_curves.items()}
+    return user_passbands, {f"{FILTER_PREFIX}{name}": origin for name, (_, origin) in read_curves.items()}
+
+
+def _read_passband(name: str, curves: Curves) -> tuple[Passband, Origin]:
+    location = curves.location or f"{FILTER_PREFIX}{name}"
+    if name in passbands.names():
+        raise BadInput(f"{location}: truesky has a passband {name}: choose another name for this curve")
+    with _prefix_errors(location):
+        return from_files.passband(curves.files[0], name, curves.medium, curves.format), _user_origin(curves)
 
 
 def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
@@ -169,9 +172,8 @@ def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], li
 def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband]) -> list[Passband]:
     """Return the passbands with the given names, built-in or from the user; raises BadInput if a name is unknown."""
     available = (*passbands.names(), *user_passbands)
-    for name in names:
-        if name not in available:
-            raise BadInput(f"fluxes.bands: {name!r} is not one of {', '.join(available)}")
+    if unknown := [name for name in names if name not in available]:
+        raise bad_input(f"fluxes.bands: {refuse_name(name, available)}" for name in unknown)
     return [user_passbands[name] if name in user_passbands else passbands.load(name) for name in names]
 
 
@@ -322,9 +324,8 @@ def published_stars(lake: Folder, templates_key: str) -> Library:
         return {"flux": np.stack(rows.sort_by("sed")["flux"].to_numpy()).astype(np.float32)}
 
     key = cache.content_key(templates_key, code_key(__name__))
-    return replace(
-        templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], external=True
-    )
+    arrays = cache.cached_arrays("published_stars", key, read_rows, cache_labels.label_published())
+    return replace(templates.stellar_library(), flux=arrays["flux"], external=True)
 
 
 def published_passband(lake: Folder, key: str, name: str) -> Passband:

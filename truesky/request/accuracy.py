@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 
-from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.errors import BadInput, OutOfRange, bad_input
+from lake_schema.texts import spelling
 
 # Table of drawing settings with their measured errors and CPU times, written by benchmarks/trade.py.
 _TABLE = Path(__file__).with_name("accuracy.csv")
@@ -58,12 +59,18 @@ SURVEY = Accuracy(flux=1e-3, shape=1e-4, position=1e-4, background=0.02)
 # 6e-3 of the sky noise, since tabulated Sersic profiles have errors of 3e-6 of the light.
 REFERENCE = Accuracy(flux=1e-4, shape=1e-5, position=1e-5, background=0.006)
 PRESETS = {"quicklook": QUICKLOOK, "draft": DRAFT, "survey": SURVEY, "reference": REFERENCE}
+# Values that a request may have, for error messages.
+ALLOWED = (
+    f"{', '.join(PRESETS)}, or a table such as {{ flux = 1e-3, shape = 1e-4, position = 1e-4, background = 0.02 }}"
+)
 
 
 def preset(name: str) -> Accuracy:
     """Return the accuracy with the given name in `PRESETS`, such as "survey"; raises BadInput for an unknown name."""
     if name not in PRESETS:
-        raise BadInput(f"accuracy = {name!r} is not one of {', '.join(PRESETS)}")
+        suggestion = spelling.did_you_mean(name, PRESETS)
+        problem = f"is not allowed: {suggestion} allowed:" if suggestion else "is not one of"
+        raise BadInput(f"accuracy = {name!r} {problem} {ALLOWED}")
     return PRESETS[name]
 
 
@@ -102,7 +109,7 @@ def fastest_row(allowed: Accuracy) -> dict[str, float]:
         for name, value in asdict(allowed).items()
         if value < best[name]
     ]
-    raise BadInput("; ".join(lines))
+    raise bad_input(lines)
 
 
 def expected_errors(allowed: Accuracy) -> Accuracy:

@@ -5,7 +5,7 @@ An area can list the HEALPix cells that it touches and test whether positions ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,21 +13,37 @@ import numpy.typing as npt
 
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.sky.ecliptic import ecliptic, tile_corners, tile_count
 from truesky.numerics import matrices
-from truesky.request.toml_values import Toml, as_table, boolean, checked_number, integer, number, number_pair
+from truesky.request import sky_notation
+from truesky.request.sky_notation import DEC_LIMITS, RA_LIMITS
+from truesky.request.toml_values import (
+    Toml,
+    as_table,
+    boolean,
+    checked_number,
+    integer,
+    number,
+    quote_value,
+    required_value,
+)
 
 _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 # The wide survey omits positions within these angles (deg) of the Galactic and ecliptic planes. The values are adopted.
 # They leave about 15 000 deg2, as in Serrano et al. 2024, where the region follows maps of stars, dust and zodiacal
 # light.
-_GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
+GALACTIC_MIN, ECLIPTIC_MIN = 30.0, 15.0
+_WIDE_SQUARE_DEGREES = 15_000.0
+# Where keys belong that an area does not have.
+_PLACES = {**dict.fromkeys(("ra", "dec", "radius", "circle"), "cone = { ra, dec, radius }"), "vertices": "polygon"}
 # Largest number of vertices of a polygon, and of circles of an area.
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000
-# Name, smallest and largest value (deg) of a coordinate.
-_RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
+# Limits of right ascensions of a box in degrees, which may begin before 0 or end after 360.
+_BOX_RA_LIMITS = (-360.0, 720.0)
+# Example of each form of an area, for error messages.
+_EXAMPLES = "cone = { ra = 150.1, dec = 2.2, radius = 0.5 } or box = { ra = [150, 151], dec = [2, 3] } (deg)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +134,7 @@ class Area:
         lon, lat = np.asarray(ra, float), np.asarray(dec, float)
         if self.wide:
             b, beta = sky.galactic(lon, lat)[1], ecliptic(lon, lat)[1]
-            return np.asarray(np.minimum(np.abs(b) - _GALACTIC_MIN, np.abs(beta) - _ECLIPTIC_MIN))
+            return np.asarray(np.minimum(np.abs(b) - GALACTIC_MIN, np.abs(beta) - ECLIPTIC_MIN))
         if self.patches:
             distance = [radius - sky.separation(lon, lat, x, y) for x, y, radius in self.patches]
             return np.asarray(np.max(distance, axis=0))
@@ -131,6 +147,23 @@ class Area:
         if self.vertices:
             return _polygon_depth(self.vertices, lon, lat)
         return self.radius - sky.separation(lon, lat, self.ra, self.dec)
+
+    def square_degrees(self) -> float:
+        """Return the size of the area in square degrees; circles that overlap count twice.
+
+        It is rounded for the sky of the wide survey. The cells that the area touches are larger together.
+        """
+        if self.wide:
+            return _WIDE_SQUARE_DEGREES
+        if self.box is not None:
+            west, east, south, north = np.radians(self.box)
+            solid_angle = (east - west) % (2.0 * np.pi) * (np.sin(north) - np.sin(south))
+        elif self.vertices:
+            solid_angle = _polygon_solid_angle(self.vertices)
+        else:
+            radii = np.array([patch[2] for patch in self.patches] or [self.radius])
+            solid_angle = 4.0 * np.pi * np.sum(np.sin(0.5 * np.radians(radii)) ** 2)
+        return float(np.degrees(np.degrees(solid_angle)))
 
     def bounding_circle(self) -> tuple[float, float, float]:
         """Return right ascension, declination and radius (degrees) of a circle that contains the area.
@@ -156,12 +189,34 @@ def _corners_of(box: tuple[float, float, float, float] | None) -> list[tuple[flo
     return [(float(x) % 360.0, y) for x in lon for y in (south, north)]
 
 
-def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Float) -> Float:
+def _polygon_solid_angle(vertices: Sequence[tuple[float, float]]) -> float:
+    """Return the solid angle (sr) of a convex spherical polygon: the sum of the triangles at its first vertex.
+
+    References
+    ----------
+    van Oosterom & Strackee 1983, IEEE Trans. Biomed. Eng. 30, 125
+    """
+    corners = sky.unit_vectors(*np.array(vertices).T)
+    a, b, c = corners[0], corners[1:-1], corners[2:]
+    triple = np.abs(np.sum(a * np.cross(b, c), axis=1))
+    total = 1.0 + np.sum(a * b, axis=1) + np.sum(b * c, axis=1) + np.sum(a * c, axis=1)
+    return float(2.0 * np.sum(np.arctan2(triple, total)))
+
+
+def side_normals(vertices: Sequence[tuple[float, float]]) -> Float:
+    """Return the unit normals of the sides of a polygon, which point into it: float64[n, 3].
+
+    `vertices` are right ascension and declination in degrees, in clockwise or counterclockwise order. The scalar
+    products of all normals with a position in the polygon are 0 or larger.
+    """
     corners = sky.unit_vectors(*np.array(vertices).T)
     sides = np.cross(corners, np.roll(corners, -1, 0))
     sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
-    # Let all normals point into the polygon, whose vertices may be in clockwise or counterclockwise order.
-    sides *= np.sign(matrices.matmul(sides[0], corners[2]))
+    return np.asarray(sides * np.sign(matrices.matmul(sides[0], corners[2])))
+
+
+def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Float) -> Float:
+    sides = side_normals(vertices)
     x, y = np.radians(ra), np.radians(dec)
     place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
     depth = np.degrees(np.arcsin(np.clip(matrices.matmul(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
@@ -190,9 +245,10 @@ def parse(table: Toml, path: str = "area") -> Area:
     OutOfRange
         If a number is out of range.
     """
-    table = as_table(table, path, set(_FORMS))
+    table = as_table(table, path, _FORMS, _PLACES)
     if len(table) != 1:
-        raise BadInput(f"{path} must have exactly one of {', '.join(_FORMS)}")
+        has = f"it has {', '.join(table)}" if table else f"such as {_EXAMPLES}"
+        raise BadInput(f"{path} must have exactly one of {', '.join(_FORMS)}; {has}")
     readers = {
         "polygon": lambda: _polygon(table["polygon"], f"{path}.polygon"),
         "cone": lambda: _cone(table["cone"], f"{path}.cone"),
@@ -205,15 +261,21 @@ def parse(table: Toml, path: str = "area") -> Area:
 
 
 def _cone(value: object, path: str) -> Area:
-    cone = as_table(value, path, {"ra", "dec", "radius"})
-    ra = number(cone, f"{path}.ra", -360.0, 360.0) % 360.0
-    return Area(ra=ra, dec=number(cone, f"{path}.dec", -90.0, 90.0), radius=number(cone, f"{path}.radius", 0.0, 180.0))
+    cone = as_table(value, path, ("ra", "dec", "radius"))
+    with Mistakes() as mistakes:
+        ra = mistakes.read(sky_notation.ra_of, cone, f"{path}.ra")
+        dec = mistakes.read(sky_notation.dec_of, cone, f"{path}.dec")
+        radius = mistakes.read(number, cone, f"{path}.radius", 0.0, 180.0, unit="deg")
+    return Area(ra=ra, dec=dec, radius=radius)
 
 
 def _box(value: object, path: str) -> Area:
-    box = as_table(value, path, {"ra", "dec"})
-    west, east = number_pair(box, f"{path}.ra", -360.0, 720.0)
-    south, north = number_pair(box, f"{path}.dec", -90.0, 90.0)
+    box = as_table(value, path, ("ra", "dec"))
+    with Mistakes() as mistakes:
+        ra_range = mistakes.read(_angle_pair, box, f"{path}.ra", "ra", _BOX_RA_LIMITS)
+        dec_range = mistakes.read(_angle_pair, box, f"{path}.dec", "dec", DEC_LIMITS)
+    west, east = ra_range
+    south, north = dec_range
     # A box may cross right ascension 0: the range [350, 10] has a width of 20 deg.
     width = east - west + (360.0 if east < west else 0.0)
     if not 0.0 < width < 180.0:
@@ -223,12 +285,24 @@ def _box(value: object, path: str) -> Area:
     return Area(box=(west % 360.0, east % 360.0, south, north))
 
 
+def _angle_pair(table: Toml, path: str, axis: str, limits: tuple[float, float]) -> tuple[float, float]:
+    """Read a list of two angles in degrees. `axis` is "ra" or "dec"; `limits` has the smallest and largest angle."""
+    values = required_value(table, path, "it must be [from, to] in degrees")
+    if not isinstance(values, list) or len(values) != 2:
+        raise BadInput(f"{path} must be [from, to] in degrees, got {quote_value(values)}")
+    with Mistakes() as mistakes:
+        angles = [
+            mistakes.read(sky_notation.angle, item, f"{path}[{i}]", axis, limits) for i, item in enumerate(values)
+        ]
+    return angles[0], angles[1]
+
+
 def _polygon(value: object, path: str) -> Area:
-    vertices = tuple((ra, dec) for ra, dec in _coordinate_lists(value, path, 3, _MAX_VERTICES, _RA, _DEC))
+    vertices = tuple((ra, dec) for ra, dec in _coordinate_lists(value, path, 3, _MAX_VERTICES))
     try:
         sky.cells_in_polygon(vertices, 0)
     except BadInput as error:
-        raise BadInput(f"{path}: {error}") from None
+        raise error.with_prefix(path) from None
     return Area(vertices=vertices)
 
 
@@ -237,29 +311,41 @@ def _tile(tile: int) -> Area:
 
 
 def _patches(value: object, path: str) -> Area:
-    circles = _coordinate_lists(value, path, 1, _MAX_PATCHES, _RA, _DEC, ("radius", 0.0, 90.0))
+    def radius_of(item: object, radius_path: str) -> float:
+        return checked_number(item, radius_path, 0.0, 90.0, "deg")
+
+    circles = _coordinate_lists(value, path, 1, _MAX_PATCHES, radius_of)
     return Area(patches=tuple((ra, dec, radius) for ra, dec, radius in circles))
 
 
 def _coordinate_lists(
-    value: object, path: str, min_count: int, max_count: int, *bounds: tuple[str, float, float]
+    value: object,
+    path: str,
+    min_count: int,
+    max_count: int,
+    read_radius: Callable[[object, str], float] | None = None,
 ) -> list[list[float]]:
-    """Read `min_count` to `max_count` lists of numbers in degrees, of which the first is a right ascension.
+    """Read `min_count` to `max_count` lists [ra, dec], or [ra, dec, radius] if `read_radius` is given, in degrees.
 
-    `bounds` has the name, smallest and largest value of each number in a list. Right ascensions are converted to 0 to
-    360. Raises BadInput, which names `path`, if the value is not such a list.
+    `read_radius` is a function of a value and its path. Right ascensions are converted to 0 to 360. Raises BadInput,
+    which names `path`, if the value is not such a list.
     """
-    form = f"[{', '.join(name for name, _, _ in bounds)}]"
+    form = "[ra, dec]" if read_radius is None else "[ra, dec, radius]"
     if not isinstance(value, list) or not min_count <= len(value) <= max_count:
-        raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form}")
+        actual = len(value) if isinstance(value, list) else quote_value(value)
+        raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form} in degrees, got {actual}")
     places = []
-    for i, place in enumerate(value):
-        if not isinstance(place, list) or len(place) != len(bounds):
-            raise BadInput(f"{path}[{i}] must be {form}")
-        numbers = zip(place, bounds, strict=True)
-        ra, *rest = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
-        places.append([ra % 360.0, *rest])
-    return places
+    with Mistakes() as mistakes:
+        for i, place in enumerate(value):
+            if not isinstance(place, list) or len(place) != form.count(",") + 1:
+                mistakes.add(BadInput(f"{path}[{i}] must be {form} in degrees, got {quote_value(place)}"))
+                continue
+            ra = mistakes.read(sky_notation.angle, place[0], f"{path}[{i}].ra", "ra", RA_LIMITS)
+            numbers = [ra, mistakes.read(sky_notation.angle, place[1], f"{path}[{i}].dec", "dec", DEC_LIMITS)]
+            if read_radius is not None:
+                numbers.append(mistakes.read(read_radius, place[2], f"{path}[{i}].radius"))
+            places.append(numbers)
+    return [[ra % 360.0, *rest] for ra, *rest in places]
 
 
 def _wide(enabled: bool, path: str) -> Area:

@@ -1,17 +1,24 @@
 """Find the passbands in which the exposures of a request (a user's TOML file) are taken.
 
-Fluxes of sources are computed in these passbands if the request does not name others.
+Fluxes of sources are computed in these passbands if the request does not name others. A request without exposures has
+the passbands of `DEFAULT_BANDS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lake_schema.errors import BadInput
 from lake_schema.tables.exposures import EUCLID_BANDS, SELECTION_BANDS
-from truesky.request.observations import Observation
+from truesky.request import instruments
+from truesky.request.exposures.observations import Observation
 from truesky.request.schema import Request
+
+# Passbands in which fluxes are computed for a request that names none and has no exposures: the bands of Euclid's
+# images and of the Rubin Observatory.
+DEFAULT_BANDS = (
+    "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_u", "lsst_g", "lsst_r", "lsst_i", "lsst_z", "lsst_y",
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
@@ -45,7 +52,7 @@ def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[st
         try:
             bands += observation_bands(block, mission)
         except BadInput as error:
-            raise BadInput(f"observation[{i}].bands: {error}") from None
+            raise error.with_prefix(f"observation[{i}].bands") from None
     return tuple(dict.fromkeys([*bands, *_selection_bands(request)]))
 
 
@@ -83,11 +90,12 @@ def observation_bands(block: Observation, mission: MissionConfiguration) -> tupl
     """
     if block.table is not None:
         return block.table.bands
+    available, owner = instruments.observable_bands(block.channels, block.survey, block.blue, mission)
+    for band in block.bands:
+        instruments.check_band(band, available, owner, "")
+    selected = tuple(band for band in available if not block.bands or band in block.bands)
     if "EXT" in block.channels:
-        rules = [row for row in mission.rows("survey.external") if row["survey"] == block.survey]
-        return _select(block.bands, [b for rule in rules for b in rule["bands"].split()], f"survey {block.survey}")
-    available = [b for channel in block.channels for b in EUCLID_BANDS[channel] if b != "nisp_blue" or block.blue]
-    selected = _select(block.bands, available, ", ".join(block.channels))
+        return selected
     # If the observation names no filter of a channel, all filters of this channel are used.
     return tuple(
         band
@@ -95,9 +103,3 @@ def observation_bands(block: Observation, mission: MissionConfiguration) -> tupl
         for band in EUCLID_BANDS[channel]
         if band in available and (band in selected or not set(selected) & set(EUCLID_BANDS[channel]))
     )
-
-
-def _select(requested: Sequence[str], available: Sequence[str], owner: str) -> tuple[str, ...]:
-    if unknown := [band for band in requested if band not in available]:
-        raise BadInput(f"{owner} has no band {unknown[0]!r} ({', '.join(available)})")
-    return tuple(band for band in available if not requested or band in requested)

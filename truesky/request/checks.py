@@ -6,13 +6,13 @@ Checks of single keys are in the modules that read them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.tables.exposures import RENDERED_TYPES
 from truesky.request.files import Ingest
-from truesky.request.schema import Request, Stars
+from truesky.request.schema import MissionChoice, Request, Stars
 
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
@@ -28,10 +28,9 @@ def check_sources(request: Request) -> None:
         "stars": request.stars != Stars(),
         "solar_system": request.bodies,
     }
-    if request.sources is not None:
-        for key, is_present in other_sections.items():
-            if is_present:
-                raise BadInput(f"sources: the tables contain all sources, the section {key} is not allowed")
+    present = [key for key, is_present in other_sections.items() if is_present]
+    if request.sources is not None and present:
+        raise bad_input(f"sources: the tables contain all sources, the section {key} is not allowed" for key in present)
 
 
 def check_bands(request: Request) -> None:
@@ -42,70 +41,78 @@ def check_bands(request: Request) -> None:
     """
     user_passbands = {name for name, _ in request.curves.passbands}
     of_cameras = {(camera.name, curve.band) for camera in request.mission.cameras for curve in camera.curves}
-    for i, pointing in enumerate(request.pointings):
-        if (pointing.camera, pointing.band) in of_cameras:
-            continue
-        if pointing.band in user_passbands and pointing.channel != "VIS":
-            problem = (
-                f"{pointing.band} is a user passband, for which camera {pointing.camera} has no zero point and sky"
-            )
-            raise BadInput(f"pointing[{i}].band: {problem}: only VIS can observe in it")
-    for i, block in enumerate(request.observations):
-        if user_bands := sorted(user_passbands & set(block.bands)):
-            raise BadInput(f"observation[{i}].bands: {user_bands[0]} is a user passband: no survey observes in it")
+    with Mistakes() as mistakes:
+        for i, pointing in enumerate(request.pointings):
+            if (pointing.camera, pointing.band) in of_cameras:
+                continue
+            if pointing.band in user_passbands and pointing.channel != "VIS":
+                problem = (
+                    f"{pointing.band} is a user passband, for which camera {pointing.camera} has no zero point and sky"
+                )
+                mistakes.add(BadInput(f"pointing[{i}].band: {problem}: only VIS can observe in it"))
 
 
-def check_mission(request: Request) -> MissionConfiguration:
-    """Check and return the mission parameters (instruments and survey) that a request selects.
+def check_mission(choice: MissionChoice) -> MissionConfiguration:
+    """Check and return the mission parameters (instruments and survey) that the section `mission` selects.
 
-    Parameters
-    ----------
-    request : Request
-        The request.
-
-    Returns
-    -------
-    MissionConfiguration
-        Parameters with the values (overrides) and cameras of the user.
+    The parameters have the values (overrides) and cameras of the user.
 
     Raises
     ------
     BadInput
-        If a user's value has an unknown name or a wrong unit, or is out of range. This includes the values that the
-        section `explore` tries in turn. Also if a user's camera, or the ramp of an infrared detector (numbers of
-        groups, reads and drops), is not valid. The message names the key.
+        If a user's value has an unknown name or a wrong unit, or is out of range. Also if a user's camera, or the ramp
+        of an infrared detector (numbers of groups, reads and drops), is not valid. There is one line for each mistake,
+        which names the key.
     """
     from lake_schema.mission.checks import camera_faults, ramp_faults
     from lake_schema.mission.configuration import resolve
 
-    overrides = {key: (override.value, override.unit) for key, override in request.mission.overrides}
+    overrides = {key: (override.value, override.unit) for key, override in choice.overrides}
     try:
-        mission = resolve(ladder=request.mission.ladder, overrides=overrides, cameras=request.mission.cameras)
+        mission = resolve(ladder=choice.ladder, overrides=overrides, cameras=choice.cameras)
     except BadInput as error:
-        raise BadInput(f"mission: {error}") from None
-    for i, camera in enumerate(request.mission.cameras):
-        for fault in camera_faults(camera.name, mission):
-            raise BadInput(f"mission.cameras[{i}]: {fault}")
-    for fault in ramp_faults(mission):
-        raise BadInput(f"mission: {fault}")
-    for key, values in request.explore:
-        if key == "accuracy" or key.startswith("effects."):
-            continue
+        raise error.with_prefix("mission") from None
+    with Mistakes() as mistakes:
+        for i, camera in enumerate(choice.cameras):
+            for fault in camera_faults(camera.name, mission):
+                mistakes.add(BadInput(f"mission.cameras[{i}]: {fault}"))
+        for fault in ramp_faults(mission):
+            mistakes.add(BadInput(f"mission: {fault}"))
+    return mission
+
+
+def check_explored(explore: Sequence[tuple[str, Sequence[str]]], mission: MissionConfiguration) -> None:
+    """Raise BadInput if a parameter in the section `explore` is unknown, or a value that it takes is not valid.
+
+    `explore` has the parameters with their values as JSON texts. There is one line for each mistake.
+    """
+    with Mistakes() as mistakes:
+        for key, values in explore:
+            if key != "accuracy" and not key.startswith("effects."):
+                mistakes.read(_check_values, key, values, mission)
+
+
+def _check_values(key: str, values: Sequence[str], mission: MissionConfiguration) -> None:
+    from lake_schema.mission.checks import ramp_faults
+
+    with Mistakes() as mistakes:
         for value in values:
             try:
                 changed_mission = mission.with_overrides({key: tuple(json.loads(value))})
             except BadInput as error:
-                raise BadInput(f"explore.{key}: {error}") from None
+                mistakes.add(error.with_prefix(f"explore.{key}"))
+                continue
             for fault in ramp_faults(changed_mission):
-                raise BadInput(f"explore.{key}: {fault}")
-    return mission
+                mistakes.add(BadInput(f"explore.{key}: {fault}"))
 
 
 def check_rendered(request: Request) -> None:
     """Raise BadInput if the request contains a channel and image type that cannot be rendered, only planned."""
-    for key, (channel, image_type) in _requested_types(request):
-        if not _is_rendered((channel, image_type)):
-            raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can only be planned")
+    with Mistakes() as mistakes:
+        for key, (channel, image_type) in _requested_types(request):
+            if not _is_rendered((channel, image_type)):
+                problem = f"{key}: no simulator renders {channel} {image_type} yet"
+                mistakes.add(BadInput(f"{problem}: it can only be planned"))
 
 
 def describe_skipped(request: Request) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
 from truesky.request.toml_values import Toml, as_table, boolean, number, quote_value, string, strings
@@ -154,37 +154,71 @@ class UserSources:
     Attributes
     ----------
     galaxies, stars : Path, optional
-        CSV files (truesky/catalogue/given_sources.py lists their columns); None if there are no such sources.
+        Files (truesky/catalogue/given_sources.py lists their columns); None if there are no such sources.
     band : str
         Passband of the magnitudes in the tables.
     spacing : float
         Spacing in arcsec of a grid that fills the area. The rows of both tables are placed on it in turn, and repeated
         until the grid is full. 0 if the tables have positions.
+    galaxy_columns, star_columns : tuple of (str, str)
+        Pairs of a property, and the column of the file or its definition as JSON; also settings. If there are no pairs
+        or only settings, the columns of the file have the names of the properties.
     """
 
     galaxies: Path | None
     stars: Path | None
     band: str
     spacing: float
+    galaxy_columns: tuple[tuple[str, str], ...] = ()
+    star_columns: tuple[tuple[str, str], ...] = ()
 
     def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
         """Return checksums and options of the tables as JSON values, from which hashes of catalogues are computed.
 
         `bounds` is the bounding circle of the area in degrees: right ascension, declination and radius. It is included
-        only if the sources are on a grid. Raises BadInput if a file does not exist or is not a .csv file.
+        only if the sources are on a grid. Raises BadInput if a file does not exist.
         """
         files = {"galaxies": self.galaxies, "stars": self.stars}
         checksums = {
-            name: file_sha256(_check_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None
+            name: file_sha256(user_files.check_file(file, SOURCES_KIND, f"sources.{name}"))
+            for name, file in files.items()
+            if file is not None
         }
+        mapped = {"galaxies": dict(self.galaxy_columns), "stars": dict(self.star_columns)}
+        columns = {name: pairs for name, pairs in mapped.items() if pairs}
         grid = {"spacing": self.spacing, "bounds": list(bounds)} if self.spacing else {}
-        return {"sha256": checksums, "band": self.band, **grid}
+        return {"sha256": checksums, "band": self.band, **grid, **({"columns": columns} if columns else {})}
+
+    def count_rows(self) -> dict[str, int]:
+        """Return the number of rows of each table by its name, "galaxies" or "stars".
+
+        Raises BadInput if a file cannot be read, or has no column of magnitudes.
+        """
+        # Import here, because the import is slow and few requests have such tables.
+        from lake_schema.external import rows
+
+        counts = {}
+        for name, file, pairs in (
+            ("galaxies", self.galaxies, self.galaxy_columns),
+            ("stars", self.stars, self.star_columns),
+        ):
+            if file is not None:
+                title = _column_of_numbers(pairs)
+                batches = rows.read_batches(file, [title], kind=SOURCES_KIND)
+                counts[name] = sum(len(batch.columns[title]) for batch in batches)
+        return counts
 
 
-def _check_csv(file: Path, key: str) -> Path:
-    if file.suffix.lower() != ".csv":
-        raise BadInput(f"{key}: {user_files.format_path(file)}: the file name must end with .csv")
-    return user_files.check_file(file, SOURCES_KIND, key)
+def _column_of_numbers(pairs: Sequence[tuple[str, str]]) -> str:
+    """Return the name of a column of numbers that a mapping requires; "mag" if it maps no column."""
+    entries = {key: json.loads(text) for key, text in pairs}
+    for key in ("mag", "ra", "dec"):
+        entry = entries.get(key)
+        if isinstance(entry, dict) and isinstance(entry.get("column"), str):
+            return str(entry["column"])
+        if isinstance(entry, str):
+            return entry
+    return "mag"
 
 
 def resolve_path(folder: Path, name: str) -> Path:
@@ -222,13 +256,16 @@ def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     from lake_schema.mission import camera_folder
 
     user_cameras: list[Camera] = []
-    for i, name in enumerate(names):
-        try:
-            user_cameras.append(camera_folder.read(resolve_path(folder, name)))
-        except BadInput as error:
-            raise BadInput(f"mission.cameras[{i}]: {error}") from None
-        if user_cameras[-1].name in [camera.name for camera in user_cameras[:-1]]:
-            raise BadInput(f"mission.cameras[{i}]: two cameras have the name {user_cameras[-1].name}")
+    with Mistakes() as mistakes:
+        for i, name in enumerate(names):
+            try:
+                camera = camera_folder.read(resolve_path(folder, name))
+            except BadInput as error:
+                mistakes.add(error.with_prefix(f"mission.cameras[{i}]"))
+                continue
+            if camera.name in [other.name for other in user_cameras]:
+                mistakes.add(BadInput(f"mission.cameras[{i}]: two cameras have the name {camera.name}"))
+            user_cameras.append(camera)
     return tuple(user_cameras)
 
 
@@ -284,39 +321,76 @@ def parse_curves(table: Toml, folder: Path) -> UserCurves:
     BadInput
         If a key is missing or unknown, or has a wrong value. The message names the key.
     """
-    filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
-    laws = as_table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
-    passbands = [
-        _curves(value, f"fluxes.passbands.{layout.check_name(key)}", folder, True) for key, value in filters.items()
-    ]
-    extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
-    templates = None
-    if "templates" in table:
-        path = "fluxes.templates"
-        templates_table = as_table(table["templates"], path, {"files", "format"})
-        files = strings(templates_table, f"{path}.files", distinct=False)
-        if not files:
-            raise BadInput(f"{path}.files is missing")
-        templates = Curves(
-            tuple(resolve_path(folder, file) for file in files), string(templates_table, f"{path}.format")
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        curves = UserCurves(
+            passbands=read(_passbands, table, folder),
+            templates=read(_templates, table["templates"], folder) if "templates" in table else None,
+            extinction=read(_extinction_laws, table, folder),
+            intergalactic=read(boolean, table, "fluxes.intergalactic", False),
         )
-    stars = as_table(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
+        stars = read(_stars, table, folder)
+    return replace(curves, basel=stars[0], irtf=stars[1])
+
+
+def _passbands(table: Toml, folder: Path) -> tuple[tuple[str, Curves], ...]:
+    filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
+    with Mistakes() as mistakes:
+        for key in filters:
+            mistakes.read(layout.check_name, key)
+        curves = [
+            mistakes.read(_curves, value, f"fluxes.passbands.{key}", folder, True) for key, value in filters.items()
+        ]
+    return tuple(zip(filters, curves, strict=True))
+
+
+def _extinction_laws(table: Toml, folder: Path) -> tuple[tuple[int, Curves], ...]:
+    laws = as_table(table.get("extinction", {}), "fluxes.extinction", ("1", "2", "3", "4"))
+    with Mistakes() as mistakes:
+        curves = [mistakes.read(_curves, value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
+    return tuple(zip(map(int, laws), curves, strict=True))
+
+
+def _templates(value: object, folder: Path) -> Curves:
+    path = "fluxes.templates"
+    table = as_table(value, path, ("files", "format"))
+    with Mistakes() as mistakes:
+        files = mistakes.read(_file_list, table, path, folder, distinct=False)
+        form = mistakes.read(string, table, f"{path}.format")
+    return Curves(files, form)
+
+
+def _stars(table: Toml, folder: Path) -> tuple[Path | None, tuple[Path, ...]]:
+    """Return the file of BaSeL and the files of IRTF in the section `fluxes.stars`: None and () if it is missing."""
+    path = "fluxes.stars"
+    stars = as_table(table.get("stars", {}), path, ("basel", "irtf"))
     if "stars" in table and not stars:
-        raise BadInput("fluxes.stars must have basel or irtf")
-    return UserCurves(
-        tuple(zip(filters, passbands, strict=True)),
-        templates,
-        tuple(zip(map(int, laws), extinction, strict=True)),
-        resolve_path(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
-        tuple(resolve_path(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
-        boolean(table, "fluxes.intergalactic", False),
-    )
+        raise BadInput(f"{path} must have basel or irtf")
+    with Mistakes() as mistakes:
+        basel = mistakes.read(_file, stars, f"{path}.basel", folder) if "basel" in stars else None
+        irtf = mistakes.read(strings, stars, f"{path}.irtf")
+    return basel, tuple(resolve_path(folder, name) for name in irtf)
+
+
+def _file(table: Toml, path: str, folder: Path) -> Path:
+    return resolve_path(folder, string(table, path))
+
+
+def _file_list(table: Toml, path: str, folder: Path, distinct: bool = True) -> tuple[Path, ...]:
+    """Return the paths in the key `files` of the section `path`; raises BadInput if it names no file."""
+    names = strings(table, f"{path}.files", distinct=distinct)
+    if not names:
+        raise BadInput(f'{path}.files is missing or empty: it must be a list of files such as ["a.fits"]')
+    return tuple(resolve_path(folder, name) for name in names)
 
 
 def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
-    table = as_table(value, path, {"file", "format", *(["medium"] if has_medium else [])})
-    medium = string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
-    return Curves((resolve_path(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
+    table = as_table(value, path, ("file", "format", *(("medium",) if has_medium else ())))
+    with Mistakes() as mistakes:
+        medium = mistakes.read(string, table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
+        file = mistakes.read(_file, table, f"{path}.file", folder)
+        form = mistakes.read(string, table, f"{path}.format")
+    return Curves((file,), form, medium)
 
 
 def parse_ingest(table: Toml, folder: Path) -> Ingest:
@@ -326,27 +400,34 @@ def parse_ingest(table: Toml, folder: Path) -> Ingest:
     ------
     BadInput
         If a key is missing or unknown, or has a wrong value. Also if a complete catalogue of galaxies is combined with
-        halos or training galaxies. The message names the key.
+        halos or training galaxies. There is one line for each mistake, which names the key.
     """
-    galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
-    halos, training = (
-        _catalogue(table[name], f"ingest.{name}", folder) if name in table else None for name in ("halos", "training")
-    )
-    if galaxies and halos:
-        raise BadInput("ingest.halos is not allowed with ingest.galaxies, a finished catalogue")
-    if galaxies and training:
-        raise BadInput("ingest.training is not allowed with ingest.galaxies, whose galaxies have spectra")
-    dust = None
-    if "dust" in table:
-        dust_table = as_table(table["dust"], "ingest.dust", set(DustMap.__slots__))
-        dust = DustMap(
-            resolve_path(folder, string(dust_table, "ingest.dust.file")),
-            string(dust_table, "ingest.dust.column"),
-            string(dust_table, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
-            string(dust_table, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in dust_table else "",
-            string(dust_table, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in dust_table else "",
+    with Mistakes() as mistakes:
+        galaxies, halos, training = (
+            mistakes.read(_catalogue, table[name], f"ingest.{name}", folder) if name in table else None
+            for name in ("galaxies", "halos", "training")
         )
+        if "galaxies" in table and "halos" in table:
+            mistakes.add(BadInput("ingest.halos is not allowed with ingest.galaxies, a finished catalogue"))
+        if "galaxies" in table and "training" in table:
+            mistakes.add(BadInput("ingest.training is not allowed with ingest.galaxies, whose galaxies have spectra"))
+        dust = mistakes.read(_dust_map, table["dust"], folder) if "dust" in table else None
     return Ingest(galaxies, halos, training, dust)
+
+
+def _dust_map(value: object, folder: Path) -> DustMap:
+    path = "ingest.dust"
+    table = as_table(value, path, DustMap.__slots__)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        dust = DustMap(
+            read(_file, table, f"{path}.file", folder),
+            read(string, table, f"{path}.column"),
+            read(string, table, f"{path}.quantity", ("ebv", "a_v"), "ebv"),
+            read(string, table, f"{path}.ordering", ("RING", "NESTED")) if "ordering" in table else "",
+            read(string, table, f"{path}.coordinates", ("G", "C")) if "coordinates" in table else "",
+        )
+    return dust
 
 
 def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
@@ -360,15 +441,17 @@ def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
     BadInput
         If a value is not a file name or a list of them. The message names the key.
     """
-    band_files = []
-    for band in sorted(table):
-        path = f"psf.{band}"
-        is_list = isinstance(table[band], list)
-        names = strings(table, path) if is_list else (string(table, path),)
-        if not names:
-            raise BadInput(f"{path} names no file")
-        band_files += [(layout.check_name(band), str(resolve_path(folder, name))) for name in names]
-    return tuple(band_files)
+    with Mistakes() as mistakes:
+        names_by_band = {band: mistakes.read(_psf_names, table, band) for band in sorted(table)}
+    return tuple((band, str(resolve_path(folder, name))) for band, names in names_by_band.items() for name in names)
+
+
+def _psf_names(table: Toml, band: str) -> tuple[str, ...]:
+    path = f"psf.{layout.check_name(band)}"
+    names = strings(table, path) if isinstance(table[band], list) else (string(table, path),)
+    if not names:
+        raise BadInput(f"{path} names no file")
+    return names
 
 
 def parse_sources(table: Toml, folder: Path) -> UserSources | None:
@@ -385,30 +468,54 @@ def parse_sources(table: Toml, folder: Path) -> UserSources | None:
     """
     if not table:
         return None
-    grid = string(table, "sources.only", ("table", "grid")) == "grid"
-    if "spacing" in table and not grid:
-        raise BadInput('sources.spacing requires only = "grid": with only = "table" the rows have positions')
-    spacing = number(table, "sources.spacing", 0.01, 3600.0) if grid else 0.0
-    files = {
-        name: resolve_path(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table
-    }
-    if not files:
-        raise BadInput("sources must have galaxies or stars")
-    band = string(table, "sources.band", default="euclid_vis")
-    return UserSources(files.get("galaxies"), files.get("stars"), band, spacing)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        kind = read(string, table, "sources.only", ("table", "grid"))
+        if "spacing" in table and kind == "table":
+            problem = 'sources.spacing requires only = "grid": with only = "table" the rows have positions'
+            mistakes.add(BadInput(problem))
+        spacing = read(number, table, "sources.spacing", 0.01, 3600.0, unit="arcsec") if kind == "grid" else 0.0
+        sources = {
+            name: read(_source_file, table[name], f"sources.{name}", folder)
+            for name in ("galaxies", "stars")
+            if name in table
+        }
+        if not sources:
+            mistakes.add(BadInput("sources must have galaxies or stars"))
+        band = read(string, table, "sources.band", default="euclid_vis")
+    galaxies, galaxy_columns = sources.get("galaxies", (None, ()))
+    stars, star_columns = sources.get("stars", (None, ()))
+    return UserSources(galaxies, stars, band, spacing, galaxy_columns, star_columns)
+
+
+def _source_file(value: object, path: str, folder: Path) -> tuple[Path, tuple[tuple[str, str], ...]]:
+    """Return the file of galaxies or stars and its columns, from a file name or from a table { file, columns }."""
+    if isinstance(value, str):
+        return resolve_path(folder, value), ()
+    if not isinstance(value, dict):
+        raise BadInput(f"{path} must be a file name or a table {{ file, columns }}, got {quote_value(value)}")
+    source = as_table(value, path, ("file", "columns"))
+    with Mistakes() as mistakes:
+        file = mistakes.read(_file, source, f"{path}.file", folder)
+        columns = mistakes.read(_columns, source, path)
+    return file, columns
 
 
 def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
-    table = as_table(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
-    files = strings(table, f"{path}.files")
-    if not files:
-        raise BadInput(f"{path}.files is missing or empty")
+    table = as_table(value, path, ("files", "columns", *(("format",) if path.endswith("galaxies") else ())))
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        files = read(_file_list, table, path, folder)
+        form = read(string, table, f"{path}.format", default="")
+        texts = read(_columns, table, path)
+    return Catalogue(files, form, texts)
+
+
+def _columns(table: Toml, path: str) -> tuple[tuple[str, str], ...]:
     columns = as_table(table.get("columns", {}), f"{path}.columns", None)
-    return Catalogue(
-        tuple(resolve_path(folder, name) for name in files),
-        string(table, f"{path}.format", default=""),
-        tuple((key, _to_json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
-    )
+    with Mistakes() as mistakes:
+        texts = tuple((key, mistakes.read(_to_json, columns[key], f"{path}.columns.{key}")) for key in sorted(columns))
+    return texts
 
 
 def _to_json(value: object, path: str) -> str:

@@ -7,7 +7,8 @@ All keys::
                | {flux = .., shape = .., position = .., background = ..}
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
-    [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
+    [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells
+                   lensing_nside         64 to 2048, default: by area and accuracy (lensing_resolution.py)
                    high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
                    rotation       deg, added to the position angle of every galaxy before lensing
@@ -29,7 +30,8 @@ All keys::
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
                    for one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
                    cameras = ["my_camera/"]   user's ground cameras (lake_schema/mission/camera_folder.py)
-    [fluxes]       bands = [..]           default: the bands of the pointings and observations
+    [fluxes]       bands = [..]           default: the bands of the pointings and observations; without exposures
+                                          euclid_vis, euclid_y, euclid_j, euclid_h, lsst_u .. lsst_y
                    intergalactic = true   intergalactic hydrogen absorbs the light of galaxies
     [fluxes.passbands.NAME]        user's filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
     [fluxes.templates]             user's galaxy spectra, earliest type first, counted by sed_1 and sed_2: files, format
@@ -44,6 +46,8 @@ All keys::
                                           analogue-to-digital conversion (ALWAYS_ON in truesky/request/schema.py)
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
+                   band           default: euclid_vis, euclid_h, nisp_red, or the r band of a ground camera
+                   mjd            default: the first date after the launch at which the field can be observed
                    grism_angle    direction of NISP-S spectra in the focal plane: -4, 0, 180, 184 deg
                    realisations   number of exposures that differ only in their noise
     [[observation]]
@@ -54,7 +58,7 @@ All keys::
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}
                      default: the area of the request, or of the deep field if survey = "edf_north" ..
         ra, dec, position_angle    user's field instead of the fields of the survey (docs/own_field.md)
-        pointings = "file.csv"     table of pointings instead of both (truesky/request/pointing_tables.py)
+        pointings = "file.csv"     table of pointings instead of both (truesky/request/exposures/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
         lamps = [..], intensities = [..] of flat and persistence
@@ -71,8 +75,12 @@ All keys::
                    readout = "raw" | "amplifiers" | "electrons"   for ground cameras: one array, one extension per
                                          amplifier, or electrons before the readout
 
+A right ascension may be a text in hours ("03:32:28", "3h32m28s"), a declination a text in degrees ("-27:48:30"), and a
+date (mjd) an ISO date in UTC ("2027-01-01") instead of an MJD (UTC).
+
 File names are relative to the folder of the request; truesky/fluxes/libraries/spectrum_formats.toml has their formats.
-An unknown key, a wrong type or a number out of bounds is refused. The message gives the full path of the key::
+An unknown key, a wrong type or a number out of bounds is refused. All mistakes are reported together, each in one line
+with the full path of the key::
 
     truesky check FILE [--plan]
 """
@@ -81,18 +89,19 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import layout
 from truesky.request import area as areas
 from truesky.request import bands as request_bands
-from truesky.request import checks, files, observations, structure
-from truesky.request.accuracy import SURVEY, Accuracy, fastest_row, preset
+from truesky.request import checks, files, lensing_resolution, structure
+from truesky.request.accuracy import ALLOWED, SURVEY, Accuracy, fastest_row, preset
 from truesky.request.area import Area
-from truesky.request.files import UserSources
+from truesky.request.exposures import observations, pointings
 from truesky.request.schema import (
     ALWAYS_ON,
     BOX_CELLS,
@@ -114,49 +123,89 @@ from truesky.request.schema import (
     Stars,
     Universe,
 )
+from truesky.request.section_reader import RequestReader
 from truesky.request.toml_values import Toml
 from truesky.request.toml_values import as_table as _as_table
 from truesky.request.toml_values import boolean as _boolean
-from truesky.request.toml_values import check_keys as _check_keys
 from truesky.request.toml_values import checked_number as _checked_number
 from truesky.request.toml_values import integer as _integer
 from truesky.request.toml_values import integer_choice as _integer_choice
 from truesky.request.toml_values import number as _number
 from truesky.request.toml_values import optional_number as _optional_number
 from truesky.request.toml_values import quote_value as _quote_value
+from truesky.request.toml_values import refuse_name as _refuse_name
 from truesky.request.toml_values import required_value as _required_value
-from truesky.request.toml_values import section as _section
 from truesky.request.toml_values import string as _string
 from truesky.request.toml_values import strings as _strings
 
-__all__ = ["Area", "Override", "Request", "parse"]
+__all__ = ["Area", "Override", "Request", "ValidParts", "parse", "parse_valid_parts"]
 
 _MAX_VARIANTS = 10_000
 _MAX_SEED = 2**63 - 1
 _ALL = "all"
-_SECTIONS = (
-    "area", "universe", "stars", "ingest", "sources", "strong_lenses", "structure", "mission", "fluxes",
-    "psf", "solar_system", "effects", "explore", "products",
-)  # fmt: skip
+# Keys of a request for which the mission parameters are needed.
+_MISSION_KEYS = frozenset({"mission", "explore", "pointing", "observation"})
 # Names that a request must not have: SQL queries (truesky/explore) use the request's name as the schema of its tables,
 # and these schemas exist already.
 _RESERVED_NAMES = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
 
+@dataclass(frozen=True, slots=True)
+class ValidParts:
+    """A request that may have mistakes.
+
+    Attributes
+    ----------
+    request : Request or None
+        The request, in which default values replace the sections and lists with mistakes. None if the area, or a
+        section that defines instruments or passbands, has mistakes, so that exposures cannot be planned.
+    messages : tuple of str
+        One line for each mistake in the order of the file, () for a valid request.
+    invalid : frozenset of str
+        Keys of the request, such as "universe" or "pointing", whose values have mistakes.
+    """
+
+    request: Request | None
+    messages: tuple[str, ...]
+    invalid: frozenset[str]
+
+    def valid_request(self) -> Request:
+        """Return the request; raise BadInput with all mistakes if there are any."""
+        if self.request is None or self.messages:
+            raise bad_input(self.messages)
+        return self.request
+
+
+def parse_valid_parts(path: Path) -> ValidParts:
+    """Read the valid parts of a request file, and collect all mistakes.
+
+    Raises BadInput if the file cannot be read or is not TOML.
+    """
+    return read_valid_parts(read_file(path), path.resolve().parent)
+
+
 def parse(path: Path) -> Request:
-    """Read and check a request file; raises BadInput if it is not valid, with one line that names file and key."""
+    """Read and check a request file; raises BadInput if it is not valid, with lines that name file and key."""
+    parts = parse_valid_parts(path)
     try:
-        table = user_files.read_toml(path, "request")
+        return parts.valid_request()
+    except BadInput as error:
+        raise error.with_prefix(f"request {user_files.format_path(path)}") from None
+
+
+def read_file(path: Path) -> Toml:
+    """Return the table of a request file; raises BadInput if it cannot be read or is not TOML."""
+    try:
+        return user_files.read_toml(path, "request")
     except BadInput as error:
         raise BadInput(f"request {error}") from None
-    try:
-        return from_table(table, path.resolve().parent)
-    except BadInput as error:
-        raise BadInput(f"request {user_files.format_path(path)}: {error}") from None
 
 
 def _name(table: Toml) -> str:
-    name = layout.check_name(_string(table, "name"))
+    name = _string(table, "name")
+    if not layout.is_name(name):
+        form = 'small letters, digits, "_" and "-", at most 64, such as "my_field"'
+        raise BadInput(f"name = {_quote_value(name)} must have only {form}")
     if name in _RESERVED_NAMES:
         raise BadInput(f"name = {name!r} is reserved in SQL; these names are not allowed: {', '.join(_RESERVED_NAMES)}")
     return name
@@ -180,55 +229,136 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     Raises
     ------
     BadInput
-        If a key is missing or unknown, or has a value that is not allowed. The message names the key.
+        If keys are missing or unknown, or have values that are not allowed. There is one line for each mistake, which
+        names the key.
     """
-    _check_keys(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
-    pointings, blocks = observations.parse_pointings(table), observations.parse_observations(table, folder)
-    fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
-    bands = _strings(fluxes, "fluxes.bands")
-    mission = _mission(_section(table, "mission", {"ladder", "overrides", "cameras"}), folder)
-    named_bands = {
-        *bands,
-        *(pointing.band for pointing in pointings),
-        *(b for o in blocks if o.table for b in o.table.bands),
-    }
-    curves = files.with_camera_passbands(files.parse_curves(fluxes, folder), mission.cameras, named_bands)
-    products_table = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
-    solar_system = _section(table, "solar_system", {"bodies"})
-    bodies = files.resolve_path(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
-    universe = _universe(_section(table, "universe", set(Universe.__slots__)))
+    return read_valid_parts(table, folder).valid_request()
+
+
+def read_valid_parts(table: Toml, folder: Path = Path()) -> ValidParts:
+    """Read the valid parts of a request, and collect all mistakes.
+
+    Parameters
+    ----------
+    table : Toml
+        The whole request.
+    folder : Path, optional
+        Folder to which file names in the request are relative; by default the current folder.
+
+    Returns
+    -------
+    ValidParts
+        The request and its mistakes.
+    """
+    reader = RequestReader(table)
+    read, section = reader.read, reader.section
+    reader.check_top_keys()
+    explore = read("explore", _explore, section("explore"))
+    choice = read("mission", _mission, section("mission"), folder)
+    # The import of the mission parameters takes half a second, so that they are read only if the request uses them.
+    mission = None
+    if choice is not None and not _MISSION_KEYS.isdisjoint(table):
+        mission = read("mission", checks.check_mission, choice)
+    if mission is not None:
+        read("explore", checks.check_explored, explore or (), mission)
+    fluxes = section("fluxes")
+    bands = read("fluxes", _strings, fluxes, "fluxes.bands")
+    curves = read("fluxes", files.parse_curves, fluxes, folder)
+    user_bands = [] if curves is None else [name for name, _ in curves.passbands]
+    # Without the user's passbands, the names of bands and detectors are not checked.
+    named = None if curves is None else mission
+    pointing_list = read("pointing", pointings.parse_pointings, table, named, user_bands) or ()
+    blocks = read("observation", observations.parse_observations, table, folder, named, user_bands) or ()
+    area = read("area", areas.parse, table.get("area", {}))
+    values = _values(reader, folder, area)
+    invalid = reader.invalid
+    if area is None or explore is None or choice is None or curves is None or bands is None or "mission" in invalid:
+        return ValidParts(None, reader.messages(), frozenset(invalid))
     request = Request(
-        name=_name(table),
-        seed=_integer(table, "seed", 0, _MAX_SEED),
-        accuracy=_accuracy(table.get("accuracy"), "accuracy"),
-        area=areas.parse(_section(table, "area", None)),
-        universe=universe,
-        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder, universe.star_limit),
-        mission=mission,
+        area=area,
+        mission=choice,
+        # Values that are not valid would be reported a second time by the plan.
+        explore=() if "explore" in invalid else explore,
         bands=bands,
-        pointings=pointings,
-        truth=_truth(products_table),
-        compression=_string(products_table, "products.compression", COMPRESSIONS, "none"),
-        wcs=_string(products_table, "products.wcs", WCS_CONVENTIONS) if "wcs" in products_table else None,
-        files=_string(products_table, "products.files", FILE_LAYOUTS, "detector"),
-        readout=_string(products_table, "products.readout", READOUTS, "raw"),
         curves=curves,
+        pointings=pointing_list,
         observations=blocks,
-        effects=_effects(_section(table, "effects", {"on", "off"})),
-        explore=_explore(_section(table, "explore", None)),
-        ingest=files.parse_ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
-        bodies=bodies,
-        sources=files.parse_sources(_section(table, "sources", {"only", *UserSources.__slots__}), folder),
-        structure=structure.parse(_section(table, "structure", set(structure.Structure.__slots__)), folder),
-        noise_seed=_integer(table, "noise_seed", 0, _MAX_SEED) if "noise_seed" in table else None,
-        psfs=files.parse_psfs(_section(table, "psf", None), folder),
-        strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
+        **values,
     )
-    checks.check_sources(request)
-    checks.check_bands(request)
-    default_bands = request_bands.requested_bands(request, checks.check_mission(request))
-    user_bands = (name for name, _ in curves.passbands)
-    return replace(request, bands=tuple(dict.fromkeys((*(bands or default_bands), *user_bands))))
+    with_curves = read("fluxes", _with_camera_passbands, request) or request
+    read("sources", checks.check_sources, with_curves)
+    read("pointing", checks.check_bands, with_curves)
+    if mission is not None and not bands:
+        bands = read("observation", request_bands.requested_bands, with_curves, mission) or ()
+    added = (name for name, _ in with_curves.curves.passbands)
+    all_bands = tuple(dict.fromkeys((*bands, *added))) or request_bands.DEFAULT_BANDS
+    return ValidParts(replace(with_curves, bands=all_bands), reader.messages(), frozenset(invalid))
+
+
+def _values(reader: RequestReader, folder: Path, area: Area | None) -> dict[str, Any]:
+    """Read the keys and sections that no other section needs. Return values of `Request` by name, without mistakes.
+
+    `area` is None if the section `area` has a mistake.
+    """
+    read, table = reader.read, reader.table
+    products, solar_system, lenses = (reader.section(key) for key in ("products", "solar_system", "strong_lenses"))
+    accuracy = read("accuracy", _accuracy, table.get("accuracy"), "accuracy") or SURVEY
+    nside = Universe().lensing_nside if area is None else lensing_resolution.default_nside(area, accuracy)
+    universe = read("universe", _universe, reader.section("universe"), nside)
+    star_limit = math.inf if universe is None else universe.star_limit
+    values = {
+        "name": read("name", _name, table) or "request",
+        "seed": read("seed", _integer, table, "seed", 0, _MAX_SEED) or 0,
+        "noise_seed": read("noise_seed", _integer, table, "noise_seed", 0, _MAX_SEED)
+        if "noise_seed" in table
+        else None,
+        "accuracy": accuracy,
+        "universe": universe,
+        "stars": read("stars", _stars, reader.section("stars"), folder, star_limit),
+        "effects": read("effects", _effects, reader.section("effects")),
+        "ingest": read("ingest", files.parse_ingest, reader.section("ingest"), folder),
+        "bodies": read("solar_system", _bodies, solar_system, folder) if solar_system else None,
+        "sources": read("sources", files.parse_sources, reader.section("sources"), folder),
+        "structure": read("structure", structure.parse, reader.section("structure"), folder),
+        "psfs": read("psf", files.parse_psfs, reader.section("psf"), folder),
+        "strong_lens_boost": read("strong_lenses", _number, lenses, "strong_lenses.boost", 1e-3, 1e5, 1.0),
+        **(read("products", _products, products) or {"truth": ()}),
+    }
+    defaults = {"universe": Universe(), "stars": Stars()}
+    return {name: value for name, value in {**defaults, **_without_none(values)}.items()}
+
+
+def _without_none(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _products(table: Toml) -> dict[str, Any]:
+    """Read the section `products`, and return its values by name of the attribute of `Request`."""
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        values = {
+            "truth": read(_truth, table),
+            "compression": read(_string, table, "products.compression", COMPRESSIONS, "none"),
+            "wcs": read(_string, table, "products.wcs", WCS_CONVENTIONS) if "wcs" in table else None,
+            "files": read(_string, table, "products.files", FILE_LAYOUTS, "detector"),
+            "readout": read(_string, table, "products.readout", READOUTS, "raw"),
+        }
+    return values
+
+
+def _bodies(table: Toml, folder: Path) -> Path:
+    return files.resolve_path(folder, _string(table, "solar_system.bodies"))
+
+
+def _with_camera_passbands(request: Request) -> Request:
+    """Return the request with the passbands of the user's cameras in which it has exposures or fluxes."""
+    tables = (block.table for block in request.observations if block.table is not None)
+    bands = {
+        *request.bands,
+        *(pointing.band for pointing in request.pointings),
+        *(band for table in tables for band in table.bands),
+    }
+    return replace(request, curves=files.with_camera_passbands(request.curves, request.mission.cameras, bands))
 
 
 # The functions below read one section or key of a request each. They raise BadInput, which names the key, if a value is
@@ -240,28 +370,38 @@ def _accuracy(value: object, path: str) -> Accuracy:
         return SURVEY
     if isinstance(value, str):
         return preset(value)
-    table = _as_table(value, path, {"flux", "shape", "position", "background"})
-    accuracy = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    if not isinstance(value, dict):
+        raise BadInput(f"{path} = {_quote_value(value)} is not one of {ALLOWED}")
+    table = _as_table(value, path, Accuracy.__slots__)
+    with Mistakes() as mistakes:
+        numbers = {key: mistakes.read(_number, table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__}
+    accuracy = Accuracy(**numbers)
     # Call `fastest_row` only for its check: it raises BadInput if no drawing settings reach this accuracy.
     fastest_row(accuracy)
     return accuracy
 
 
-def _universe(table: Toml) -> Universe:
+def _universe(table: Toml, lensing_nside: int) -> Universe:
+    """Read the section `universe`; `lensing_nside` is the resolution of the lensing maps without this key."""
     default = Universe()
-    return Universe(
-        galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
-        galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
-        star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
-        z_max=_number(table, "universe.z_max", 0.01, 6.0, default.z_max),
-        box_cells=_integer_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
-        high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
-        quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
-        lensing_nside=_integer_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
-        lensing=_lensing(table.get("lensing", "box")),
-        alignment=_number(table, "universe.alignment", 0.0, 10.0, default.alignment),
-        rotation=_number(table, "universe.rotation", -360.0, 360.0, default.rotation),
-    )
+    with Mistakes() as mistakes:
+        read, boosts = mistakes.read, (0.0, 1e5)
+        universe = Universe(
+            galaxy_limit=read(_number, table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit, "mag"),
+            galaxy_band=read(_string, table, "universe.galaxy_band", default=default.galaxy_band),
+            star_limit=read(_number, table, "universe.star_limit", 0.0, 30.0, default.star_limit, "mag"),
+            z_max=read(_number, table, "universe.z_max", 0.01, 6.0, default.z_max),
+            box_cells=read(_integer_choice, table, "universe.box_cells", BOX_CELLS, default.box_cells),
+            high_redshift_boost=read(
+                _number, table, "universe.high_redshift_boost", *boosts, default.high_redshift_boost
+            ),
+            quasar_boost=read(_number, table, "universe.quasar_boost", *boosts, default.quasar_boost),
+            lensing_nside=read(_integer_choice, table, "universe.lensing_nside", LENSING_NSIDES, lensing_nside),
+            lensing=read(_lensing, table.get("lensing", "box")),
+            alignment=read(_number, table, "universe.alignment", 0.0, 10.0, default.alignment),
+            rotation=read(_number, table, "universe.rotation", -360.0, 360.0, default.rotation, "deg"),
+        )
+    return universe
 
 
 def _lensing(value: object) -> tuple[float, float] | None:
@@ -272,8 +412,12 @@ def _lensing(value: object) -> tuple[float, float] | None:
     path = "universe.lensing"
     if isinstance(value, str):
         return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
-    table = _as_table(value, path, {"g1", "g2"})
-    g1, g2 = (_number(table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
+    if not isinstance(value, dict):
+        form = '"box", "none" or a table such as { g1 = 0.02, g2 = 0.0 }'
+        raise BadInput(f"{path} must be {form}, got {_quote_value(value)}")
+    table = _as_table(value, path, ("g1", "g2"))
+    with Mistakes() as mistakes:
+        g1, g2 = (mistakes.read(_number, table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
     if (size := math.hypot(g1, g2)) > MAX_SHEAR:
         raise BadInput(f"{path} = {_quote_value(value)}: |g| = {size:.4g} must be at most {MAX_SHEAR}")
     return g1, g2
@@ -281,38 +425,62 @@ def _lensing(value: object) -> tuple[float, float] | None:
 
 def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
     default = Stars()
-    bright_limit = _optional_number(table, "stars.bright_limit", -10.0, 30.0)
-    if bright_limit is not None and bright_limit >= star_limit:
-        raise BadInput(f"stars.bright_limit = {bright_limit:g} leaves no star up to star_limit = {star_limit:g}")
-    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
-    plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
-    catalogue_table = _as_table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
-    columns = _as_table(catalogue_table.get("columns", {}), "stars.catalogue.columns", None)
-    return Stars(
-        density=_string(table, "stars.density", DENSITY_MODELS) if "density" in table else default.density,
-        brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
-        tycho2=tuple(files.resolve_path(folder, name) for name in _strings(table, "stars.tycho2")),
-        catalogue=files.resolve_path(folder, _string(catalogue_table, "stars.catalogue.file"))
-        if catalogue_table
-        else None,
-        columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
-        plane_limit=None if math.isnan(plane_limit) else plane_limit,
-        bright_limit=bright_limit,
-        rows_a_file=rows,
-    )
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        bright_limit = read(_optional_number, table, "stars.bright_limit", -10.0, 30.0, "mag")
+        if bright_limit is not None and bright_limit >= star_limit:
+            problem = f"stars.bright_limit = {bright_limit:g} leaves no star up to star_limit = {star_limit:g}"
+            mistakes.add(BadInput(f"{problem}: it must be smaller"))
+        tycho2 = read(_strings, table, "stars.tycho2") or ()
+        catalogue, columns = read(_star_catalogue, table, folder) or (None, ())
+        stars = Stars(
+            density=read(_string, table, "stars.density", DENSITY_MODELS, default.density),
+            brown_dwarf_boost=read(_number, table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
+            tycho2=tuple(files.resolve_path(folder, name) for name in tycho2),
+            catalogue=catalogue,
+            columns=columns,
+            plane_limit=read(_optional_number, table, "stars.plane_limit", 0.0, 30.0, "mag"),
+            bright_limit=bright_limit,
+            rows_a_file=read(_integer, table, "stars.rows_a_file", 1, 3_000_000, default.rows_a_file),
+        )
+    return stars
+
+
+def _star_catalogue(table: Toml, folder: Path) -> tuple[Path | None, tuple[tuple[str, str], ...]]:
+    """Return file and columns of the user's catalogue of stars, None and () without a catalogue."""
+    path = "stars.catalogue"
+    catalogue = _as_table(table.get("catalogue", {}), path, ("file", "columns"))
+    columns = _as_table(catalogue.get("columns", {}), f"{path}.columns", None)
+    with Mistakes() as mistakes:
+        file = mistakes.read(_string, catalogue, f"{path}.file") if catalogue else None
+        names = tuple((key, mistakes.read(_string, columns, f"{path}.columns.{key}")) for key in sorted(columns))
+    return None if file is None else files.resolve_path(folder, file), names
 
 
 def _mission(table: Toml, folder: Path) -> MissionChoice:
-    ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
-    overrides = _as_table(table.get("overrides", {}), "mission.overrides", None)
-    chosen = tuple(sorted((key, _override(value, key)) for key, value in overrides.items()))
-    return MissionChoice(ladder, chosen, files.read_cameras(_strings(table, "mission.cameras"), folder))
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        ladder = read(_strings, table, "mission.ladder", STATUSES) or LADDER
+        overrides = read(_as_table, table.get("overrides", {}), "mission.overrides", None) or {}
+        chosen = tuple(sorted((key, read(_override, value, key)) for key, value in overrides.items()))
+        cameras = read(files.read_cameras, read(_strings, table, "mission.cameras") or (), folder)
+    return MissionChoice(ladder, chosen, cameras)
 
 
 def _override(value: object, key: str) -> Override:
     path = f"mission.overrides.{key}"
-    table = _as_table(value, path, {"value", "unit"})
-    return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
+    if not isinstance(value, dict):
+        example = f'"{key}" = {{ value = .., unit = ".." }}'
+        raise BadInput(f"{path} must be a table such as {example}, got {_quote_value(value)}")
+    if any(isinstance(item, dict) for item in value.values()):
+        raise BadInput(
+            f'{path}: write the name of the parameter in quotes, such as "{key}.{next(iter(value))}" = {{ .. }}'
+        )
+    table = _as_table(value, path, ("value", "unit"))
+    with Mistakes() as mistakes:
+        number = mistakes.read(_number, table, f"{path}.value", -math.inf, math.inf)
+        unit = mistakes.read(_string, table, f"{path}.unit")
+    return Override(number, unit)
 
 
 def _truth(table: Toml) -> tuple[str, ...]:
@@ -320,29 +488,36 @@ def _truth(table: Toml) -> tuple[str, ...]:
 
 
 def _effects(table: Toml) -> Effects:
-    on, off = _strings(table, "effects.on", EFFECTS), _strings(table, "effects.off", (_ALL, *EFFECTS))
+    with Mistakes() as mistakes:
+        on = mistakes.read(_strings, table, "effects.on", EFFECTS)
+        off = mistakes.read(_strings, table, "effects.off", (_ALL, *EFFECTS))
     if off == (_ALL,):
         return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS_ON, *on)))
     if _ALL in off:
         raise BadInput("effects.off: 'all' must be the only item")
+    if required := [name for name in off if name in ALWAYS_ON]:
+        raise bad_input(f"effects.off: {name!r} cannot be switched off: every image needs it" for name in required)
     if conflicts := sorted(set(on) & set(off)):
         raise BadInput(f"effects: {conflicts[0]!r} is both on and off")
     return Effects(on, off)
 
 
 def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    explored, count = [], 1
-    for key in sorted(table):
-        values = _choices(key, table[key])
-        if not values:
-            raise BadInput(f"explore.{key} has no value")
-        if len(set(values)) != len(values):
-            raise BadInput(f"explore.{key} contains a value twice")
-        count *= len(values)
-        if count > _MAX_VARIANTS:
-            raise BadInput(f"explore.{key}: the values give more than {_MAX_VARIANTS} combinations")
-        explored.append((key, values))
-    return tuple(explored)
+    with Mistakes() as mistakes:
+        explored = tuple((key, mistakes.read(_distinct_choices, key, table[key])) for key in sorted(table))
+    if (count := math.prod(len(values) for _, values in explored)) > _MAX_VARIANTS:
+        key = max(explored, key=lambda entry: len(entry[1]))[0]
+        raise BadInput(f"explore.{key}: the values give {count} combinations, more than {_MAX_VARIANTS}")
+    return explored
+
+
+def _distinct_choices(key: str, value: object) -> tuple[str, ...]:
+    values = _choices(key, value)
+    if not values:
+        raise BadInput(f"explore.{key} has no value")
+    if len(set(values)) != len(values):
+        raise BadInput(f"explore.{key} contains a value twice")
+    return values
 
 
 def _choices(key: str, value: object) -> tuple[str, ...]:
@@ -353,7 +528,7 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
     """
     path = f"explore.{key}"
     if key != "accuracy" and not key.startswith("effects."):
-        table = _as_table(value, path, {"values", "unit"})
+        table = _as_table(value, path, ("values", "unit"))
         unit, numbers = _string(table, f"{path}.unit"), _required_value(table, f"{path}.values")
         if not isinstance(numbers, list):
             raise BadInput(f"{path}.values must be a list of numbers, got {_quote_value(numbers)}")
@@ -363,6 +538,10 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
         raise BadInput(f"{path} must be a list, got {_quote_value(value)}")
     if key == "accuracy":
         return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
-    if key.removeprefix("effects.") not in EFFECTS:
-        raise BadInput(f"{path} is not one of the effects {', '.join(EFFECTS)}")
-    return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))
+    effect = key.removeprefix("effects.")
+    if effect not in EFFECTS:
+        raise BadInput(f"explore.effects: {_refuse_name(effect, EFFECTS)}")
+    switches = [_boolean({f"{effect}[{i}]": item}, f"{path}[{i}]", True) for i, item in enumerate(value)]
+    if effect in ALWAYS_ON and False in switches:
+        raise BadInput(f"{path} = {_quote_value(value)}: the effect cannot be switched off: every image needs it")
+    return tuple(json.dumps(switch) for switch in switches)

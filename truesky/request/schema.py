@@ -13,8 +13,9 @@ from lake_schema.tables import mission as database
 from lake_schema.tables import products
 from truesky.request.accuracy import Accuracy
 from truesky.request.area import Area
+from truesky.request.exposures.observations import Observation
+from truesky.request.exposures.pointings import Pointing
 from truesky.request.files import Ingest, UserCurves, UserSources
-from truesky.request.observations import Observation, Pointing
 from truesky.request.structure import Structure
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ class Universe:
     box_cells : int
         Number of cells of 4 Mpc/h along each side of the periodic box with the simulated matter density.
     lensing_nside : int
-        HEALPix N_side of the lensing maps computed from the matter box. Maps with 1024 need 5 GB in the cache on disc.
+        HEALPix N_side of the lensing maps computed from the matter box. Maps with 1024 need 4.8 GB in the cache on
+        disc. A request without this key has the value of truesky/request/lensing_resolution.py.
     lensing : (float, float), optional
         Constant reduced shear (g1, g2) of all galaxies. In the frame (east, north), g1 > 0 stretches east-west and
         g2 > 0 from the south-west to the north-east. None for lensing by the matter box and halos.

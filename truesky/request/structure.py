@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from truesky.request.toml_values import Toml, as_table, boolean, integer, number, string
 
 # Smallest and largest number of knots per disc. Fewer knots do not fill a disc. More take too long, since each knot is
@@ -77,33 +77,39 @@ def parse(table: Toml, folder: Path) -> Structure:
     BadInput
         If the section is not valid. The message names the key.
     """
-    return Structure(_arms(table.get("arms", False)), _stamps(table["stamps"], folder) if "stamps" in table else None)
+    with Mistakes() as mistakes:
+        arms = mistakes.read(_arms, table.get("arms", False))
+        stamps = mistakes.read(_stamps, table["stamps"], folder) if "stamps" in table else None
+    return Structure(arms, stamps)
 
 
 def _stamps(value: object, folder: Path) -> Stamps:
     path = "structure.stamps"
-    stamps_table = as_table(value, path, set(Stamps.__slots__))
-    nearest = boolean(stamps_table, f"{path}.nearest", False)
-    if "least_radius" in stamps_table and not nearest:
-        raise BadInput(f"{path}.least_radius requires nearest = true: stamps selected by number are drawn at any size")
-    return Stamps(
-        user_files.expand_path(string(stamps_table, f"{path}.file"), folder),
-        nearest,
-        number(stamps_table, f"{path}.least_radius", 0.05, 60.0, 0.5),
-    )
+    stamps_table = as_table(value, path, Stamps.__slots__)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        nearest = read(boolean, stamps_table, f"{path}.nearest", False)
+        if "least_radius" in stamps_table and nearest is False:
+            problem = f"{path}.least_radius requires nearest = true: stamps selected by number are drawn at any size"
+            mistakes.add(BadInput(problem))
+        file = read(string, stamps_table, f"{path}.file")
+        radius = read(number, stamps_table, f"{path}.least_radius", 0.05, 60.0, 0.5, "arcsec")
+    return Stamps(user_files.expand_path(file, folder), nearest, radius)
 
 
 def _arms(value: object) -> Arms | None:
     path, default = "structure.arms", Arms()
     if isinstance(value, bool):
         return default if value else None
-    arms_table = as_table(value, path, set(Arms.__slots__))
-    arms = Arms(
-        number(arms_table, f"{path}.contrast", 0.0, 2.0, default.contrast),
-        number(arms_table, f"{path}.knots", 0.0, 0.5, default.knots),
-        integer(arms_table, f"{path}.number", *_KNOT_LIMITS) if "number" in arms_table else default.number,
-        number(arms_table, f"{path}.least_radius", 0.3, 60.0, default.least_radius),
-    )
+    arms_table = as_table(value, path, Arms.__slots__)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        arms = Arms(
+            read(number, arms_table, f"{path}.contrast", 0.0, 2.0, default.contrast),
+            read(number, arms_table, f"{path}.knots", 0.0, 0.5, default.knots),
+            read(integer, arms_table, f"{path}.number", *_KNOT_LIMITS, default.number),
+            read(number, arms_table, f"{path}.least_radius", 0.3, 60.0, default.least_radius, "arcsec"),
+        )
     if not arms.contrast and not arms.knots:
         raise BadInput(f"{path}: contrast or knots must be above 0; use arms = false for smooth discs")
     return arms

@@ -7,15 +7,19 @@ sections, for example "universe.z_max". The function looks for the last part, he
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
-from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.errors import BadInput, OutOfRange, bad_input
+from lake_schema.texts import spelling
 
 Toml = Mapping[str, Any]
+# Keys of a request that are in no section.
+TOP_KEYS = ("name", "seed", "noise_seed", "accuracy")
+_NO_PLACES: Mapping[str, str] = {}
 
 
-def check_keys(table: Toml, path: str, keys: set[str]) -> None:
+def check_keys(table: Toml, path: str, keys: Iterable[str], places: Mapping[str, str] = _NO_PLACES) -> None:
     """Check that a table has no unknown keys.
 
     Parameters
@@ -24,21 +28,41 @@ def check_keys(table: Toml, path: str, keys: set[str]) -> None:
         The table of a section.
     path : str
         Name of the section with the sections around it, for the error message; "" for the whole request.
-    keys : set of str
+    keys : iterable of str
         Keys that are allowed. They need not be present.
+    places : mapping of str to str, optional
+        Where keys belong that are not allowed here, for the error message: a section such as "[universe]" by key.
 
     Raises
     ------
     BadInput
-        If the table has another key. The message names the first one.
+        If the table has other keys. There is one line for each, with the most similar allowed key.
     """
-    unknown = sorted(set(table) - keys)
+    allowed = sorted(keys)
+    unknown = [key for key in table if key not in allowed]
     if unknown:
-        key_path = f"{path}.{unknown[0]}" if path else unknown[0]
-        raise BadInput(f"{key_path} is not a key of a request; allowed here: {', '.join(sorted(keys))}")
+        missing = [key for key in allowed if key not in table]
+        hints = {key: _hint(key, path, missing, allowed, places) for key in unknown}
+        raise bad_input(_describe_unknown(key, path, hints[key], allowed) for key in unknown)
 
 
-def section(table: Toml, key: str, keys: set[str] | None) -> Toml:
+def _hint(key: str, path: str, missing: Sequence[str], allowed: Sequence[str], places: Mapping[str, str]) -> str:
+    """Return where an unknown key belongs, or which allowed key the user may have meant, preferably a missing one."""
+    if path and key in TOP_KEYS:
+        return "it belongs at the top of the file, before the first [section]; "
+    if key in places:
+        return f"it belongs in {places[key]}; "
+    suggestion = spelling.did_you_mean(key, missing) or spelling.did_you_mean(key, allowed)
+    return f"{suggestion} " if suggestion else ""
+
+
+def _describe_unknown(key: str, path: str, hint: str, allowed: Sequence[str]) -> str:
+    printable_key = quote_value(key)[1:-1]
+    key_path = f"{path}.{printable_key}" if path else printable_key
+    return f"{key_path} is not a key of a request: {hint}allowed here: {', '.join(allowed)}"
+
+
+def section(table: Toml, key: str, keys: Iterable[str] | None, places: Mapping[str, str] = _NO_PLACES) -> Toml:
     """Return a section of a request as a table, empty if the section is missing.
 
     Parameters
@@ -47,8 +71,10 @@ def section(table: Toml, key: str, keys: set[str] | None) -> Toml:
         Table that contains the section, such as the whole request.
     key : str
         Name of the section.
-    keys : set of str or None
+    keys : iterable of str or None
         Keys that are allowed in the section; None for any.
+    places : mapping of str to str, optional
+        Where keys belong that are not allowed here, as in `check_keys`.
 
     Returns
     -------
@@ -60,10 +86,10 @@ def section(table: Toml, key: str, keys: set[str] | None) -> Toml:
     BadInput
         If the value is not a table, or the section has another key.
     """
-    return as_table(table.get(key, {}), key, keys)
+    return as_table(table.get(key, {}), key, keys, places)
 
 
-def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
+def as_table(value: object, path: str, keys: Iterable[str] | None, places: Mapping[str, str] = _NO_PLACES) -> Toml:
     """Check that a value is a table, and return it.
 
     Parameters
@@ -72,8 +98,10 @@ def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
         Value of a key in the request.
     path : str
         Path of the key, for error messages.
-    keys : set of str or None
+    keys : iterable of str or None
         Keys that are allowed in the table; None for any.
+    places : mapping of str to str, optional
+        Where keys belong that are not allowed here, as in `check_keys`.
 
     Returns
     -------
@@ -86,9 +114,11 @@ def as_table(value: object, path: str, keys: set[str] | None) -> Toml:
         If the value is not a table, or the table has another key.
     """
     if not isinstance(value, dict):
-        raise BadInput(f"{path} must be a table, got {quote_value(value)}")
+        form = f"{path} = {{ {', '.join(f'{key} = ..' for key in sorted(keys))} }}" if keys else "{ key = value, .. }"
+        hint = f"; write [{path}] once" if isinstance(value, list) and "." not in path else f" such as {form}"
+        raise BadInput(f"{path} must be a table{hint}, got {quote_value(value)}")
     if keys is not None:
-        check_keys(value, path, keys)
+        check_keys(value, path, keys, places)
     return cast(Toml, value)
 
 
@@ -116,7 +146,8 @@ def table_list(table: Toml, key: str, max_tables: int) -> list[object]:
     """
     entries = table.get(key, [])
     if not isinstance(entries, list) or len(entries) > max_tables:
-        raise BadInput(f"{key} must be a list of at most {max_tables} tables")
+        hint = f": write [[{key}]] instead of [{key}]" if isinstance(entries, dict) else ""
+        raise BadInput(f"{key} must be a list of at most {max_tables} tables{hint}")
     return entries
 
 
@@ -125,11 +156,31 @@ def has_key(table: Toml, path: str) -> bool:
     return path.rpartition(".")[2] in table
 
 
-def required_value(table: Toml, path: str) -> object:
-    """Return the value of the key at the end of `path`, of any type; raises BadInput if the table has no such key."""
+def required_value(table: Toml, path: str, allowed: str = "") -> object:
+    """Return the value of a key, of any type.
+
+    Parameters
+    ----------
+    table : Toml
+        Table of the section with the key.
+    path : str
+        Path of the key.
+    allowed : str, optional
+        Description of the values that are allowed, for the error message.
+
+    Returns
+    -------
+    object
+        The value.
+
+    Raises
+    ------
+    BadInput
+        If the table has no such key.
+    """
     key = path.rpartition(".")[2]
     if key not in table:
-        raise BadInput(f"{path} is missing")
+        raise BadInput(f"{path} is missing: {allowed}" if allowed else f"{path} is missing")
     return table[key]
 
 
@@ -159,12 +210,22 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
     """
     if default is not None and not has_key(table, path):
         return default
-    text = required_value(table, path)
+    text = required_value(
+        table, path, f"it must be one of {', '.join(legal)}" if legal else "it must be text in quotes"
+    )
     if not isinstance(text, str):
-        raise BadInput(f"{path} must be text, got {quote_value(text)}")
+        one_of = f", one of {', '.join(legal)}" if legal else ""
+        raise BadInput(f"{path} must be text in quotes{one_of}, got {quote_value(text)}")
     if legal and text not in legal:
-        raise BadInput(f"{path} = {quote_value(text)} is not one of {', '.join(legal)}")
+        raise BadInput(f"{path} = {refuse_name(text, legal)}")
     return text
+
+
+def refuse_name(name: str, legal: Sequence[str]) -> str:
+    """Return the end of an error message about a name: the most similar legal name, if any, and the legal names."""
+    if suggestion := spelling.did_you_mean(name, legal):
+        return f"{quote_value(name)} is not allowed: {suggestion} allowed: {', '.join(legal)}"
+    return f"{quote_value(name)} is not one of {', '.join(legal)}"
 
 
 def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = True) -> tuple[str, ...]:
@@ -193,16 +254,16 @@ def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = 
     """
     texts = table.get(path.rpartition(".")[2], [])
     if not isinstance(texts, list) or not all(isinstance(item, str) for item in texts):
-        raise BadInput(f"{path} must be a list of texts, got {quote_value(texts)}")
-    for item in texts:
-        if legal and item not in legal:
-            raise BadInput(f"{path}: {quote_value(item)} is not one of {', '.join(legal)}")
+        form = f"[{quote_value(texts)}]" if isinstance(texts, str) else '[".."]'
+        raise BadInput(f"{path} must be a list of texts such as {form}, got {quote_value(texts)}")
+    if unknown := [item for item in texts if legal and item not in legal]:
+        raise bad_input(f"{path}: {refuse_name(item, legal)}" for item in unknown)
     if distinct and len(set(texts)) != len(texts):
         raise BadInput(f"{path} = {quote_value(texts)} contains a text twice")
     return tuple(texts)
 
 
-def number(table: Toml, path: str, lo: float, hi: float, default: float | None = None) -> float:
+def number(table: Toml, path: str, lo: float, hi: float, default: float | None = None, unit: str = "") -> float:
     """Read the value of a key that must be a finite number.
 
     Parameters
@@ -215,6 +276,8 @@ def number(table: Toml, path: str, lo: float, hi: float, default: float | None =
         Smallest and largest number that is allowed.
     default : float, optional
         Value if the key is missing, which is not checked; None if the key is required.
+    unit : str, optional
+        Unit of the number, for error messages.
 
     Returns
     -------
@@ -230,10 +293,11 @@ def number(table: Toml, path: str, lo: float, hi: float, default: float | None =
     """
     if default is not None and not has_key(table, path):
         return default
-    return checked_number(required_value(table, path), path, lo, hi)
+    value = required_value(table, path, f"it must be {_describe_range(lo, hi, unit)}")
+    return checked_number(value, path, lo, hi, unit)
 
 
-def optional_number(table: Toml, path: str, lo: float, hi: float) -> float | None:
+def optional_number(table: Toml, path: str, lo: float, hi: float, unit: str = "") -> float | None:
     """Read the value of a key that must be a finite number; return None if the key is missing.
 
     Parameters
@@ -244,6 +308,8 @@ def optional_number(table: Toml, path: str, lo: float, hi: float) -> float | Non
         Path of the key.
     lo, hi : float
         Smallest and largest number that is allowed.
+    unit : str, optional
+        Unit of the number, for error messages.
 
     Returns
     -------
@@ -257,10 +323,10 @@ def optional_number(table: Toml, path: str, lo: float, hi: float) -> float | Non
     OutOfRange
         If the number is outside its limits, NaN or infinite.
     """
-    return number(table, path, lo, hi) if has_key(table, path) else None
+    return number(table, path, lo, hi, unit=unit) if has_key(table, path) else None
 
 
-def checked_number(value: object, path: str, lo: float, hi: float) -> float:
+def checked_number(value: object, path: str, lo: float, hi: float, unit: str = "") -> float:
     """Check that a value is a finite number, and return it as float.
 
     Parameters
@@ -271,6 +337,8 @@ def checked_number(value: object, path: str, lo: float, hi: float) -> float:
         Path of the key, for error messages.
     lo, hi : float
         Smallest and largest number that is allowed.
+    unit : str, optional
+        Unit of the number, for error messages.
 
     Returns
     -------
@@ -285,11 +353,18 @@ def checked_number(value: object, path: str, lo: float, hi: float) -> float:
         If the number is outside its limits, NaN or infinite.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise BadInput(f"{path} must be a number, got {quote_value(value)}")
+        hint = " in quotes" if isinstance(value, str) else ""
+        raise BadInput(f"{path} must be {_describe_range(lo, hi, unit)}, got {quote_value(value)}{hint}")
     # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
     if not lo <= value <= hi or not math.isfinite(value):
         raise OutOfRange(path, quote_value(value), lo, hi)
     return float(value)
+
+
+def _describe_range(lo: float, hi: float, unit: str) -> str:
+    """Return "a number from 1 to 2 deg", or "a number" if the limits are infinite."""
+    limits = f" from {lo:g} to {hi:g}" if math.isfinite(lo) and math.isfinite(hi) else ""
+    return f"a number{limits}{' ' if unit else ''}{unit}"
 
 
 def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None) -> int:
@@ -320,9 +395,9 @@ def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None
     """
     if default is not None and not has_key(table, path):
         return default
-    integer_value = required_value(table, path)
+    integer_value = required_value(table, path, f"it must be a whole number from {lo} to {hi}")
     if isinstance(integer_value, bool) or not isinstance(integer_value, int):
-        raise BadInput(f"{path} must be a whole number, got {quote_value(integer_value)}")
+        raise BadInput(f"{path} must be a whole number from {lo} to {hi}, got {quote_value(integer_value)}")
     if not lo <= integer_value <= hi:
         raise OutOfRange(path, quote_value(integer_value), lo, hi)
     return integer_value
@@ -352,7 +427,7 @@ def boolean(table: Toml, path: str, default: bool) -> bool:
     """
     flag = table.get(path.rpartition(".")[2], default)
     if not isinstance(flag, bool):
-        raise BadInput(f"{path} must be true or false, got {quote_value(flag)}")
+        raise BadInput(f"{path} must be true or false without quotes, got {quote_value(flag)}")
     return flag
 
 
@@ -380,41 +455,10 @@ def integer_choice(table: Toml, path: str, legal: Sequence[int], default: int) -
     BadInput
         If the value is not one of the allowed numbers.
     """
-    selected = integer(table, path, min(legal), max(legal), default)
-    if selected not in legal:
-        raise BadInput(f"{path} = {selected} is not one of {', '.join(map(str, legal))}")
+    selected = table.get(path.rpartition(".")[2], default)
+    if isinstance(selected, bool) or not isinstance(selected, int) or selected not in legal:
+        raise BadInput(f"{path} = {quote_value(selected)} is not one of {', '.join(map(str, legal))}")
     return selected
-
-
-def number_pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, float]:
-    """Read the value of a key that must be a list of two finite numbers.
-
-    Parameters
-    ----------
-    table : Toml
-        Table of the section with the key.
-    path : str
-        Path of the key.
-    lo, hi : float
-        Smallest and largest number that is allowed, for both numbers.
-
-    Returns
-    -------
-    (float, float)
-        The numbers, in the order of the list.
-
-    Raises
-    ------
-    BadInput
-        If the key is missing, or the value is not a list of two numbers.
-    OutOfRange
-        If a number is outside its limits, NaN or infinite.
-    """
-    numbers = required_value(table, path)
-    if not isinstance(numbers, list) or len(numbers) != 2:
-        raise BadInput(f"{path} must be [from, to], got {quote_value(numbers)}")
-    first, second = (checked_number(item, path, lo, hi) for item in numbers)
-    return first, second
 
 
 def quote_value(value: object) -> str:

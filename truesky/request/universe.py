@@ -77,7 +77,8 @@ def _difference(version: read.Version, request: Request) -> str:
     # example, the manifest has no limiting magnitude.
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if canonical(facts.get(key)) != canonical(values[key]):
-            return f"{key} {facts.get(key)}, the request {values[key]}"
+            remedy = " (by default from area and accuracy: set universe.lensing_nside)" * (key == "lensing_nside")
+            return f"{key} {facts.get(key)}, the request {values[key]}{remedy}"
     for key, named in _named_files(version.table, request) if sources is None else ():
         if (named is None) is (key in facts):
             return f"{'no ' if named else ''}files of {key}, the request {'some' if named else 'none'}"

@@ -5,9 +5,10 @@ import csv
 import pytest
 
 from lake_schema.errors import BadInput
-from lake_schema.mission import camera_folder, camera_tables, camera_template, checks, commands
+from lake_schema.mission import camera_folder, camera_tables, camera_template, checks
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import CAMERAS
+from truesky.commands import __main__
 
 KNOWN = resolve()
 
@@ -287,11 +288,11 @@ def test_a_name_that_a_camera_may_not_have_is_refused(folder, name):
 
 
 def test_the_command_writes_a_folder_and_never_over_another(tmp_path, capsys):
-    assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 0
+    assert __main__.main(["mission", "camera", str(tmp_path / "mine"), "--like", "decam"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5
-    assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 2
+    assert __main__.main(["mission", "camera", str(tmp_path / "mine"), "--like", "decam"]) == 2
     assert capsys.readouterr().err.endswith("mine: already exists\n")
-    assert commands.main(["camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
+    assert __main__.main(["mission", "camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
     assert not (tmp_path / "No Name").exists()
 
 
@@ -302,9 +303,9 @@ def test_a_path_that_the_system_does_not_take_is_refused(tmp_path, monkeypatch, 
     for name in ("loop", long):
         with pytest.raises(BadInput, match=r"loop: no such folder|x: File name too long"):
             camera_folder.read(tmp_path / name)
-        assert commands.main(["camera", name, "--like", "decam"]) == 2
+        assert __main__.main(["mission", "camera", name, "--like", "decam"]) == 2
         said = capsys.readouterr().err
         assert len(said.splitlines()) == 1
         assert said.endswith(("already exists\n", "File name too long\n"))
-    assert commands.main(["camera", "loop/mine", "--like", "decam"]) == 2
+    assert __main__.main(["mission", "camera", "loop/mine", "--like", "decam"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units
 
-from lake_schema.errors import BadInput
-from lake_schema.mission import checks
-from lake_schema.mission.bounds import bounds_of_parameter
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission import checks, parameter
+from lake_schema.mission.bounds import bounds_of_parameter, check_bounds
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS, STATUSES, read_all_parameters
 from lake_schema.tables.mission import LADDER
@@ -26,6 +27,24 @@ def test_every_value_has_bounds_of_its_kind():
         # A bound that allows a single value would be a second source of that value.
         for lo, hi, _ in bounds_of_parameter(record.key):
             assert lo < hi
+
+
+def test_every_value_of_the_package_is_within_its_bounds():
+    """`resolve` checks only the values of users."""
+    for record in read_all_parameters():
+        check_bounds(record, record.key)
+    records = [replace(record, value=-1.0) if record.key == "vis.gain" else record for record in read_all_parameters()]
+    with pytest.raises(OutOfRange, match=r"vis\.gain"):
+        resolve(records)
+
+
+def test_units_and_factors_of_the_package_are_those_of_astropy():
+    """These units are not parsed, and the factors are not computed, because astropy is slow to import."""
+    assert {record.unit for record in read_all_parameters()} <= parameter._SHIPPED_UNITS
+    for text in parameter._SHIPPED_UNITS:
+        assert isinstance(units.Unit(text), units.UnitBase)
+    for (unit, to), factor in parameter._FACTORS.items():
+        assert units.Unit(unit).to(units.Unit(to)) == factor
 
 
 # ------------------------------------------------------------------------------------------------ faults
@@ -81,8 +100,8 @@ def test_faults_are_named(key, change, words):
     ("change", "words"),
     [
         (lambda rows: rows[::-1], "do not ascend"),
-        (with_first("throughput", "1.001"), "outside 0 to 1"),
-        (with_first("throughput", "-0.1"), "outside"),
+        (lambda rows: ((rows[0][0], 1.001), *rows[1:]), "outside 0 to 1"),
+        (lambda rows: ((rows[0][0], -0.1), *rows[1:]), "outside"),
     ],
 )
 def test_throughputs_are_checked(change, words):

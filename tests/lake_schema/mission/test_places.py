@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import __main__
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission import detector_overrides, listing
 from lake_schema.mission.checks import faults
@@ -14,6 +13,7 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.mission.detector_overrides import DetectorPlace
 from lake_schema.mission.model import read_models
 from lake_schema.mission.parameter import CAMERAS, read_all_parameters
+from truesky.commands import __main__
 
 GAIN = "electron / adu"
 MISSION = resolve()
@@ -143,7 +143,7 @@ def test_the_list_is_aligned_and_filtered(capsys, tmp_path):
     assert found["vis.gain.E"]["value"] == 3.3
     assert "nisp.gain_spread" in found
     assert __main__.main(["mission", "list", "nothing"]) == 2
-    assert capsys.readouterr().err == "lake_schema: no name of the mission database matches 'nothing'\n"
+    assert capsys.readouterr().err == "truesky mission: no name of the mission database matches 'nothing'\n"
 
 
 def test_one_configuration_is_compared_with_the_default(capsys, tmp_path):

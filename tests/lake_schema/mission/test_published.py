@@ -5,7 +5,6 @@ import json
 
 import pytest
 
-from lake_schema import __main__
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.mission import compare, published
 from lake_schema.mission.configuration import MissionConfiguration, differences, resolve
@@ -14,6 +13,7 @@ from lake_schema.mission.parameter import Parameter
 from lake_schema.store import publish, read
 from lake_schema.store.plan import Plan, Task
 from lake_schema.tables.mission import LADDER, MISSION
+from truesky.commands import __main__
 
 CHANGED = resolve(ladder=("SIM", *LADDER[:-1]), overrides={"vis.gain": (3.3, "electron / adu")})
 

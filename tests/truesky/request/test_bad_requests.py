@@ -113,7 +113,8 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     assert time.process_time() - started < HANGS
     said = capsys.readouterr().err
     assert words in said
-    assert said.count("\n") == 1
+    # An empty request lacks its name, its seed and its area.
+    assert said.count("\n") == (3 if not text else 1)
     for job in JOBS:
         assert submitted_job.main(job, ["--lake", str(lake), "--request", str(path)]) == 2
         assert words in capsys.readouterr().err
@@ -144,7 +145,7 @@ def test_the_check_from_a_shell_imports_nothing_slow(tmp_path):
         "duckdb",
         "galsim",
         "hats",
-        "healpy",
+        "healpy.pixelfunc",
         "matplotlib",
         "numba",
         "pandas",

@@ -84,7 +84,7 @@ BAD = [
     ("ingest", {"training": {"files": ["x"]}, "galaxies": {"files": ["y"]}}, "ingest.training is not allowed"),
     ("universe", {"deep": True}, "universe.deep"),
     ("universe", {"lensing": "some"}, "universe.lensing = 'some' is not one of box, none"),
-    ("universe", {"lensing": 0.1}, "universe.lensing must be a table"),
+    ("universe", {"lensing": 0.1}, "universe.lensing must be .* or a table"),
     ("universe", {"lensing": {"g1": 0.1}}, "universe.lensing.g2 is missing"),
     ("universe", {"lensing": {"g1": 0.1, "g2": 1.5}}, "universe.lensing.g2"),
     ("universe", {"lensing": {"g1": 0.7, "g2": 0.7}}, r"universe.lensing = .*: \|g\| = 0.9899"),
@@ -134,7 +134,7 @@ BAD = [
     ("pointing.mjd", 0, r"pointing\[0\].mjd"),
     ("pointing.exposure_time_s", -1, r"pointing\[0\].exposure_time_s"),
     ("pointing.detectors", "3-4", r"pointing\[0\].detectors"),
-    ("pointing.camera", "../vis", "name"),
+    ("pointing.camera", "../vis", r"pointing\[0\].camera: channel VIS has no camera '../vis'"),
     ("pointing.colour", 1, r"pointing\[0\].colour"),
 ]
 

@@ -41,9 +41,18 @@ MISTAKES = {
     "a band misspelt": (pointed("euclid_vis", "euclid_viz"), "no band 'euclid_viz'"),
     "a band of another camera": (pointed("euclid_vis", "lsst_r"), "pointing[0].band"),
     "a camera misspelt": (GOOD + 'camera = "viz"\n', "pointing[0].camera"),
-    "a pointing in hours": (pointed("ra = 53.117\ndec", 'ra = "03:32:28"\ndec'), "pointing[0].ra must be a number"),
-    "a Julian date": (pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is outside"),
-    "no date": (pointed("mjd = 60905.0\n", ""), "pointing[0].mjd is missing"),
+    "a pointing in degrees as text": (
+        pointed("ra = 53.117\ndec", 'ra = "53.117"\ndec'), "pointing[0].ra = '53.117' must be a number in degrees, or",
+    ),
+    "a Julian date": (
+        pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is a Julian date: write the MJD 60905",
+    ),
+    "a date of words": (pointed("60905.0", '"1 May 2027"'), "pointing[0].mjd = '1 May 2027' must be a number (MJD,"),
+    "a PSF of spectra": (
+        WIDE + '[[observation]]\nchannels = ["NISP-S"]\nfields = 1\n[psf]\nnisp_red = "x.fits"\n',
+        "psf.nisp_red: spectra do not support PSF files",
+    ),
+    "an effect that every image needs": (GOOD + '[effects]\noff = ["adc"]\n', "effects.off: 'adc' cannot be switched"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
     "an area too small": (pointed("0.2 }", "0.01 }"), "[area] cone = { ra = 53.117, dec = -27.808,"),
     "an area elsewhere": (
@@ -73,8 +82,12 @@ MISTAKES = {
     "no catalogue of galaxies": (
         GOOD + '[ingest.galaxies]\nformat = "flagship2"\nfiles = ["none.parquet"]\n', "none.parquet",
     ),
-    "a format of no name": (GOOD + '[ingest.galaxies]\nformat = "flagship9"\nfiles = ["none.parquet"]\n', "flagship9"),
-    "no file of halos": (GOOD + '[ingest.halos]\nfiles = ["none.parquet"]\n', "ingest.halos"),
+    "a format of no name": (GOOD + '[ingest.galaxies]\nformat = "flagship9"\nfiles = ["p.csv"]\n', "flagship9"),
+    "no columns of halos": (GOOD + '[ingest.halos]\nfiles = ["p.csv"]\n', "ingest.halos.columns must have ra, dec,"),
+    "no file of halos": (
+        GOOD + '[ingest.halos]\nfiles = ["none.parquet"]\n'
+        'columns = { ra = "a", dec = "d", z_true = "z", log_mass = "m" }\n', "none.parquet: no such file",
+    ),
     "no map of dust": (GOOD + '[ingest.dust]\nfile = "none.fits"\ncolumn = "EBV"\n', "none.fits"),
     "a limit in no band": (GOOD + '[universe]\ngalaxy_band = "I"\n', "universe.galaxy_band = 'I'"),
     "a limit too faint": (GOOD + "[universe]\ngalaxy_limit = 40\n", "universe.galaxy_limit = 40"),

@@ -22,7 +22,7 @@ from truesky.render.planning import lit_flats, persistence_darks
 from truesky.render.planning.observing_sequence import FILTERS, N_GRISM_ANGLES, RED, offsets
 from truesky.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 _DAY_S = 86400.0
 # Names of the calibrators on the sky that each image type observes (two standard stars: Serrano et al. 2024).

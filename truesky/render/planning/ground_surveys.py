@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.randomness import rng
 from truesky.render.camera import detectors as camera_detectors
@@ -26,11 +26,14 @@ from truesky.render.planning import calibration_frames
 from truesky.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
 from truesky.render.sky.observatory import Site, next_dark_time, sun_altitude
 from truesky.render.sky.solar_aspect import next_allowed, position_angle
-from truesky.request import pointing_tables
 from truesky.request.area import Area
-from truesky.request.observations import Observation
-from truesky.request.pointing_tables import Row
+from truesky.request.exposures import pointing_tables
+from truesky.request.exposures.observations import Observation
+from truesky.request.exposures.pointing_tables import Row
+from truesky.request.instruments import check_band
 
+# Number of mistakes in a table of pointings after which the rest of its rows are not read.
+_MAX_MISTAKES = 20
 _DAY_S = 86400.0
 # Seconds from the end of an exposure to the start of the next one.
 _OVERHEAD_S = 30.0
@@ -280,7 +283,7 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     Parameters
     ----------
     path : Path
-        CSV table of pointings (`truesky.request.pointing_tables`), of ground or Euclid cameras.
+        CSV table of pointings (`truesky.request.exposures.pointing_tables`), of ground or Euclid cameras.
     block : Observation
         Observation block of the request that names the table; gives the values that a row leaves empty.
     mission : MissionConfiguration
@@ -302,7 +305,41 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     next visible at night.
     """
     rows = pointing_tables.read(path, block.channels, block.image_type)
-    return [_exposure_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]
+    with Mistakes() as mistakes:
+        exposures_of_rows = []
+        for number, row in enumerate(rows, start=1):
+            exposures_of_rows.append(mistakes.read(_exposure_of_row, row, number, block, mission))
+            if len(mistakes) >= _MAX_MISTAKES:
+                break
+    return exposures_of_rows
+
+
+def first_date(channel: str, camera: str, ra: float, dec: float, mission: MissionConfiguration) -> float:
+    """Return the first date after the launch of the mission at which a camera can observe a position.
+
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel and of the camera.
+    ra, dec : float
+        Position in degrees.
+    mission : MissionConfiguration
+        Mission database, with the date of the launch.
+
+    Returns
+    -------
+    float
+        MJD. Euclid observes when the Sun allows the position, a ground camera when the position is up at night.
+
+    Raises
+    ------
+    BadInput
+        If the Sun allows the position at no date.
+    """
+    launch = mission.value("svm.launch", "d")
+    if not registry.CHANNELS[channel].on_ground:
+        return next_allowed(ra, dec, launch, mission)
+    return next_dark_time(ra, dec, launch, Site.from_mission(image_types.section(camera), mission))
 
 
 def _exposure_of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
@@ -310,17 +347,12 @@ def _exposure_of_row(row: Row, number: int, block: Observation, mission: Mission
     try:
         bands = bands_of(row.channel, camera, mission)
     except BadInput as error:
-        raise BadInput(f"{row.location}: {error}") from None
-    if row.band not in bands:
-        raise BadInput(f"{row.location}: camera {camera} has no band {row.band!r} ({', '.join(bands)})")
+        raise error.with_prefix(f"{row.location}: camera") from None
+    check_band(row.band, bands, f"camera {camera}", row.location)
     mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
     is_euclid = row.channel != "EXT"
     if mjd is None:
-        mjd = mission.value("svm.launch", "d")
-        if is_euclid:
-            mjd = next_allowed(row.ra, row.dec, mjd, mission)
-        else:
-            mjd = next_dark_time(row.ra, row.dec, mjd, Site.from_mission(image_types.section(camera), mission))
+        mjd = first_date(row.channel, camera, row.ra, row.dec, mission)
     if angle is None:
         angle = position_angle(row.ra, row.dec, mjd) if is_euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s

@@ -12,7 +12,7 @@ from truesky.render.camera.lamps import LAMPS
 from truesky.render.channels import image_types
 from truesky.render.effects.light import calibration_lamp
 from truesky.render.planning.planned_exposures import Exposure, through_grism
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 # A flat is taken only if the band detects more than this fraction of the lamp's photons. The fraction is relative to
 # the highest response of the camera's built-in passbands.

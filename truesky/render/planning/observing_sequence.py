@@ -22,7 +22,7 @@ from truesky.render.camera.lamps import LEDS
 from truesky.render.effects.charge import ramp
 from truesky.render.planning.planned_exposures import Exposure, exposure_time, through_grism
 from truesky.render.planning.reference_survey import Field
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 _DAY_S = 86400.0
 # Passbands of the NISP filters, in the order in which a dither uses them after the spectrum through the grism.

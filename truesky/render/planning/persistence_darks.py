@@ -12,7 +12,7 @@ from truesky.render.channels import registry
 from truesky.render.planning import lit_flats
 from truesky.render.planning.observing_sequence import FILTERS, RED
 from truesky.render.planning.planned_exposures import Exposure, elapsed_time, exposure_time, through_grism
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 _DAY_S = 86400.0
 

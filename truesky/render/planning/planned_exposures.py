@@ -29,7 +29,7 @@ from truesky.render.psf import seeing as ground_psf
 from truesky.render.sky import night_sky, observatory
 from truesky.render.sky.diffuse_light import SkyBand, sky_rate
 from truesky.render.sky.night_sky import Night
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 # Names of the NISP grisms, by the passband in which they are used.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.randomness import rng
 from truesky.render.camera import detectors
@@ -35,9 +35,11 @@ from truesky.render.planning.planned_exposures import (
     through_grism,
 )
 from truesky.render.sky.solar_aspect import check_aspect
-from truesky.request import pointing_tables
 from truesky.request.area import Area
-from truesky.request.observations import Observation, Pointing
+from truesky.request.exposures import pointing_tables
+from truesky.request.exposures.observations import Observation
+from truesky.request.exposures.pointings import Pointing
+from truesky.request.instruments import check_band, check_detectors
 from truesky.request.schema import Request
 
 # Names of the Euclid Deep Fields.
@@ -172,15 +174,20 @@ def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[Exp
     """Return the blocks of exposures of a request, in the order in which their exposures are numbered.
 
     Raises BadInput if an exposure cannot be taken, for example because the Sun is too close or the camera lacks the
-    band; the message names the pointing or observation. Also if the request has a PSF for a band without exposures.
+    band; there is one line for each pointing or observation with a mistake. Also if the request has a PSF for a band
+    without exposures.
     """
     blocks: list[ExposureBlock] = []
-    for values in request.variants():
-        blocks += _blocks_of_variant(request, values, _ResolvedSettings.from_values(values, request, mission))
-    bands = {exposure.band for block in blocks for exposure in block.base_exposures}
-    for band, _ in request.psfs:
-        if band not in bands:
-            raise BadInput(f"psf.{band}: no exposure is taken in this band")
+    with Mistakes() as mistakes:
+        for values in request.variants():
+            settings = _ResolvedSettings.from_values(values, request, mission)
+            blocks += _blocks_of_variant(request, values, settings, mistakes)
+    with Mistakes() as mistakes:
+        bands = {exposure.band for block in blocks for exposure in block.base_exposures}
+        for band in dict.fromkeys(band for band, _ in request.psfs):
+            if band not in bands:
+                taken = ", ".join(sorted(bands))
+                mistakes.add(BadInput(f"psf.{band}: no exposure is taken in this band; exposures are in {taken}"))
     return blocks
 
 
@@ -224,109 +231,103 @@ class _ResolvedSettings:
 
 
 def _blocks_of_variant(
-    request: Request, values: Mapping[str, Any], shared: _ResolvedSettings
+    request: Request, values: Mapping[str, Any], shared: _ResolvedSettings, mistakes: Mistakes
 ) -> Iterator[ExposureBlock]:
     """Generate the blocks of exposures (one per pointing and observation) for one combination of explored parameters.
 
     `values` has the values of the combination, by name of the parameter. `shared` has the same combination as JSON, and
-    the mission parameters that result from it. If an observation gives its own up-the-ramp readout of NISP, or an
-    exposure its own parameters, these replace the shared ones.
+    the mission parameters that result from it. A pointing or an observation that cannot be taken has no block; its
+    mistakes are added to `mistakes`.
     """
     for i, pointing in enumerate(request.pointings):
-        pointed_exposure = _exposure_of_pointing(pointing, f"pointing[{i}]", request, shared.mission)
-        yield ExposureBlock(
-            request, (pointed_exposure,), pointing.realisations, {(True, ()): shared, (False, ()): shared}
-        )
+        exposure = mistakes.read(_exposure_of_pointing, pointing, f"pointing[{i}]", request, shared.mission)
+        if exposure is not None:
+            settings: dict[_SettingsKey, _ResolvedSettings] = {(True, ()): shared, (False, ()): shared}
+            yield ExposureBlock(request, (exposure,), pointing.realisations, settings)
     # Undated observations with NISP begin when the NISP exposures of earlier calibrations and undated observations have
     # ended and their persistence has faded. Other dated observations are not considered.
     nisp_free_mjd = shared.mission.value("svm.launch", "d")
-    for i, block in enumerate(request.observations):
-        where = f"observation[{i}]"
-        ramp = ramp_overrides(block)
-        block_settings = (
-            _ResolvedSettings.from_values({**values, **variants.exposure_overrides(ramp)}, request, shared.mission)
-            if ramp
-            else shared
-        )
-        scheduled = _schedule_block(block, request, block_settings.mission, where, nisp_free_mjd)
-        if not scheduled.base_exposures:
-            raise BadInput(f"{where} has no exposures")
-        settings_by_key: dict[_SettingsKey, _ResolvedSettings] = {(True, ()): block_settings, (False, ()): shared}
-        for exposure in scheduled.base_exposures:
-            of_nisp = exposure.camera == "nisp"
-            if (of_nisp, exposure.parameters) not in settings_by_key:
-                parameters = {key: (value, unit) for key, value, unit in exposure.parameters}
-                overrides = {**ramp, **parameters} if of_nisp else parameters
-                exposure_settings = _ResolvedSettings.from_values(
-                    {**values, **variants.exposure_overrides(overrides)}, request, shared.mission
-                )
-                settings_by_key[of_nisp, exposure.parameters] = exposure_settings
-        exposure_block = ExposureBlock(
-            request,
-            scheduled.base_exposures,
-            block.realisations,
-            settings_by_key,
-            scheduled.fields,
-            scheduled.make_exposures,
-        )
-        for exposure in scheduled.last_exposures():
-            if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _is_undated(block)):
-                nisp_free_mjd = max(
-                    nisp_free_mjd, persistence_darks.persistence_end_mjd(exposure, block_settings.mission)
-                )
-        yield exposure_block
+    for i in range(len(request.observations)):
+        block_and_mjd = mistakes.read(_block_of_observation, i, request, values, shared, nisp_free_mjd)
+        if block_and_mjd is not None:
+            exposure_block, nisp_free_mjd = block_and_mjd
+            yield exposure_block
+
+
+def _block_of_observation(
+    number: int, request: Request, values: Mapping[str, Any], shared: _ResolvedSettings, nisp_free_mjd: float
+) -> tuple[ExposureBlock, float]:
+    """Return the block of exposures of an observation, and the MJD from which the next undated one may use NISP.
+
+    `number` is the index of the observation in the request, and `nisp_free_mjd` the MJD from which it may use NISP.
+    `values` and `shared` are arguments of `_blocks_of_variant`. If an observation gives its own up-the-ramp readout of
+    NISP, or an exposure its own parameters, these replace the shared ones. Raises BadInput if an exposure cannot be
+    taken; the message names the observation.
+    """
+    block, where = request.observations[number], f"observation[{number}]"
+    ramp = ramp_overrides(block)
+    block_settings = (
+        _ResolvedSettings.from_values({**values, **variants.exposure_overrides(ramp)}, request, shared.mission)
+        if ramp
+        else shared
+    )
+    scheduled = _schedule_block(block, request, block_settings.mission, where, nisp_free_mjd)
+    if not scheduled.base_exposures:
+        raise BadInput(f"{where} has no exposures")
+    settings_by_key: dict[_SettingsKey, _ResolvedSettings] = {(True, ()): block_settings, (False, ()): shared}
+    for exposure in scheduled.base_exposures:
+        of_nisp = exposure.camera == "nisp"
+        if (of_nisp, exposure.parameters) not in settings_by_key:
+            parameters = {key: (value, unit) for key, value, unit in exposure.parameters}
+            overrides = {**ramp, **parameters} if of_nisp else parameters
+            exposure_settings = _ResolvedSettings.from_values(
+                {**values, **variants.exposure_overrides(overrides)}, request, shared.mission
+            )
+            settings_by_key[of_nisp, exposure.parameters] = exposure_settings
+    exposure_block = ExposureBlock(
+        request,
+        scheduled.base_exposures,
+        block.realisations,
+        settings_by_key,
+        scheduled.fields,
+        scheduled.make_exposures,
+    )
+    for exposure in scheduled.last_exposures():
+        if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _is_undated(block)):
+            nisp_free_mjd = max(nisp_free_mjd, persistence_darks.persistence_end_mjd(exposure, block_settings.mission))
+    return exposure_block, nisp_free_mjd
 
 
 def _exposure_of_pointing(pointing: Pointing, where: str, request: Request, mission: MissionConfiguration) -> Exposure:
     try:
         bands = bands_of(pointing.channel, pointing.camera, mission)
     except BadInput as error:
-        raise BadInput(f"{where}.camera: {error}") from None
-    if pointing.band not in bands and pointing.band not in {name for name, _ in request.curves.passbands}:
-        band_names = ", ".join(bands)
-        raise BadInput(f"{where}.band: camera {pointing.camera} has no band {pointing.band!r} ({band_names})")
+        raise error.with_prefix(f"{where}.camera") from None
+    if pointing.band not in {name for name, _ in request.curves.passbands}:
+        check_band(pointing.band, bands, f"camera {pointing.camera}", f"{where}.band")
     check_detectors(pointing.camera, pointing.detectors, mission, f"{where}.detectors")
     ra, dec, angle = pointing.ra % 360.0, pointing.dec, pointing.position_angle
     if pointing.centre_on is not None:
         check_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
         target = detectors.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = boresight_for(target, ra, dec, angle)
-    if not registry.CHANNELS[pointing.channel].on_ground:
-        check_aspect(ra, dec, pointing.mjd, mission, where)
+    mjd = pointing.mjd
+    if mjd is None:
+        try:
+            mjd = ground_surveys.first_date(pointing.channel, pointing.camera, ra, dec, mission)
+        except BadInput as error:
+            raise error.with_prefix(where) from None
+    elif not registry.CHANNELS[pointing.channel].on_ground:
+        check_aspect(ra, dec, mjd, mission, f"{where}.mjd")
     seconds = pointing.exposure_time_s
     if seconds is None:
         seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
-    check_ramp(pointing.channel, pointing.camera, seconds, mission, where)
+    check_ramp(pointing.channel, pointing.camera, seconds, mission, f"{where}.exposure_time_s")
     exposure = Exposure(
-        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds,
+        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, mjd, seconds,
         request.name, detectors=pointing.detectors,
     )  # fmt: skip
     return through_grism(exposure, pointing.grism_angle, mission, f"{where}.grism_angle")
-
-
-def check_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:
-    """Raise BadInput if a camera does not have one of the detectors.
-
-    Parameters
-    ----------
-    camera : str
-        Name of the camera.
-    names : tuple of str
-        Names of the detectors.
-    mission : MissionConfiguration
-        Mission database, which lists the detectors of cameras.
-    where : str
-        Key of the request that has the names, quoted in the error message.
-
-    Raises
-    ------
-    BadInput
-        If the camera has no detector of one of these names. No names are always correct.
-    """
-    available = {detector.name for detector in detectors.detectors(camera, mission)} if names else set()
-    unknown = [name for name in names if name not in available]
-    if unknown:
-        raise BadInput(f"{where}: camera {camera} has no detector {unknown[0]!r}")
 
 
 def _is_undated(block: Observation) -> bool:
@@ -384,7 +385,7 @@ def _schedule_block(
                 check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
         return scheduled
     except BadInput as error:
-        raise BadInput(f"{where}: {error}") from None
+        raise error.with_prefix(where) from None
 
 
 def _first_visits(fields: Sequence[reference_survey.Field]) -> Iterator[reference_survey.Field]:

@@ -8,14 +8,17 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables import exposures as declared
 from lake_schema.tables.exposures import EUCLID_BANDS
+from lake_schema.texts import spelling
+from truesky.request import sky_notation
+from truesky.request.instruments import EUCLID_CAMERAS
 
 CHANNELS = tuple(code for code, _ in declared.CHANNELS)
 IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
@@ -23,8 +26,8 @@ IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 # Columns of the file: name, unit, meaning, and a description of the default for an empty field. A column is required if
 # its default is "".
 COLUMNS = (
-    ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360", ""),
-    ("dec", "deg", "declination of the boresight, ICRS", ""),
+    ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360, or sexagesimal in hours", ""),
+    ("dec", "deg", "declination of the boresight, ICRS, or sexagesimal in degrees", ""),
     (
         "position_angle",
         "deg",
@@ -34,7 +37,7 @@ COLUMNS = (
     (
         "mjd",
         "d",
-        "start of the exposure, MJD (UTC)",
+        "start of the exposure, MJD (UTC) or an ISO date (UTC)",
         "the observation's `mjd`; Euclid: the first date the Sun allows; ground: when the field is next up at night",
     ),
     ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the channel of the observation, if it has only one"),
@@ -52,7 +55,11 @@ COLUMNS = (
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
 _MAX_ROWS, _MAX_LENGTH = 1_000_000, 1000
+# Largest number of messages about the names of columns.
+_MAX_MESSAGES = 20
 _MAX_LINES, _MAX_LINE_LENGTH = 2 * _MAX_ROWS, 20 * _MAX_LENGTH
+# Number of mistakes after which the rest of a table is not read.
+_MAX_MISTAKES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +188,8 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     ------
     BadInput
         If the file does not exist or is too long, a column is missing, unknown or repeated, or a value is missing,
-        wrong or out of range. The message names the file, and the line and the column if there are any.
+        wrong or out of range. There is one message for each column and kind of mistake, which names the file, and the
+        first line and the column if there are any.
     """
     stream = io.StringIO(user_files.read_text(path, "table of pointings"), newline="")
     numbered_lines, line_number = _data_lines(path, stream), 0
@@ -194,29 +202,33 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
 
     lines = csv.DictReader(texts())
     rows: list[Row] = []
-    try:
-        _refuse_columns(path, lines.fieldnames or [], channels)
-        for row in lines:
-            if len(rows) >= _MAX_ROWS:
-                raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
-            if not all(isinstance(text, str) and len(text) <= _MAX_LENGTH for text in row.values() if text is not None):
-                raise BadInput(f"{path} line {line_number}: a text is too long, or there are more values than columns")
-            rows.append(
-                _row_from_line({k: (v or "").strip() for k, v in row.items()}, path, line_number, channels, image_type)
-            )
-    except csv.Error as error:
-        raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
+    with Mistakes() as mistakes:
+        try:
+            _refuse_columns(path, lines.fieldnames or [], channels)
+            for row in lines:
+                if len(rows) >= _MAX_ROWS:
+                    raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
+                rows.append(mistakes.read(_row_from_line, row, path, line_number, channels, image_type))
+                if len(mistakes) >= _MAX_MISTAKES:
+                    break
+        except csv.Error as error:
+            raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
     return rows
 
 
 def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
     required = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
-    if missing := [name for name in required if name not in names]:
-        raise BadInput(f"{path}: column {missing[0]} is missing")
-    if unknown := [name for name in names if name not in _NAMES]:
-        raise BadInput(f"{path}: column {user_files.format_path(unknown[0])} is unknown; allowed: {', '.join(_NAMES)}")
-    if twice := [name for name in names if list(names).count(name) > 1]:
-        raise BadInput(f"{path}: column {twice[0]} occurs twice")
+    with Mistakes() as mistakes:
+        for name in required:
+            if name not in names:
+                mistakes.add(BadInput(f"{path}: column {name} is missing; the first line must have the column names"))
+        for name in names:
+            if name not in _NAMES:
+                problem = f"{path}: column {user_files.format_path(name)} is unknown"
+                mistakes.add(BadInput(f"{problem}: {spelling.choices(name, _NAMES)}"))
+        for name in dict.fromkeys(names):
+            if list(names).count(name) > 1:
+                mistakes.add(BadInput(f"{path}: column {name} occurs twice"))
 
 
 def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
@@ -231,48 +243,81 @@ def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def _row_from_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[str], image_type: str) -> Row:
+def _row_from_line(
+    fields: Mapping[str | None, object], path: Path, line: int, channels: Sequence[str], image_type: str
+) -> Row:
     location = f"{path} line {line}"
+    if not all(isinstance(text, str) and len(text) <= _MAX_LENGTH for text in fields.values() if text is not None):
+        raise BadInput(f"{location}: a text is too long, or there are more values than columns")
+    row = {str(name): str(text or "").strip() for name, text in fields.items()}
     channel = row.get("channel") or (channels[0] if len(channels) == 1 else "")
     if channel not in channels:
         raise BadInput(f"{location}: channel = {channel!r} is not one of the observation's: {', '.join(channels)}")
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        parsed = Row(
+            location=location,
+            channel=channel,
+            camera=row.get("camera") or EUCLID_CAMERAS.get(channel, ""),
+            band=read(_band, row, channel, location),
+            image_type=read(_image_type, row, image_type, location),
+            ra=read(_angle, row, "ra", sky_notation.RA_LIMITS, location),
+            dec=read(_angle, row, "dec", sky_notation.DEC_LIMITS, location),
+            position_angle=read(_number, row, "position_angle", -360.0, 360.0, location),
+            mjd=read(_mjd, row, location),
+            exposure_time_s=read(_number, row, "exposure_time_s", 0.0, 1e6, location),
+            sky=read(_number, row, "sky", 0.0, 1e6, location),
+            seeing=read(_number, row, "seeing", 0.01, 10.0, location) if channel == "EXT" else None,
+            zero_point=read(_number, row, "zero_point", 0.0, 50.0, location),
+            psf=str(read(user_files.expand_path, row["psf"], path.parent)) if row.get("psf") else None,
+            grism_angle=read(_number, row, "grism_angle", -360.0, 360.0, location),
+            detectors=tuple(row.get("detectors", "").split()),
+        )
+    return replace(parsed, ra=parsed.ra % 360.0)
+
+
+def _band(row: Mapping[str, str], channel: str, location: str) -> str:
     euclid_bands = EUCLID_BANDS.get(channel, ())
     band = row.get("band") or (euclid_bands[0] if len(euclid_bands) == 1 else "")
     if not band:
-        raise BadInput(f"{location}: band is missing")
-    kind = row.get("image_type") or image_type
+        allowed = f": one of {', '.join(euclid_bands)}" if euclid_bands else ""
+        raise BadInput(f"{location}: band is missing{allowed}")
+    return band
+
+
+def _image_type(row: Mapping[str, str], default: str, location: str) -> str:
+    kind = row.get("image_type") or default
     if kind not in IMAGE_TYPES:
         raise BadInput(f"{location}: image_type = {kind!r} is not one of {', '.join(IMAGE_TYPES)}")
+    return kind
 
-    def number_of(name: str, lo: float, hi: float) -> float:
-        if not row[name]:
-            raise BadInput(f"{location}: {name} is missing")
-        try:
-            value = float(row[name])
-        except ValueError:
-            raise BadInput(f"{location}: {name} = {row[name]!r} is not a number") from None
-        if not lo <= value <= hi:
-            raise BadInput(f"{location}: {name} = {value} is outside {lo:g} to {hi:g}")
-        return value
 
-    def optional(name: str, lo: float, hi: float) -> float | None:
-        return number_of(name, lo, hi) if row.get(name) else None
+def _number(row: Mapping[str, str], name: str, lo: float, hi: float, location: str) -> float | None:
+    """Read a number from a field of a row; None if the field is empty. Raises BadInput if it is wrong."""
+    if not row.get(name):
+        return None
+    try:
+        value = float(row[name])
+    except ValueError:
+        raise BadInput(f"{location}: {name} = {row[name]!r} is not a number") from None
+    if not lo <= value <= hi:
+        raise BadInput(f"{location}: {name} = {value} is outside {lo:g} to {hi:g}")
+    return value
 
-    return Row(
-        location=location,
-        channel=channel,
-        camera=row.get("camera") or ("" if channel == "EXT" else channel.lower().partition("-")[0]),
-        band=band,
-        image_type=kind,
-        ra=number_of("ra", -360.0, 360.0) % 360.0,
-        dec=number_of("dec", -90.0, 90.0),
-        position_angle=optional("position_angle", -360.0, 360.0),
-        mjd=optional("mjd", 40_000.0, 100_000.0),
-        exposure_time_s=optional("exposure_time_s", 0.0, 1e6),
-        sky=optional("sky", 0.0, 1e6),
-        seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
-        zero_point=optional("zero_point", 0.0, 50.0),
-        psf=str(user_files.expand_path(row["psf"], path.parent)) if row.get("psf") else None,
-        grism_angle=optional("grism_angle", -360.0, 360.0),
-        detectors=tuple(row.get("detectors", "").split()),
-    )
+
+def _angle(row: Mapping[str, str], axis: str, limits: tuple[float, float], location: str) -> float:
+    if not row[axis]:
+        raise BadInput(f"{location}: {axis} is missing")
+    return sky_notation.angle(_as_number(row[axis]), f"{location}: {axis}", axis, limits)
+
+
+def _mjd(row: Mapping[str, str], location: str) -> float | None:
+    return sky_notation.mjd(_as_number(row["mjd"]), f"{location}: mjd") if row.get("mjd") else None
+
+
+def _as_number(text: str) -> float | str:
+    """Return the number that a text contains, or the text if it is not a number."""
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,38 +1,42 @@
-"""Read the observations of a request (a user's TOML file): single pointings, and blocks of exposures.
-
-The user gives position and time of a pointing. The planner schedules the exposures of a block.
-"""
+"""Read the observations of a request (a user's TOML file): blocks of exposures, which the planner schedules."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lake_schema import ramps, user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store import layout
 from truesky.request import area as areas
-from truesky.request import pointing_tables
+from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
-from truesky.request.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
+from truesky.request.exposures import pointing_tables
+from truesky.request.exposures.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
+from truesky.request.exposures.pointings import MAX_REALISATIONS
 from truesky.request.toml_values import (
     Toml,
     as_table,
     boolean,
+    check_keys,
     checked_number,
-    has_key,
     integer,
-    number,
     optional_number,
     quote_value,
+    refuse_name,
     section,
     string,
     strings,
     table_list,
 )
 
-# Largest number of pointings and of observation blocks in a request, and of copies of an exposure with different noise.
-_MAX_POINTINGS, _MAX_OBSERVATIONS, _MAX_REALISATIONS = 100_000, 1000, 10_000
+if TYPE_CHECKING:
+    from lake_schema.mission.configuration import MissionConfiguration
+
+# Largest number of observation blocks in a request.
+_MAX_OBSERVATIONS = 1000
 # Largest number of values in a list that gives one value per calibration frame, such as delays_s.
 _MAX_VALUES = 1000
 # Largest number of dither offsets that a user may give, and largest offset along each axis (arcsec).
@@ -95,55 +99,13 @@ _TYPES_OF_KEY = {
     "magnitude": ("bleeding", "white_dwarf", "stray_light"),
     "distance_deg": ("stray_light",),
 }
+# Where keys belong that an observation does not have.
+_PLACES = dict.fromkeys(("camera", "centre_on", "grism_angle"), "[[pointing]]")
 # Light of the bright exposure that precedes the dark frames in which persistence is measured.
 BRIGHT_TYPES = ("flat", "sky")
 # Number of LEDs of the calibration unit of each channel. This copies the renderer's lamps, because requests must not
 # import the renderer; test_infrared.py compares the two.
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
-
-
-@dataclass(frozen=True, slots=True)
-class Pointing:
-    """One science exposure of a request, with its position and time.
-
-    Attributes
-    ----------
-    channel : str
-        VIS, NISP-P, NISP-S or EXT (ground cameras).
-    camera : str
-        Name of the camera in the mission database.
-    band : str
-        Name of the passband.
-    ra, dec : float
-        ICRS position in degrees of the boresight, or of the centre of detector `centre_on`.
-    position_angle : float
-        Position angle of the focal plane's y axis in degrees, from north through east.
-    mjd : float
-        Start of the exposure (MJD).
-    detectors : tuple of str
-        Names of detectors to render; () for all detectors of the camera.
-    centre_on : str, optional
-        Detector whose centre has the position ra, dec.
-    exposure_time_s : float, optional
-        Exposure time in seconds; None for the value in the mission database.
-    realisations : int
-        Number of exposures that differ only in their noise.
-    grism_angle : float, optional
-        Direction of NISP-S spectra in the focal plane in degrees; None for 0.
-    """
-
-    channel: str
-    camera: str
-    band: str
-    ra: float
-    dec: float
-    position_angle: float
-    mjd: float
-    detectors: tuple[str, ...] = ()
-    centre_on: str | None = None
-    exposure_time_s: float | None = None
-    realisations: int = 1
-    grism_angle: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +153,8 @@ class Observation:
     detectors : tuple of str
         Names of detectors to render; () for all detectors of the camera.
     mjd : float, optional
-        Earliest date (MJD); None for the launch of the mission. Without a date, an observation with NISP begins when
-        earlier NISP observations without a date, or of calibrations, have ended and their persistence has faded.
+        Earliest date (MJD, UTC); None for the launch of the mission. Without a date, an observation with NISP begins
+        when earlier NISP observations without a date, or of calibrations, have ended and their persistence has faded.
     exposure_time_s : float, optional
         Exposure time in seconds; None for the mission's value.
     realisations : int
@@ -260,99 +222,174 @@ class Observation:
         return None if self.ra is None or self.dec is None else (self.ra, self.dec)
 
 
-def parse_pointings(table: Toml) -> tuple[Pointing, ...]:
-    """Read the list `pointing` of a request, () if it is missing.
-
-    `table` is the parsed request. Raises BadInput, which names the key, if an entry is not valid.
-    """
-    entries = table_list(table, "pointing", _MAX_POINTINGS)
-    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(entries))
+# Keys of an observation. `table` is made from the file that `pointings` names.
+_OBSERVATION_KEYS = tuple(key for key in Observation.__slots__ if key != "table")
 
 
-def _pointing(value: object, path: str) -> Pointing:
-    table = as_table(value, path, set(Pointing.__slots__))
-    channel = string(table, f"{path}.channel", CHANNELS)
-    return Pointing(
-        channel=channel,
-        camera=layout.check_name(string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
-        band=layout.check_name(string(table, f"{path}.band")),
-        ra=number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
-        dec=number(table, f"{path}.dec", -90.0, 90.0),
-        position_angle=number(table, f"{path}.position_angle", -360.0, 360.0, 0.0),
-        mjd=number(table, f"{path}.mjd", 40_000.0, 100_000.0),
-        detectors=strings(table, f"{path}.detectors"),
-        centre_on=string(table, f"{path}.centre_on") if "centre_on" in table else None,
-        exposure_time_s=optional_number(table, f"{path}.exposure_time_s", 0.0, 1e6),
-        realisations=integer(table, f"{path}.realisations", 1, _MAX_REALISATIONS, 1),
-        grism_angle=optional_number(table, f"{path}.grism_angle", -360.0, 360.0),
-    )
-
-
-def parse_observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
+def parse_observations(
+    table: Toml, folder: Path = Path(), mission: MissionConfiguration | None = None, user_bands: Collection[str] = ()
+) -> tuple[Observation, ...]:
     """Read the list `observation` of a request, () if it is missing.
 
-    `table` is the parsed request and `folder` its folder. Tables of pointings (CSV files that an observation may name)
-    are read, too. They must be in this folder or below.
+    Tables of pointings (CSV files that an observation may name) are read, too.
+
+    Parameters
+    ----------
+    table : Toml
+        The parsed request.
+    folder : Path, optional
+        Folder of the request. Tables of pointings must be in this folder or below.
+    mission : MissionConfiguration, optional
+        Mission parameters, which list the passbands and detectors. None if they are not valid; then these names are
+        not checked.
+    user_bands : collection of str, optional
+        Names of the user's passbands, in which no survey observes.
+
+    Returns
+    -------
+    tuple of Observation
+        The observations in the order of the file.
 
     Raises
     ------
     BadInput
-        If an observation or its table of pointings is not valid. The message names the key.
+        If observations or their tables of pointings are not valid. There is one line for each mistake, which names the
+        key.
     """
-    entries = table_list(table, "observation", _MAX_OBSERVATIONS)
-    return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(entries))
+    with Mistakes() as mistakes:
+        observations = tuple(
+            mistakes.read(_observation, value, f"observation[{i}]", folder, mission, user_bands)
+            for i, value in enumerate(table_list(table, "observation", _MAX_OBSERVATIONS))
+        )
+    return observations
 
 
-def _observation(value: object, path: str, folder: Path) -> Observation:
-    table = as_table(value, path, set(Observation.__slots__) - {"table"})
-    channels = strings(table, f"{path}.channels", CHANNELS)
-    if not channels:
-        raise BadInput(f"{path}.channels is missing or empty")
-    ground = "EXT" in channels
-    if ground and len(channels) > 1:
-        raise BadInput(f"{path}.channels: EXT must be the only channel")
-    image_type = string(table, f"{path}.image_type", IMAGE_TYPES, "science")
+def _observation(
+    value: object, path: str, folder: Path, mission: MissionConfiguration | None, user_bands: Collection[str]
+) -> Observation:
+    table = as_table(value, path, None)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        read(check_keys, table, path, _OBSERVATION_KEYS, _PLACES)
+        places = read(_refuse_two_places, table, path)
+        kind = read(_kind, table, path)
+        values = read(_values_of_kind, table, path, kind, mission, user_bands) if kind is not None else {}
+        if kind is not None and places is not None:
+            # A second place is one mistake: neither its keys nor a table of pointings are mistakes, too.
+            read(_refuse_unused, table, *kind, path)
+            values = {**(values or {}), **(read(_table_of_pointings, table, path, kind, folder) or {})}
+        observation = Observation(
+            channels=(),
+            ra=read(sky_notation.optional_ra, table, f"{path}.ra"),
+            dec=read(sky_notation.optional_dec, table, f"{path}.dec"),
+            position_angle=read(optional_number, table, f"{path}.position_angle", -360.0, 360.0, "deg"),
+            area=read(_area, table, f"{path}.area"),
+            fields=read(integer, table, f"{path}.fields", 1, 1_000_000, 0),
+            visits=read(integer, table, f"{path}.visits", 1, 1000, 0),
+            exposures=read(integer, table, f"{path}.exposures", 1, 1_000_000, 0),
+            short=read(boolean, table, f"{path}.short", True),
+            flat=read(boolean, table, f"{path}.flat", True),
+            blue=read(boolean, table, f"{path}.blue", False),
+            mjd=read(sky_notation.optional_mjd, table, f"{path}.mjd"),
+            exposure_time_s=read(optional_number, table, f"{path}.exposure_time_s", 0.0, 1e6, "s"),
+            realisations=read(integer, table, f"{path}.realisations", 1, MAX_REALISATIONS, 1),
+            macc=read(_macc, table, f"{path}.macc"),
+            phase_times_s=read(_numbers, table, f"{path}.phase_times_s", 1e-6, 100.0),
+            defocus_nm=read(_numbers, table, f"{path}.defocus_nm", -2000.0, 2000.0),
+            magnitude=read(optional_number, table, f"{path}.magnitude", -10.0, 30.0),
+            distance_deg=read(optional_number, table, f"{path}.distance_deg", 0.0, 10.0, "deg"),
+            intensities=read(_numbers, table, f"{path}.intensities", 1e-4, 1e4),
+            delays_s=read(_numbers, table, f"{path}.delays_s", 1.0, 1e6),
+            bright=read(string, table, f"{path}.bright", BRIGHT_TYPES, BRIGHT_TYPES[0]),
+        )
+    return replace(observation, **values)
+
+
+def _area(table: Toml, path: str) -> Area | None:
+    return areas.parse(section(table, "area", None), path) if "area" in table else None
+
+
+def _kind(table: Toml, path: str) -> tuple[tuple[str, ...], str]:
+    """Return channels and image type of an observation; raises BadInput if they are wrong or do not fit together."""
+    with Mistakes() as mistakes:
+        channels = mistakes.read(_channels, table, f"{path}.channels")
+        image_type = mistakes.read(string, table, f"{path}.image_type", IMAGE_TYPES, "science")
     if image_type not in _SKY_TYPES:
         for channel in channels:
             if image_type not in _CALIBRATIONS[channel]:
                 legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
                 raise BadInput(f"{path}.image_type = {image_type!r} is not a type of {channel}: {legal}")
+    return channels, image_type
+
+
+def _channels(table: Toml, path: str) -> tuple[str, ...]:
+    channels = strings(table, path, CHANNELS)
+    if not channels:
+        raise BadInput(f'{path} is missing or empty: it must be a list of VIS, NISP-P and NISP-S, or ["EXT"]')
+    if "EXT" in channels and len(channels) > 1:
+        raise BadInput(f"{path}: EXT must be the only channel: use another [[observation]] for the others")
+    return channels
+
+
+def _values_of_kind(
+    table: Toml,
+    path: str,
+    kind: tuple[tuple[str, ...], str],
+    mission: MissionConfiguration | None,
+    user_bands: Collection[str],
+) -> dict[str, Any]:
+    """Read those values of an observation that depend on its channels and its image type, and return them by key.
+
+    `kind` has the channels and the image type.
+    """
+    channels, image_type = kind
+    ground = "EXT" in channels
     surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
-    _refuse_two_places(table, path)
-    _refuse_unused(table, channels, image_type, path)
+    with Mistakes() as mistakes:
+        read = mistakes.read
+        values: dict[str, Any] = {
+            "channels": channels,
+            "image_type": image_type,
+            "survey": read(string, table, f"{path}.survey", surveys, None if ground else "wide"),
+            "dither": read(_dither, table, f"{path}.dither", ground),
+            "bands": read(strings, table, f"{path}.bands"),
+            "detectors": read(strings, table, f"{path}.detectors"),
+            "lamps": read(_lamps, table, f"{path}.lamps", channels),
+        }
+        if mission is not None and None not in (values["survey"], values["bands"], values["detectors"]):
+            of_user = [band for band in values["bands"] if band in user_bands]
+            for band in of_user:
+                problem = f"{path}.bands: {band} is a user passband: no survey observes in it"
+                mistakes.add(BadInput(f"{problem}, use [[pointing]]"))
+            names = {**values, "bands": [band for band in values["bands"] if band not in of_user]}
+            read(_check_names, names, table.get("blue") is True, mission, path)
+    return values
+
+
+def _table_of_pointings(table: Toml, path: str, kind: tuple[tuple[str, ...], str], folder: Path) -> dict[str, Any]:
+    """Read the table of pointings of an observation, and return its file and its summary by key; {} without a table."""
     file = _pointings_file(table, path, folder)
-    return Observation(
-        channels=channels,
-        image_type=image_type,
-        survey=string(table, f"{path}.survey", surveys, None if ground else "wide"),
-        pointings="" if file is None else str(file),
-        table=None if file is None else _contents(file, channels, image_type, path),
-        ra=_wrap_ra(optional_number(table, f"{path}.ra", -360.0, 360.0)),
-        dec=optional_number(table, f"{path}.dec", -90.0, 90.0),
-        position_angle=optional_number(table, f"{path}.position_angle", -360.0, 360.0),
-        area=areas.parse(section(table, "area", None), f"{path}.area") if has_key(table, f"{path}.area") else None,
-        fields=integer(table, f"{path}.fields", 1, 1_000_000, 0),
-        visits=integer(table, f"{path}.visits", 1, 1000, 0),
-        exposures=integer(table, f"{path}.exposures", 1, 1_000_000, 0),
-        dither=_dither(table, f"{path}.dither", ground),
-        short=boolean(table, f"{path}.short", True),
-        flat=boolean(table, f"{path}.flat", True),
-        blue=boolean(table, f"{path}.blue", False),
-        bands=tuple(layout.check_name(band) for band in strings(table, f"{path}.bands")),
-        detectors=strings(table, f"{path}.detectors"),
-        mjd=optional_number(table, f"{path}.mjd", 40_000.0, 100_000.0),
-        exposure_time_s=optional_number(table, f"{path}.exposure_time_s", 0.0, 1e6),
-        realisations=integer(table, f"{path}.realisations", 1, _MAX_REALISATIONS, 1),
-        lamps=_lamps(table, f"{path}.lamps", channels),
-        macc=_macc(table, f"{path}.macc"),
-        phase_times_s=_numbers(table, f"{path}.phase_times_s", 1e-6, 100.0),
-        defocus_nm=_numbers(table, f"{path}.defocus_nm", -2000.0, 2000.0),
-        magnitude=optional_number(table, f"{path}.magnitude", -10.0, 30.0),
-        distance_deg=optional_number(table, f"{path}.distance_deg", 0.0, 10.0),
-        intensities=_numbers(table, f"{path}.intensities", 1e-4, 1e4),
-        delays_s=_numbers(table, f"{path}.delays_s", 1.0, 1e6),
-        bright=string(table, f"{path}.bright", BRIGHT_TYPES, BRIGHT_TYPES[0]),
+    return {} if file is None else {"pointings": str(file), "table": _contents(file, *kind, path)}
+
+
+def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: MissionConfiguration, path: str) -> None:
+    """Raise BadInput if an observation names passbands or detectors that its channels or its survey do not have.
+
+    `values` has the channels, survey, bands and detectors of the observation by key.
+    """
+    channels, survey = values["channels"], values["survey"]
+    bands, owner = instruments.observable_bands(channels, survey, has_blue_grism, mission)
+    cameras = dict.fromkeys(
+        instruments.EUCLID_CAMERAS[channel]
+        if channel in instruments.EUCLID_CAMERAS
+        else instruments.survey_camera(survey, mission)
+        for channel in channels
     )
+    with Mistakes() as mistakes:
+        for band in values["bands"]:
+            mistakes.read(instruments.check_band, band, bands, owner, f"{path}.bands")
+        for camera in cameras:
+            mistakes.read(instruments.check_detectors, camera, values["detectors"], mission, f"{path}.detectors")
 
 
 def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
@@ -411,12 +448,8 @@ def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
     return numbers
 
 
-def _wrap_ra(ra: float | None) -> float | None:
-    return None if ra is None else ra % 360.0
-
-
-def _refuse_two_places(table: Toml, path: str) -> None:
-    """Raise BadInput if an observation has more than one way to give positions, or an incomplete one.
+def _refuse_two_places(table: Toml, path: str) -> Toml:
+    """Return an observation; raise BadInput if it has more than one way to give positions, or an incomplete one.
 
     The ways are the position of a user's field (`ra` and `dec`), a table of pointings, and survey fields in an `area`.
     """
@@ -427,21 +460,25 @@ def _refuse_two_places(table: Toml, path: str) -> None:
     for key in ("ra", "pointings"):
         for other in ("pointings", "area", "fields"):
             if key != other and key in table and other in table:
-                raise BadInput(f"{path}: {key} and {other} exclude each other")
+                raise BadInput(f"{path}: {key} and {other} exclude each other: delete one of them")
+    return table
 
 
 def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
     """Raise BadInput if a key has no effect on this kind of observation, its channels or its image type."""
     ground = "EXT" in channels
     kind = _block_kind(table, ground, image_type)
-    for key in table:
-        used_by = _BLOCKS_OF_KEY.get(key, (kind,))
-        if kind not in used_by and not (ground and key == "survey"):
-            raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(used_by)}")
-        if key in _TYPES_OF_KEY and image_type not in _TYPES_OF_KEY[key]:
-            raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF_KEY[key])}")
-        if (allowed := _CHANNELS_OF_KEY.get(key)) is not None and not {*allowed} & {*channels}:
-            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(allowed)}")
+    with Mistakes() as mistakes:
+        for key in table:
+            used_by = _BLOCKS_OF_KEY.get(key, (kind,))
+            allowed_channels = _CHANNELS_OF_KEY.get(key, channels)
+            if kind not in used_by and not (ground and key == "survey"):
+                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(used_by)}"))
+            elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):
+                mistakes.add(BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(types)}"))
+            elif not {*allowed_channels} & {*channels}:
+                problem = f"{path}.{key} is not for {', '.join(channels)}"
+                mistakes.add(BadInput(f"{problem}: used by {', '.join(allowed_channels)}"))
 
 
 def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
@@ -467,14 +504,14 @@ def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
     try:
         return user_files.check_file(layout.check_inside(folder, file), "table of pointings")
     except BadInput as error:
-        raise BadInput(f"{path}.pointings: {error}") from None
+        raise error.with_prefix(f"{path}.pointings") from None
 
 
 def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str) -> Contents:
     try:
         return pointing_tables.contents(file, channels, image_type)
     except BadInput as error:
-        raise BadInput(f"{path}.pointings: {error}") from None
+        raise error.with_prefix(f"{path}.pointings") from None
 
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
@@ -484,12 +521,16 @@ def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, fl
     """
     dither = table.get("dither", "none" if ground else "S")
     if not isinstance(dither, list):
-        pattern = string({"dither": dither}, path, DITHERS)
-        if ground and pattern != "none":
+        if not isinstance(dither, str) or dither not in DITHERS:
+            name = refuse_name(str(dither), DITHERS) if isinstance(dither, str) else quote_value(dither)
+            raise BadInput(
+                f"{path} = {name}: it must be {', '.join(DITHERS)} or a list of offsets, [[x, y], ..] arcsec"
+            )
+        if ground and dither != "none":
             raise BadInput(
                 f"{path} = {quote_value(dither)} is a Euclid pattern: use a list of offsets in arcsec, [[x, y], ..]"
             )
-        return pattern
+        return dither
     if not 1 <= len(dither) <= _MAX_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in dither):
         raise BadInput(f"{path} must be one of {', '.join(DITHERS)}, or 1 to {_MAX_DITHERS} offsets [x, y] in arcsec")
     steps = [

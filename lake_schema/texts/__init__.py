@@ -1,0 +1,1 @@
+"""Write texts for people: amounts with units, suggestions for misspelt names, and tables."""

@@ -1,0 +1,94 @@
+"""Suggest the names that a user may have meant by a name that does not exist."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+
+# Smallest similarity (0 to 1, by difflib) of a suggested name.
+_LEAST_SIMILARITY = 0.6
+# Largest number of names that are compared or listed, and the number of first names that stand for a longer list.
+_MAX_COMPARED, _MAX_LISTED, _EXAMPLES = 10_000, 60, 8
+
+
+def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[str]:
+    """Return the existing names that are most similar to a name, the best first, [] if none is similar.
+
+    Parameters
+    ----------
+    name : str
+        A name that does not exist. Upper and lower case are the same.
+    existing : iterable of str
+        Names that exist.
+    count : int, optional
+        Largest number of names to return.
+
+    Returns
+    -------
+    list of str
+        Names with another spelling, and names of which `name` is a part between underscores or hyphens, such as
+        "euclid_vis" for "VIS".
+    """
+    by_lower_case = {other.lower(): other for other in list(existing)[:_MAX_COMPARED]}
+    lower = name.lower()[:100]
+    if lower in by_lower_case:
+        return [by_lower_case[lower]]
+    similar = difflib.get_close_matches(lower, by_lower_case, count, _LEAST_SIMILARITY)
+    with_part = [other for other in by_lower_case if lower and lower in re.split("[-_.]", other)]
+    without_marks = [other for other in by_lower_case if _letters(lower) and _letters(other) == _letters(lower)]
+    return [by_lower_case[other] for other in dict.fromkeys((*without_marks, *with_part, *similar))][:count]
+
+
+def _letters(text: str) -> str:
+    return re.sub("[^a-z0-9]", "", text)
+
+
+def did_you_mean(name: str, existing: Iterable[str], count: int = 1) -> str:
+    """Return "did you mean X?" with the closest existing names, or "" if no name is similar.
+
+    Parameters
+    ----------
+    name : str
+        A name that does not exist.
+    existing : iterable of str
+        Names that exist.
+    count : int, optional
+        Largest number of names to suggest.
+
+    Returns
+    -------
+    str
+        The question, without a blank at its end.
+    """
+    names = closest_names(name, existing, count)
+    return f"did you mean {' or '.join(names)}?" if names else ""
+
+
+def suggestion(name: str, existing: Iterable[str]) -> str:
+    """Return " (did you mean X?)" with the existing name that is most similar to a name, or "" if none is similar."""
+    question = did_you_mean(name, existing)
+    return f" ({question})" if question else ""
+
+
+def choices(name: str, existing: Sequence[str], count: int = 1) -> str:
+    """Return the end of an error message about a name that does not exist: a suggestion, and the names that exist.
+
+    Parameters
+    ----------
+    name : str
+        A name that does not exist.
+    existing : sequence of str
+        Names that exist. Of more than 60, only the first ones are listed.
+    count : int, optional
+        Largest number of names to suggest.
+
+    Returns
+    -------
+    str
+        Text such as "did you mean des_r? allowed: des_g, des_r".
+    """
+    listed = ", ".join(existing if len(existing) <= _MAX_LISTED else existing[:_EXAMPLES])
+    rest = f", ... ({len(existing)} names)" if len(existing) > _MAX_LISTED else ""
+    suggestion = did_you_mean(name, existing, count)
+    return f"{suggestion} allowed: {listed}{rest}".strip()

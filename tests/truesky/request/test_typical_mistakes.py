@@ -1,0 +1,209 @@
+"""Typical mistakes of users are answered by one line that names the key and the remedy."""
+
+import tomllib
+
+import pytest
+
+from truesky.request.from_toml import read_valid_parts
+
+HEAD = 'name = "x"\nseed = 1\n'
+AREA = "[area]\ncone = { ra = 53.117, dec = -27.808, radius = 0.2 }\n"
+POINT = """[[pointing]]
+channel = "VIS"
+band = "euclid_vis"
+ra = 53.117
+dec = -27.808
+detectors = ["3-4"]
+mjd = 60905.0
+"""
+GOOD = HEAD + AREA + POINT
+EUCLID = HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nra = 53.117\ndec = -27.808\n'
+GROUND = HEAD + AREA + '[[observation]]\nchannels = ["EXT"]\nsurvey = "lsst"\nra = 53.117\ndec = -27.808\n'
+
+
+def changed(old, new, text=GOOD):
+    assert old in text
+    return text.replace(old, new)
+
+
+def area(line):
+    return f"{HEAD}[area]\n{line}\n"
+
+
+def section(name, line):
+    return f"{GOOD}[{name}]\n{line}\n"
+
+
+# Text of the request, words that name the key, words that name the remedy.
+MISTAKES = {
+    "no name": (changed('name = "x"\n', ""), "name is missing", "text in quotes"),
+    "a name with blanks": (changed('"x"', '"My Field"'), "name = 'My Field'", "small letters, digits"),
+    "no seed": (changed("seed = 1\n", ""), "seed is missing", "a whole number from 0"),
+    "a seed of text": (changed("seed = 1", 'seed = "1"'), "seed must be a whole number", "from 0 to"),
+    "a negative seed": (changed("seed = 1", "seed = -1"), "seed = -1", "[0, 9223372036854775807]"),
+    "noise seed": ("noiseseed = 1\n" + GOOD, "noiseseed is not a key", "did you mean noise_seed?"),
+    "one number for the accuracy": (
+        "accuracy = 1e-3\n" + GOOD,
+        "accuracy = 0.001",
+        "quicklook, draft, survey, reference, or a",
+    ),
+    "an accuracy of no name": ('accuracy = "high"\n' + GOOD, "accuracy = 'high'", "{ flux = 1e-3, shape = 1e-4"),
+    "an accuracy in capitals": ('accuracy = "Survey"\n' + GOOD, "accuracy = 'Survey'", "did you mean survey?"),
+    "no area": (HEAD + POINT, "area must have exactly one of polygon, cone", "such as cone = { ra = 150.1"),
+    "two areas": (changed("0.2 }", "0.2 }\ntile = 3"), "area must have exactly one", "it has cone, tile"),
+    "a radius in arcmin": (changed("0.2 }", '"12 arcmin" }'), "area.cone.radius", "a number from 0 to 180 deg"),
+    "a radius above 180": (changed("0.2 }", "500 }"), "area.cone.radius = 500", "[0.0, 180.0]"),
+    "no radius": (changed(", radius = 0.2", ""), "area.cone.radius is missing", "a number from 0 to 180 deg"),
+    "rad": (changed("radius", "rad"), "area.cone.rad is not a key", "did you mean radius?"),
+    "a declination beyond the pole": (changed("-27.808, r", "-97.808, r"), "area.cone.dec = -97.808", "[-90.0, 90.0]"),
+    "two vertices": (
+        area("polygon = [[53, -28], [54, -28]]"),
+        "area.polygon must be",
+        "3 to 1000 [ra, dec] in degrees, got 2",
+    ),
+    "a polygon that crosses itself": (
+        area("polygon = [[53, -28], [54, -27], [54, -28], [53, -27]]"),
+        "area.polygon",
+        "must be convex",
+    ),
+    "a box the wrong way round": (
+        area("box = { ra = [54, 52], dec = [-29, -27] }"),
+        "area.box.ra",
+        "the second must be east of the first",
+    ),
+    "a circle": (area("circle = { ra = 1, dec = 2, radius = 1 }"), "area.circle", "cone = { ra, dec, radius }"),
+    "a key misspelt": (section("universe", "galaxy_limt = 25"), "universe.galaxy_limt", "did you mean galaxy_limit?"),
+    "a number in quotes": (
+        section("universe", 'galaxy_limit = "25"'),
+        "universe.galaxy_limit",
+        "10 to 30 mag, got '25' in quotes",
+    ),
+    "too deep": (section("universe", "galaxy_limit = 99"), "universe.galaxy_limit = 99", "[10.0, 30.0]"),
+    "a key above its section": ("galaxy_limit = 25\n" + GOOD, "galaxy_limit is not a key", "it belongs in [universe]"),
+    "a section in capitals": (section("Universe", "z_max = 2.0"), "Universe is not a key", "did you mean universe?"),
+    "a box of another size": (section("universe", "box_cells = 200"), "universe.box_cells = 200", "192, 256, 384"),
+    "lensing on": (section("universe", "lensing = true"), "universe.lensing", '"box", "none" or a table such as'),
+    "one bracket": (
+        changed("[[pointing]]", "[pointing]"),
+        "pointing must be a list",
+        "write [[pointing]] instead of [pointing]",
+    ),
+    "a band in capitals": (
+        changed("euclid_vis", "VIS"),
+        "pointing[0].band",
+        "did you mean euclid_vis? allowed: euclid_vis",
+    ),
+    "a band of another camera": (changed("euclid_vis", "lsst_r"), "pointing[0].band", "allowed: euclid_vis"),
+    "a camera in capitals": (
+        changed('channel = "VIS"\nband = "euclid_vis"', 'channel = "EXT"\ncamera = "LSSTCam"'),
+        "pointing[0].camera",
+        "did you mean lsstcam? allowed: decam, gpc1",
+    ),
+    "a channel in small letters": (
+        changed('"VIS"', '"vis"'),
+        "pointing[0].channel",
+        "did you mean VIS? allowed: VIS, NISP-P",
+    ),
+    "half a channel": (changed('"VIS"', '"NISP"'), "pointing[0].channel", "did you mean NISP-P?"),
+    "a detector of another name": (changed('"3-4"', '"CCD_7"'), "pointing[0].detectors", "allowed: 1-1, 1-2, 1-3"),
+    "a detector misspelt": (changed('"3-4"', '"3_4"'), "pointing[0].detectors", "did you mean 3-4?"),
+    "one detector": (changed('["3-4"]', '"3-4"'), "pointing[0].detectors", "a list of texts such as ['3-4']"),
+    "a Julian date": (changed("60905.0", "2460905.5"), "pointing[0].mjd", "write the MJD 60905"),
+    "a date of words": (changed("60905.0", '"1 Jan 2027"'), "pointing[0].mjd", 'a date in UTC such as "2027-01-01"'),
+    "degrees in quotes": (
+        changed("ra = 53.117\nd", 'ra = "53.117"\nd'),
+        "pointing[0].ra",
+        "a number in degrees, or hours",
+    ),
+    "a negative time": (GOOD + "exposure_time_s = -5\n", "pointing[0].exposure_time_s = -5", "[0.0, 1000000.0]"),
+    "exptime": (GOOD + "exptime = 100\n", "pointing[0].exptime", "did you mean exposure_time_s?"),
+    "an image type of a pointing": (
+        GOOD + 'image_type = "dark"\n',
+        "pointing[0].image_type",
+        "it belongs in [[observation]]",
+    ),
+    "bands of a pointing": (changed("band =", "bands ="), "pointing[0].bands", "did you mean band?"),
+    "a seed below a section": (GOOD + "noise_seed = 1\n", "pointing[0].noise_seed", "at the top of the file"),
+    "channels without brackets": (changed('["VIS"]', '"VIS"', EUCLID), "observation[0].channels", "such as ['VIS']"),
+    "a camera as channel": (
+        changed('["VIS"]', '["LSST"]', EUCLID),
+        "observation[0].channels",
+        "is not one of VIS, NISP-P",
+    ),
+    "Euclid and the ground": (
+        changed('["VIS"]', '["VIS", "EXT"]', EUCLID),
+        "[0].channels",
+        "use another [[observation]]",
+    ),
+    "an image type of NISP": (EUCLID + 'image_type = "standard_star"\n', "[0].image_type", "science, deep, bias, dark"),
+    "an image type misspelt": (EUCLID + 'image_type = "sciense"\n', "[0].image_type", "did you mean science?"),
+    "a survey in capitals": (changed('"lsst"', '"LSST"', GROUND), "observation[0].survey", "did you mean lsst?"),
+    "no survey": (changed('survey = "lsst"\n', "", GROUND), "observation[0].survey is missing", "des, lsst, cfis"),
+    "a short name of a band": (
+        GROUND + 'bands = ["r"]\n',
+        "observation[0].bands",
+        "did you mean lsst_r? allowed: lsst_u",
+    ),
+    "one band": (GROUND + 'bands = "lsst_r"\n', "observation[0].bands", "such as ['lsst_r']"),
+    "a number of dithers": (EUCLID + "dither = 4\n", "observation[0].dither = 4", "S, J, none or a list of offsets"),
+    "exposures of a Euclid field": (EUCLID + "exposures = 3\n", "observation[0].exposures", "used by a ground survey"),
+    "a detector of NISP": (EUCLID + 'detectors = ["DET22"]\n', "observation[0].detectors", "allowed: 1-1, 1-2"),
+    "no file": (
+        changed("ra = 53.117\ndec = -27.808\n", 'pointings = "q.csv"\n', EUCLID),
+        "[0].pointings",
+        "no such file",
+    ),
+    "truth misspelt": (section("products", 'truth = ["noisefree"]'), "products.truth", "did you mean noise_free?"),
+    "one truth": (section("products", 'truth = "stars"'), "products.truth", "such as ['stars']"),
+    "an unknown compression": (section("products", 'compression = "gzip"'), "products.compression", "none, rice"),
+    "an effect misspelt": (section("effects", 'off = ["cosmics"]'), "effects.off", "did you mean cosmic_rays?"),
+    "an effect as key": (section("effects", "cosmic_rays = false"), "effects.cosmic_rays", "the lists on and off"),
+    "a parameter misspelt": (
+        section("mission.overrides", '"vis.gian" = { value = 3.0, unit = "" }'),
+        "override vis.gian",
+        "did you mean vis.gain?",
+    ),
+    "a parameter without a unit": (
+        section("mission.overrides", '"vis.gain" = 3.0'),
+        "mission.overrides.vis.gain",
+        '{ value = .., unit = ".." }',
+    ),
+    "a parameter without quotes": (
+        section("mission.overrides", 'vis.gain = { value = 3.0, unit = "" }'),
+        "mission.overrides.vis",
+        '"vis.gain" = { .. }',
+    ),
+    "a wrong unit": (
+        section("mission.overrides", '"vis.gain" = { value = 3.0, unit = "mm" }'),
+        "override vis.gain",
+        "to electron / adu",
+    ),
+    "a list of values": (
+        section("explore", '"vis.gain" = [3.0, 3.5]'),
+        "explore.vis.gain",
+        "{ unit = .., values = .. }",
+    ),
+    "a file instead of a table": (
+        section("stars", 'catalogue = "g.csv"'),
+        "stars.catalogue",
+        "{ columns = .., file = .. }",
+    ),
+    "one file": (section("ingest.galaxies", 'file = "x.parquet"'), "ingest.galaxies.file", "did you mean files?"),
+}
+
+
+@pytest.mark.parametrize(("text", "key", "remedy"), MISTAKES.values(), ids=MISTAKES)
+def test_one_line_names_the_key_and_the_remedy(tmp_path, text, key, remedy):
+    (line,) = read_valid_parts(tomllib.loads(text), tmp_path).messages
+    assert key in line
+    assert remedy in line
+    assert len(line) <= 1000
+
+
+def test_there_are_more_than_60_mistakes():
+    assert len(MISTAKES) > 60
+
+
+@pytest.mark.parametrize("text", [GOOD, EUCLID, GROUND])
+def test_requests_without_a_mistake_are_valid(tmp_path, text):
+    assert read_valid_parts(tomllib.loads(text), tmp_path).messages == ()

@@ -1,0 +1,194 @@
+"""Find the cameras, passbands and detectors that a request (a user's TOML file) may name, and refuse other names."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+from lake_schema.errors import BadInput, bad_input
+from lake_schema.tables.exposures import EUCLID_BANDS
+from lake_schema.texts import spelling
+
+if TYPE_CHECKING:
+    from lake_schema.mission.configuration import MissionConfiguration
+
+# Camera of each channel of Euclid. The channel EXT has all ground cameras of the mission database.
+EUCLID_CAMERAS = {"VIS": "vis", "NISP-P": "nisp", "NISP-S": "nisp"}
+# Channel of the ground cameras.
+GROUND_CHANNEL = "EXT"
+# Passband of a pointing that names none, by channel of Euclid.
+_DEFAULT_BANDS = {"VIS": "euclid_vis", "NISP-P": "euclid_h", "NISP-S": "nisp_red"}
+# End of the name of the passband of a ground camera that is the default for pointings, if the camera has it.
+_DEFAULT_GROUND_BAND = "_r"
+# Largest number of detectors that an error message suggests.
+_SUGGESTED_DETECTORS = 3
+
+
+def camera_names(channel: str, mission: MissionConfiguration) -> tuple[str, ...]:
+    """Return the names of the cameras of a channel: one for each channel of Euclid, all ground cameras for EXT."""
+    return (EUCLID_CAMERAS[channel],) if channel in EUCLID_CAMERAS else mission.ground_cameras
+
+
+@cache
+def band_names(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
+    """Return the names of the passbands that a camera has in a channel.
+
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel ("VIS", "NISP-P", "NISP-S" or "EXT") and of the camera.
+    mission : MissionConfiguration
+        Mission parameters. A ground camera has the passbands for which they contain a zero point.
+
+    Returns
+    -------
+    tuple of str
+        Names of the passbands.
+    """
+    if channel in EUCLID_BANDS:
+        return EUCLID_BANDS[channel]
+    prefix = f"ext.{camera}."
+    keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
+    return tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
+
+
+def survey_bands(survey: str, mission: MissionConfiguration) -> tuple[str, ...]:
+    """Return the passbands of a ground survey, in the order of its rules in the mission parameters."""
+    rules = [row for row in mission.rows("survey.external") if row["survey"] == survey]
+    return tuple(band for rule in rules for band in rule["bands"].split())
+
+
+def survey_camera(survey: str, mission: MissionConfiguration) -> str:
+    """Return the camera of a ground survey."""
+    return next(row["camera"] for row in mission.rows("survey.external") if row["survey"] == survey)
+
+
+def observable_bands(
+    channels: Sequence[str], survey: str, has_blue_grism: bool, mission: MissionConfiguration
+) -> tuple[tuple[str, ...], str]:
+    """Return the passbands in which an observation may take exposures, and the name of their owner.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Channels of the observation.
+    survey : str
+        Survey of the observation, which defines the passbands of ground cameras.
+    has_blue_grism : bool
+        True if the observation uses the blue grism.
+    mission : MissionConfiguration
+        Mission parameters.
+
+    Returns
+    -------
+    bands : tuple of str
+        Names of the passbands in the order of the channels.
+    owner : str
+        Names of the channels, or the survey, for error messages.
+    """
+    if GROUND_CHANNEL in channels:
+        return survey_bands(survey, mission), f"survey {survey}"
+    bands = (band for channel in channels for band in EUCLID_BANDS[channel])
+    return tuple(band for band in bands if band != "nisp_blue" or has_blue_grism), ", ".join(channels)
+
+
+def default_band(channel: str, camera: str, mission: MissionConfiguration) -> str:
+    """Return the passband of a pointing that names none.
+
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel and of the camera.
+    mission : MissionConfiguration
+        Mission parameters.
+
+    Returns
+    -------
+    str
+        euclid_vis, euclid_h or nisp_red for the channels of Euclid. For a ground camera the r band, or its first
+        passband if it has no r band.
+    """
+    if channel in _DEFAULT_BANDS:
+        return _DEFAULT_BANDS[channel]
+    bands = band_names(channel, camera, mission)
+    return next((band for band in bands if band.endswith(_DEFAULT_GROUND_BAND)), bands[0])
+
+
+def check_camera(channel: str, camera: str, mission: MissionConfiguration, path: str) -> None:
+    """Check that a channel has a camera.
+
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel and of the camera.
+    mission : MissionConfiguration
+        Mission parameters.
+    path : str
+        Path of the key, for the error message.
+
+    Raises
+    ------
+    BadInput
+        If the channel has no such camera. The message lists its cameras.
+    """
+    names = camera_names(channel, mission)
+    if camera not in names:
+        raise BadInput(f"{path}: channel {channel} has no camera {camera!r}: {spelling.choices(camera, names)}")
+
+
+def check_band(band: str, bands: Sequence[str], owner: str, path: str) -> None:
+    """Check that a camera or a survey has a passband.
+
+    Parameters
+    ----------
+    band : str
+        Name of the passband.
+    bands : sequence of str
+        Names of the passbands that are allowed.
+    owner : str
+        Camera or survey with these passbands, such as "camera vis", for the error message.
+    path : str
+        Path of the key, for the error message; "" if the caller adds it.
+
+    Raises
+    ------
+    BadInput
+        If the passband is not allowed.
+    """
+    if band not in bands:
+        raise BadInput(f"{path}{': ' if path else ''}{owner} has no band {band!r}: {spelling.choices(band, bands)}")
+
+
+def check_detectors(camera: str, names: Collection[str], mission: MissionConfiguration, path: str) -> None:
+    """Check that a camera has detectors with the given names.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the camera.
+    names : collection of str
+        Names of the detectors.
+    mission : MissionConfiguration
+        Mission parameters, which list the detectors of cameras.
+    path : str
+        Path of the key, for the error message.
+
+    Raises
+    ------
+    BadInput
+        If the camera has no detector of one of these names. There is one line for each.
+    """
+    if not names:
+        return
+    # Import here, because most requests name no detectors.
+    from lake_schema.mission import detector_overrides
+
+    existing = detector_overrides.detectors(camera if camera in EUCLID_CAMERAS.values() else f"ext.{camera}", mission)
+    unknown = [name for name in names if name not in existing]
+    if unknown:
+        raise bad_input(
+            f"{path}: camera {camera} has no detector {name!r}: "
+            f"{spelling.choices(name, existing, _SUGGESTED_DETECTORS)}"
+            for name in unknown
+        )

@@ -1,0 +1,176 @@
+"""Read positions and dates of a request (a user's TOML file) that are not plain numbers.
+
+A right ascension may be sexagesimal in hours ("03:32:28" or "3h32m28s"), and a declination sexagesimal in degrees
+("-27:48:30" or "-27d48m30s"). A date may be an ISO date in UTC ("2027-01-01" or "2027-01-01T12:30:00"), which becomes
+an MJD in UTC.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from datetime import UTC, date, datetime
+from typing import Any
+
+from lake_schema.errors import BadInput
+from truesky.request.toml_values import Toml, checked_number, has_key, quote_value, required_value
+
+# First and last date (MJD) that a request may contain: 1968 to 2132.
+MJD_LIMITS = (40_000.0, 100_000.0)
+# Limits of a right ascension and of a declination in degrees.
+RA_LIMITS, DEC_LIMITS = (-360.0, 360.0), (-90.0, 90.0)
+# Units in which a sexagesimal text is read.
+_SEXAGESIMAL_UNITS = {"ra": "hourangle", "dec": "deg"}
+_FORMS = {
+    "ra": 'a number in degrees, or hours such as "03:32:28" or "3h32m28s"',
+    "dec": 'a number in degrees, or degrees such as "-27:48:30" or "-27d48m30s"',
+    "mjd": 'a number (MJD, UTC), or a date in UTC such as "2027-01-01" or "2027-01-01T12:30:00"',
+}
+# Text of at least two numbers with separators. A single number in quotes is not sexagesimal: its unit would be unclear.
+_SEXAGESIMAL = re.compile(
+    r"[+-]?\s*\d+\s*(?:[:hHdD°]|\s)\s*\d+(?:\s*(?:[:mM'′]|\s)\s*\d+(?:\.\d*)?)?\s*(?:[sS\"″]|[mM'′])?"
+)
+# Midnight (UTC) at the start of MJD 0.
+_MJD_0 = datetime(1858, 11, 17, tzinfo=UTC)
+
+
+def angle(value: object, path: str, axis: str, limits: tuple[float, float]) -> float:
+    """Read a right ascension or a declination.
+
+    Parameters
+    ----------
+    value : object
+        Value in the request: a number in degrees, or a sexagesimal text.
+    path : str
+        Path of the key, for error messages.
+    axis : str
+        "ra" (texts are in hours) or "dec" (texts are in degrees).
+    limits : (float, float)
+        Smallest and largest angle in degrees.
+
+    Returns
+    -------
+    float
+        The angle in degrees.
+
+    Raises
+    ------
+    BadInput
+        If the value is neither a number nor a sexagesimal text.
+    OutOfRange
+        If the angle is outside its limits.
+    """
+    if isinstance(value, str):
+        return checked_number(_degrees(value, path, axis), f"{path} (deg)", *limits)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise BadInput(f"{path} must be {_FORMS[axis]}, got {quote_value(value)}")
+    return checked_number(value, path, *limits)
+
+
+def _degrees(text: str, path: str, axis: str) -> float:
+    problem = BadInput(f"{path} = {quote_value(text)} must be {_FORMS[axis]}")
+    if len(text) > 60 or not _SEXAGESIMAL.fullmatch(text.strip()):
+        raise problem
+    # Import here, because the import takes a second and most requests have only numbers.
+    from astropy.coordinates import Angle
+
+    try:
+        degrees = float(Angle(text.strip(), unit=_SEXAGESIMAL_UNITS[axis]).deg)
+    except ValueError:
+        raise problem from None
+    return degrees
+
+
+def mjd(value: object, path: str) -> float:
+    """Read a date: a number (MJD, UTC), an ISO date as text, or a date of TOML; without a time it begins at midnight.
+
+    Parameters
+    ----------
+    value : object
+        Value in the request. A time without a time zone is in UTC.
+    path : str
+        Path of the key, for error messages.
+
+    Returns
+    -------
+    float
+        MJD in UTC.
+
+    Raises
+    ------
+    BadInput
+        If the value is neither a number nor a date.
+    OutOfRange
+        If the date is before 1968 or after 2132.
+    """
+    if isinstance(value, str):
+        try:
+            value = datetime.fromisoformat(value.strip())
+        except ValueError:
+            raise BadInput(f"{path} = {quote_value(value)} must be {_FORMS['mjd']}") from None
+    if isinstance(value, date):
+        return checked_number(_mjd_of_date(value), path, *MJD_LIMITS)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise BadInput(f"{path} must be {_FORMS['mjd']}, got {quote_value(value)}")
+    if MJD_LIMITS[0] <= value - 2_400_000.5 <= MJD_LIMITS[1]:
+        raise BadInput(f"{path} = {value} is a Julian date: write the MJD {value - 2_400_000.5:.10g}")
+    return checked_number(value, path, *MJD_LIMITS)
+
+
+def _mjd_of_date(value: date) -> float:
+    moment = value if isinstance(value, datetime) else datetime(value.year, value.month, value.day)
+    # `timedelta` counts days of 86,400 s, as MJD (UTC) does.
+    elapsed = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)) - _MJD_0
+    return elapsed.days + (elapsed.seconds + 1e-6 * elapsed.microseconds) / 86_400.0
+
+
+def ra_of(table: Toml, path: str) -> float:
+    """Return the right ascension of a required key in degrees, 0 to 360; raises BadInput if it is missing or wrong."""
+    return angle(required_value(table, path, _FORMS["ra"]), path, "ra", RA_LIMITS) % 360.0
+
+
+def dec_of(table: Toml, path: str) -> float:
+    """Return the declination of a required key in degrees; raises BadInput if it is missing or wrong."""
+    return angle(required_value(table, path, _FORMS["dec"]), path, "dec", DEC_LIMITS)
+
+
+def optional_ra(table: Toml, path: str) -> float | None:
+    """Return the right ascension of a key in degrees, 0 to 360; None if the key is missing. Raises BadInput."""
+    return ra_of(table, path) if has_key(table, path) else None
+
+
+def optional_dec(table: Toml, path: str) -> float | None:
+    """Return the declination of a key in degrees, None if the key is missing. Raises BadInput if it is wrong."""
+    return dec_of(table, path) if has_key(table, path) else None
+
+
+def optional_mjd(table: Toml, path: str) -> float | None:
+    """Return the date (MJD) of a key, None if the key is missing. Raises BadInput if it is wrong."""
+    return mjd(required_value(table, path), path) if has_key(table, path) else None
+
+
+def understood_values(table: Toml) -> Iterator[str]:
+    """Yield one line for each position or date of a valid request that is not a number: the number that it means.
+
+    `table` is the parsed request. Lines are, for example, "pointing[0].mjd = '2027-01-01' is MJD 61406 (UTC)".
+    """
+    for key in ("area", "pointing", "observation"):
+        yield from _understood(table.get(key), key, "")
+
+
+def _understood(value: Any, path: str, axis: str) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _understood(item, f"{path}.{key}", key)
+    elif isinstance(value, list):
+        is_place = axis in ("polygon", "patches") and not any(isinstance(item, (list, dict)) for item in value)
+        for i, item in enumerate(value):
+            # The first numbers of a vertex or of a circle are its right ascension and its declination.
+            inner = ("ra", "dec", "")[min(i, 2)] if is_place else axis
+            yield from _understood(item, f"{path}[{i}]", inner)
+    elif axis == "mjd" and isinstance(value, (str, date)):
+        yield f"{path} = {value} is MJD {mjd(value, path):.10g} (UTC)"
+    elif axis in _SEXAGESIMAL_UNITS and isinstance(value, str):
+        degrees = angle(value, path, axis, (-math.inf, math.inf))
+        yield f"{path} = {value} is {degrees:.10g} deg"
