@@ -5,7 +5,8 @@ rows as a stream of Arrow batches::
 
     python -m lake_schema.external.files FILE NUMBER COLUMN ... >stream
 
-The first NUMBER columns must exist; the other ones are sent if they exist.
+The first NUMBER columns must exist; the other ones are sent if they exist. Without columns, the names of the file's
+columns are sent as one column of texts.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import pyarrow.parquet as pq
 
 from lake_schema import command, user_files
 from lake_schema.errors import BadInput
+from lake_schema.texts import spelling
 
 # First and last four bytes of a Parquet file.
 _MAGIC = b"PAR1"
@@ -79,6 +81,17 @@ def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
     yield from read_in_subprocess(__name__, path, columns, text_columns)
 
 
+def column_names(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file; raise BadInput if it cannot be read."""
+    _refuse_large_footer(path)
+    return column_names_from_subprocess(__name__, path)
+
+
+def column_names_from_subprocess(module: str, path: Path) -> list[str]:
+    """Return the names of a file's columns, which `module` reads in a separate process (see `read_in_subprocess`)."""
+    return [name for batch in read_in_subprocess(module, path, ()) for name in batch.column(0).to_pylist()]
+
+
 def read_in_subprocess(
     module: str, path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()
 ) -> Iterator[pa.RecordBatch]:
@@ -91,14 +104,14 @@ def read_in_subprocess(
     path : Path
         The file.
     columns : sequence of str
-        Names of required columns.
+        Names of required columns; () to get the names of all columns instead of rows.
     text_columns : sequence of str, optional
         Names of columns that are sent if they exist.
 
     Yields
     ------
     pyarrow.RecordBatch
-        Rows.
+        Rows, or names of columns.
 
     Raises
     ------
@@ -179,7 +192,8 @@ def send_batches(path: Path, required: Sequence[str], text_columns: Sequence[str
     required : sequence of str
         Names of columns that must exist.
     text_columns : sequence of str
-        Names of columns that are left out if they do not exist.
+        Names of columns that are left out if they do not exist. If there is no column to read, the names of all columns
+        are written instead of rows.
     out : binary file
         File to which the stream is written.
 
@@ -191,11 +205,21 @@ def send_batches(path: Path, required: Sequence[str], text_columns: Sequence[str
     """
     try:
         with _open_file(path, required, text_columns) as (file, columns):
-            _send(path, file, columns, out)
+            if columns:
+                _send(path, file, columns, out)
+            else:
+                send_names([file.schema.column(i).path for i in range(len(file.schema))], out)
     except BadInput:
         raise
     except Exception as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
+
+
+def send_names(names: Sequence[str], out: IO[bytes]) -> None:
+    """Write the names of a file's columns to a binary file, as an Arrow stream with one column of texts."""
+    batch = pa.record_batch([pa.array(names, pa.string())], names=["name"])
+    with pa.ipc.new_stream(out, batch.schema) as stream:
+        stream.write_batch(batch)
 
 
 def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) -> None:
@@ -247,12 +271,14 @@ def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str])
     Raises
     ------
     BadInput
-        If a required column is missing or occurs more than once. The message lists all missing columns.
+        If a required column is missing or occurs more than once. The message lists all missing columns, with similar
+        names that the file has.
     """
     count = Counter(names)
     if missing := [column for column in dict.fromkeys(columns) if not count[column]]:
         has = " ".join(", ".join(names).split())[:300]
-        raise BadInput(f"{path}: has no column {', '.join(missing)}; it has {has}")
+        absent = ", ".join(f"{column}{spelling.suggestion(column, names)}" for column in missing)
+        raise BadInput(f"{path}: has no column {absent}; it has {has}")
     for column in columns:
         if count[column] > 1:
             raise BadInput(f"{path}: has column {column} more than once")

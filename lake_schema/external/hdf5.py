@@ -48,6 +48,11 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     yield from files.read_in_subprocess(__name__, path, columns)
 
 
+def column_names(path: Path) -> list[str]:
+    """Return the names of the columns of an HDF5 file; raise BadInput if it cannot be read."""
+    return files.column_names_from_subprocess(__name__, path)
+
+
 # ------------------------------------- functions that run in the separate process
 
 
@@ -59,7 +64,7 @@ def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
     path : Path
         An HDF5 file of another program.
     columns : sequence of str
-        Names of columns of numbers, at least one.
+        Names of columns of numbers; () to write the names of all columns instead of rows.
     text_columns : sequence of str
         Not used; `files.main` requires this parameter.
     out : binary file
@@ -74,6 +79,9 @@ def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
 
     try:
         with h5py.File(path, "r", locking=False) as file:
+            if not columns:
+                files.send_names(list(_data_groups(path, file)[0])[:_MAX_GROUPS], out)
+                return
             slice_columns = [_column_datasets(path, group, columns) for group in _data_groups(path, file)]
             if not sum(_row_count(columns_of_slice) for columns_of_slice in slice_columns):
                 raise BadInput(f"{path}: dataset {slice_columns[0][0].name} has no rows")

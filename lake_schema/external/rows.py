@@ -22,6 +22,7 @@ from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.external import files as external_files
 from lake_schema.external import hdf5
+from lake_schema.external.mistakes import TableMistakes
 from lake_schema.fits import external
 
 # Number of bytes of a CSV file that Arrow parses at a time.
@@ -30,6 +31,11 @@ _BLOCK_BYTES = 8 << 20
 _HEADER_BYTES = 1 << 16
 # Largest number of characters of an entry in a column of texts.
 _MAX_TEXT_LENGTH = 64
+# Entries of a CSV file that stand for a missing value.
+_NULL_VALUES = ["", "NaN", "nan", "null", "NULL", "\\N"]
+# Patterns of the numbers that Arrow reads from a CSV file.
+_INTEGER = r"^-?[0-9]+$"
+_NUMBER = r"(?i)^[-+]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?|inf(inity)?|nan)$"
 # Largest number of columns of a CSV file.
 _MAX_COLUMNS = 4096
 # Endings of the files of each format, in lower case.
@@ -185,55 +191,26 @@ def read_batches(
         first_row += batch.num_rows
 
 
-def csv_column_names(file: Path, kind: str = "catalogue") -> list[str]:
-    """Return the names of the columns of a CSV file, in its order.
+def column_names(file: Path, kind: str = "catalogue") -> list[str]:
+    """Return the names of the columns of a Parquet, FITS, CSV or HDF5 file, in its order.
 
-    BadInput is raised if the file is not CSV in UTF-8, is too large for its type `kind` (a key of
-    `user_files.MAX_BYTES`), or a name occurs twice.
+    BadInput is raised if the file cannot be read, or is too large for its type `kind` (a key of
+    `user_files.MAX_BYTES`).
     """
+    endings = _endings_of_format(check_format(file, kind), kind)
+    if endings == _FITS:
+        return external.column_names(file, kind)
+    if endings == _HDF5:
+        return hdf5.column_names(file)
+    if endings == _PARQUET:
+        return external_files.column_names(file)
     try:
-        with user_files.open_file(check_format(file, kind), kind) as stream, csv.open_csv(stream) as table:
-            names = list(table.schema.names)
+        with user_files.open_file(file, kind) as stream, csv.open_csv(stream) as table:
+            return list(table.schema.names)
     except UnicodeDecodeError:
         raise BadInput(f"{file}: is not CSV in UTF-8") from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
-    external_files.check_column_names(file, names, names)
-    return names
-
-
-def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, float]) -> Array:
-    """Return the values of a column unchanged if all are within bounds, which are included.
-
-    Parameters
-    ----------
-    file : Path
-        The file, for the message.
-    column : str
-        Name of the column, for the message.
-    values : array, shape (n,)
-        Values of all rows of the file.
-    bounds : tuple of (float, float)
-        Smallest and largest value that is allowed.
-
-    Returns
-    -------
-    array, shape (n,)
-        The same values.
-
-    Raises
-    ------
-    BadInput
-        If a value is out of bounds or NaN. The message gives the first row with such a value, counted from 1, and how
-        many rows have such values.
-    """
-    low, high = bounds
-    outside = ~((values >= low) & (values <= high))
-    if outside.any():
-        row = int(outside.argmax())
-        message = f"{column} of row {row + 1} is {values[row]:g}, not in [{low:g}, {high:g}]"
-        raise BadInput(f"{file}: {message} ({outside.sum()} of {outside.size} rows like it)")
-    return values
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
@@ -291,14 +268,45 @@ def _csv_batches(
         convert_options = csv.ConvertOptions(
             column_types={**types, **dict.fromkeys(text_columns, pa.string())},
             include_columns=included,
-            null_values=["", "NaN", "nan", "null", "NULL", "\\N"],
+            null_values=_NULL_VALUES,
         )
         with csv.open_csv(file, read_options=read_options, convert_options=convert_options) as stream:
             yield from stream
     except UnicodeDecodeError:
         raise BadInput(f"{file}: is not CSV in UTF-8") from None
+    except pa.ArrowInvalid as error:
+        _find_texts(file, columns, integer_columns).refuse()
+        raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _find_texts(file: Path, columns: Sequence[str], integer_columns: Sequence[str]) -> TableMistakes:
+    """Find the entries in columns of numbers of a CSV file that are not numbers."""
+    mistakes, first_row = TableMistakes(), 1
+    convert_options = csv.ConvertOptions(
+        column_types=dict.fromkeys(columns, pa.string()),
+        include_columns=list(columns),
+        null_values=_NULL_VALUES,
+        strings_can_be_null=True,
+    )
+    read_options = csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
+    try:
+        with csv.open_csv(file, read_options=read_options, convert_options=convert_options) as stream:
+            for batch in stream:
+                for name in columns:
+                    is_integer = name in integer_columns
+                    texts = pc.fill_null(pc.utf8_trim_whitespace(batch.column(name)), "0")
+                    wrong = pc.invert(pc.match_substring_regex(texts, _INTEGER if is_integer else _NUMBER))
+                    if (row := pc.index(wrong, True).as_py()) >= 0:
+                        problem = f"is {texts[row].as_py()[:40]!r}"
+                        allowed = f"must be {'an integer' if is_integer else 'a number'}"
+                        mistakes.add_rows(file, first_row, name, wrong.to_numpy(zero_copy_only=False), problem, allowed)
+                first_row += batch.num_rows
+    except (pa.ArrowException, UnicodeDecodeError):
+        # The file cannot be read as texts either, for example because a line has another number of fields.
+        return TableMistakes()
+    return mistakes
 
 
 def _to_numbers(file: Path, first_row: int, name: str, values: pa.Array, integer_columns: Sequence[str]) -> Array:

@@ -1,33 +1,39 @@
 """Read the user's tables of stars and galaxies for a request that draws no sources, but lists every one.
 
-A table is a CSV file with a line of column names. Sources have positions in the table, or are placed on a grid. A
-column that is absent has its default value in GALAXIES or STARS. `mag` is an AB magnitude in the band of the request,
-without magnification and without the Milky Way's extinction `a_v`. Galaxies have no emission lines.
+A table is a Parquet, FITS, CSV or HDF5 file. Its columns have the names of the properties, or the request maps them.
+Sources have positions in the table, or are placed on a grid. A property without a column has its default value in
+GALAXIES or STARS. `mag` is an AB magnitude in the band of the request, without magnification and without the Milky
+Way's extinction `a_v`. Galaxies have no emission lines.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from lake_schema import sky, units, user_files
+from lake_schema import sky, units
 from lake_schema.arrays import Array, Float, Float32, Int
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.external import rows as external_rows
+from lake_schema.external.mistakes import TableMistakes
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical
+from lake_schema.texts import spelling
+from truesky.catalogue.external import mapping, reading
 from truesky.catalogue.external.ingest import Split
 from truesky.catalogue.external.mapping import GALAXY_BOUNDS, Columns, Field
-from truesky.catalogue.galaxies import from_catalogue, lensing
+from truesky.catalogue.galaxies import band_ratios, from_catalogue, lensing
 from truesky.catalogue.galaxies.from_catalogue import IngestModel
 from truesky.catalogue.stars.from_catalogue import KEYS, StarCatalogue
 from truesky.catalogue.stars.stars import nearest_template
-from truesky.fluxes import integration, passbands
+from truesky.fluxes import cosmology, integration, passbands
 from truesky.fluxes.libraries import stellar, templates
 from truesky.fluxes.sources import Stars
 from truesky.request.area import Area
@@ -35,8 +41,8 @@ from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MAX_SHEAR
 
 _POSITION = ("ra", "dec")
-# Columns of the table of galaxies, and the default value of each column if it is absent; None if it is required. Units
-# and frames are the same as in table `galaxies`.
+# Properties of galaxies, and the default value of each one without a column; None if it is required. Units and frames
+# are the same as in table `galaxies`.
 GALAXIES: Mapping[str, float | None] = {
     "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
     "bulge_half_light_radius": 0.3, "disk_half_light_radius": 0.3, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 1.0,
@@ -44,10 +50,15 @@ GALAXIES: Mapping[str, float | None] = {
     "stamp": -1.0,
 }  # fmt: skip
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
-_GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
-# Columns whose values must be whole numbers.
-_INTEGER_COLUMNS = ("ext_law", "stamp")
-_STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
+# Lowest and highest valid value of each property. The last four are properties of a whole galaxy, which replace those
+# of its bulge and disc.
+_GALAXY_BOUNDS = {
+    **{name: GALAXY_BOUNDS[name] for name in (*_POSITION, *GALAXIES, "axis_ratio", "half_light_radius", "e1", "e2")},
+    "sed": (0.0, 30.0),
+}
+_STAR_BOUNDS = {**{name: KEYS[name] for name in (*_POSITION, "teff", "a_v")}, "mag": GALAXY_BOUNDS["mag"]}
+# Settings of the columns of galaxies.
+_SETTINGS = ("ellipticity", "frame")
 # Largest number of grid positions in the square around the area.
 _MAX_GRID_POSITIONS = 4_000_000
 # Dust map with A(V) = 0, for the function that makes the rows and requires a map. The map has no effect, because the
@@ -96,23 +107,21 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
     """
     if planned is not None and canonical(source_tables.facts(area.bounding_circle())) != canonical(planned):
         raise BadInput("sources: a table has changed since the job began")
+    messages: list[str] = []
     if source_tables.band not in passbands.names():
-        raise BadInput(f"sources.band = {source_tables.band!r} is not one of {', '.join(passbands.names())}")
-    position_columns = () if source_tables.spacing else _POSITION
-    tables = {
-        "galaxies": _read(source_tables.galaxies, {**dict.fromkeys(position_columns), **GALAXIES}, _GALAXY_BOUNDS),
-        "stars": _read(source_tables.stars, {**dict.fromkeys(position_columns), **STARS}, _STAR_BOUNDS),
-    }
+        allowed = f"{', '.join(passbands.names())}{spelling.suggestion(source_tables.band, passbands.names())}"
+        messages.append(f"sources.band = {source_tables.band!r} is not one of {allowed}")
+    tables = {}
+    for name, file in (("galaxies", source_tables.galaxies), ("stars", source_tables.stars)):
+        try:
+            tables[name] = _read(file, name, source_tables, None if messages else area)
+        except BadInput as error:
+            messages += error.messages
+    refuse_mistakes(messages)
     if source_tables.spacing:
         tables = _on_grid(tables, area, source_tables.spacing)
-    _refuse_caustics(source_tables.galaxies, tables["galaxies"])
-    for file, values in zip((source_tables.galaxies, source_tables.stars), tables.values(), strict=True):
+    for values in tables.values():
         values["ra"] = sky.wrap_angle(values["ra"])
-        cell = sky.cell_at(values["ra"], values["dec"], GENERATION_ORDER)
-        outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
-        if outside.any():
-            row = values["origin_id"][outside.argmax()]
-            raise BadInput(f"{file}: ra, dec of row {row} must be in the request's area")
         values["index"] = sky.healpix_29(values["ra"], values["dec"])
     return SourceColumns(*(_sort_by_cell(values) for values in tables.values()))
 
@@ -141,8 +150,7 @@ def model(
         The model.
     """
     columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band)
-    maxima = [float(sources.galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")]
-    return from_catalogue.model(seed, columns, Split(Path(), {}, 0, *maxima), lens, rotation)
+    return from_catalogue.model(seed, columns, _split(sources.galaxies), lens, rotation)
 
 
 def galaxies(cell: int, sources: SourceColumns, universe: IngestModel) -> pa.Table:
@@ -181,55 +189,106 @@ def stars(sources: SourceColumns, band: str) -> StarCatalogue:
     return StarCatalogue(values.pop("index"), values)
 
 
-def _read(
-    file: Path | None, defaults: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
-) -> dict[str, Array]:
-    """Read a CSV table, and return its columns by name, with default values for absent columns.
+def _columns(file: Path, name: str, source_tables: UserSources) -> Columns:
+    """Return which columns of a table give which properties; properties without a column have their default values.
 
-    If `file` is None, all columns are empty. Raises BadInput if a column is unknown or a required one is missing, if
-    there are no rows, or if a value is out of `bounds` or not a whole number where it must be one.
+    `name` is the name of the table, "galaxies" or "stars". Raises BadInput if a column is unknown or a required one is
+    missing.
+    """
+    is_galaxies = name == "galaxies"
+    defaults = GALAXIES if is_galaxies else STARS
+    bounds: Mapping[str, tuple[float, float]] = _GALAXY_BOUNDS if is_galaxies else _STAR_BOUNDS
+    required = [(key,) for key, value in defaults.items() if value is None]
+    if source_tables.spacing:
+        bounds = {key: limits for key, limits in bounds.items() if key not in _POSITION}
+    else:
+        required = [(key,) for key in _POSITION] + required
+    requested = source_tables.galaxy_columns if is_galaxies else source_tables.star_columns
+    entries: dict[str, Any] = {key: json.loads(text) for key, text in requested}
+    path = f"sources.{name}.columns"
+    if set(entries) <= set(_SETTINGS):
+        # The request maps no column, so the columns of the file have the names of the properties.
+        entries |= {title: title for title in _known_titles(file, bounds, [key for (key,) in required])}
+        path = f"sources.{name}: {file.name}"
+    replaced = {key for whole, keys in mapping.WHOLE_GALAXY.items() if whole in entries for key in keys}
+    constants = {key: {"value": value} for key, value in defaults.items() if value is not None and key not in replaced}
+    settings = _SETTINGS if is_galaxies else ()
+    return mapping.parse_columns({**constants, **entries}, bounds, path, required, legal_settings=settings)
+
+
+def _known_titles(file: Path, bounds: Mapping[str, object], required: list[str]) -> list[str]:
+    """Return the names of a file's columns; raise BadInput if they are not names of properties, or one is missing."""
+    titles = external_rows.column_names(file, SOURCES_KIND)
+    messages = []
+    if unknown := [f"{title}{spelling.suggestion(title, bounds)}" for title in titles if title not in bounds]:
+        names = ", ".join(bounds)
+        messages = [f"{file}: unknown column {', '.join(unknown)}; allowed are {names}, or a table {{ file, columns }}"]
+    messages += [
+        f"{file}: column {name} is missing{spelling.suggestion(name, [t for t in titles if t not in bounds])}"
+        for name in required
+        if name not in titles
+    ]
+    messages += [f"{file}: has column {title} more than once" for title in titles if titles.count(title) > 1]
+    refuse_mistakes(messages)
+    return titles
+
+
+def _read(file: Path | None, name: str, source_tables: UserSources, area: Area | None) -> dict[str, Array]:
+    """Read and check a table, and return its properties by name.
+
+    If `file` is None, all properties are empty. Raises BadInput if a column is unknown or a required one is missing, if
+    there are no rows, or if a value is out of bounds or not a whole number where it must be one, with one message for
+    each column and kind of mistake. Without `area`, positions and absolute magnitudes are not checked.
     """
     if file is None:
-        return {name: np.zeros(0) for name in defaults} | {"origin_id": np.zeros(0, np.int64)}
-    titles = external_rows.csv_column_names(file, SOURCES_KIND)
-    for title in titles:
-        if title not in defaults:
-            raise BadInput(
-                f"{user_files.format_path(file)}: unknown column {title}, must be one of {', '.join(defaults)}"
-            )
-    for name, value in defaults.items():
-        if value is None and name not in titles:
-            raise BadInput(f"{user_files.format_path(file)}: column {name} is missing")
-    pieces = list(external_rows.read_batches(file, titles, kind=SOURCES_KIND))
-    columns = {title: np.concatenate([np.zeros(0), *(piece.columns[title] for piece in pieces)]) for title in titles}
-    n = len(columns["mag"])
-    if n == 0:
-        raise BadInput(f"{user_files.format_path(file)}: the table has no rows")
-    for title, values in columns.items():
-        external_rows.check_bounds(file, title, values, bounds[title])
-    for title in _INTEGER_COLUMNS:
-        if (not_whole := columns.get(title, np.zeros(n)) % 1.0 != 0.0).any():
-            raise BadInput(
-                f"{user_files.format_path(file)}: {title} of row {not_whole.argmax() + 1} is not a whole number"
-            )
-    columns |= {name: np.full(n, value) for name, value in defaults.items() if name not in columns}
-    columns |= {name: columns[name].astype(np.int64) for name in _INTEGER_COLUMNS if name in columns}
-    return columns | {"origin_id": np.arange(1, n + 1)}
+        defaults = GALAXIES if name == "galaxies" else STARS
+        empty = {key: np.zeros(0) for key in (*(() if source_tables.spacing else _POSITION), *defaults)}
+        return empty | {"origin_id": np.zeros(0, np.int64)}
+    pieces = list(reading.read([file], _columns(file, name, source_tables), SOURCES_KIND))
+    count = sum(len(piece.values["mag"]) for piece in pieces)
+    if count == 0:
+        raise BadInput(f"{file}: the table has no rows")
+    values = {key: np.concatenate([piece.values[key] for piece in pieces]) for key in pieces[0].values}
+    mistakes = TableMistakes()
+    if area is not None and not source_tables.spacing:
+        cell = sky.cell_at(sky.wrap_angle(values["ra"]), values["dec"], GENERATION_ORDER)
+        outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
+        mistakes.add_rows(file, 1, "ra and dec", outside, "is outside the area", "must be in the request's area")
+    if name == "galaxies":
+        _add_caustics(file, values, mistakes)
+        if area is not None:
+            _add_magnitudes(file, values, source_tables.band, mistakes)
+    mistakes.refuse()
+    return values | {"origin_id": np.arange(1, count + 1)}
 
 
-def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
-    """Raise BadInput if a galaxy is near a lensing caustic, because its image would not be an ellipse there.
+def _add_caustics(file: Path, values: Mapping[str, Array], mistakes: TableMistakes) -> None:
+    """Add galaxies near a lensing caustic to `mistakes`, because their images would not be ellipses there.
 
-    BadInput is also raised if a reduced shear |gamma / (1 - kappa)| is larger than `MAX_SHEAR`.
+    Also galaxies with a reduced shear |gamma / (1 - kappa)| above `MAX_SHEAR`.
     """
     kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
     bad = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
     bad |= np.hypot(gamma1, gamma2) > MAX_SHEAR * np.abs(1.0 - kappa)
-    if bad.any():
-        row, column_names = values["origin_id"][bad.argmax()], "kappa, gamma1, gamma2"
-        raise BadInput(
-            f"{file}: {column_names} of row {row} are near a caustic: images are ellipses up to |g| = {MAX_SHEAR}"
-        )
+    allowed = f"images are ellipses up to |g| = {MAX_SHEAR}"
+    mistakes.add_rows(file, 1, "kappa, gamma1, gamma2", bad, "is near a caustic", allowed)
+
+
+def _add_magnitudes(file: Path, values: Mapping[str, Array], band: str, mistakes: TableMistakes) -> None:
+    """Add galaxies to `mistakes` whose magnitude, redshift and spectrum give an impossible absolute magnitude."""
+    z = np.maximum(values["z_true"], reading.MIN_REDSHIFT)
+    sed = band_ratios.sed_of_index(values["sed"], values["ext_law"], values["ebv"])
+    offset = band_ratios.offset(from_catalogue.band_table(band, _split(values)), z, sed)
+    absolute = values["mag"] - cosmology.distance_modulus(z) - offset
+    lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
+    is_wrong = ~((absolute >= lo) & (absolute <= hi))
+    column = "mag, z_true, sed (absolute magnitude)"
+    mistakes.add_rows(file, 1, column, is_wrong, absolute, f"must be in [{lo:g}, {hi:g}]")
+
+
+def _split(galaxies: Mapping[str, Array]) -> Split:
+    """Return the largest redshift and E(B-V) of galaxies, in the form of a stored catalogue without files."""
+    return Split(Path(), {}, 0, *(float(galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")))
 
 
 def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:

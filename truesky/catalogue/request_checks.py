@@ -3,60 +3,95 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
+from lake_schema.external import rows as external_rows
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 from truesky.catalogue import dust_map, given_sources
 from truesky.catalogue.external import ingest, mapping
 from truesky.catalogue.stars import bright_stars, from_catalogue, stars
 from truesky.fluxes import passbands
+from truesky.fluxes.libraries import templates
+from truesky.request.files import Catalogue
 from truesky.request.schema import Request, Stars
+from truesky.request.toml_values import refuse_name
 
 
 def check_request(request: Request) -> None:
     """Check the settings of the galaxies and stars of a request, and the user's files that it names.
 
+    Every row of a user's file is checked. The result is stored in the disc cache, so that a second check of the same
+    files only computes their checksums. A catalogue of galaxies is also stored there by sky cell, for the job that uses
+    it. Files of any size are read in batches.
+
     Raises BadInput if a passband is unknown, a file is missing or has wrong columns or values, or an area has too many
-    stars. The message names the key of the request, or the file and its column or row. A catalogue of
-    galaxies, halos or training galaxies is checked here only by the first rows of its first file; the job that uses it
-    reads all rows.
+    stars. There is one message for each mistake, which names the key of the request, or the file, its column and row.
     """
-    user_inputs = request.ingest
-    if user_inputs.dust is not None:
-        dust_map.map_for_request(request.seed, user_inputs.dust)
+    with Mistakes() as mistakes:
+        for check in (_check_dust, _check_sources, _check_galaxies, _check_halos, _check_training, _check_stars):
+            mistakes.read(check, request)
+
+
+def _check_dust(request: Request) -> None:
+    if request.ingest.dust is not None:
+        dust_map.map_for_request(request.seed, request.ingest.dust)
+
+
+def _check_sources(request: Request) -> None:
     if request.sources is not None:
         given_sources.load(request.sources, request.area)
+
+
+def _check_galaxies(request: Request) -> None:
+    if request.sources is None:
+        check_band(request)
+    if (catalogue := request.ingest.galaxies) is not None:
+        replaces_lensing = request.universe.lensing is not None
+        columns = _with_existing_files(catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing))
+        ingest.split_by_cell(*ingest.files_with_checksums(catalogue.files, columns), columns)
+
+
+def _check_halos(request: Request) -> None:
+    if (catalogue := request.ingest.halos) is not None:
+        columns = _with_existing_files(catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
+        ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)
+
+
+def _check_training(request: Request) -> None:
+    if (catalogue := request.ingest.training) is not None:
+        columns = _with_existing_files(catalogue, lambda: mapping.training_columns(dict(catalogue.columns)))
+        columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
+        ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)
+
+
+def _with_existing_files(catalogue: Catalogue, make_columns: Callable[[], mapping.Columns]) -> mapping.Columns:
+    """Return the mapping of a catalogue; raise BadInput for mistakes in it and for files that do not exist."""
+    with Mistakes() as mistakes:
+        for path in catalogue.files:
+            mistakes.read(external_rows.find_files, path)
+        columns = mistakes.read(make_columns)
+    return columns
+
+
+def _check_stars(request: Request) -> None:
+    if request.sources is not None:
         return
-    check_band(request)
-    if user_inputs.galaxies is not None:
-        _check_first_rows(
-            user_inputs.galaxies.files,
-            mapping.galaxy_columns(user_inputs.galaxies.format, dict(user_inputs.galaxies.columns)),
-        )
-    if user_inputs.halos is not None:
-        _check_first_rows(user_inputs.halos.files, mapping.halo_columns(dict(user_inputs.halos.columns)))
-    if user_inputs.training is not None:
-        _check_first_rows(user_inputs.training.files, mapping.training_columns(dict(user_inputs.training.columns)))
     choice, limit = request.stars, request.universe.star_limit
-    stars.expected_counts(request.area.cells(), star_model(limit, choice, star_files(choice)))
+    model = star_model(limit, choice, star_files(choice))
+    try:
+        stars.expected_counts(request.area.cells(), model)
+    except BadInput as error:
+        raise error.with_prefix("area") from None
 
 
 def check_band(request: Request) -> None:
     """Raise BadInput if galaxies are drawn and the band of their magnitude limit is not a built-in passband."""
     if request.ingest.galaxies is None and request.universe.galaxy_band not in passbands.names():
-        band_names = ", ".join(passbands.names())
-        raise BadInput(f"universe.galaxy_band = {request.universe.galaxy_band!r} is not one of {band_names}")
-
-
-def _check_first_rows(files: Sequence[Path], columns: mapping.Columns) -> None:
-    listed_files, _ = ingest.list_files(files, columns)
-    # Reading the first rows checks the columns, the units and the values of these rows.
-    next(mapping.read(listed_files[:1], columns), None)
+        raise BadInput(f"universe.galaxy_band = {refuse_name(request.universe.galaxy_band, passbands.names())}")
 
 
 def star_files(choice: Stars) -> dict[str, Any]:

@@ -1,7 +1,12 @@
 """Tables that list all sources of a request: the catalogue contains their values, and errors name their rows."""
 
+import galsim
+import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from astropy.table import Table
 
 from lake_schema import sky, units
 from lake_schema.errors import BadInput
@@ -94,23 +99,23 @@ def test_rows_stand_on_a_grid_in_turn(tmp_path):
 
 
 BAD = [
-    ({"galaxies": TWO.replace("24.5", "")}, r"galaxies.csv: mag of row 2 is nan"),
-    ({"galaxies": TWO.replace("24.5", "faint")}, r"galaxies.csv: .*faint"),
-    ({"galaxies": TWO.replace("-27.81", "-97.81")}, r"galaxies.csv: dec of row 2 is -97.81"),
-    ({"galaxies": TWO.replace("53.11", "63.11")}, r"galaxies.csv: ra, dec of row 2 must be in the request's area"),
-    ({"galaxies": TWO.replace("-0.02", "-0.95")}, r"galaxies.csv: kappa, gamma1, gamma2 of row 2 are near a caustic"),
-    ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: unknown column shear, must be one of ra, dec, mag"),
+    ({"galaxies": TWO.replace("24.5", "")}, r"galaxies.csv: column mag of row 2 is nan, must be a number in "),
+    ({"galaxies": TWO.replace("24.5", "faint")}, r"galaxies.csv: column mag of row 2 is 'faint', must be a number"),
+    ({"galaxies": TWO.replace("-27.81", "-97.81")}, r"galaxies.csv: column dec of row 2 is -97.81"),
+    ({"galaxies": TWO.replace("53.11", "63.11")}, r"galaxies.csv: column ra and dec of row 2 is outside the area"),
+    ({"galaxies": TWO.replace("-0.02", "-0.95")}, r"column kappa, gamma1, gamma2 of row 2 is near a caustic"),
+    ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: unknown column shear; allowed are ra, dec, mag"),
     ({"galaxies": TWO.replace("gamma1", "mag")}, r"galaxies.csv: has column mag more than once"),
     (
         {"galaxies": TWO.replace("gamma1", "ext_law")},
         "ext_law of row 2 is -0.02",
     ),
-    ({"galaxies": TWO.replace("gamma1", "ext_law").replace("-0.02", "2")}, "ext_law of row 1 is not a whole number"),
+    ({"galaxies": TWO.replace("gamma1", "ext_law").replace("-0.02", "2")}, "row 1 is 0.05, must be a whole number"),
     ({"galaxies": "ra,dec\n53.1,-27.8\n"}, r"galaxies.csv: column mag is missing"),
     ({"galaxies": "ra,dec,mag\n"}, r"galaxies.csv: the table has no rows"),
     ({"galaxies": ""}, r"galaxies.csv: .*mpty"),
-    ({"stars": STAR.replace("4000", "4")}, r"stars.csv: teff of row 1 is 4"),
-    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown column ra, must be one of mag"),
+    ({"stars": STAR.replace("4000", "4")}, r"stars.csv: column teff of row 1 is 4"),
+    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown column ra, dec; allowed are mag"),
     ({"more": 'only = "grid"'}, r"sources.spacing is missing"),
     ({"more": 'only = "table"\nspacing = 20.0'}, r"sources.spacing requires only"),
     ({"more": 'only = "some"'}, r"sources.only = 'some'"),
@@ -125,8 +130,112 @@ BAD = [
 def test_bad_tables_are_refused(tmp_path, keys, words):
     with pytest.raises(BadInput, match=words) as caught:
         made(tmp_path, **keys)
-    assert "\n" not in str(caught.value)
+    assert all(line.strip() for line in str(caught.value).splitlines())
     assert not (tmp_path / "lake" / "galaxies").exists()
+
+
+MAPPED = """
+[sources]
+only = "table"
+[sources.galaxies]
+file = "theirs.{}"
+[sources.galaxies.columns]
+ra = "RA"
+dec = "DEC"
+mag = {{ column = "FLUX", log10 = true, scale = -2.5, offset = 23.9 }}
+z_true = "Z"
+half_light_radius = "R"
+e1 = "E1"
+e2 = "E2"
+ellipticity = "distortion"
+frame = "west_north"
+"""
+
+
+def written_as(form, path, columns):
+    """Write columns to a file in one of the formats of [ingest]."""
+    if form == "parquet":
+        pq.write_table(pa.table(columns), path)
+    elif form == "hdf5":
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file.create_dataset(f"data/{name}", data=values)
+    else:
+        Table(columns).write(path)
+
+
+@pytest.mark.parametrize("form", ["csv", "fits", "parquet", "hdf5"])
+def test_every_format_of_ingest_is_read_with_a_mapping(tmp_path, form):
+    """Columns that are not mapped are ignored; ellipticities become axis ratios and position angles."""
+    columns = {
+        "RA": np.array([53.1, 53.11]), "DEC": np.array([-27.8, -27.81]), "Z": np.array([0.3, 0.5]),
+        "FLUX": 10.0 ** (0.4 * (23.9 - np.array([20.0, 24.5]))), "R": np.array([0.5, 0.7]), "flag": np.array([1, 2]),
+        "E1": np.array([0.3, 0.0]), "E2": np.array([0.4, 0.0]),
+    }  # fmt: skip
+    written_as(form, tmp_path / f"theirs.{form}", columns)
+    request = parse(requests.written(tmp_path, MAPPED.format(form), requests.FIELD.format(0.05)))
+    sources = given_sources.load(request.sources, request.area)
+    rows = {name: values[np.argsort(sources.galaxies["origin_id"])] for name, values in sources.galaxies.items()}
+    assert len(sources.stars["mag"]) == 0
+    assert rows["mag"] == pytest.approx([20.0, 24.5], abs=1e-10)
+    for name in ("bulge_half_light_radius", "disk_half_light_radius"):
+        assert rows[name].tolist() == [0.5, 0.7]
+    shear = galsim.Shear(e1=0.3, e2=0.4)
+    for name in ("bulge_axis_ratio", "disk_axis_ratio"):
+        assert rows[name] == pytest.approx([shear.q, 1.0], abs=1e-12)
+    assert rows["position_angle"][0] == pytest.approx(shear.beta / galsim.degrees - 90.0, abs=1e-9)
+    assert rows["bulge_sersic_index"].tolist() == [4.0, 4.0]
+    assert request.sources.count_rows() == {"galaxies": 2}
+    assert set(request.sources.facts((0.0, 0.0, 1.0))) == {"sha256", "band", "columns"}
+
+
+def test_all_mistakes_of_both_tables_are_reported_at_once(tmp_path):
+    galaxies = "ra,dec,mag,z_true,bulge_fraction\n" + "53.1,-27.8,20,0.2,0.5\n" + "153.1,-27.8,20,-1,2\n" * 3
+    request = asked(
+        tmp_path, more='only = "table"\nband = "lsst_q"', galaxies=galaxies, stars=STAR.replace("4000", "4")
+    )
+    with pytest.raises(BadInput) as caught:
+        given_sources.load(request.sources, request.area)
+    lines = [line.replace(f"{tmp_path}/", "") for line in caught.value.messages]
+    assert lines[0].startswith("sources.band = 'lsst_q' is not one of")
+    assert "(did you mean lsst_" in lines[0]
+    assert lines[1:] == [
+        "galaxies.csv: column z_true of row 2 is -1, must be in [0, 15] (2 more rows)",
+        "galaxies.csv: column bulge_fraction of row 2 is 2, must be in [0, 1] (2 more rows)",
+        "stars.csv: column teff of row 1 is 4, must be in [300, 100000]",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ('ra = "RA", mag = "MAG"', "sources.galaxies.columns must have dec"),
+        ('ra = "ra", dec = "dec", mag = "mag", e1 = "z_true", e2 = "mag"', "e1, e2 require ellipticity"),
+        ('ra = "ra", dec = "dec", mag = "mag", e1 = "mag", ellipticity = "shear"', "e1 requires e2"),
+        ('ra = "ra", dec = "dec", mag = "mag", e1 = "mag", e2 = "mag", ellipticity = "shears"', "did you mean shear"),
+        (
+            'ra = "ra", dec = "dec", mag = "mag", axis_ratio = "mag", disk_axis_ratio = "mag"',
+            "axis_ratio replaces disk",
+        ),
+        ('ra = "ra", dec = "dec", mag = "mag", frame = "north_east"', "frame requires e1 and e2"),
+        ('ra = "ra", dec = "dec", mag = "mag", bulge_fracton = "x"', "did you mean bulge_fraction"),
+        ('ra = "ra", dec = "dec", mag = "MAG_I"', r"has no column MAG_I \(did you mean mag"),
+    ],
+)
+def test_a_wrong_mapping_is_refused(tmp_path, columns, message):
+    (tmp_path / "galaxies.csv").write_text("ra,dec,mag,z_true\n53.1,-27.8,20,0.2\n")
+    text = f'[sources]\nonly = "table"\n[sources.galaxies]\nfile = "galaxies.csv"\ncolumns = {{ {columns} }}\n'
+    request = parse(requests.written(tmp_path, text, requests.FIELD.format(0.05)))
+    with pytest.raises(BadInput, match=message):
+        given_sources.load(request.sources, request.area)
+
+
+def test_an_impossible_absolute_magnitude_is_named(tmp_path):
+    """The job that computes fluxes would refuse it."""
+    galaxies = "ra,dec,mag,z_true\n53.1,-27.8,24,0.2\n53.1,-27.8,28.5,0\n"
+    request = asked(tmp_path, galaxies=galaxies, stars=None)
+    with pytest.raises(BadInput, match=r"column mag and z_true \(absolute magnitude\) of row 2 is 6\.\d+, must be in"):
+        given_sources.load(request.sources, request.area)
 
 
 def test_a_table_that_changes_while_it_is_read_is_refused(tmp_path):

@@ -6,9 +6,7 @@ or more per HEALPix cell of order 5. Each worker process then reads only the row
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -26,11 +24,14 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store.provenance import file_sha256
-from truesky.catalogue.external import mapping
-from truesky.catalogue.external.mapping import Columns, Rows
-from truesky.numerics import cache
+from truesky.catalogue.external import mapping, reading
+from truesky.catalogue.external.mapping import Columns
+from truesky.catalogue.external.reading import Rows
+from truesky.fluxes.libraries import templates
+from truesky.numerics import cache, cache_entries
 from truesky.numerics.cache import cache_dir, content_key
 from truesky.numerics.code_fingerprints import code_key
+from truesky.request.files import Catalogue
 
 # Number of rows that are collected in memory before they are written to the files of their cells.
 _MAX_BUFFERED_ROWS = 2_000_000
@@ -64,6 +65,17 @@ class Split:
     rows: int
     z_max: float
     ebv_max: float
+
+
+def galaxy_columns(catalogue: Catalogue, replaces_lensing: bool) -> Columns:
+    """Return which columns of a user's catalogue give which properties of galaxies, for the built-in templates.
+
+    Columns with lensed positions are left out if the request replaces the lensing of the catalogue. Raises BadInput if
+    the mapping in the request is wrong.
+    """
+    columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
+    columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
+    return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
 
 def files_with_checksums(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], list[str]]:
@@ -121,28 +133,63 @@ def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns
         If a file cannot be read, or has a missing, wrong or repeated value; the message names the file, the column and
         the row. Also if the stored files cannot be read back.
     """
-    columns_json = json.dumps(
-        [sorted((key, repr(field)) for key, field in columns.fields.items()), columns.companion_prefixes]
-    )
-    folder = cache_dir() / f"ingest-{content_key(code_key(__name__), columns_json, *sha256)[:32]}"
+    folder = cache_dir() / f"ingest-{_content_key(sha256, columns)[:32]}"
     checksums = _read_checksums(folder)
     if checksums is None:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        try:
-            summary = _write_pieces(temporary, files, columns)
-            (temporary / _SUMMARY_FILE).write_text(json.dumps(summary))
-            cache.store_checksums(
-                temporary,
-                sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file()),
-            )
-            _publish(temporary, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-        checksums = _read_checksums(folder)
+        with cache.lock(folder):
+            # Another process may have stored the catalogue while this one waited.
+            if _read_checksums(folder) is None:
+                _store(folder, files, columns)
+            checksums = _read_checksums(folder)
     if checksums is None:
         raise BadInput(f"cache {folder}: the files written by this process cannot be read")
     return Split(folder, checksums, **json.loads((folder / _SUMMARY_FILE).read_text()))
+
+
+def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> None:
+    """Check every row of a user's catalogue, unless the disc cache says that the same files have been checked before.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Files of the catalogue, without companion files.
+    sha256 : sequence of str
+        SHA-256 of all files and companion files, by which the cache recognises the catalogue.
+    columns : Columns
+        Mapping from the columns of the files to properties.
+
+    Raises
+    ------
+    BadInput
+        If a file cannot be read, has a missing, wrong or repeated value, or if there are no rows. The message names the
+        file, the column and the row.
+    """
+
+    def count_rows() -> dict[str, Array]:
+        cache_dir().mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=cache_entries.MAKING, dir=cache_dir()) as folder:
+            identifiers, rows = _IdentifierStore(Path(folder) / "seen"), 0
+            for piece in reading.read(files, columns):
+                rows += len(next(iter(piece.values.values())))
+                if "origin_id" in piece.values:
+                    identifiers.add(files.index(piece.file), piece)
+            identifiers.refuse_duplicates(files, _identifier_title(columns))
+        if not rows:
+            raise BadInput(f"{files[0]}: the table has no rows")
+        return {"rows": np.array([rows])}
+
+    cache.cached_arrays("checked_rows", _content_key(sha256, columns), count_rows)
+
+
+def _content_key(sha256: Sequence[str], columns: Columns) -> str:
+    fields = sorted((key, repr(field)) for key, field in columns.fields.items())
+    settings = [columns.companion_prefixes, columns.ellipticity, columns.frame]
+    bounds = sorted((key, *map(float, limits)) for key, limits in columns.bounds.items())
+    return content_key(code_key(__name__), json.dumps([fields, settings, bounds]), *sha256)
+
+
+def _identifier_title(columns: Columns) -> str:
+    return columns.fields["origin_id"].column if "origin_id" in columns.fields else ""
 
 
 def _read_checksums(folder: Path) -> dict[str, int] | None:
@@ -205,19 +252,14 @@ def _names_and_columns(table: pa.Table) -> tuple[list[str], list[pa.ChunkedArray
     return table.column_names, table.columns
 
 
-def _publish(temporary: Path, folder: Path) -> None:
-    while True:
-        try:
-            return os.rename(temporary, folder)
-        except FileExistsError:
-            pass
-        except OSError as error:
-            if error.errno != errno.ENOTEMPTY:
-                raise
-        # The folder exists: another process has just made it, or has left a damaged one. `_read_checksums` deletes a
-        # damaged folder, and the loop then tries to rename again.
-        if _read_checksums(folder) is not None:
-            return None
+def _store(folder: Path, files: Sequence[Path], columns: Columns) -> None:
+    with cache_entries.staging_folder(folder) as staged:
+        summary = _write_pieces(staged, files, columns)
+        (staged / _SUMMARY_FILE).write_text(json.dumps(summary))
+        cache.store_checksums(
+            staged, sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
+        )
+        cache.publish(staged, folder)
 
 
 def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict[str, Any]:
@@ -225,7 +267,7 @@ def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict
     buffered_rows = count = piece_number = 0
     z_max = ebv_max = 0.0
     identifiers = _IdentifierStore(folder / "seen")
-    for piece in mapping.read(files, columns):
+    for piece in reading.read(files, columns):
         size = len(piece.values["ra"])
         if size:
             z_max = max(z_max, *(float(piece.values[k].max()) for k in ("z_true", "z_obs") if k in piece.values))
@@ -238,7 +280,7 @@ def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict
             _write_cells(folder, buffered, piece_number)
             buffered, buffered_rows, piece_number = [], 0, piece_number + 1
     _write_cells(folder, buffered, piece_number)
-    identifiers.refuse_duplicates(files, columns.fields["origin_id"].column if "origin_id" in columns.fields else "")
+    identifiers.refuse_duplicates(files, _identifier_title(columns))
     return {"rows": count, "z_max": z_max, "ebv_max": ebv_max}
 
 

@@ -1,29 +1,25 @@
-"""Map the columns of a user's table to properties of galaxies or halos, and check the values.
+"""Map the columns of a user's table to properties of galaxies or halos.
 
 A mapping says for each property (key), such as "z_true", from which column of the table it is computed and how. The
 mappings of known catalogue formats are in ingest_formats.toml, and a request can override their entries. For tables of
-halos and of training galaxies, the whole mapping is in the request. Each value is checked; an error names the file, the
-column and the row.
+halos and of training galaxies, the whole mapping is in the request.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lake_schema import user_files
-from lake_schema.arrays import Array
-from lake_schema.errors import BadInput
-from lake_schema.external import rows as external_rows
-from lake_schema.external.rows import RowBatch
+from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.tables.galaxies import GALAXIES
-from truesky.fluxes import cosmology
+from lake_schema.texts import spelling
+from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
+from truesky.fluxes import passbands
 
 Bounds = Mapping[str, tuple[float, float]]
 
@@ -32,10 +28,26 @@ IDENTIFIER_KEYS = ("origin_id", "halo")
 _FIELD_KEYS = (
     "column", "plus", "minus", "over", "kpc_at", "power10", "log10", "scale", "offset", "unit", "value", "beside",
 )  # fmt: skip
-_FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
-_SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
+# Settings of a mapping, which stand between its columns in a request.
+SETTINGS = ("band", "beside", "seen_over_v", "lines_magnified", "ellipticity", "frame")
+# Groups of properties that are only allowed together.
+_TOGETHER = (
+    ("ra_lensed", "dec_lensed"),
+    ("kappa", "gamma1", "gamma2"),
+    ("sed", "ext_law", "ebv"),
+    ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2"),
+    ("e1", "e2"),
+)
 # Properties of table `galaxies` that cannot be mapped, because they are computed or follow from other properties.
 _NOT_MAPPED = ("id", "halo_id", "_healpix_29", "ra_true", "dec_true")
+# Smallest axis ratio of bulges and discs in the table `galaxies`.
+MIN_AXIS_RATIO = float(GALAXIES.column("disk_axis_ratio").lo or 0.0)
+# Properties of a whole galaxy, and the properties of its components that they replace.
+WHOLE_GALAXY = {
+    "e1": ("axis_ratio", "bulge_axis_ratio", "disk_axis_ratio", "inclination", "position_angle"),
+    "axis_ratio": ("bulge_axis_ratio", "disk_axis_ratio", "inclination"),
+    "half_light_radius": ("bulge_half_light_radius", "disk_half_light_radius"),
+}
 GALAXY_BOUNDS: Bounds = {
     **{c.name: (c.lo, c.hi) for c in GALAXIES.columns if c.lo is not None and c.hi is not None},
     "ra": (-360.0, 360.0),
@@ -52,6 +64,10 @@ GALAXY_BOUNDS: Bounds = {
     "origin_id": (-(2.0**63), 2.0**63),
     "halo": (-(2.0**63), 2.0**63),
     "stamp": (-1, 1e6),
+    "axis_ratio": (MIN_AXIS_RATIO, 1.0),
+    "half_light_radius": (0.0, 120.0),
+    "e1": (-4.0, 4.0),
+    "e2": (-4.0, 4.0),
 }
 NULLABLE = tuple(c.name for c in GALAXIES.columns if c.nullable)
 HALO_BOUNDS: Bounds = {
@@ -71,7 +87,7 @@ TRAINING_BOUNDS: Bounds = {
     "ext_law": (0, 4),
     "ebv": (0.0, 3.0),
 }
-_INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "stamp")
+INTEGER_KEYS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "stamp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +140,10 @@ class Columns:
         Way's extinction. None if `mag` includes neither.
     lines_magnified : bool
         True if the fluxes of emission lines include magnification.
+    ellipticity : str
+        Convention of the properties `e1` and `e2`, one of `CONVENTIONS` in ellipticity.py; "" without them.
+    frame : str
+        Axes of the ellipticities, one of `FRAMES` in ellipticity.py.
     """
 
     fields: Mapping[str, Field]
@@ -133,6 +153,8 @@ class Columns:
     companion_prefixes: tuple[str, ...] = ()
     seen_over_v: float | None = None
     lines_magnified: bool = False
+    ellipticity: str = ""
+    frame: str = FRAMES[0]
 
     def titles(self, in_companion: bool) -> list[str]:
         """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).
@@ -141,25 +163,6 @@ class Columns:
         """
         titles = [title for field in self.fields.values() if field.beside is in_companion for title in field.titles()]
         return list(dict.fromkeys(titles))
-
-
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """Checked rows of one file of a user's table.
-
-    Attributes
-    ----------
-    file : Path
-        The file.
-    first : int
-        Number of the first of these rows in the file, from which error messages count.
-    values : mapping of str to array
-        Values by name of the property.
-    """
-
-    file: Path
-    first: int
-    values: Mapping[str, Array]
 
 
 def formats() -> dict[str, dict[str, Any]]:
@@ -197,24 +200,79 @@ def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
     """
     all_formats = formats()
     if name and name not in all_formats:
-        raise BadInput(f"ingest.galaxies.format = {name!r} is not one of {', '.join(all_formats)}")
+        hint = spelling.suggestion(name, all_formats)
+        raise BadInput(f"ingest.galaxies.format = {name!r} is not one of {', '.join(all_formats)}{hint}")
     shipped = all_formats.get(name, {"columns": {}})
-    overriding_fields = {key: json.loads(text) for key, text in overrides.items() if key not in _FORMAT_KEYS}
-    settings = {**shipped, **{key: json.loads(text) for key, text in overrides.items() if key in _FORMAT_KEYS}}
-    fields = _fields({**shipped["columns"], **overriding_fields}, GALAXY_BOUNDS, "ingest.galaxies.columns")
-    _require(
-        fields, "ingest.galaxies.columns", ("ra",), ("dec",), ("z_true", "z_obs"), ("abs_mag_r01", "mag_r01", "mag")
-    )
-    for group in (("ra_lensed", "dec_lensed"), ("kappa", "gamma1", "gamma2"), ("sed", "ext_law", "ebv"), _SED):
-        present = [key for key in group if key in fields]
-        if present and len(present) < len(group):
-            missing = next(key for key in group if key not in fields)
-            raise BadInput(f"ingest.galaxies.columns: {present[0]} requires {missing}")
-    if "mag" in fields and not settings.get("band"):
-        raise BadInput("ingest.galaxies.columns: mag requires band")
-    companion_prefixes, seen_over_v = tuple(settings.get("beside", ())), settings.get("seen_over_v")
-    lines = bool(settings.get("lines_magnified", False))
-    return Columns(fields, GALAXY_BOUNDS, NULLABLE, settings.get("band", ""), companion_prefixes, seen_over_v, lines)
+    requested = {key: json.loads(text) for key, text in overrides.items()}
+    entries = {**{key: value for key, value in shipped.items() if key in SETTINGS}, **shipped["columns"], **requested}
+    required = ("ra",), ("dec",), ("z_true", "z_obs"), ("abs_mag_r01", "mag_r01", "mag")
+    path = "ingest.galaxies.columns"
+    return parse_columns(entries, GALAXY_BOUNDS, path, required, NULLABLE, SETTINGS)
+
+
+def parse_columns(
+    entries: Mapping[str, Any],
+    bounds: Bounds,
+    path: str,
+    required: Sequence[Sequence[str]],
+    nullable: tuple[str, ...] = (),
+    legal_settings: Sequence[str] = (),
+) -> Columns:
+    """Check the entries of a mapping, and return the mapping.
+
+    Parameters
+    ----------
+    entries : mapping of str to object
+        Column or definition of each property, and settings (`SETTINGS`), as in a TOML file.
+    bounds : mapping of str to (float, float)
+        Allowed properties with the lowest and highest valid value.
+    path : str
+        Key of the request that contains the entries, for messages.
+    required : sequence of sequence of str
+        Groups of properties, of each of which at least one is required.
+    nullable : tuple of str, optional
+        Allowed properties whose values may be missing.
+    legal_settings : sequence of str, optional
+        Allowed settings.
+
+    Returns
+    -------
+    Columns
+        The mapping.
+
+    Raises
+    ------
+    BadInput
+        If entries are wrong or required ones are missing. There is one message for each mistake.
+    """
+    messages: list[str] = []
+    # With an empty text or table, the request says that the catalogue lacks the column that the format names.
+    entries = {key: entry for key, entry in entries.items() if entry not in ("", {})}
+    settings = {key: entry for key, entry in entries.items() if key in legal_settings}
+    legal = dict.fromkeys([*(key for key in bounds if key not in _NOT_MAPPED), *nullable, *legal_settings])
+    fields = {}
+    for key, entry in entries.items():
+        if key not in legal:
+            messages.append(f"{path}.{key} is not one of {', '.join(legal)}{spelling.suggestion(key, legal)}")
+        elif key not in legal_settings:
+            try:
+                fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
+            except BadInput as error:
+                messages.append(str(error))
+    messages += _wrong_settings(settings, path)
+    messages += _missing_keys(entries, path, required)
+    if "mag" in fields and "band" in legal_settings and "band" not in settings:
+        messages.append(f"{path}: mag requires band, the name of its passband")
+    messages += _excluded_keys(fields, settings, path)
+    refuse_mistakes(messages)
+    companion_prefixes = tuple(settings.pop("beside", ()))
+    return Columns(fields, bounds, nullable, companion_prefixes=companion_prefixes, **settings)
+
+
+def with_last_template(columns: Columns, last: int) -> Columns:
+    """Return `columns` with template indices limited to the library, whose last template is `last`."""
+    limited = {key: (0.0, float(last)) for key in ("sed", "sed_1", "sed_2") if key in columns.bounds}
+    return replace(columns, bounds={**columns.bounds, **limited})
 
 
 def drop_lensed_positions(columns: Columns) -> Columns:
@@ -229,9 +287,9 @@ def halo_columns(entries: Mapping[str, str]) -> Columns:
     `entries` contains for each property that the request gives its column or value, as JSON text. Raises BadInput if
     such a text is wrong, or if ra, dec, z_true or log_mass is missing.
     """
-    fields = _fields({key: json.loads(text) for key, text in entries.items()}, HALO_BOUNDS, "ingest.halos.columns")
-    _require(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
-    return Columns(fields, HALO_BOUNDS)
+    parsed = {key: json.loads(text) for key, text in entries.items()}
+    required = ("ra",), ("dec",), ("z_true",), ("log_mass",)
+    return parse_columns(parsed, HALO_BOUNDS, "ingest.halos.columns", required)
 
 
 def training_columns(entries: Mapping[str, str]) -> Columns:
@@ -241,23 +299,8 @@ def training_columns(entries: Mapping[str, str]) -> Columns:
     such a text is wrong, or if one of the properties in TRAINING_BOUNDS is missing.
     """
     parsed = {key: json.loads(text) for key, text in entries.items()}
-    fields = _fields(parsed, TRAINING_BOUNDS, "ingest.training.columns")
-    _require(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
-    return Columns(fields, TRAINING_BOUNDS)
-
-
-def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
-    """Yield the rows of files in batches, as checked values by property.
-
-    Codes, template indices and stamp numbers become int64, most other values float64. Raises BadInput for a value that
-    is missing or out of range, a wrong unit, or a companion file with other rows.
-    """
-    identifier_columns = [columns.fields[key].column for key in IDENTIFIER_KEYS if key in columns.fields]
-    for file in files:
-        pieces = external_rows.read_batches(file, columns.titles(in_companion=False), identifier_columns)
-        for piece in _with_companion(file, pieces, columns) if columns.companion_prefixes else pieces:
-            _check_units(piece, columns)
-            yield Rows(file, piece.first_row, _checked_values(piece, columns))
+    required = [(key,) for key in TRAINING_BOUNDS]
+    return parse_columns(parsed, TRAINING_BOUNDS, "ingest.training.columns", required)
 
 
 def companion_file(file: Path, prefixes: Sequence[str]) -> Path:
@@ -268,19 +311,6 @@ def companion_file(file: Path, prefixes: Sequence[str]) -> Path:
     if not file.name.startswith(prefixes[0]):
         raise BadInput(f"{file}: the name must begin with {prefixes[0]}")
     return file.with_name(prefixes[1] + file.name.removeprefix(prefixes[0]))
-
-
-def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Field]:
-    legal = [key for key in bounds if key not in _NOT_MAPPED] + [key for key in NULLABLE if bounds is GALAXY_BOUNDS]
-    fields = {}
-    for key, entry in table.items():
-        if key not in legal:
-            raise BadInput(f"{path}.{key} is not one of {', '.join(dict.fromkeys(legal))}")
-        if entry in ("", {}):
-            # With an empty text or table, the request says that the catalogue lacks the column that the format names.
-            continue
-        fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
-    return fields
 
 
 def _field(entry: Any, path: str) -> Field:
@@ -299,17 +329,68 @@ def _field(entry: Any, path: str) -> Field:
     if bool(field.column) == (field.value is not None):
         raise BadInput(f"{path} must have either column or value")
     if field.unit:
-        _unit(field.unit, path)
+        parse_unit(field.unit, path)
     return field
 
 
-def _require(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> None:
-    for alternatives in groups:
-        if not any(key in fields for key in alternatives):
-            raise BadInput(f"{path} must have {' or '.join(alternatives)}")
+def _missing_keys(entries: Collection[str], path: str, required: Sequence[Sequence[str]]) -> list[str]:
+    missing = [" or ".join(group) for group in required if not any(key in entries for key in group)]
+    messages = [f"{path} must have {', '.join(missing)}"] if missing else []
+    for group in _TOGETHER:
+        first = next((key for key in group if key in entries), None)
+        messages += [f"{path}: {first} requires {key}" for key in group if first and key not in entries]
+    return messages
 
 
-def _unit(text: str, where: str) -> Any:
+def _excluded_keys(fields: Mapping[str, Field], settings: Mapping[str, Any], path: str) -> list[str]:
+    """Return messages about properties that exclude each other, and about settings that are missing or without use."""
+    messages = []
+    for key, replaced in WHOLE_GALAXY.items():
+        if key in fields and (both := [other for other in replaced if other in fields]):
+            name = "e1, e2" if key == "e1" else key
+            messages.append(f'{path}: {name} replaces {", ".join(both)}: remove them, or set {both[0]} = ""')
+    if "e1" in fields and "ellipticity" not in settings:
+        messages.append(f"{path}: e1, e2 require ellipticity, their convention: one of {', '.join(CONVENTIONS)}")
+    messages += [
+        f"{path}.{key} requires e1 and e2" for key in ("ellipticity", "frame") if key in settings and "e1" not in fields
+    ]
+    if "beside" in settings:
+        if "origin_id" not in fields:
+            messages.append(f"{path}: beside requires origin_id, by which the rows of both files are compared")
+    else:
+        companions = [key for key, field in fields.items() if field.beside]
+        messages += [
+            f"{path}.{key}: beside = true requires the setting beside, the beginnings of two file names"
+            for key in companions
+        ]
+    return messages
+
+
+def _wrong_settings(settings: Mapping[str, Any], path: str) -> list[str]:
+    choices = {"ellipticity": CONVENTIONS, "frame": FRAMES, "band": passbands.names()}
+    messages = []
+    for key, value in settings.items():
+        if key in choices:
+            wrong = value not in choices[key]
+            allowed = f"one of {', '.join(choices[key])}{spelling.suggestion(str(value), choices[key])}"
+        elif key == "beside":
+            wrong = not (isinstance(value, list) and len(value) == 2 and all(isinstance(text, str) for text in value))
+            allowed = "the beginnings of two file names"
+        elif key == "lines_magnified":
+            wrong, allowed = not isinstance(value, bool), "true or false"
+        else:
+            wrong = isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 100.0
+            allowed = "a number"
+        if wrong:
+            messages.append(f"{path}.{key} = {value!r}"[:200] + f" must be {allowed}")
+    return messages
+
+
+def parse_unit(text: str, where: str) -> Any:
+    """Return an astropy unit for a text; raise BadInput, with the place `where`, if it is not a unit.
+
+    "Msun" and "/h" are also understood.
+    """
     # Import here, because astropy is slow to import and only needed for external catalogues.
     from astropy import units
     from astropy.cosmology.units import littleh
@@ -320,108 +401,3 @@ def _unit(text: str, where: str) -> Any:
             return units.Unit(text.replace("Msun", "solMass").replace("/h", " / littleh"))
     except ValueError:
         raise BadInput(f"{where}: unit {text!r} must be a unit of astropy") from None
-
-
-def _check_units(piece: RowBatch, columns: Columns) -> None:
-    for key, field in columns.fields.items():
-        file_unit = piece.units.get(field.column, "")
-        if not field.unit or not file_unit:
-            continue
-        where = f"{piece.file}: column {field.column}"
-        if _unit(file_unit, where) != _unit(field.unit, where):
-            raise BadInput(f"{where} ({key}) has unit {file_unit!r}, but the mapping has {field.unit!r}")
-
-
-def _checked_values(piece: RowBatch, columns: Columns) -> dict[str, Array]:
-    rows = len(next(iter(piece.columns.values())))
-    by_key = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
-    for k in "12":
-        # If a template has the flux fraction 0, set its index and its dust to 0, because they may have invalid values.
-        if f"frac_{k}" in by_key:
-            dark = by_key[f"frac_{k}"] == 0.0
-            for name in (f"sed_{k}", f"ext_law_{k}", f"ebv_{k}"):
-                by_key[name] = np.where(dark, 0.0, by_key[name])
-    for key, values in by_key.items():
-        _check_bounds(piece, key, columns, values)
-    return {key: values.astype(np.int64) if key in _INTEGERS else values for key, values in by_key.items()}
-
-
-def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> Array:
-    if field.value is not None:
-        return np.full(rows, field.value)
-    values = columns[field.column]
-    if key in IDENTIFIER_KEYS:
-        return values.astype(np.int64) if values.dtype.kind in "iu" else values
-    values = values.astype(np.float64)
-    with np.errstate(all="ignore"):
-        if field.plus:
-            values = values + columns[field.plus]
-        if field.minus:
-            values = values - columns[field.minus]
-        if field.over:
-            values = values / columns[field.over]
-        if field.kpc_at:
-            values = values / _kpc_per_arcsec(columns[field.kpc_at])
-        if field.power10:
-            values = 10.0**values
-        if field.log10:
-            values = np.log10(values)
-        return np.asarray(field.scale * values + field.offset)
-
-
-def _kpc_per_arcsec(z: Array) -> Array:
-    """Return the proper length per angle (kpc/arcsec) at redshifts.
-
-    It is NaN at redshifts of 0 or less or beyond the largest redshift of the cosmology. Later checks refuse NaN.
-    """
-    valid = (z > 0.0) & (z <= cosmology.Z_MAX)
-    return np.where(valid, cosmology.kpc_per_arcsec(np.where(valid, z, 1.0)), np.nan)
-
-
-def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array) -> None:
-    lo, hi = columns.bounds.get(key, (-np.inf, np.inf))
-    single = key in GALAXIES.names and GALAXIES.column(key).type == "float32"
-    slack = 1e-6 * max(abs(lo), abs(hi)) if single and np.isfinite(hi - lo) else 0.0
-    bad = ~((values >= lo - slack) & (values <= hi + slack))
-    if key in columns.nullable:
-        bad &= ~np.isnan(values) if values.dtype.kind == "f" else True
-    if key in (*IDENTIFIER_KEYS, *_INTEGERS) and values.dtype.kind == "f":
-        bad |= values != np.floor(values)
-    if bad.any():
-        row = int(bad.argmax())
-        where = f"{piece.file}: column {' and '.join(columns.fields[key].titles()) or key} ({key})"
-        allowed = f"in [{lo:g}, {hi:g}]" if key not in IDENTIFIER_KEYS else "an integer"
-        raise BadInput(f"{where} of row {piece.first_row + row} is {values[row]:g}, must be {allowed}")
-    if slack:
-        np.clip(values, lo, hi, out=values)
-
-
-def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:
-    """Yield the batches of a file with the columns of its companion file added.
-
-    Raises BadInput if the companion file has fewer rows, or if the identifiers of both files differ in a row.
-    """
-    companion = companion_file(file, columns.companion_prefixes)
-    name = columns.fields["origin_id"].column
-    titles = [name, *columns.titles(in_companion=True)]
-    buffered: dict[str, Array] = {title: np.zeros(0) for title in titles}
-    stream = external_rows.read_batches(companion, titles, [name])
-    for piece in pieces:
-        row_count = len(piece.columns[name])
-        while len(buffered[name]) < row_count:
-            next_piece = next(stream, None)
-            if next_piece is None:
-                row = piece.first_row + len(buffered[name])
-                raise BadInput(f"{companion}: column {name} ends before row {row} of {file}")
-            buffered = (
-                {title: np.concatenate([buffered[title], next_piece.columns[title]]) for title in titles}
-                if len(buffered[name])
-                else dict(next_piece.columns)
-            )
-        companion_rows = {title: values[:row_count] for title, values in buffered.items()}
-        buffered = {title: values[row_count:] for title, values in buffered.items()}
-        differ = companion_rows[name] != piece.columns[name]
-        if differ.any():
-            row = piece.first_row + int(differ.argmax())
-            raise BadInput(f"{companion}: column {name} of row {row} must equal the same row of {file.name}")
-        yield RowBatch(file, piece.first_row, {**companion_rows, **piece.columns}, piece.units)

@@ -19,11 +19,12 @@ import numpy.typing as npt
 
 from lake_schema import sky, user_files
 from lake_schema.arrays import Array, Float, Int
-from lake_schema.errors import BadInput
-from lake_schema.external import rows as external_rows
+from lake_schema.errors import BadInput, refuse_mistakes
+from lake_schema.external.mistakes import TableMistakes, find_out_of_bounds
 from lake_schema.fits import external
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.provenance import canonical
+from lake_schema.texts import spelling
 from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
@@ -74,20 +75,24 @@ class StarCatalogue:
 
 
 def check_columns(columns: Mapping[str, str]) -> None:
-    """Raise BadInput if a mapping from properties to column names is incomplete, or has a property not in `KEYS`.
+    """Raise BadInput if a mapping from properties to column names is incomplete, or has properties not in `KEYS`.
 
     Required are a position, an H magnitude and a temperature. A magnitude with extinction also requires the extinction.
     """
-    for key in columns:
-        if key not in KEYS:
-            raise BadInput(f"stars.catalogue.columns.{key} is not one of {', '.join(KEYS)}")
+    path = "stars.catalogue.columns"
+    messages = [
+        f"{path}.{key} is not one of {', '.join(KEYS)}{spelling.suggestion(key, KEYS)}"
+        for key in columns
+        if key not in KEYS
+    ]
     for alternatives in _REQUIRED_KEYS:
         if sum(key in columns for key in alternatives) != 1:
-            raise BadInput(f"stars.catalogue.columns must have one of {' and '.join(alternatives)}")
+            messages.append(f"{path} must have one of {' and '.join(alternatives)}")
     if ("ra" in columns) != ("dec" in columns):
-        raise BadInput("stars.catalogue.columns must have ra and dec, or l and b")
+        messages.append(f"{path} must have ra and dec, or l and b")
     if "mag_h_seen" in columns and "a_v" not in columns:
-        raise BadInput("stars.catalogue.columns: mag_h_seen requires a_v")
+        messages.append(f"{path}: mag_h_seen requires a_v")
+    refuse_mistakes(messages)
 
 
 def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
@@ -111,7 +116,7 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
     ------
     BadInput
         If the file cannot be read or has no such columns, or if a value is missing or outside the range in `KEYS`. For
-        values, the message names the file, the column and the first bad row, and the number of bad rows.
+        values, there is one message for each column, with the file, the first bad row, and the number of further ones.
     """
     key = content_key(code_key(__name__), sha256, canonical(dict(columns)))
     arrays = cached_arrays("star_catalogue", key, lambda: _read(file, columns))
@@ -133,10 +138,13 @@ def stars_of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
 
 def _read(file: Path, columns: Mapping[str, str]) -> dict[str, Array]:
     table = _read_table(file, list(columns.values()))
-    values: dict[str, Array] = {
-        key: external_rows.check_bounds(file, f"{title} ({key})", table[title], KEYS[key])
-        for key, title in columns.items()
-    }
+    labels = {key: title if title == key else f"{title} ({key})" for key, title in columns.items()}
+    find_out_of_bounds(
+        file,
+        {labels[key]: table[title] for key, title in columns.items()},
+        {labels[key]: KEYS[key] for key in columns},
+    ).refuse()
+    values: dict[str, Array] = {key: table[title] for key, title in columns.items()}
     if "l" in values:
         values["ra"], values["dec"] = sky.equatorial(values.pop("l"), values.pop("b"))
     values["ra"], values["dec"] = sky.check_positions(values["ra"], values["dec"])
@@ -163,7 +171,8 @@ def _read_table(file: Path, titles: list[str]) -> Mapping[str, Float]:
     if file.suffix.lower() in (".fits", ".fit"):
         columns = external.read_numbers(file, KIND)
         if absent := [title for title in titles if title not in columns]:
-            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(columns)}")
+            listed = ", ".join(f"{title}{spelling.suggestion(title, columns)}" for title in absent)
+            raise BadInput(f"{file}: has no column {listed}; it has {', '.join(columns)}")
         return columns
     return _read_text(file, titles)
 
@@ -183,22 +192,22 @@ def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
             raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines has the columns {', '.join(titles)}")
         if duplicates := [title for title in titles if head.count(title) > 1]:
             raise BadInput(f"{file}: the column name {duplicates[0]} must not occur twice")
-        values = {title: array("d") for title in titles}
+        values, mistakes = {title: array("d") for title in titles}, TableMistakes()
         for line in lines:
             fields = _split_line(line)
             if len(fields) != len(head):
                 break
             for title in titles:
-                values[title].append(_parse_number(file, title, fields[head.index(title)], len(values[title]) + 1))
+                text = fields[head.index(title)]
+                try:
+                    values[title].append(float(text))
+                except ValueError:
+                    values[title].append(np.nan)
+                    problem = f"column {title} of row {len(values[title])} is {text[:40]!r}, must be a number"
+                    mistakes.add_row(file, title, "number", f"{file}: {problem}")
+    mistakes.refuse()
     return {title: np.array(column) for title, column in values.items()}
 
 
 def _split_line(line: str) -> list[str]:
     return [field.strip() for field in line.split(",")] if "," in line else line.split()
-
-
-def _parse_number(file: Path, title: str, text: str, row: int) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise BadInput(f"{file}: {title} of row {row} is {text[:40]!r}, not a number") from None

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
-from scipy.special import chdtri, erfc, ndtri
+import scipy
 
 from lake_schema import sky, units
 from lake_schema.arrays import Float
@@ -60,7 +60,7 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     vega = ab_minus_vega()
     g = true_mags[0] - vega[0]
     listed = np.flatnonzero(chance[_LISTED] < completeness(g))
-    noise, listed_stars = ndtri(chance[:, listed]), stars.take(pa.array(listed))
+    noise, listed_stars = scipy.special.ndtri(chance[:, listed]), stars.take(pa.array(listed))
     columns: dict[str, Any] = {"id": ids[listed], **_astrometry(listed_stars, g[listed], noise)}
     columns |= _motion(listed_stars, g[listed], noise)
     columns["ruwe"] = _ruwe(chance[_RUWE, listed])
@@ -82,7 +82,7 @@ def ab_minus_vega() -> tuple[float, ...]:
 def completeness(g: npt.ArrayLike) -> Float:
     """Return the fraction of stars with each G magnitude (Vega) that Gaia detects, 0 to 1."""
     law = parameters.section(_FILE, "completeness")
-    return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
+    return np.asarray(0.5 * scipy.special.erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
 
 
 def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
@@ -147,7 +147,7 @@ def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 
 def _ruwe(chance: Float) -> Float:
     degrees = parameters.section(_FILE, "goodness")["degrees"]
-    return np.asarray(np.sqrt(chdtri(degrees, chance) / degrees))
+    return np.asarray(np.sqrt(scipy.special.chdtri(degrees, chance) / degrees))
 
 
 def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:

@@ -335,12 +335,14 @@ def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_lim
     float array, shape (n,)
         Expected number.
     """
-    total, local = np.zeros(lon.size), galaxy.local + galaxy.companions
+    total = np.zeros(lon.size)
+    # Number density of the stars in all bins of M_H below each edge, for each component.
+    brighter = np.cumsum(galaxy.local + galaxy.companions, axis=1)
+    brighter = np.concatenate([np.zeros((len(brighter), 1)), brighter], axis=1)
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
-        per_shell = (
-            matrices.matmul(_may_be_visible(galaxy, float(limit)), local.T) * shell_volumes(galaxy, area)[:, None]
-        )
+        visible_bins = _may_be_visible(galaxy, float(limit)).sum(axis=1)
+        per_shell = brighter.T[visible_bins] * shell_volumes(galaxy, area)[:, None]
         for batch in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
             r, z, azimuth = cylindrical(galaxy, lon[batch, None], lat[batch, None], shell_distances(galaxy))
             for component, weights in zip(galaxy.components, per_shell.T, strict=True):

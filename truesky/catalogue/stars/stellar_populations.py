@@ -16,13 +16,15 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from lake_schema.arrays import Bool, Float, Int
+from lake_schema.arrays import Array, Bool, Float, Int
 from truesky.catalogue import parameters
 from truesky.catalogue.stars import isochrones
 from truesky.fluxes import passbands
 from truesky.fluxes.calibration import STAR_BAND
 from truesky.fluxes.libraries import model_stars, stellar
 from truesky.fluxes.libraries.vega import vega_magnitude
+from truesky.numerics import cache
+from truesky.numerics.code_fingerprints import code_key
 
 DWARF, GIANT, WHITE_DWARF, BROWN_DWARF, SUBGIANT = range(5)
 _FILE = "milky_way.toml"
@@ -34,6 +36,8 @@ _SUN_TEFF, _SUN_M_BOL = 5772.0, 4.74
 _NEARBY_MASS, _MODEL_MASS = 0.5, 0.7
 # Stars after the main sequence are subgiants if their log g (cm s-2) is larger, and giants if it is smaller.
 _GIANT_LOG_G = 3.5
+# Fields of `Tracks` that are stored in the cache.
+_TRACK_ARRAYS = ("evolved", "log_mass", "log_teff", "log_g", "m_h")
 # Largest distance from the mean of the normal distribution of metallicity, standard deviations.
 _REACH = 3.0
 
@@ -183,8 +187,17 @@ def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, ce
 def build_tracks(age: Float, metallicity: Float) -> Tracks:
     """Return isochrones of ages (Gyr) and metallicities [M/H], shape (k,), with the sequence of nearby dwarfs.
 
-    The sequence of nearby dwarfs replaces the isochrones below 0.5 Msun, and is blended with them up to 0.7 Msun.
+    The sequence of nearby dwarfs replaces the isochrones below 0.5 Msun, and is blended with them up to 0.7 Msun. They
+    are computed once and stored in the cache on disc.
     """
+    key = cache.content_key(code_key(__name__), age, metallicity)
+    arrays = cache.cached_arrays("isochrones", key, lambda: _compute_tracks(age, metallicity))
+    evolved, *values = (arrays[name] for name in _TRACK_ARRAYS)
+    return Tracks(age, metallicity, int(evolved[0]), *values)
+
+
+def _compute_tracks(age: Float, metallicity: Float) -> dict[str, Array]:
+    """Return the arrays `_TRACK_ARRAYS` of `Tracks`; `evolved` is an array with one element."""
     model, types = isochrones.isochrones(age, metallicity), stellar.types()
     solar = isochrones.isochrones(age, np.zeros(age.size))
     nearby = _nearby_dwarfs(types)
@@ -213,7 +226,8 @@ def build_tracks(age: Float, metallicity: Float) -> Tracks:
     )
     low[1] = low[1] + hotter
     values = [np.concatenate(pair, 1) for pair in zip(low, parts, strict=True)]
-    return Tracks(age, metallicity, int(is_low_mass.sum()) + model.main_sequence, *values)
+    evolved = np.array([int(is_low_mass.sum()) + model.main_sequence])
+    return dict(zip(_TRACK_ARRAYS, (evolved, *values), strict=True))
 
 
 def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:

@@ -1,0 +1,152 @@
+"""Every row of a user's tables is read; all mistakes are reported at once with the user's columns and rows."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from lake_schema.errors import BadInput
+from truesky.catalogue.external import ingest, mapping, reading
+
+GALAXIES = {"ra": "RA", "dec": "DEC", "z_true": "Z", "mag": "MAG", "band": "euclid_vis", "origin_id": "ID"}
+HALOS = {"ra": "RA", "dec": "DEC", "z_true": "Z", "log_mass": "M", "origin_id": "ID"}
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
+
+
+def table(number=50, **changes):
+    """Return columns of a user's table; `changes` gives (row, value) by column, with rows from 1."""
+    rng = np.random.default_rng(4)
+    columns = {
+        "ID": np.arange(number), "RA": rng.uniform(53.0, 54.0, number), "DEC": rng.uniform(-28.0, -27.0, number),
+        "Z": rng.uniform(0.1, 2.0, number), "MAG": rng.uniform(20.0, 25.0, number), "M": rng.uniform(12, 14, number),
+    }  # fmt: skip
+    for name, (row, value) in changes.items():
+        columns[name][row - 1] = value
+    return columns
+
+
+def galaxies(entries=GALAXIES, **more):
+    return mapping.galaxy_columns("", {key: json.dumps(value) for key, value in {**entries, **more}.items()})
+
+
+def halos():
+    return mapping.halo_columns({key: json.dumps(value) for key, value in HALOS.items()})
+
+
+def written(folder, *tables):
+    paths = [folder / f"{number}.parquet" for number in range(len(tables))]
+    for path, columns in zip(paths, tables, strict=True):
+        pq.write_table(pa.table(columns), path)
+    return paths
+
+
+def mistakes(folder, files, columns):
+    """Return the lines of the error when the files are read."""
+    with pytest.raises(BadInput) as caught:
+        list(reading.read(files, columns))
+    return [line.replace(f"{folder}/", "") for line in caught.value.messages]
+
+
+def test_rows_beyond_the_first_batch_and_file_are_read(tmp_path):
+    """A batch has at most 65,536 rows."""
+    files = written(tmp_path, table(70_000, DEC=(66_001, -91.0)), table(Z=(7, np.nan), DEC=(8, 95.0)))
+    assert mistakes(tmp_path, files, galaxies()) == [
+        "0.parquet: column DEC (dec) of row 66001 is -91, must be in [-90, 90] (1 more row in 2 files)",
+        "1.parquet: column Z (z_true) of row 7 is nan, must be a number in [0, 15]",
+    ]
+
+
+def test_missing_columns_and_wrong_values_are_reported_together(tmp_path):
+    columns = table(DEC=(3, 95.0), MAG=(4, 99.0))
+    columns["Redshift"] = columns.pop("Z")
+    lines = mistakes(tmp_path, written(tmp_path, columns), galaxies({**GALAXIES, "z_true": "redshift"}))
+    assert lines == [
+        "0.parquet: has no column redshift (did you mean Redshift?); it has ID, RA, DEC, MAG, M, Redshift",
+        "0.parquet: column DEC (dec) of row 3 is 95, must be in [-90, 90]",
+        "0.parquet: column MAG (mag) of row 4 is 99, must be in [-5, 60]",
+    ]
+
+
+def test_texts_in_columns_of_numbers_are_named(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("RA,DEC,Z,MAG,ID\n53,-27,0.5,21,1\n53,-27,half,-,2\n53,-27,+.5e0,1e1,3\n53,-27,,n/a,4\n")
+    assert mistakes(tmp_path, [path], galaxies()) == [
+        "x.csv: column Z of row 2 is 'half', must be a number",
+        "x.csv: column MAG of row 2 is '-', must be a number (1 more row)",
+    ]
+
+
+def test_an_ellipticity_without_an_axis_ratio_is_named(tmp_path):
+    columns = {**table(3), "E1": np.array([0.1, 0.9, 0.6]), "E2": np.array([0.1, 0.0, 0.8])}
+    shapes = {"e1": "E1", "e2": "E2", "ellipticity": "shear"}
+    (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies(**shapes))
+    assert line == "0.parquet: column E1 and E2 (|e|) of row 3 is 1, must be at most 0.9608, for an axis ratio of 0.02"
+
+
+def test_an_impossible_absolute_magnitude_is_named(tmp_path):
+    """A galaxy of 29 mag at z = 0 would be fainter than any galaxy; the job that computes fluxes would refuse it."""
+    columns = table(MAG=(2, 29.0), Z=(2, 0.0))
+    (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies())
+    assert line.startswith("0.parquet: column MAG and Z (absolute magnitude) of row 2 is 6.")
+    assert line.endswith("must be in [-30, 5]")
+
+
+def test_properties_of_a_whole_galaxy_become_those_of_its_components(tmp_path):
+    columns = {**table(2), "Q": np.array([0.5, 1.0]), "R": np.array([0.3, 0.4])}
+    (rows,) = reading.read(written(tmp_path, columns), galaxies(axis_ratio="Q", half_light_radius="R"))
+    for name, values in (("axis_ratio", [0.5, 1.0]), ("half_light_radius", [0.3, 0.4])):
+        assert name not in rows.values
+        assert rows.values[f"bulge_{name}"].tolist() == rows.values[f"disk_{name}"].tolist() == values
+
+
+def test_a_table_is_checked_once(tmp_path, monkeypatch):
+    """The second check of the same files reads no rows; identifiers of all files are compared."""
+    files = written(tmp_path, table(), {**table(), "ID": np.arange(50) + 50})
+    ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
+    with monkeypatch.context() as context:
+        context.setattr(reading, "read", lambda *arguments: pytest.fail("rows were read again"))
+        ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
+    written(tmp_path, table(), {**table(), "ID": np.arange(50) + 49})
+    with pytest.raises(BadInput, match=r"column ID: 49 is in row 1 of .*1\.parquet and in row 50 of .*0\.parquet"):
+        ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
+    written(tmp_path, table(0), table(0))
+    with pytest.raises(BadInput, match="the table has no rows"):
+        ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"origin_id": "", "beside": ["a", "b"]}, "beside requires origin_id"),
+        ({"a_v": {"column": "AV", "beside": True}}, "columns.a_v: beside = true requires the setting beside"),
+        ({"beside": "a"}, "columns.beside = 'a' must be the beginnings of two file names"),
+        ({"band": "euclid_viz"}, r"band = 'euclid_viz' must be one of .* \(did you mean euclid_vis\?\)"),
+        ({"band": ""}, "mag requires band"),
+        ({"seen_over_v": True}, "seen_over_v = True must be a number"),
+        ({"lines_magnified": 1}, "lines_magnified = 1 must be true or false"),
+        ({"frame": "south"}, "frame = 'south' must be one of east_north"),
+        ({"e1": "E1", "e2": "E2", "ellipticity": "shear", "position_angle": "PA"}, "e1, e2 replaces position_angle"),
+    ],
+)
+def test_wrong_settings_are_refused(more, message):
+    with pytest.raises(BadInput, match=message):
+        galaxies(**more)
+
+
+def test_all_mistakes_of_a_mapping_are_reported_at_once():
+    with pytest.raises(BadInput) as caught:
+        galaxies({"ra": "RA", "mag": {"column": "M", "times": 2}, "bulge_fracton": "B", "kappa": "K"})
+    lines = caught.value.messages
+    assert [line.removeprefix("ingest.galaxies.columns") for line in lines[2:]] == [
+        " must have dec, z_true or z_obs",
+        ": kappa requires gamma1",
+        ": kappa requires gamma2",
+    ]
+    assert lines[0].startswith("ingest.galaxies.columns.mag.times is not one of column")
+    assert lines[1].endswith("(did you mean bulge_fraction?)")
