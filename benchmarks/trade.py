@@ -8,6 +8,8 @@ The benchmark also measures galsim with default parameters, and galsim with a re
 measures approximations with which other programs save time, relative to the most accurate drawing of truesky. The
 errors of each setting, and each approximation, are measured in a separate process. The CPU times of all settings are
 measured in one process.
+
+With --lensing it measures the lensing maps of the catalogue instead: errors of the shear and cost by resolution.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ import numpy as np
 
 from benchmarks import _approximations as approximations
 from benchmarks import _errors as errors
+from benchmarks import _lensing as lensing
 from benchmarks import _peers as peers
 from benchmarks import _positions as positions
 from benchmarks import _references as references
@@ -532,6 +535,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     extra_parser.add_argument(
         "--positions", type=Path, metavar="FILE", help="write only the table of positions of the PSF"
     )
+    extra_parser.add_argument(
+        "--lensing", type=Path, metavar="FILE", help="write only the table of resolutions of the lensing maps"
+    )
     extra_parser.add_argument("--repeats", type=int, default=3, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("trade", __doc__ or "", other_arguments)
@@ -539,6 +545,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         extra_options.positions.write_text(
             positions.table_text(positions.measure_positions(positions.NUM_STARS)), encoding="utf-8"
         )
+        return 0
+    if extra_options.lensing:
+        lensing.write_table(lensing.measure(options.quick), extra_options.lensing)
         return 0
     repeats = 1 if options.quick else extra_options.repeats
     rows: list[Row] = []

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from benchmarks import _approximations as approximations
+from benchmarks import _lensing as lensing
 from benchmarks import _scenes as scenes
 from benchmarks import trade
 from benchmarks._scenes import VIS
 from tests.benchmarks import run
 from truesky.render.drawing.settings import settings_for
 from truesky.render.sources import galaxy_shapes
-from truesky.request import accuracy
+from truesky.request import accuracy, lensing_resolution
 from truesky.request.accuracy import SURVEY
 
 RESULTS = Path(trade.__file__).with_name("results")
@@ -106,3 +107,25 @@ def test_the_quick_benchmark(tmp_path):
         found = {row["kind"]: row for row in csv.DictReader(file)}
     assert float(found["settings"]["shear_m_worst"]) < 1e-3
     assert float(found["approximation"]["seconds_before"]) > 0
+
+
+@pytest.mark.nightly
+def test_lensing_maps_are_compared_by_resolution(tmp_path):
+    """Errors of small maps of a small box fall with the resolution, and the file can be read."""
+    trade.main(["--lensing", str(tmp_path / "lensing.csv"), "--quick"])
+    lines = (line for line in (tmp_path / "lensing.csv").read_text().splitlines() if line[0] != "#")
+    coarse, fine, reference = csv.DictReader(lines)
+    assert [row["nside"] for row in (coarse, fine, reference)] == ["16", "32", "64"]
+    assert coarse.keys() == lensing_resolution.rows()[0].keys()
+    assert 0.0 < float(fine["shear_rms"]) < float(coarse["shear_rms"])
+    assert float(coarse["gb"]) < float(fine["gb"]) < float(reference["gb"])
+
+
+def test_the_table_of_resolutions_is_as_the_benchmark_writes_it(tmp_path):
+    file = Path(accuracy.__file__).with_name("lensing_resolution.csv")
+    lensing.write_table(lensing_resolution.rows(), tmp_path / "lensing.csv")
+    written, shipped = ((tmp_path / "lensing.csv").read_text(), file.read_text())
+    # The last line of the comment names the machine.
+    assert [line for line in written.splitlines() if " On " not in line] == [
+        line for line in shipped.splitlines() if " On " not in line
+    ]

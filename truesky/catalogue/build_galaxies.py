@@ -9,6 +9,7 @@ Command: spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQ
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -244,7 +245,11 @@ def _universe(facts: Json, user_inputs: Ingest | None = None) -> GalaxyModel:
 
 
 def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
-    return Universe(**{name: facts[name] for name in ("galaxy_band", *names)})
+    # The list of JSON becomes a tuple, because models are kept by their settings.
+    settings: dict[str, Any] = {name: facts[name] for name in ("galaxy_band", *names)}
+    if settings.get("lensing") is not None:
+        settings["lensing"] = tuple(settings["lensing"])
+    return Universe(**settings)
 
 
 def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone | None, Training | None]:
@@ -266,7 +271,7 @@ def _input_facts(catalogue: Catalogue, columns: mapping.Columns) -> Json:
 
 
 def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
-    columns = _columns(catalogue, request.universe.lensing is not None)
+    columns = ingest.galaxy_columns(catalogue, request.universe.lensing is not None)
     files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
     catalogue_facts = {"sha256": sha256, "format": catalogue.format, "columns": dict(catalogue.columns)}
     dust = request.ingest.dust
@@ -283,15 +288,6 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
     if not layout.version_folder(lake, GALAXIES.name, plan.key).exists():
         ingest.split_by_cell(files, sha256, columns)
     return Step(plan, partial(ingest_galaxies, catalogue=catalogue, dust=dust))
-
-
-def _columns(catalogue: Catalogue, replaces_lensing: bool) -> mapping.Columns:
-    """Return which columns of a user's catalogue give which properties of galaxies.
-
-    Columns with lensed positions are left out if the request replaces the lensing of the catalogue.
-    """
-    columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
-    return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
 
 def _given_step(request: Request, source_tables: UserSources) -> Step:
@@ -356,7 +352,7 @@ def ingest_galaxies(lake: Path, facts: Json, catalogue: Catalogue, dust: DustMap
     Output
         Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
-    columns = _columns(catalogue, facts["lensing"] is not None)
+    columns = ingest.galaxy_columns(catalogue, facts["lensing"] is not None)
     files, _ = ingest.list_files(catalogue.files, columns)
     split_catalogue = ingest.split_by_cell(files, facts["ingest"]["sha256"], columns)
     model = from_catalogue.model(facts["seed"], columns, split_catalogue, _shear(facts), facts["rotation"])

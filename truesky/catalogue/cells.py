@@ -18,6 +18,7 @@ from lake_schema.columns import Table
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import layout
 from lake_schema.store.plan import Json, Task
+from truesky.numerics import activity
 from truesky.request.area import Area
 
 
@@ -94,7 +95,8 @@ def draw_rows(facts: Json, table: Table, draw: Callable[[int], pa.Table]) -> pa.
     Table
         Rows of all cells, sorted as by `sort_rows`.
     """
-    return pa.concat_tables([table.empty(), *(draw(cell) for cell in sorted(facts["generation_cells"]))])
+    generation_cells = activity.track(sorted(facts["generation_cells"]), f"{table.name}, cell")
+    return pa.concat_tables([table.empty(), *(draw(cell) for cell in generation_cells)])
 
 
 def sort_rows(rows: pa.Table) -> pa.Table:

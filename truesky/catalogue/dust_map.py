@@ -12,7 +12,6 @@ from dataclasses import asdict, astuple, dataclass
 from importlib.metadata import version
 from typing import Any
 
-import healpy as hp
 import numpy as np
 import numpy.typing as npt
 
@@ -20,10 +19,12 @@ from lake_schema import user_files
 from lake_schema.arrays import Float, Float32
 from lake_schema.errors import BadInput
 from lake_schema.fits.external import read_map
+from lake_schema.lazy_healpy import healpy as hp
 from lake_schema.sky import equatorial, galactic
 from lake_schema.store.provenance import canonical, file_sha256
 from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
+from truesky.numerics.cache_labels import label_dust_map
 from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 from truesky.request.files import DustMap
@@ -133,7 +134,7 @@ def load(seed: int) -> Float32:
     """
     model = cosecant()
     key = content_key(code_key(__name__), version("healpy"), seed, *astuple(model))
-    return cached_arrays("dust_map", key, lambda: {"a_v": make_map(seed, model)})["a_v"]
+    return cached_arrays("dust_map", key, lambda: {"a_v": make_map(seed, model)}, label_dust_map(seed))["a_v"]
 
 
 def facts(user_map: DustMap | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Export the table `gaia`: python -m truesky.catalogue.export_gaia --lake LAKE --out FILE.
+"""Export the table `gaia`: python -m truesky.catalogue.export_gaia LAKE --out FILE.
 
 table  CSV or FITS with the column names of Gaia's archive; --release dr3 uses DR3's columns in DR3's order
 ldac   FITS_LDAC for SCAMP (ASTREF_CATALOG FILE), with the column names that SCAMP expects
@@ -25,6 +25,7 @@ from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS
 from truesky.catalogue import parameters
 from truesky.catalogue.exports import ldac
 from truesky.catalogue.stars import gaia
+from truesky.command_line.parser import Parser
 
 RELEASES = {"dr2": EXPORT, "dr3": EXPORT_DR3}
 FORMS = {"table": (".csv", ".fits"), "ldac": (".fits", ".cat", ".ldac")}
@@ -33,13 +34,13 @@ _MAS = np.pi / 180.0 / 3.6e6
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 success, 1 a problem in the lake, 2 wrong arguments."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="export_gaia",
         description=__doc__,
         epilog=f"truesky {__version__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_lake()
     parser.add_argument("--name", help="name of the request to export, if the lake contains several")
     parser.add_argument(
         "--out", required=True, type=Path, help="file to write: .csv or .fits; for ldac .fits, .cat or .ldac"

@@ -1,6 +1,6 @@
 """Export the table `galaxies` in formats that other programs read.
 
-python -m truesky.catalogue.export_galaxies --lake LAKE --out FOLDER --form FORM
+python -m truesky.catalogue.export_galaxies LAKE --out FOLDER --form FORM
 
 fits         one binary table per Nside-32 cell (nested) with all columns, units (TUNIT) and UCDs (TUCD)
 skycatalogs  LSST DESC skyCatalogs 2: galaxies, and stars if the lake contains them, with spectra and LSST fluxes;
@@ -18,19 +18,20 @@ from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import layout, read
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue.exports import skycatalogs
+from truesky.command_line.parser import Parser
 
 FORMS = ("fits", "skycatalogs")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 success, 1 a problem in the lake, 2 wrong arguments."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="export_galaxies",
         description=__doc__,
         epilog=f"truesky {__version__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_lake()
     parser.add_argument(
         "--out", required=True, type=Path, help="folder to write to; it is created if it does not exist"
     )

@@ -1,18 +1,20 @@
 """Store arrays that are expensive to compute in a cache on disc, under a hash of the inputs of the computation.
 
 Arrays are memory-mapped. Before a process maps a file for the first time, it checks the checksum. If a file is damaged,
-its arrays are computed again, with a warning.
+its arrays are computed again, with a warning. If several processes need the same missing arrays, one of them computes
+them and the others wait. The cache has a largest size (truesky/numerics/cache_entries.py).
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import logging
 import os
-import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -24,14 +26,21 @@ from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.store import blocks, layout, manifest
 from lake_schema.store.provenance import digest, machine
+from truesky.numerics import activity, cache_entries
+from truesky.numerics.cache_entries import CHECKSUM_FILE
 
-# Name of the file with the checksums of a folder's files, and suffix of a file with an array.
-_CHECKSUM_FILE, _ARRAY = "sums.json", ".npy"
+# Suffix of a file with an array.
+_ARRAY = ".npy"
 # Largest number of attempts to write and read an entry (a folder of arrays): another process may remove it as damaged
 # just after this process has replaced it.
 _TRIES = 3
 # Number of hexadecimal digits of the hash in the name of an entry's folder.
 _KEY_LENGTH = 32
+# Longest time for which a process waits for another one that makes the same entry, and time between two looks, s.
+_MAX_WAIT_S, _LOOK_S = 3600.0, 0.05
+# Name of the module that compiles functions. It is composed here so that this file does not contain it and therefore
+# does not belong to the files of `sources_key`.
+_COMPILING = b".".join((b"truesky", b"numerics", b"compiling"))
 
 
 def cache_dir() -> Path:
@@ -63,6 +72,11 @@ def use_temporary_dir() -> Iterator[None]:
                 os.environ["TRUESKY_CACHE"] = previous
 
 
+def _labels_dir() -> Path:
+    """Return the folder with one small file per label: the name of the entry that has the label."""
+    return cache_dir() / "labels"
+
+
 def machine_code_dir() -> Path:
     """Return the folder for machine code of numba, named by a hash of the sources (16 digits of `sources_key`).
 
@@ -76,11 +90,11 @@ def machine_code_dir() -> Path:
 def sources_key(root: Path = Path(__file__).parents[1]) -> str:
     """Return one sha256 (hexadecimal) of the paths and contents of all Python files that affect compiled machine code.
 
-    They are the files below the folder `root` that contain the text "truesky.numerics.compiling". Numba compiles a
-    function again if its own file changes, but not if its constants or the functions that it calls change in another
-    file. The other file must therefore contain this text, for example in a comment.
+    They are the files below the folder `root` that contain the full name of the module `compiling` of this package.
+    Numba compiles a function again if its own file changes, but not if its constants or the functions that it calls
+    change in another file. The other file must therefore contain this name, for example in a comment.
     """
-    compiled = [path for path in sorted(root.rglob("*.py")) if b"truesky.numerics.compiling" in path.read_bytes()]
+    compiled = [path for path in sorted(root.rglob("*.py")) if _COMPILING in path.read_bytes()]
     return content_key(*(part for path in compiled for part in (path.relative_to(root).as_posix(), path.read_bytes())))
 
 
@@ -112,7 +126,7 @@ def _canonical(part: object) -> tuple[str, bytes]:
     raise BadInput(f"content keys support bytes, strings, numbers and arrays, got {type(part).__name__}")
 
 
-def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
+def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]], label: str = "") -> dict[str, Array]:
     """Return arrays from the cache, or compute and store them.
 
     Parameters
@@ -124,6 +138,8 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     make : callable
         Function without arguments that returns the arrays by name. It is called only if the cache has no intact files
         for the key. If several processes compute the arrays at the same time, all use those that were stored first.
+    label : str, optional
+        Hash from `truesky.numerics.cache_labels`, by which `has_label` finds the arrays without their key.
 
     Returns
     -------
@@ -142,12 +158,95 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     folder = cache_dir() / f"{layout.check_name(name)}-{machine_key}"
     arrays: Mapping[str, Array] | None = None
     for _ in range(_TRIES):
+        if (stored := _load(folder)) is not None:
+            break
+        # Find a mistake in the limit before the computation.
+        cache_entries.limit_bytes()
+        with lock(folder):
+            # Another process may have stored the arrays while this one waited.
+            if (stored := _load(folder)) is not None:
+                break
+            with cache_entries.staging_folder(folder) as staged:
+                if arrays is None:
+                    with activity.report(f"{name.replace('_', ' ')} (computed once, then in the cache)"):
+                        arrays = make()
+                _store(arrays, staged)
+                publish(staged, folder)
+    else:
         stored = _load(folder)
-        if stored is not None:
-            return stored
-        arrays = make() if arrays is None else arrays
-        _publish(arrays, folder)
-    raise BadInput(f"cache {folder}: files that were just written cannot be read")
+    if stored is None:
+        raise BadInput(f"cache {folder}: files that were just written cannot be read")
+    if label:
+        _store_label(label, folder.name)
+    return stored
+
+
+def has_label(label: str) -> bool:
+    """Return True if the cache contains arrays that `cached_arrays` has computed or used with this label."""
+    try:
+        return (cache_dir() / (_labels_dir() / label).read_text()).is_dir()
+    except FileNotFoundError:
+        return False
+
+
+def _store_label(label: str, entry: str) -> None:
+    """Write the name of an entry (a folder of arrays) to the file of a label, unless it contains this name."""
+    file = _labels_dir() / label
+    # The cache of another user may be read-only. The label is then missing, which only affects forecasts.
+    with contextlib.suppress(OSError):
+        if not file.exists() or file.read_text() != entry:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=file.parent, prefix=".making-", delete=False) as stream:
+                stream.write(entry)
+            Path(stream.name).replace(file)
+
+
+@contextlib.contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Let only one process or thread at a time make the entry `folder` of the cache; the others wait.
+
+    If a process is killed, the next one continues at once. After an hour, and on file systems without locks, the `with`
+    block is entered without the lock; the first process that publishes the entry then wins.
+    """
+    path = folder.with_name(f".lock-{folder.name}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = _acquire(path)
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            # Remove the file before the lock is released. A process that waits for this lock then notices that its file
+            # is no longer there, and makes a new one.
+            with contextlib.suppress(OSError):
+                path.unlink()
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+            os.close(descriptor)
+
+
+def _acquire(path: Path) -> int | None:
+    """Return the descriptor of the locked file, or None if it cannot be locked."""
+    deadline = time.monotonic() + _MAX_WAIT_S
+    while True:
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError:
+            return None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        except FileNotFoundError:
+            # The process that had the lock has just removed the file.
+            pass
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                os.close(descriptor)
+                return None
+            time.sleep(_LOOK_S)
+        except OSError:
+            os.close(descriptor)
+            return None
+        os.close(descriptor)
 
 
 def _load(folder: Path) -> dict[str, Array] | None:
@@ -160,7 +259,7 @@ def _load(folder: Path) -> dict[str, Array] | None:
     try:
         return {name.removesuffix(_ARRAY): _map(folder / name) for name in checksums}
     except (ValueError, EOFError, FileNotFoundError) as error:
-        # Treat a file that vanished like a damaged one: another process may have removed the folder in the meantime.
+        # Another process may have removed the folder in the meantime.
         discard(folder, str(error))
         return None
 
@@ -171,7 +270,7 @@ def store_checksums(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         manifest.sync(folder / name)
         checksums[name] = blocks.crc32(folder / name)
-    manifest.write_json(folder / _CHECKSUM_FILE, {"sums": checksums, "digest": digest(checksums)})
+    manifest.write_json(folder / CHECKSUM_FILE, {"sums": checksums, "digest": digest(checksums)})
     for path in {(folder / name).parent for name in checksums}:
         manifest.sync(path)
 
@@ -186,12 +285,14 @@ def stored_checksums(folder: Path) -> dict[str, int] | None:
         # Test for the folder before reading the list. Another process may publish the folder in between, and the code
         # below would remove a folder whose list was missing.
         return None
+    # Record the use before the files are opened, so that no other process removes them in between.
+    cache_entries.record_use(folder.parent, folder)
     try:
-        stored = json.loads((folder / _CHECKSUM_FILE).read_bytes())
+        stored = json.loads((folder / CHECKSUM_FILE).read_bytes())
         checksums: dict[str, int] = stored["sums"]
         if digest(checksums) == stored["digest"]:
             return checksums
-        reason = f"{_CHECKSUM_FILE} is damaged"
+        reason = f"{CHECKSUM_FILE} is damaged"
     except (ValueError, LookupError, TypeError, FileNotFoundError, RecursionError) as error:
         reason = str(error)
     discard(folder, reason)
@@ -216,19 +317,12 @@ def _crc32(path: Path, *file_state: int) -> int:
 
 
 def discard(folder: Path, reason: str) -> None:
-    """Remove a damaged folder of the cache, and log a warning with the reason."""
-    logging.getLogger(__name__).warning("cache %s: %s: computed again", folder, " ".join(reason.split()))
-    _remove(folder)
-
-
-def _remove(folder: Path) -> None:
+    """Remove a damaged folder of the cache, and log a warning with the reason, unless it does not exist any more."""
     if not folder.exists():
+        # Another process has removed it, because it was damaged or the cache was too large.
         return
-    # Rename the folder before its files are removed, so that no other process finds a folder with some files missing.
-    trash = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
-    with contextlib.suppress(OSError):
-        folder.rename(trash / folder.name)
-    shutil.rmtree(trash, ignore_errors=True)
+    logging.getLogger(__name__).warning("cache %s: %s: computed again", folder, " ".join(reason.split()))
+    cache_entries.remove(folder, folder.parent)
 
 
 def _map(file: Path) -> Array:
@@ -237,25 +331,25 @@ def _map(file: Path) -> Array:
     return np.asarray(mapped)
 
 
-def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
-    """Write the arrays to a temporary folder, and rename it to `folder` when it is complete.
-
-    If another process has created `folder` in the meantime, discard the temporary one.
-    """
+def _store(arrays: Mapping[str, Array], staged: Path) -> None:
     if not arrays:
-        raise BadInput(f"cache {folder.name}: the computation returned no arrays")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
+        raise BadInput(f"cache {staged.name}: the computation returned no arrays")
+    for stem, array in arrays.items():
+        np.save(staged / f"{layout.check_name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
+    store_checksums(staged, [f"{stem}{_ARRAY}" for stem in arrays])
+
+
+def publish(staged: Path, folder: Path) -> None:
+    """Rename the temporary folder of a complete entry to `folder`, and remove old entries if the cache is too large.
+
+    If another process has created `folder` in the meantime, the temporary folder is left.
+    """
+    staged.chmod(0o755)
     try:
-        for stem, array in arrays.items():
-            np.save(staged / f"{layout.check_name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
-        store_checksums(staged, [f"{stem}{_ARRAY}" for stem in arrays])
-        staged.chmod(0o755)
-        try:
-            staged.rename(folder)
-            manifest.sync(folder.parent)
-        except OSError:
-            if not folder.is_dir():
-                raise
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
+        staged.rename(folder)
+        manifest.sync(folder.parent)
+    except OSError:
+        if not folder.is_dir():
+            raise
+    cache_entries.record_use(folder.parent, folder)
+    cache_entries.enforce_limit(folder.parent, folder)

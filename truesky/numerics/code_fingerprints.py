@@ -7,7 +7,7 @@ does not change with docstrings, comments and blank lines.
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,8 +19,9 @@ _ENDINGS = (".csv", ".toml")
 # Packages and modules that check, store, transport or name arrays but do not compute them. Their code is not part of a
 # hash.
 _IRRELEVANT = (
-    "truesky.numerics.cache", "truesky.numerics.code_fingerprints", "truesky.request", "lake_schema.arrays",
-    "lake_schema.columns", "lake_schema.errors", "lake_schema.mission", "lake_schema.store", "lake_schema.tables",
+    "truesky.numerics.cache", "truesky.numerics.cache_entries", "truesky.numerics.cache_labels",
+    "truesky.numerics.code_fingerprints", "truesky.request", "lake_schema.arrays", "lake_schema.columns",
+    "lake_schema.errors", "lake_schema.mission", "lake_schema.store", "lake_schema.tables",
 )  # fmt: skip
 
 # Modules in the packages of `_IRRELEVANT` that do affect the numbers in arrays.
@@ -95,9 +96,8 @@ def _data() -> dict[str, Path]:
     return {file.name: file for file in (_ROOT / "truesky").rglob("*") if file.suffix in _ENDINGS}
 
 
-@lru_cache
 def _code(source: bytes) -> str:
-    return code_text(source.decode())
+    return _analyse(source)[2]
 
 
 @lru_cache
@@ -106,15 +106,25 @@ def _scan(module: str) -> tuple[tuple[str, ...], tuple[Path, ...]]:
 
     A table is a .csv or .toml file whose name is a string in the code.
     """
-    tree = ast.parse(_source(module))
-    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    imports, texts, _ = _analyse(_source(module))
     names = {module.rpartition(".")[2] + text if text in _ENDINGS else text for text in texts}
-    files = tuple(_data()[name] for name in names if isinstance(name, str) and name in _data())
-    return tuple(_imports(tree)), files
+    return imports, tuple(_data()[name] for name in names if name in _data())
 
 
-def _imports(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+@lru_cache(maxsize=1024)
+def _analyse(source: bytes) -> tuple[tuple[str, ...], frozenset[str], str]:
+    """Return the project modules that a source imports, the strings in it, and its code without comments.
+
+    They are found together, because parsing a source takes most of the time.
+    """
+    tree = ast.parse(source)
+    nodes = list(ast.walk(tree))
+    texts = frozenset(node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    return tuple(_imports(nodes)), texts, code_text(source.decode(), tree)
+
+
+def _imports(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
             # `from package import name` imports the module `name`, or an object of the package's __init__.py.
             names = [f"{node.module}.{alias.name}" for alias in node.names]

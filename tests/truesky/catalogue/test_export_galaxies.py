@@ -11,7 +11,7 @@ from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue import export_galaxies
-from truesky.catalogue.external import mapping
+from truesky.catalogue.external import mapping, reading
 
 CELL = 8989
 
@@ -59,7 +59,7 @@ def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
         f"galaxy_flux_{pixel}.parquet",
         "skyCatalog.yaml",
     ]
-    (piece,) = mapping.read(written[:1], mapping.galaxy_columns("skycatalogs", {}))
+    (piece,) = reading.read(written[:1], mapping.galaxy_columns("skycatalogs", {}))
     rows = read.version(lake, "galaxies").rows()
     for name in ("gamma1", "gamma2", "kappa", "a_v", "z_true", "disk_axis_ratio", "bulge_half_light_radius"):
         assert piece.values[name] == pytest.approx(rows[name].to_numpy(), rel=1e-5), name

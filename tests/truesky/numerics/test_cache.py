@@ -2,6 +2,9 @@
 
 import os
 import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,11 @@ from truesky.numerics import cache
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
+
+
+def stored_names():
+    """The names in the cache's folder, but for that with the names of the entries in use."""
+    return sorted(name for name in os.listdir(cache.cache_dir()) if name != ".in_use")
 
 
 def test_folder_is_named_by_the_environment(monkeypatch, tmp_path):
@@ -40,6 +48,7 @@ def test_old_entries_alone_are_removed_between_runs(tmp_path):
         os.utime(path, (0, 0))
     subprocess.run([root / ".ci" / "trim_cache", folder], check=True)
     left = {path.relative_to(folder).as_posix() for path in (*folder.iterdir(), *(folder / "numba").iterdir())}
+    left.discard(".in_use")
     assert left == {new.name, "numba", "documents", "numba/other", "numba/0123456789abcdef"}
 
 
@@ -101,24 +110,75 @@ def test_a_failed_make_leaves_nothing():
         cache.cached_arrays("thing", "0" * 64, lambda: {"a": np.ones(2), "b": np.array([object()])})
     with pytest.raises(BadInput, match="returned no arrays"):
         cache.cached_arrays("thing", "0" * 64, dict)
-    assert os.listdir(cache.cache_dir()) == []
+    assert stored_names() == []
 
 
-def test_the_loser_of_a_race_uses_the_winners_arrays():
+def test_the_loser_of_a_race_uses_the_winners_arrays(monkeypatch):
+    """Processes that do not wait for each other, as on file systems without locks, use what was stored first."""
     key = "1" * 64
+    monkeypatch.setattr(cache, "_MAX_WAIT_S", 0.0)
 
     def slow():
         cache.cached_arrays("thing", key, lambda: {"a": np.full(3, 1.0)})
         return {"a": np.full(3, 2.0)}
 
     assert cache.cached_arrays("thing", key, slow)["a"].tolist() == [1.0, 1.0, 1.0]
-    assert len(os.listdir(cache.cache_dir())) == 1
+    assert len(stored_names()) == 1
+
+
+def test_others_wait_for_the_one_that_computes():
+    calls, results = [], []
+
+    def make():
+        calls.append(1)
+        time.sleep(0.3)
+        assert any(name.startswith(".making-thing-") for name in stored_names())
+        return {"a": np.ones(3)}
+
+    def load():
+        results.append(cache.cached_arrays("thing", "9" * 64, make)["a"].tolist())
+
+    threads = [threading.Thread(target=load) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(calls), results) == (1, 3 * [[1.0, 1.0, 1.0]])
+    assert len(stored_names()) == 1
+
+
+MAKER = """
+import sys
+from truesky.numerics import cache
+cache.cached_arrays("thing", "a" * 64, lambda: print("making", flush=True) or sys.stdin.read())
+"""
+
+
+def test_a_killed_process_does_not_hold_the_others_up():
+    root = Path(__file__).resolve().parents[3]
+    with subprocess.Popen([sys.executable, "-c", MAKER], stdin=-1, stdout=-1, cwd=root, env={**os.environ}) as maker:
+        assert maker.stdout.readline() == b"making\n"
+        maker.kill()
+    start = time.perf_counter()
+    assert cache.cached_arrays("thing", "a" * 64, lambda: {"a": np.ones(1)})["a"] == 1.0
+    assert time.perf_counter() - start < 10.0
+    # The rest of the killed process remains for a day.
+    assert [name[:13] for name in stored_names()] == [".making-thing", f"thing-{stored_names()[1][6:13]}"]
+
+
+def test_entries_are_made_without_locks_where_there_are_none(monkeypatch):
+    def refuse(descriptor, operation):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(cache.fcntl, "flock", refuse)
+    assert cache.cached_arrays("thing", "b" * 64, lambda: {"a": np.ones(1)})["a"] == 1.0
+    assert list((cache.cache_dir() / ".in_use").iterdir()) == []
 
 
 def test_an_array_cut_short_is_made_again():
     key = "2" * 64
     cache.cached_arrays("thing", key, lambda: {"a": np.arange(1000.0)})
-    (file,) = cache.cache_dir().glob("*/a.npy")
+    (file,) = cache.cache_dir().glob("t*/a.npy")
     file.write_bytes(file.read_bytes()[:200])
     assert cache.cached_arrays("thing", key, lambda: {"a": np.zeros(3)})["a"].tolist() == [0.0] * 3
 
@@ -134,7 +194,7 @@ def test_files_with_a_changed_bit_are_computed_again_with_a_warning(caplog, monk
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
     key, files = "4" * 64, 0
     made_again(key, 1.0)
-    for path in sorted(cache.cache_dir().glob("*/*")):
+    for path in sorted(cache.cache_dir().glob("t*/*")):
         whole = path.read_bytes()
         for bit in range(0, 8 * len(whole), step):
             data = bytearray(whole)
@@ -152,7 +212,7 @@ def test_files_with_a_changed_bit_are_computed_again_with_a_warning(caplog, monk
                 # White space of the list.
                 assert set(found["a"].tolist()) == set(found["b"].tolist()) == {1.0}
             made = cache.cache_dir() / path.parent.name
-            assert sorted(os.listdir(cache.cache_dir())) == [made.name]
+            assert stored_names() == [made.name]
             if found["a"][0] == 2.0:
                 for file in made.iterdir():
                     file.unlink()
@@ -167,7 +227,7 @@ def test_files_with_a_changed_bit_are_computed_again_with_a_warning(caplog, monk
 def test_zeroed_blocks_are_made_again():
     key = "5" * 64
     cache.cached_arrays("thing", key, lambda: {"a": np.arange(1e5)})
-    (file,) = cache.cache_dir().glob("*/a.npy")
+    (file,) = cache.cache_dir().glob("t*/a.npy")
     with file.open("r+b") as stream:
         stream.seek(4096 * 20)
         stream.write(bytes(4096))
@@ -183,7 +243,7 @@ def test_a_process_compares_a_file_once(monkeypatch):
     for _ in range(3):
         made_again(key, 2.0)
     assert seen == []
-    for path in cache.cache_dir().glob("*/*.npy"):
+    for path in cache.cache_dir().glob("t*/*.npy"):
         os.utime(path)
     for _ in range(3):
         assert made_again(key, 2.0)["a"][0] == 1.0
@@ -206,7 +266,7 @@ def test_what_is_stored_is_synced_before_it_has_its_name(monkeypatch):
 def test_arrays_without_a_seal_are_made_again(caplog):
     key = "8" * 64
     made_again(key, 0.0)
-    (seal,) = cache.cache_dir().glob("*/sums.json")
+    (seal,) = cache.cache_dir().glob("t*/sums.json")
     seal.unlink()
     assert made_again(key, 1.0)["a"][0] == 1.0
     assert "sums.json" in caplog.text

@@ -5,12 +5,13 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 import truesky
-from truesky.numerics import cache, compiling
+from truesky.numerics import cache, compiling, machine_code
 
 # A kernel whose inner function sums in any order.
 SCRIPT = """
@@ -26,7 +27,7 @@ print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
 def test_machine_code_is_kept_in_the_cache(tmp_path):
     """Next to the sources its key would be the function's file only, not the files that are compiled into it."""
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    code = "from truesky.numerics import cache, compiling; import numba; "
+    code = "from truesky.numerics import cache, machine_code; import numba; "
     code += "print(cache.machine_code_dir(), numba.config.CACHE_DIR)"
     command = [sys.executable, "-c", code]
     environment["TRUESKY_CACHE"] = str(tmp_path)
@@ -51,13 +52,45 @@ def test_compiled_here_or_found_in_the_cache(tmp_path):
 def test_code_of_the_package_is_named_by_its_module():
     """Another clone has the same names; a user's own functions go where numba puts them."""
     sources = Path(truesky.__file__).parent
-    locate = compiling.PackageCacheLocator.from_function
+    locate = machine_code.PackageCacheLocator.from_function
     locator = locate(_plus_one, str(sources / "render" / "drawing" / "stamps.py"))
     assert locator.get_cache_path() == str(cache.machine_code_dir() / "render.drawing")
     assert locate(_plus_one, __file__) is None
     compiled = compiling.exact_jit(_plus_one)
     assert compiled(1) == 2
-    assert "truesky" not in compiling.numba.config.CACHE_LOCATOR_CLASSES
+    assert "truesky" not in machine_code.numba.config.CACHE_LOCATOR_CLASSES
+
+
+def test_numba_is_imported_by_the_first_call(tmp_path):
+    """Compiled functions call each other with the results of Python, and keep their names."""
+    (tmp_path / "functions.py").write_text("""
+import sys
+from truesky.numerics import compiling, compiled_products
+
+@compiling.exact_jit
+def twice(x):
+    return 2 * x
+
+@compiling.jit
+def twice_and_one(x):
+    return twice(x) + 1
+
+print("numba" in sys.modules, compiled_products.multiply_rows.__name__, compiled_products.multiply_rows.__module__)
+print(twice_and_one(20), twice_and_one(x=0.5), "numba" in sys.modules)
+""")
+    command = [sys.executable, str(tmp_path / "functions.py")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(truesky.__file__).parents[1])}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [
+        "False", "multiply_rows", "truesky.numerics.compiled_products", "41", "2.0", "True"
+    ]  # fmt: skip
+
+
+def test_several_threads_share_one_compiled_function():
+    function = compiling.exact_jit(_plus_one)
+    with ThreadPoolExecutor(8) as pool:
+        loaded = list(pool.map(lambda _: function.load(), range(64)))
+    assert len({id(one) for one in loaded}) == 1
 
 
 def _plus_one(number):

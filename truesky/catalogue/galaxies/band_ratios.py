@@ -26,6 +26,7 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.spectra import extinction
 from truesky.numerics import matrices
 from truesky.numerics.cache import cached_arrays, content_key
+from truesky.numerics.cache_labels import label_band_ratios
 from truesky.numerics.code_fingerprints import code_key
 
 # Passband 0.1r: SDSS r blueshifted to z = 0.1.
@@ -188,7 +189,7 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
         table = build(library, band, z_max, ebv_max)
         return {"ebv": table.ebv, "values": table.values}
 
-    cached = cached_arrays(f"band_ratios_{band}", key, make_arrays)
+    cached = cached_arrays(f"band_ratios_{band}", key, make_arrays, label_band_ratios(band))
     return BandRatios(band, cached["ebv"], cached["values"])
 
 

@@ -25,7 +25,8 @@ from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue import cells, dust_map
 from truesky.catalogue.external.ingest import Split
-from truesky.catalogue.external.mapping import Columns
+from truesky.catalogue.external.mapping import GALAXY_BOUNDS, Columns
+from truesky.catalogue.external.reading import MIN_REDSHIFT
 from truesky.catalogue.galaxies import band_ratios, emission_lines, lensing, morphology, sequences, stellar_mass
 from truesky.catalogue.galaxies.band_ratios import BandRatios, Sed
 from truesky.catalogue.galaxies.emission_lines import LineModel
@@ -58,8 +59,6 @@ class IngestModel:
         Uniform shear that replaces the catalogue's lensing; None to keep the lensing of the catalogue.
     rotation : float
         Angle that is added to the position angle of each galaxy before lensing, deg.
-    templates : int
-        Number of template spectra in the library.
     colours, colour_limits : Colours, ColourLimits
         Distributions of the colours, and the range of colours that the templates can have.
     reference : BandRatios
@@ -81,7 +80,6 @@ class IngestModel:
     columns: Columns
     lens: Shear | None
     rotation: float
-    templates: int
     colours: Colours
     colour_limits: ColourLimits
     reference: BandRatios
@@ -116,10 +114,7 @@ def model(
     IngestModel
         The model.
     """
-    # Round the ranges up to steps of 0.1, so that catalogues with similar ranges use the same tables in the disc cache.
-    dustiest, z_max = (
-        float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, split_catalogue.ebv_max), split_catalogue.z_max + 0.1)
-    )
+    dustiest = _round_up(max(_LEAST_EBV, split_catalogue.ebv_max))
     library = templates.galaxy_library()
     colours, colour = sequences.model(), band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return IngestModel(
@@ -127,17 +122,27 @@ def model(
         columns,
         lens,
         rotation,
-        library.flux.shape[0],
         colours,
         sequences.colour_limits(colour, colours.dust),
-        band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
+        band_table(band_ratios.REFERENCE_BAND, split_catalogue),
         colour,
-        band_ratios.load(library, columns.band, z_max, dustiest) if "mag" in columns.fields else None,
+        band_table(columns.band, split_catalogue) if "mag" in columns.fields else None,
         morphology.shapes(),
         stellar_mass.mass_to_light(),
         stellar_mass.star_formation(),
         emission_lines.model(),
     )
+
+
+def band_table(band: str, split_catalogue: Split) -> BandRatios:
+    """Return the brightness of each template in a passband, for the redshifts and E(B-V) of a stored catalogue."""
+    z_max, dustiest = _round_up(split_catalogue.z_max + 0.1), _round_up(max(_LEAST_EBV, split_catalogue.ebv_max))
+    return band_ratios.load(templates.galaxy_library(), band, z_max, dustiest)
+
+
+def _round_up(value: float) -> float:
+    """Round up to a step of 0.1, so that catalogues with similar ranges use the same tables in the disc cache."""
+    return float(np.ceil(10.0 * value) / 10.0)
 
 
 def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Float32) -> pa.Table:
@@ -163,13 +168,13 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
     Raises
     ------
     BadInput
-        If a galaxy has a template index that is not in the library.
+        If the magnitude of a galaxy and its spectrum give an impossible absolute magnitude.
     """
     if not catalogue or not catalogue["index"].size:
         return GALAXIES.empty()
     n, rng = catalogue["index"].size, _streams(universe.seed, cell)
     z = _first_column(catalogue, "z_true", "z_obs")
-    z = np.maximum(z, 1e-4)
+    z = np.maximum(z, MIN_REDSHIFT)
     kind = catalogue.get("kind", np.zeros(n, np.int64))
     lens = _lensing(catalogue, n)
     if universe.columns.lines_magnified:
@@ -192,6 +197,7 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
         catalogue, "log_sfr", _star_formation(universe.star_formation, z, log_mass, colour, rng)
     )
     line_fluxes = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
+    _refuse_impossible_magnitudes(catalogue, z, m_r, catalogue.get("mag_r01", reference_mag))
     columns: dict[str, Any] = {
         **_identity(catalogue, cell, kind),
         **lensed,
@@ -221,6 +227,24 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
         columns["stamp"] = np.ma.masked_less(catalogue["stamp"], 0)
     rows = GALAXIES.build({name: _mask_missing(name, values) for name, values in columns.items()})
     return cells.sort_rows(lensing.rotate_position_angles(rows, universe.rotation))
+
+
+def _refuse_impossible_magnitudes(catalogue: CatalogueColumns, z: Float, m_r: Float, mag_r01: Float) -> None:
+    """Raise BadInput if a galaxy has an absolute or apparent magnitude for which no flux can be computed.
+
+    It can follow from the catalogue's magnitude, redshift and the spectrum that is drawn for the galaxy.
+    """
+    for name, values in (("abs_mag_r01", m_r), ("mag_r01", mag_r01)):
+        lo, hi = GALAXY_BOUNDS[name]
+        is_wrong = ~((values >= lo) & (values <= hi))
+        if is_wrong.any():
+            row = int(is_wrong.argmax())
+            galaxy = f"galaxy {catalogue['origin_id'][row]}" if "origin_id" in catalogue else "a galaxy"
+            position = f"ra = {catalogue['ra'][row]:.6f}, dec = {catalogue['dec'][row]:.6f}, redshift = {z[row]:g}"
+            raise BadInput(
+                f"ingest.galaxies: {galaxy} at {position}: its magnitude gives {name} = {values[row]:g}, "
+                f"must be in [{lo:g}, {hi:g}]"
+            )
 
 
 def _streams(seed: int, cell: int) -> Any:
@@ -326,7 +350,7 @@ def _light(
         red = colour > np.quantile(colour, 1.0 - float(np.mean(fraction)))
         drawn_colour = sequences.place_on_sequence(universe.colours, guess, z, colour, red)
     if "sed" in catalogue or "sed_1" in catalogue:
-        sed = _spectra(catalogue, universe.templates)
+        sed = _spectra(catalogue)
         if "color_gr_01" not in catalogue:
             realised = band_ratios.colours(universe.colour, sed)
             drawn_colour = sequences.place_on_sequence(universe.colours, guess, z, realised, sed.ebv <= 0.0)
@@ -350,15 +374,10 @@ def _star_formation(law: stellar_mass.StarFormation, z: Float, log_mass: Float, 
     return stellar_mass.log_sfr(law, main, colour.sequence, colour.deviate, rng("star_formation"))
 
 
-def _spectra(catalogue: CatalogueColumns, count: int) -> Sed:
+def _spectra(catalogue: CatalogueColumns) -> Sed:
     if "sed" in catalogue:
-        sed = band_ratios.sed_of_index(catalogue["sed"], catalogue["ext_law"], catalogue["ebv"])
-    else:
-        sed = Sed(*(catalogue[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
-    highest = max(int(sed.template_1.max()), int(sed.template_2.max()))
-    if highest >= count:
-        raise BadInput(f"ingest.galaxies: a galaxy has template {highest}, must be from 0 to {count - 1}")
-    return sed
+        return band_ratios.sed_of_index(catalogue["sed"], catalogue["ext_law"], catalogue["ebv"])
+    return Sed(*(catalogue[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
 
 
 def _shapes(

@@ -9,7 +9,7 @@ not change existing values.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -158,6 +158,8 @@ class SelectedGalaxies:
         return SelectedGalaxies(*rows, self.colour.select(keep), self.sed.select(keep))
 
 
+# A worker makes one partition after another of the same request, so it keeps the model.
+@lru_cache(maxsize=1)
 def model(
     seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> GalaxyModel:
@@ -238,6 +240,13 @@ def halos_and_galaxies(
     Population
         The population. It is complete for galaxies brighter than the magnitude limit, whatever their spectrum.
     """
+    # Only these settings matter, so that the tables `halos` and `galaxies` share the population.
+    settings = {name: getattr(requested, name) for name in ("galaxy_band", "galaxy_limit", "z_max", "box_cells")}
+    return _population(seed, Universe(**settings), light_cone, training)
+
+
+@lru_cache(maxsize=1)
+def _population(seed: int, requested: Universe, light_cone: LightCone | None, training: Training | None) -> Population:
     nodes, brightest = band_ratios.brightest_offset(_selection(requested, training))
 
     def faintest(z: Float) -> Float:

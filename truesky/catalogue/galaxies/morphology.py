@@ -15,7 +15,7 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammainc, gammaincinv, ndtr, ndtri
+import scipy
 
 from lake_schema.arrays import Bool, Float
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
@@ -322,11 +322,13 @@ def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayL
     Graham & Driver 2005, PASA 22, 118
     """
     n = np.asarray(sersic, float)
-    return _enclosed_light(np.asarray(r, float) / np.asarray(half_light, float), n, gammaincinv(2.0 * n, 0.5))
+    return _enclosed_light(
+        np.asarray(r, float) / np.asarray(half_light, float), n, scipy.special.gammaincinv(2.0 * n, 0.5)
+    )
 
 
 def _enclosed_light(x: Float, n: Float, b: Float) -> Float:
-    return np.asarray(gammainc(2.0 * n, b * x ** (1.0 / n)))
+    return np.asarray(scipy.special.gammainc(2.0 * n, b * x ** (1.0 / n)))
 
 
 def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
@@ -349,7 +351,7 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
     # The radius of bulge and disc together is between the two radii, so the result is between 1 and 1 / ratio.
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
     disc_sersic = np.ones(1)
-    b_bulge, b_disc = gammaincinv(2.0 * sersic, 0.5), gammaincinv(2.0 * disc_sersic, 0.5)
+    b_bulge, b_disc = scipy.special.gammaincinv(2.0 * sersic, 0.5), scipy.special.gammaincinv(2.0 * disc_sersic, 0.5)
     for _ in range(_BISECTIONS):
         middle = np.sqrt(low * high)
         inside = fraction * _enclosed_light(1.0 / (ratio * middle), sersic, b_bulge)
@@ -401,8 +403,8 @@ def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
         Axis ratio.
     """
     limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
-    low, high = ndtr(limits)
-    q = bulge.axis_ratio_mean + bulge.axis_ratio_scatter * ndtri(low + (high - low) * rng.random(n))
+    low, high = scipy.special.ndtr(limits)
+    q = bulge.axis_ratio_mean + bulge.axis_ratio_scatter * scipy.special.ndtri(low + (high - low) * rng.random(n))
     return np.asarray(np.clip(q, *bulge.axis_ratio_limits))
 
 

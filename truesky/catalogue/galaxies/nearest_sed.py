@@ -21,7 +21,7 @@ import numpy as np
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from truesky.catalogue import parameters
-from truesky.catalogue.external import mapping
+from truesky.catalogue.external import mapping, reading
 from truesky.catalogue.external.mapping import Columns
 from truesky.catalogue.galaxies import band_ratios
 from truesky.catalogue.galaxies.band_ratios import Sed
@@ -116,7 +116,8 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     last = templates.galaxy_library().flux.shape[0] - 1
     key = content_key(code_key(__name__), columns_json, last, *sha256)
-    return build_training(cached_arrays("training", key, lambda: _read(files, columns, last)), last)
+    limited = mapping.with_last_template(columns, last)
+    return build_training(cached_arrays("training", key, lambda: _read(files, limited)), last)
 
 
 def build_training(values: dict[str, Array], last: int) -> Training:
@@ -169,14 +170,8 @@ def _scale(law: Nearness, colour: Float, m_r: Float, z: Float) -> Float:
     return np.asarray(np.stack([colour, m_r, z], 1) / np.array(law.units))
 
 
-def _read(files: Sequence[Path], columns: Columns, last: int) -> dict[str, Array]:
-    pieces = list(mapping.read(files, columns))
-    for piece in pieces:
-        is_unknown = piece.values["sed"] > last
-        if is_unknown.any():
-            row = int(is_unknown.argmax())
-            where = f"{piece.file}: column {columns.fields['sed'].column} (sed) of row {piece.first + row}"
-            raise BadInput(f"{where} is {piece.values['sed'][row]:g}, the library's last template is {last}")
+def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
+    pieces = list(reading.read(files, columns))
     if not sum(len(piece.values["sed"]) for piece in pieces):
         raise BadInput(f"{files[0]}: the table has no rows")
     return {name: np.concatenate([piece.values[name] for piece in pieces]) for name in _KEYS}

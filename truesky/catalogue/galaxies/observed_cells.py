@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
-from scipy.spatial import cKDTree
+import scipy
 
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Float32, Int
@@ -30,6 +30,7 @@ from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.halos import halos, population
 from truesky.catalogue.halos.population import CellCache
+from truesky.numerics import activity
 
 # HEALPix order (cells 26 arcsec wide) in which distances from the borders of the requested cells are computed. Finer
 # cells would cost more time than they save.
@@ -53,14 +54,14 @@ class _RequestedCells:
     """
 
     cells: Int
-    border: cKDTree
+    border: scipy.spatial.cKDTree
     distances: dict[tuple[int, int], float] = field(default_factory=dict)
 
     @classmethod
     def from_cells(cls, requested: Sequence[int]) -> _RequestedCells:
         cells = np.unique(np.asarray(requested, np.int64))
         borders = [sky.border_cells(GENERATION_ORDER, cell, _BORDER_ORDER) for cell in cells.tolist()]
-        return cls(cells, cKDTree(_directions(np.concatenate([*borders, np.zeros(0, np.int64)]))))
+        return cls(cells, scipy.spatial.cKDTree(_directions(np.concatenate([*borders, np.zeros(0, np.int64)]))))
 
     def contains(self, index: Int) -> Bool:
         """Return True for positions inside the requested cells; positions are nested indices of order-29 cells."""
@@ -147,7 +148,7 @@ def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust
     region = _RequestedCells.from_cells(requested)
     tables = [GALAXIES.empty()]
     done, sky_model = set(region.cells.tolist()), _SkyModel(universe, cells, dust)
-    for cell in region.cells.tolist():
+    for cell in activity.track(region.cells.tolist(), "galaxies, cell"):
         tables.append(_rows_inside(region, galaxies.draw(cell, universe, cells, dust)))
         if isinstance(universe.lens, Planes):
             # Draw the cells next to this one now, because the halos that they need are still in the cache.

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammainc, ndtr, ndtri
+import scipy
 
 from lake_schema.arrays import Bool, Float, Int
 from truesky.catalogue import parameters
@@ -288,7 +288,7 @@ def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Flo
     min_colour = np.where(sequence == RED, max(law.red_least, low), low)
     max_colour = limits.reddest - law.inside[1]
     colour = mean + scatter * truncated_normal((min_colour - mean) / scatter, (max_colour - mean) / scatter, uniform)
-    return Colour(sequence, np.clip(colour, min_colour, max_colour), ndtri(uniform))
+    return Colour(sequence, np.clip(colour, min_colour, max_colour), scipy.special.ndtri(uniform))
 
 
 def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red: Bool) -> Colour:
@@ -350,11 +350,11 @@ def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
     """
     mirrored = low > 0.0
     a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
-    below, above = ndtr(a), ndtr(b)
+    below, above = scipy.special.ndtr(a), scipy.special.ndtr(b)
     u = np.where(mirrored, 1.0 - uniform, uniform)
     # Limit the probability to avoid infinite deviates. If both limits are 30 standard deviations away from 0, the
     # result is about the nearer limit.
-    deviate = ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
+    deviate = scipy.special.ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
     return np.asarray(np.where(mirrored, -deviate, deviate))
 
 
@@ -417,7 +417,7 @@ def _open_uniform(rng: AnyGenerator, n: int) -> Float:
 
 def _gamma_table(shape: float) -> Float:
     """Return the cumulative Gamma distribution with this shape and scale 1 at `_GAMMA_NODES`."""
-    return np.asarray(gammainc(shape, _GAMMA_NODES))
+    return np.asarray(scipy.special.gammainc(shape, _GAMMA_NODES))
 
 
 def _dwarf_factor(law: RedFraction, m_r: Float) -> Float:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy.optimize import brentq
+import scipy
 
 from lake_schema import ids, sky
 from lake_schema.arrays import Array, Float, Float32, Int
@@ -312,7 +312,7 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
     values = across(phi)
     images = []
     for i in np.flatnonzero(values[:-1] * values[1:] < 0.0):
-        root = brentq(across, phi[i], phi[i + 1], xtol=1e-13)
+        root = scipy.optimize.brentq(across, phi[i], phi[i + 1], xtol=1e-13)
         direction = np.array([np.cos(root), np.sin(root)])
         bent = deflection(lens, direction[:1], direction[1:])
         distance = (east + bent[0][0]) * direction[0] + (north + bent[1][0]) * direction[1]

@@ -18,7 +18,7 @@ from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.units import LIGHT_KM_S
-from truesky.catalogue.external import mapping
+from truesky.catalogue.external import reading
 from truesky.catalogue.external.mapping import Columns
 from truesky.catalogue.halos import halos
 from truesky.catalogue.halos.halos import HaloModel, Halos
@@ -125,7 +125,7 @@ def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: in
 
 
 def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
-    pieces = list(mapping.read(files, columns))
+    pieces = list(reading.read(files, columns))
     if not sum(len(piece.values["ra"]) for piece in pieces):
         raise BadInput(f"{files[0]}: the table has no rows")
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
@@ -142,7 +142,7 @@ def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
     return {name: np.asarray(column)[order] for name, column in arrays.items()}
 
 
-def _refuse_duplicates(pieces: Sequence[mapping.Rows], column: str) -> None:
+def _refuse_duplicates(pieces: Sequence[reading.Rows], column: str) -> None:
     identifiers = np.concatenate([piece.values["origin_id"] for piece in pieces])
     order = np.argsort(identifiers, kind="stable")
     duplicates = np.flatnonzero(np.diff(identifiers[order]) == 0)

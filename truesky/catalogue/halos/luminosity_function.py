@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gamma, gammaincc
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
@@ -205,7 +205,7 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
     # Each step of the recurrence from a + 1 to a loses digits at large x: use two steps only if one is not enough.
     second = order < _ONE_STEP
     start = np.where(second, order + 2.0, order + 1.0)
-    above = gamma(start) * gammaincc(start, at)
+    above = scipy.special.gamma(start) * scipy.special.gammaincc(start, at)
     middle = np.where(second, order + 1.0, 1.0)
     above = np.where(second, (above - np.exp(middle * np.log(at) - at)) / middle, above)
     return np.asarray(np.maximum((above - np.exp(order * np.log(at) - at)) / order, 0.0))

@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from itertools import groupby
 
 import numpy as np
@@ -25,7 +26,7 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.catalogue.matter import density_box, lightcone
 from truesky.catalogue.matter.density_box import Box, BoxModel
 from truesky.fluxes import cosmology
-from truesky.numerics import matrices
+from truesky.numerics import activity, matrices
 from truesky.numerics.compiling import exact_jit
 
 # Last redshift of the tables of distance and growth. It does not depend on the most distant sources, so that the
@@ -130,11 +131,20 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
     planes = np.empty((chi.size, len(direction), _PATCH_SIZE), np.float32)
     done = 0
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-        for cut in _group_layers(slabs, np.searchsorted(chi, slabs.middle)):
+
+        @lru_cache(maxsize=1)
+        def density(growth: float, factor: int) -> Float32:
+            # Consecutive groups of layers often have the same density.
+            return average_density(box, growth, factor, pool).ravel()
+
+        groups = list(_group_layers(slabs, np.searchsorted(chi, slabs.middle)))
+        for cut in activity.track(groups, "layer of the lensing matter"):
             while done < chi.size and chi[done] <= slabs.middle[cut.start]:
                 planes[done] = sums[:, 0] - sums[:, 1] / np.float32(chi[done])
                 done += 1
-            _add_group(box, replicas, slabs.select(cut), direction, sums, pool)
+            group = slabs.select(cut)
+            delta = density(float(group.growth[0]), int(group.factor[0]))
+            _add_group(box, replicas, group, delta, direction, sums, pool)
     planes[done:] = sums[:, 0] - sums[:, 1] / chi[done:, None, None].astype(np.float32)
     return planes.reshape(chi.size, -1)
 
@@ -333,14 +343,20 @@ def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
 
 
 def _add_group(
-    box: Box, replicas: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
+    box: Box,
+    replicas: lightcone.Replicas,
+    slabs: Layers,
+    delta: Float32,
+    direction: Float32,
+    sums: Float32,
+    pool: ThreadPoolExecutor,
 ) -> None:
     """Add consecutive layers to the sums from which the convergence follows; `sums` is changed in place.
 
-    The layers must have the same averaged density. `direction` and `sums` have the shapes of `add_layers`.
+    The layers must have the same averaged density `delta`. `direction`, `delta` and `sums` have the shapes of
+    `add_layers`.
     """
     factor = int(slabs.factor[0])
-    delta = average_density(box, float(slabs.growth[0]), factor, pool).ravel()
     shell = (slabs.middle // box.length).astype(np.int64)
     scale = (replicas.sign[shell] * (slabs.middle / box.length)[:, None]).astype(np.float32)
     shift = (replicas.shift[shell] / box.length).astype(np.float32)

@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import permutations, product
 
-import healpy as hp
 import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Bool, Float, Int
+from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology
 from truesky.randomness.rng import stream

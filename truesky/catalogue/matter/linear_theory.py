@@ -18,6 +18,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from truesky.fluxes import cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
+from truesky.numerics.cache_labels import label_halo_tables
 from truesky.numerics.code_fingerprints import code_key
 
 # Halo masses are M_200m, as colossus calls them.
@@ -44,7 +45,7 @@ def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     """
     numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
     key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
-    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z))
+    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z), label_halo_tables())
 
 
 def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
