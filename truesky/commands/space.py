@@ -18,8 +18,10 @@ from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import layout, read, reuse
 from lake_schema.store.plan import Plan, Task
 from lake_schema.store.provenance import code_version
+from lake_schema.texts.amounts import format_size
 from truesky.fluxes import compute_fluxes
-from truesky.render.forecasting import catalogue_forecast
+from truesky.render.forecasting.image_costs import ImageCosts
+from truesky.render.forecasting.request_cost import job_costs
 from truesky.render.planning import preconditions
 from truesky.render.planning import tasks as planned
 from truesky.request import universe
@@ -54,16 +56,16 @@ def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) 
     BadInput
         If the free space is too small. The message gives the forecast of each job.
     """
-    forecast_bytes = {line.job: line.gb * _GB for line in catalogue_forecast.for_request(request)}
+    images = ImageCosts(request)
     if plan is not None:
-        requested_tasks = planned.select_requested(preconditions.require_renderable_tasks(*plan), request)
-        forecast_bytes["render_exposures"] = sum(row["bytes"] for row in requested_tasks)
+        images.add(*plan)
+    forecast_bytes = {job.job: job.bytes for job in job_costs(request, images) if job.bytes}
     total = max(sum(forecast_bytes.values()) - _reusable_bytes(root, request, plan), 0.0)
     free = shutil.disk_usage(next(path for path in (root, *root.parents) if path.exists())).free
     if total > free:
-        parts = ", ".join(f"{name} {size / _GB:.2f}" for name, size in forecast_bytes.items())
+        parts = ", ".join(f"{name} {format_size(size)}" for name, size in forecast_bytes.items())
         raise BadInput(
-            f"lake {root}: {free / _GB:.2f} GB are free, the forecast is {total / _GB:.2f} GB ({parts}): free some "
+            f"lake {root}: {format_size(free)} are free, the forecast is {format_size(total)} ({parts}): free some "
             "space, or render fewer detectors (--detectors, --limit)"
         )
     return total / _GB, free / _GB

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import pyarrow as pa
 from lake_schema import sky
 from lake_schema.errors import LakeError
 from lake_schema.store import read
+from lake_schema.texts import text_tables
 from truesky.render.camera import footprints
 from truesky.render.planning import exposure_chunks
 from truesky.render.products import run_log
@@ -206,18 +207,45 @@ def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
     return metrics
 
 
-def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """Yield the comparison as lines of a text table, beginning with a title; "-" means 0 in the last two columns."""
-    yield (
-        f"{'channel':8} {'camera':9} {'image type':17} {'detectors':>9} {'of':>6} {'measured':>8} {'CPU s':>9} "
-        f"{'forecast':>9} {'peak GB':>8} {'GB':>8} {'forecast':>8} {'deg2':>7} {'core-h/deg2':>11}"
-    )
-    for line in lines:
-        area = f"{line.deg2:7.3f}" if line.deg2 else f"{'-':>7}"
-        hours = f"{line.core_hours_deg2:11.3f}" if line.core_hours_deg2 else f"{'-':>11}"
-        yield (
-            f"{line.channel:8} {line.camera:9} {line.image_type:17} {line.rendered:9,} {line.planned:6,} "
-            f"{line.measured:8,} {line.cpu_s:9,.1f} {line.forecast_s:9,.1f} {line.peak_gb:8.2f} {line.gb:8.3f} "
-            f"{line.forecast_gb:8.3f} "
-            f"{area} {hours}"
-        )
+_HEADINGS = (
+    "channel", "camera", "image type", "images", "planned", "CPU time, s", "forecast, s", "peak memory, GB", "size, GB",
+    "forecast, GB", "area, deg2", "CPU h/deg2",
+)  # fmt: skip
+
+
+def format_table(lines: Sequence[Line]) -> list[str]:
+    """Return the comparison as lines of a text table, beginning with the headings.
+
+    Lines without a rendered image are left out, and so are sums of a single line, columns without any value, and the
+    column of planned images if all are rendered. "-" means that a value is unknown or does not apply.
+    """
+    kinds = [line for line in lines if line.camera != _ALL and line.rendered]
+    channels = Counter(line.channel for line in kinds)
+    sums = [
+        line
+        for line in lines
+        if line.camera == _ALL and (channels[line.channel] > 1 or (line.channel == _ALL and len(kinds) > 1))
+    ]
+    rows = [_cells(line) for line in (*kinds, *sums)]
+    columns = [
+        i
+        for i, heading in enumerate(_HEADINGS)
+        if any(row[i] not in ("", "-") for row in rows)
+        and (heading != "planned" or any(line.planned != line.rendered for line in kinds))
+    ]
+    headings = [_HEADINGS[i] for i in columns]
+    return text_tables.format_table(headings, [[row[i] for i in columns] for row in rows], _HEADINGS[3:])
+
+
+def _cells(line: Line) -> tuple[str, ...]:
+    def number(value: float, digits: int) -> str:
+        # Print small values with two significant digits, so that none appears as 0.
+        if not value:
+            return "-"
+        return f"{value:,.{digits}f}" if value >= 10.0**-digits else f"{value:.2g}"
+
+    return (
+        line.channel, line.camera, line.image_type, f"{line.rendered:,}", f"{line.planned:,}", number(line.cpu_s, 1),
+        number(line.forecast_s, 1), number(line.peak_gb, 2), number(line.gb, 3), number(line.forecast_gb, 3),
+        number(line.deg2, 3), number(line.core_hours_deg2, 2),
+    )  # fmt: skip

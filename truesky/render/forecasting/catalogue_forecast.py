@@ -6,25 +6,23 @@ The catalogues are dark-matter halos, galaxies and stars, and the tables of thei
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lake_schema import sky
 from lake_schema.errors import LakeError
-from lake_schema.external import rows as external_rows
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.render.planning.mission import mission_of
 from truesky.render.planning.source_counts import Densities
 from truesky.request.area import Area
-from truesky.request.files import SOURCES_KIND, UserSources
+from truesky.request.files import UserSources
 from truesky.request.schema import MissionChoice, Request, Universe
 
 # HEALPix order of the largest cells that a file of the table `stars` covers (truesky/catalogue/build_stars.py).
@@ -55,12 +53,15 @@ class Line:
         CPU seconds of the reference machine, multiplied by the factor that was given for this machine.
     gb : float
         Size of the files that it writes, in GB.
+    wall_s : float
+        Wall seconds, if `WORKERS` processes run the tasks.
     """
 
     job: str
     rows: float
     seconds: float
     gb: float
+    wall_s: float
 
 
 def for_request(request: Request, factor: float = 1.0) -> list[Line]:
@@ -99,9 +100,13 @@ def for_lake(lake: Folder, factor: float = 1.0) -> list[Line]:
         versions = {name: version for name in _TABLES if (version := _find_version(lake, name, request))}
         new = {(name, version.key) for name, version in versions.items()} - counted
         for line in _forecast_versions(versions, factor, {name for name, _ in new}):
-            total = line_of_job.get(line.job, Line(line.job, 0.0, 0.0, 0.0))
+            total = line_of_job.get(line.job, Line(line.job, 0.0, 0.0, 0.0, 0.0))
             line_of_job[line.job] = Line(
-                line.job, total.rows + line.rows, total.seconds + line.seconds, total.gb + line.gb
+                line.job,
+                total.rows + line.rows,
+                total.seconds + line.seconds,
+                total.gb + line.gb,
+                total.wall_s + line.wall_s,
             )
         counted |= new
     return [line_of_job[job] for job in _TABLES_OF_JOB if job in line_of_job]
@@ -121,13 +126,6 @@ def _forecast_versions(versions: Mapping[str, read.Version], factor: float, new_
         bands |= {name: len(facts["bands"])} if "bands" in facts else {}
     partition_counts = {name: len(version.partitions) for name, version in versions.items()}
     return _make_lines(rows, partition_counts, bands, factor, new_tables)
-
-
-def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """Yield the forecast of rows, core-hours and GB as lines of a text table, one per job, beginning with a title."""
-    yield f"{'job':16} {'rows':>15} {'core-hours':>11} {'GB':>10}"
-    for line in lines:
-        yield f"{line.job:16} {line.rows:15,.0f} {line.seconds / 3600.0:11,.3f} {line.gb:10,.3f}"
 
 
 def _file_count(cells: Sequence[int], order: int) -> int:
@@ -161,19 +159,13 @@ def _given_rows(sources: UserSources, area: Area) -> dict[str, float]:
     If the sources are placed on a grid, it is the number of grid points in the circle around the area, divided in
     proportion to the rows of the tables.
     """
-    files = {"galaxies": sources.galaxies, "stars": sources.stars}
-    rows = {name: float(_count_rows(file)) for name, file in files.items() if file is not None}
+    rows = {name: float(count) for name, count in sources.count_rows().items()}
     if sources.spacing:
         radius = np.radians(area.bounding_circle()[2])
         places = 4.0 * np.pi * np.sin(0.5 * radius) ** 2 / np.radians(sources.spacing / 3600.0) ** 2
         total = sum(rows.values())
         rows = {name: max(1.0, places * number / total) for name, number in rows.items()}
     return rows
-
-
-def _count_rows(file: Path) -> int:
-    title = external_rows.csv_column_names(file, SOURCES_KIND)[0]
-    return sum(len(batch.columns[title]) for batch in external_rows.read_batches(file, [title], kind=SOURCES_KIND))
 
 
 def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
@@ -212,7 +204,7 @@ def _make_lines(
     """
     lines = []
     for job, tables in _TABLES_OF_JOB.items():
-        seconds = size = row_count = 0.0
+        serial = parallel = wall = size = row_count = 0.0
         for table in tables:
             catalogue = _CATALOGUE_OF_FLUXES.get(table, table)
             if (
@@ -226,12 +218,15 @@ def _make_lines(
                 partition_counts.get(table, partition_counts[catalogue]),
                 bands.get(table, 1),
             )
+            used = min(n, WORKERS)
+            in_workers = used * cost["worker_s"] + n * cost["part_s"] + rows[catalogue] * in_bands * cost["row_s"]
             row_count += rows[catalogue]
-            seconds += cost["start_s"] + min(n, WORKERS) * cost["worker_s"] + n * cost["part_s"]
-            seconds += rows[catalogue] * in_bands * cost["row_s"]
+            serial += cost["start_s"]
+            parallel += in_workers
+            wall += in_workers / max(used, 1)
             size += cost["start_bytes"] + rows[catalogue] * (cost["row_bytes"] + in_bands * cost["band_bytes"])
         if row_count:
-            lines.append(Line(job, row_count, factor * seconds, size / 1e9))
+            lines.append(Line(job, row_count, factor * (serial + parallel), size / 1e9, factor * (serial + wall)))
     return lines
 
 

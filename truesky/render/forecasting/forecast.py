@@ -9,6 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from lake_schema.texts.amounts import format_duration, format_size
 from truesky.render.forecasting.speed import Speed
 
 # Columns of the table `tasks` that a forecast combines over detector images. The numbers of sources, CPU seconds and
@@ -130,17 +131,18 @@ def _line(row: dict[str, Any], factor: float) -> Line:
 
 
 def format_table(lines: list[Line], speed: Speed) -> Iterator[str]:
-    """Yield the forecast of core-hours, memory and storage as lines of a text table, beginning with a title.
+    """Yield the forecast of CPU time, memory and storage as lines of a text table, beginning with a title.
 
-    The last line tells how the speed of this machine, on which the core-hours depend, was estimated.
+    The last line tells how the speed of this machine, on which the CPU times depend, was estimated.
     """
     yield (
         f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
-        f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"
+        f"{'CPU time':>9} {'size':>8} {'peak GB':>8}"
     )
     for line in lines:
         yield (
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
-            f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
+            f"{line.sources:14,} {format_duration(3600.0 * line.core_hours):>9} {format_size(1e9 * line.gigabytes):>8} "
+            f"{line.memory_gb:8.2f}"
         )
-    yield f"core-hours are for this machine, {speed.source}: {speed.factor:.2f} of the channels' costs"
+    yield f"CPU times are for this machine, {speed.source}: {speed.factor:.2f} of the channels' costs"

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import scipy.fft
 
 from lake_schema.arrays import Float
 from lake_schema.errors import LakeError
@@ -60,15 +59,15 @@ class Speed:
     source: str
 
 
-def estimate_speed(lake: Folder) -> Speed:
-    """Estimate the speed of this machine.
+def estimate_speed(lake: Folder | None) -> Speed:
+    """Estimate the speed of this machine. `lake` is None without a lake.
 
     The speed is a factor: the CPU time of this machine divided by that of the reference machine. If the lake (folder of
     stored tables and images) has at least three images that this kind of machine rendered, the factor is the median of
     their CPU time divided by its forecast. Otherwise it comes from a calibration of one second, whose result is kept in
     the disc cache. The forecast time of an image then has an error of 30 %.
     """
-    ratios = list(_speed_ratios(lake))
+    ratios = [] if lake is None else list(_speed_ratios(lake))
     if len(ratios) >= _MIN_DETECTORS:
         return Speed(float(np.median(ratios)), f"estimated from {len(ratios)} detectors in this lake")
     key = cache.content_key(code_key(__name__), machine())
@@ -81,6 +80,9 @@ def run_calibration() -> Float:
 
     The operations are Fourier transforms of stamps, exponentials, Poisson numbers and a sort.
     """
+    # Import here, because the import is slow, and not needed if the cache contains the result.
+    import scipy.fft
+
     rng = np.random.default_rng(1)
     waves = (rng.normal(size=(_STAMPS, _SIDE, _SIDE // 2 + 1)) + 0j).astype(np.complex64)
     light, seconds = rng.uniform(0.0, 100.0, _NUMBERS), np.empty(_REPEATS)

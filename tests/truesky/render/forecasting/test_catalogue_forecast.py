@@ -144,7 +144,6 @@ def test_an_external_catalogue_is_not_forecast(tmp_path):
     lines = forecast(replace(wanted, ingest=Ingest(galaxies=given)))
     assert list(lines) == ["build_stars", "compute_fluxes"]
     assert lines["compute_fluxes"].rows == lines["build_stars"].rows
-    assert "\n".join(catalogue_forecast.format_table(list(lines.values()))).count("\n") == 2
 
 
 def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
@@ -156,6 +155,7 @@ def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
     lines = forecast(replace(wanted, sources=own))
     assert {job: line.rows for job, line in lines.items()} == {"build_galaxies": 2, "compute_fluxes": 2}
     # Every 36 arcsec on a circle of 0.3 deg, two places in three a galaxy.
+    (tmp_path / "g.csv").write_text("mag\n20\n21\n")
     lines = forecast(replace(wanted, sources=replace(own, stars=tmp_path / "s.csv", spacing=36.0)))
     assert lines["compute_fluxes"].rows == pytest.approx(np.pi * 30**2, rel=1e-3)
     assert lines["build_galaxies"].rows == pytest.approx(2 * lines["build_stars"].rows)
