@@ -238,11 +238,14 @@ spark.executorEnv.OMP_NUM_THREADS       1
 
 LOG4J2 = """\
 # Written by truesky/commands/prepare_spark.py. Log errors only, one line each. Errors in Python reach the driver.
-rootLogger.level = error
+# The level is that of Spark's shell, which prints two lines about any other level. The filter leaves errors only.
+rootLogger.level = warn
 rootLogger.appenderRef.stderr.ref = stderr
 appender.stderr.type = Console
 appender.stderr.name = stderr
 appender.stderr.target = SYSTEM_ERR
+appender.stderr.filter.threshold.type = ThresholdFilter
+appender.stderr.filter.threshold.level = error
 appender.stderr.layout.type = PatternLayout
 appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
 """

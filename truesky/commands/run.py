@@ -1,6 +1,6 @@
 """Run all jobs of a request (a user's TOML file) in order, then print a table and draw pictures.
 
-Usage: truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
+Usage: truesky run REQUEST LAKE [--dry-run] [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
 """
 
 from __future__ import annotations
@@ -14,23 +14,19 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from lake_schema import __version__, command, user_files
-from lake_schema.store import layout, read
+from lake_schema import user_files
+from lake_schema.store import layout
+from lake_schema.texts.amounts import format_size
 from truesky.catalogue.stars import gaia
+from truesky.command_line import commands
+from truesky.commands import closing_table, costs, space
 from truesky.commands import plan as planning
-from truesky.commands import space
-from truesky.numerics import cache
-from truesky.render.forecasting import catalogue_forecast, speed
-from truesky.render.planning import preconditions, tasks
+from truesky.render.forecasting import catalogue_forecast, request_cost
 from truesky.request import universe
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
+from truesky.running import compile_ahead, progress
 
-# Largest number of pictures of detectors. Each takes about 3 s to draw.
-_MAX_PICTURES = 12
-_COMPILATION_NOTE = (
-    "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
-)
 # Type of a function that runs a job: (name of the job's module, command-line arguments) -> exit status.
 Start = Callable[[str, Sequence[str]], int]
 
@@ -132,34 +128,44 @@ def main(argv: Sequence[str], start: Start) -> int:
         0, the exit status of the first job that fails, or 2 if the request is invalid or the disc has too little free
         space. Wrong options end the process with status 2.
     """
-    parser = argparse.ArgumentParser(
-        prog="truesky run",
-        description="Make everything that a request needs: catalogues, fluxes, plan and images. Then print a table "
-        "and draw pictures.",
-        epilog=f"Options after -- are passed to spark-submit. truesky {__version__}",
-    )
-    parser.add_argument("request", type=Path, help="simulation request, a TOML file")
-    parser.add_argument("--lake", required=True, help="folder of the lake (created if it does not exist)")
-    parser.add_argument("--detectors", nargs="+", default=(), metavar="NAME", help="render only these detectors")
-    parser.add_argument("--limit", type=int, metavar="N", help="render at most N detectors")
-    parser.add_argument("--lenses", action="store_true", help="also make the table of strong lenses")
-    parser.add_argument("--gaia", action="store_true", help="also make the table of stars as Gaia would list them")
-    parser.add_argument(
-        "--pictures", type=Path, metavar="FOLDER", help="folder for the pictures (default: LAKE/pictures)"
-    )
-    options = parser.parse_args(argv)
+    return commands.run("run", lambda options: run_command(options, start), argv)
 
-    def run_request() -> int:
-        root = layout.resolve_lake(options.lake)
-        out = user_files.check_folder(options.pictures or root / "pictures")
-        request = replace(parse(options.request), detectors=tuple(options.detectors), limit=options.limit)
-        return run(root, options.request, stages(request, options.lenses, options.gaia), request, start, out)
 
-    return command.run("truesky", run_request)
+def run_command(options: argparse.Namespace, start: Start) -> int:
+    """Run `truesky run` with its parsed arguments.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        The parsed arguments.
+    start : callable
+        Function that runs a job: (name of the job's module, command-line arguments) -> exit status.
+
+    Returns
+    -------
+    int
+        0, or the exit status of the first job that fails.
+
+    Raises
+    ------
+    BadInput
+        If the request is invalid or the disc has too little free space.
+    """
+    root, file = layout.resolve_lake(options.lake), Path(options.request)
+    out = user_files.check_folder(options.pictures or root / "pictures")
+    request = replace(parse(file), detectors=tuple(options.detectors), limit=options.limit)
+    job_stages = stages(request, options.lenses, options.gaia)
+    if options.dry_run:
+        return run(root, file, job_stages, request, None, out)
+    functions = compile_ahead.missing_functions(compile_ahead.groups_of_request(request))
+    if functions:
+        print(f"functions to compile in the background, once on this machine: {len(functions)}", flush=True)
+    with compile_ahead.compile_in_background(functions):
+        return run(root, file, job_stages, request, start, out)
 
 
 def run(
-    root: Path, file: Path, job_stages: Sequence[Stage], request: Request, start: Start, pictures_folder: Path
+    root: Path, file: Path, job_stages: Sequence[Stage], request: Request, start: Start | None, pictures_folder: Path
 ) -> int:
     """Check a request and the free space, run its jobs, then print a table and draw pictures of some images.
 
@@ -173,8 +179,9 @@ def run(
         Jobs of the request in order, from `stages`.
     request : Request
         The parsed request, with the detectors to render from the command line.
-    start : callable
-        Function that runs a job: (name of the job's module, command-line arguments) -> exit status.
+    start : callable or None
+        Function that runs a job: (name of the job's module, command-line arguments) -> exit status. With None, the
+        forecast is printed and no job runs.
     pictures_folder : Path
         Folder for the pictures.
 
@@ -190,22 +197,28 @@ def run(
     """
     # Find mistakes in the request and a lack of free space before the first job runs.
     universe.check_lake(root, request)
-    # Look for the renderer's compiled functions before planning, because planning compiles a part of the renderer.
-    is_compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
     plan = checked_plan(root, request, job_stages)
     required_gb, free_gb = space.check(root, request, plan)
-    count = _print_forecast(root, request, plan, required_gb, free_gb)
-    print(f"{_COMPILATION_NOTE}\n" if count and not is_compiled else "", flush=True)
-    timings, run_start = [], time.perf_counter()
+    cost = costs.forecast_plan(root, request, plan)
+    for line in request_cost.format_table(cost):
+        print(line)
+    print(f"{format_size(1e9 * required_gb)} to write, {format_size(1e9 * free_gb)} are free\n", flush=True)
+    if start is None:
+        return 0
+    timings: list[tuple[Stage, float]] = []
+    run_start = time.perf_counter()
+    progress.announce_run(_forecast_times(cost, job_stages), catalogue_forecast.WORKERS)
     for stage in job_stages:
+        progress.announce_job([seconds for _, seconds in timings])
         stage_start = time.perf_counter()
         print(f"{stage.name} ...", flush=True)
         if status := start(stage.module, ["--lake", str(root), "--request", str(file), *stage.options]):
             return status
         timings.append((stage, time.perf_counter() - stage_start))
-    _print_table(root, request.name, timings, time.perf_counter() - run_start)
+    progress.announce_job([seconds for _, seconds in timings])
+    closing_table.print_catalogues(root, request, timings, time.perf_counter() - run_start)
     if plan is not None:
-        _print_results(root, pictures_folder, request.name)
+        closing_table.print_images(root, pictures_folder, request.name)
     return 0
 
 
@@ -238,53 +251,12 @@ def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple
     return None
 
 
-def _print_forecast(
-    root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, required_gb: float, free_gb: float
-) -> int:
-    """Print the forecast of time and size of the whole run, and return the number of detectors to render.
+def _forecast_times(cost: request_cost.RequestCost, job_stages: Sequence[Stage]) -> list[tuple[str, float]]:
+    """Return the name and the forecast wall time (s) of each job, for the display of the progress.
 
-    `required_gb` and `free_gb` are the size of the files to write and the free space, in GB. The printed time includes
-    tables and images that the lake already contains, although they will not be made again.
+    The time of products that are computed once is part of the time of the first job.
     """
-    machine = speed.estimate_speed(root)
-    seconds = sum(line.seconds for line in catalogue_forecast.for_request(request, machine.factor))
-    count = 0
-    if plan is not None:
-        requested_tasks = tasks.select_requested(preconditions.require_renderable_tasks(*plan), request)
-        count, seconds = (
-            len(requested_tasks),
-            seconds + machine.factor * sum(task["seconds"] for task in requested_tasks),
-        )
-    hours, cores = seconds / 3600.0, catalogue_forecast.WORKERS
-    print(
-        f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
-        f"{hours / cores:.2f} h on {cores} cores; {required_gb:.2f} GB to write, {free_gb:.2f} GB are free"
-    )
-    return count
-
-
-def _print_table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
-    print(f"\n{'stage':20} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
-    for stage, seconds in stages:
-        versions = [read.version(root, name, request=request) for name in stage.tables]
-        rows = sum(version.num_rows for version in versions)
-        for i, version in enumerate(versions):
-            size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
-            pace = f"{rows / seconds:10,.1f} {size:8.1f} {seconds:8.1f}" if i == 0 else f"{'':10} {size:8.1f}"
-            print(f"{stage.name if i == 0 else '':20} {version.table:14} {version.num_rows:10,} {pace}")
-    print(f"{'all':20} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
-
-
-def _print_results(root: Path, pictures_folder: Path, request: str) -> None:
-    # Import here, because importing the renderer takes seconds and runs without images do not need it.
-    from truesky.render.forecasting import actual_costs
-    from truesky.render.products import preview, same_sky
-
-    for line in actual_costs.format_table(actual_costs.summarise(root, request, speed.estimate_speed(root).factor)):
-        print(line)
-    print()
-    for picture in (
-        *preview.previews(root, pictures_folder, _MAX_PICTURES, request),
-        *same_sky.draw(root, pictures_folder, request),
-    ):
-        print(picture)
+    wall_times = {job.job: job.wall_s for job in cost.jobs}
+    times = [(stage.name, wall_times.get(stage.name, 0.0)) for stage in job_stages]
+    (first, seconds), *later_jobs = times
+    return [(first, seconds + sum(item.wall_s for item in cost.items)), *later_jobs]

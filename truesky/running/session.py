@@ -8,6 +8,7 @@ address of this machine to the configuration. Only the path of the workers' Pyth
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import re
 import shutil
@@ -16,15 +17,21 @@ import sys
 import tempfile
 import threading
 import warnings
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 from py4j.protocol import Py4JError
 from pyspark import SparkConf, SparkContext, accumulators
+from pyspark.errors import PySparkException
 from pyspark.sql import SparkSession
 
 from lake_schema import instruction_set
+from truesky.numerics import activity
 
+# Environment variable with names of modules, separated by commas, which the process imports from which Spark forks its
+# workers.
+PRELOADED_MODULES = "TRUESKY_WORKER_MODULES"
 # Settings that prevent access from other machines. The user's configuration may override them.
 _SECURE_SETTINGS = {"spark.ui.enabled": "false"}
 # Prefix of Spark's settings for Unix domain sockets.
@@ -60,13 +67,19 @@ def get_session(name: str) -> SparkSession:
     settings = dict(_SECURE_SETTINGS)
     # Limit the CPU instructions that numpy and Arrow use in workers, so that results have the same bits. These
     # environment variables must be set before a worker starts: it may import numpy before any module of this package.
-    settings |= {f"spark.executorEnv.{name}": value for name, value in instruction_set.variables().items()}
+    variables = instruction_set.variables()
     local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
     if local:
+        names = (activity.SETTING, PRELOADED_MODULES)
+        variables |= {name: os.environ[name] for name in names if name in os.environ}
         settings |= {**_SECURE_LOCAL_SETTINGS, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+        if activity.SETTING in os.environ:
+            # The folder of the run's state is removed even if Java is killed.
+            settings["spark.local.dir"] = os.environ[activity.SETTING]
         if len(socket_dir()) <= _MAX_SOCKET_DIR:
             settings |= {f"{_SOCKET_PREFIX}.enabled": "true", f"{_SOCKET_PREFIX}.dir": socket_dir()}
             settings["spark.python.daemon.module"] = "truesky.running.spark_workers"
+    settings |= {f"spark.executorEnv.{name}": value for name, value in variables.items()}
     # PySpark reads the workers' Python from $PYSPARK_PYTHON only, and would otherwise use any `python3` on PATH.
     # Workers use the Python in the configuration, by default the Python of this process. If they are on other machines
     # and the configuration has no Python, a value of $PYSPARK_PYTHON is kept.
@@ -83,6 +96,36 @@ def get_session(name: str) -> SparkSession:
     return running
 
 
+def start_in_background(name: str, worker_modules: Sequence[str]) -> None:
+    """Start the Spark session of this process and its workers in a thread, so that other work can go on.
+
+    Parameters
+    ----------
+    name : str
+        Name of the application.
+    worker_modules : sequence of str
+        Names of modules that workers import, so that the first tasks need not wait for the import.
+
+    Notes
+    -----
+    `get_session` waits for the session. If the session does not start, `get_session` tries again and raises the error.
+    """
+
+    def start() -> None:
+        with contextlib.suppress(Py4JError, PySparkException, OSError):
+            context = get_session(name).sparkContext
+            context.setLogLevel("OFF")
+            # Run one empty task per core, for which Spark starts its workers.
+            context.parallelize(range(context.defaultParallelism), context.defaultParallelism).foreach(_do_nothing)
+
+    os.environ[PRELOADED_MODULES] = ",".join(worker_modules)
+    threading.Thread(target=start, daemon=True).start()
+
+
+def _do_nothing(number: int) -> None:
+    """Do nothing in a worker."""
+
+
 @cache
 def socket_dir() -> str:
     """Return a temporary folder for the Unix domain sockets that connect Java and its Python workers.
@@ -90,7 +133,8 @@ def socket_dir() -> str:
     The first call creates it, and it is removed when the process ends. These sockets are used because TCP delays
     acknowledgements, which costs 40 ms per task.
     """
-    folder = tempfile.mkdtemp(prefix="truesky-")
+    # In a run, the folder lies in that of the run's state, which is removed even if this process is killed.
+    folder = tempfile.mkdtemp(prefix="truesky-", dir=os.environ.get(activity.SETTING))
     atexit.register(remove_socket_dir)
     return folder
 

@@ -30,22 +30,28 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
 from lake_schema import __version__, command, instruction_set, user_files
 from lake_schema.errors import BadInput, LakeError, TasksFailed
-from lake_schema.store import layout, publish, read, stage
+from lake_schema.store import layout, publish, read, request_links, stage
 from lake_schema.store.plan import Json, Plan, Task, TaskFunction
 from lake_schema.store.provenance import code_version, git_commit, machine
+from truesky.command_line.parser import Parser
+from truesky.command_line.simulation import add_job_arguments
 from truesky.request import checks, universe
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
+from truesky.running import progress
 from truesky.running.task_metrics import WithMetrics
 
 if TYPE_CHECKING:
     from pyspark.sql import SparkSession
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +131,7 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
 
     def run_job() -> int:
         with _exit_on_signal(job):
-            _refuse_mangled(options.lake, str(options.request))
+            _refuse_mangled(options.lake, options.request)
             chosen_job = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
             run(chosen_job, layout.resolve_lake(options.lake), _request(job, options), options.verbose)
         return 0
@@ -160,8 +166,13 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
     if skipped := checks.describe_skipped(request):
         command.print_error(job.name, skipped, 0)
     metrics = {"prepare_s": time.time() - started, "prepare_cpu_s": time.process_time() - cpu}
-    for step in steps:
-        _run_step(job, step, root, request, verbose, metrics)
+    counts = [0 if step.on_driver else len(step.plan.tasks) for step in steps]
+    progress.announce_tables(sum(counts))
+    for i, step in enumerate(steps):
+        name, parts, receipts = step.plan.table.name, len(step.plan.tasks), _receipts_folder(root, step.plan)
+        with progress.table_in_work(name, step.unit, receipts, parts, sum(counts[:i])):
+            _run_step(job, step, root, request, verbose, metrics)
+        request_links.write_area(root, request.name, json.loads(json.dumps(request.facts("area")["area"])))
         # Record the time of planning only in the log of the first table, so that it counts once.
         metrics = {}
 
@@ -175,21 +186,13 @@ def common_facts(request: Request, *sections: str) -> dict[str, Any]:
 
 
 def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=job.name,
         description=job.doc,
         epilog=f"truesky {__version__}",
         formatter_class=argparse.RawTextHelpFormatter,
     )
-    parser.add_argument("--lake", required=True, help="folder of the lake (created if it does not exist)")
-    parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
-    for name, text in job.list_options:
-        parser.add_argument(f"--{name}", nargs="+", help=text)
-    for name, text in job.integer_options:
-        parser.add_argument(f"--{name}", type=int, metavar="N", help=text)
-    if job.dry_run is not None:
-        parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
-    parser.add_argument("-v", "--verbose", action="store_true", help="print tracebacks and messages of Spark")
+    add_job_arguments(parser, job.list_options, job.integer_options, job.dry_run is not None)
     return parser.parse_args(argv)
 
 
@@ -215,7 +218,7 @@ def _request(job: Job, options: argparse.Namespace) -> Request:
     }
     numbers = {name: getattr(options, name) for name, _ in job.integer_options}
     overrides |= {name: value for name, value in numbers.items() if value is not None}
-    return replace(parse(options.request), **overrides)
+    return replace(parse(Path(options.request)), **overrides)
 
 
 @contextmanager
@@ -325,6 +328,10 @@ class _RunLog:
         self.stream.close()
 
 
+def _receipts_folder(root: Path, plan: Plan) -> Path:
+    return stage.receipts_folder(layout.stage_folder(root, plan.table.name, plan.key))
+
+
 @contextmanager
 def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
     """Show a progress bar of the tasks of a table inside the `with` block.
@@ -333,10 +340,10 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
     interrupted run, and does not depend on Spark. The bar is hidden if stderr is not a terminal, unless the environment
     has $TRUESKY_PROGRESS.
     """
-    folder = stage.receipts_folder(layout.stage_folder(root, plan.table.name, plan.key))
+    folder = _receipts_folder(root, plan)
 
     def count() -> int:
-        return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
+        return progress.count_receipts(folder)
 
     quiet = not sys.stderr.isatty() and "TRUESKY_PROGRESS" not in os.environ
     with tqdm(
@@ -399,13 +406,40 @@ def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: st
     return [r for half_tasks in (tasks[:half], tasks[half:]) for r in _spark_map(function, half_tasks, name, verbose)]
 
 
+def map_in_workers(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Call a function for each item in the workers of this process's Spark session, else in this process.
+
+    Parameters
+    ----------
+    function : callable
+        Function of one item. It must be possible to call it twice, because all calls are repeated in this process if a
+        worker fails. Then the error of the function is raised.
+    items : sequence
+        The items.
+
+    Returns
+    -------
+    list
+        The results, in the order of the items.
+    """
+    if items and has_session():
+        from py4j.protocol import Py4JError
+        from pyspark.errors import PySparkException
+
+        from truesky.running.session import get_session
+
+        with contextlib.suppress(Py4JError, PySparkException, OSError), _silence_logging():
+            return list(get_session("truesky").sparkContext.parallelize(items, len(items)).map(function).collect())
+    return [function(item) for item in items]
+
+
 def has_session() -> bool:
     """Return True if this process has an active Spark session. PySpark is not imported for this test."""
     if "pyspark" not in sys.modules:
         return False
-    from pyspark.sql import SparkSession
+    from pyspark import SparkContext
 
-    return SparkSession.getActiveSession() is not None
+    return SparkContext._active_spark_context is not None
 
 
 @contextmanager

@@ -12,6 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from truesky.running import session, spark_workers
+
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -41,3 +43,13 @@ def test_a_worker_that_is_dropped_says_nothing(short, reuse):
             psutil.Process(worker).wait(60)
         _, said = daemon.communicate(timeout=60)
     assert said == b""
+
+
+def test_modules_for_all_workers_are_imported_once(tmp_path, monkeypatch):
+    (tmp_path / "module_for_workers.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(session.PRELOADED_MODULES, "module_for_workers,json")
+    spark_workers.import_worker_modules()
+    assert "module_for_workers" in sys.modules
+    monkeypatch.delenv(session.PRELOADED_MODULES)
+    spark_workers.import_worker_modules()

@@ -300,3 +300,38 @@ def test_a_worker_of_another_kind_is_reported(run, monkeypatch, capsys, kinds):
     about = "toy_job: table plain: made on machines of other kinds than this one, so last bits may differ: here here, "
     expected = "" if kinds == ["here"] else f"{about}made on {'; '.join(kinds)}\n"
     assert capsys.readouterr().err == expected
+
+
+# ---------------------------------------------------------------------------------------------- functions in workers
+
+
+def square(number):
+    return number * number
+
+
+def test_a_function_runs_here_without_a_session(monkeypatch):
+    monkeypatch.setattr(submitted_job, "has_session", lambda: False)
+    assert submitted_job.map_in_workers(square, [3, 4]) == [9, 16]
+
+
+def test_a_function_runs_here_if_a_worker_fails(monkeypatch):
+    def lost(name):
+        raise Py4JNetworkError("the worker is gone")
+
+    monkeypatch.setattr(submitted_job, "has_session", lambda: True)
+    monkeypatch.setattr("truesky.running.session.get_session", lost)
+    assert submitted_job.map_in_workers(square, [3, 4]) == [9, 16]
+    assert submitted_job.map_in_workers(square, []) == []
+
+
+def test_a_function_runs_in_workers_in_order(monkeypatch):
+    def parallelize(items, count):
+        assert count == len(items)
+        return SimpleNamespace(
+            map=lambda function: SimpleNamespace(collect=lambda: [-function(item) for item in items])
+        )
+
+    session = SimpleNamespace(sparkContext=SimpleNamespace(parallelize=parallelize))
+    monkeypatch.setattr(submitted_job, "has_session", lambda: True)
+    monkeypatch.setattr("truesky.running.session.get_session", lambda name: session)
+    assert submitted_job.map_in_workers(square, [3, 4]) == [-9, -16]
