@@ -607,14 +607,18 @@ def input_version(root: Folder, name: str, request: str) -> Version:
     Raises
     ------
     BadInput
-        If the lake has no such table, or a name is not valid.
+        If the lake has no such table, or a name is not valid. The message lists the requests of the lake.
     Damaged
         If a link leads to a version that is missing, or the manifest is missing, broken or belongs to another version.
     VersionMismatch
         If the columns of the version differ from the table's declaration in this code.
     """
-    request_key = request_links.linked_key(root, request, name)
-    return latest_version(root, name) if request_key is None else version(root, name, request=request)
+    if request_links.linked_key(root, request, name) is not None:
+        return version(root, name, request=request)
+    if layout.current_key(root, name) is None:
+        existing = ", ".join(request_links.request_names(root)) or "none"
+        raise BadInput(f"lake {root} has no table {name} of request {request}; requests of the lake: {existing}")
+    return latest_version(root, name)
 
 
 def latest_version(root: Folder, name: str) -> Version:

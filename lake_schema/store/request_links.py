@@ -1,4 +1,4 @@
-"""Symbolic links from requests to their versions of tables, so that several requests can share a lake.
+"""Symbolic links from requests to their versions of tables, so that several requests can share a lake; their areas.
 
 A request is a named set of settings of a simulation. Its links are LAKE/names/<name>/<table> ->
 ../../<table>/v-<key>. A link is replaced in one rename. The garbage collection keeps linked versions and the versions
@@ -7,18 +7,21 @@ from which they were made.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout
-from lake_schema.store.manifest import sync
+from lake_schema.store.manifest import sync, write_json
 from lake_schema.store.object_storage.s3 import Folder
 
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
+# File in the folder of a request with the area of the sky that it covers. No table has this name.
+_AREA = "area.json"
 
 
 def request_names(root: Folder) -> list[str]:
@@ -130,3 +133,39 @@ def version_keys_in(facts: Any) -> Iterator[str]:
             pending += value
         elif isinstance(value, str) and _KEY.fullmatch(value):
             yield value
+
+
+def write_area(root: Path, name: str, area: Mapping[str, Any]) -> None:
+    """Record the area of a request in the folder of its links, which must exist.
+
+    Catalogues cover whole cells of the sky, so they do not contain the area. Two requests with different areas can have
+    the same version of a table.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    name : str
+        Name of the request.
+    area : mapping
+        The area as JSON values.
+    """
+    if read_area(root, name) != area:
+        write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, area)
+
+
+def read_area(root: Folder, name: str) -> dict[str, Any] | None:
+    """Return the recorded area of a request, or None if the lake does not record it or is on object storage.
+
+    Damaged is raised if the file is not valid.
+    """
+    path = layout.requests_folder(root) / layout.check_name(name) / _AREA
+    if not isinstance(path, Path) or not path.is_file():
+        return None
+    try:
+        area = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise Damaged(f"{path}: {error}") from None
+    if not isinstance(area, dict):
+        raise Damaged(f"{path}: must contain an object")
+    return area

@@ -56,7 +56,7 @@ def test_this_process_is_of_the_standard_kind():
 def test_a_new_process_is_limited_by_the_first_import():
     if not has_level():
         pytest.skip("this CPU has no AVX2")
-    kind, difference = told("import truesky.numerics.compiling; " + KIND)
+    kind, difference = told("import truesky.numerics.machine_code; " + KIND)
     assert kind == " ".join(("x86-64-v3", *platform.libc_ver()))
     assert difference == "None"
     assert told("import truesky; " + KIND)[0] == kind

@@ -8,10 +8,10 @@ import shutil
 import pytest
 
 from lake_schema import listing
-from lake_schema.__main__ import main
 from lake_schema.store import publish
 from tests.lake_schema.store.test_request_links import made_from
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+from truesky.commands.__main__ import main
 
 
 @pytest.fixture

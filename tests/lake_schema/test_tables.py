@@ -7,7 +7,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from lake_schema import __main__, tables
+from lake_schema import tables
 from lake_schema.errors import BadInput
 from lake_schema.mission import published
 from lake_schema.mission.configuration import resolve
@@ -19,13 +19,14 @@ from lake_schema.store.validate import check_rows
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.tables.common import Origin
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
+from truesky.commands import __main__
 from truesky.fluxes import passbands as responses
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 
 
 def test_the_reference_page_is_up_to_date(capsys):
-    """If this fails, run: python -m lake_schema tables > docs/tables.md"""
+    """If this fails, run: truesky tables > docs/tables.md"""
     assert __main__.main(["tables"]) == 0
     assert PAGE.read_text() == capsys.readouterr().out
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
-from lake_schema import __version__, command, user_files
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 
 # Names of the folders with examples, and the suffix of the files in each that are copied.
@@ -66,18 +65,11 @@ def copy_examples(folder: Path) -> list[Path]:
     return list(source_by_target)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Copy the examples, print the paths of the copies, and return the exit status: 0, or 2 if a file already exists.
+def run_command(options: argparse.Namespace) -> int:
+    """Copy the examples to the folder in the parsed arguments, print the paths of the copies, and return 0.
 
-    `argv` has the target folder and options. Wrong options end the process with status 2.
+    BadInput is raised if a file already exists.
     """
-    parser = argparse.ArgumentParser(prog="truesky examples", description=__doc__, epilog=f"truesky {__version__}")
-    parser.add_argument("folder", type=Path, help="target folder (created if it does not exist)")
-    options = parser.parse_args(argv)
-
-    def copy_and_list() -> int:
-        for path in copy_examples(options.folder):
-            print(path)
-        return 0
-
-    return command.run("truesky", copy_and_list)
+    for path in copy_examples(options.folder):
+        print(path)
+    return 0

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
+from lake_schema.errors import Mistakes
 from truesky.catalogue import request_checks
 from truesky.fluxes import inputs
 from truesky.render import plan_exposures
-from truesky.render.forecasting import catalogue_forecast, speed
+from truesky.render.forecasting import request_cost, speed
+from truesky.render.forecasting.image_costs import ImageCosts
 from truesky.render.plan_exposures import Planner, PlanRows
 from truesky.render.planning import preconditions, tasks
 from truesky.render.products.keys import ephemeris_files, stamp_files
@@ -67,43 +68,73 @@ def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanR
     BadInput
         If a job would refuse the request.
     """
-    check_rendered(request)
-    # Plan the first chunk before the catalogues are checked, so that a mistake in a pointing or an observation is
-    # reported before a mistake in the catalogues.
-    chunks = Planner.from_request(lake, request).tables()
-    first_chunk = next(chunks)
-    check_catalogues(request)
-    if request.structure.stamps is not None:
-        stamp_files(request.structure.stamps.file)
+    with Mistakes() as mistakes:
+        mistakes.read(check_rendered, request)
+        # Exposures without a simulator are not planned here: their plan could have follow-up errors.
+        planner = None if len(mistakes) else mistakes.read(Planner.from_request, lake, request)
+        mistakes.read(check_catalogues, request)
+        if request.structure.stamps is not None:
+            mistakes.read(stamp_files, request.structure.stamps.file)
+        if len(mistakes) and planner is not None:
+            # Report the mistakes in the plan together with the others.
+            mistakes.read(_check_plan, planner)
+    if planner is not None:
+        yield from _planned_chunks(planner)
+
+
+def check_plan(request: Request) -> None:
+    """Raise BadInput if the exposures of a request cannot be planned, without a check of its catalogues."""
+    for _ in Planner.from_request(None, request).tables():
+        pass
+
+
+def _check_plan(planner: Planner) -> None:
+    for _ in _planned_chunks(planner):
+        pass
+
+
+def _planned_chunks(planner: Planner) -> Iterator[PlanRows]:
+    """Yield the tables `exposures` and `tasks` of each chunk of a plan, and check them.
+
+    Raises BadInput if a file of the request does not cover the dates of the exposures, or if no detector can be
+    rendered, or if the area is too small. The mistakes of all chunks are raised together after the last chunk.
+    """
+    request = planner.request
     selection, has_tasks = tasks.TaskSelection(request), False
-    for exposures, rows in chain([first_chunk], chunks):
-        if request.bodies is not None:
-            ephemeris_files(request.bodies, exposures)
-        drawable_tasks = preconditions.renderable_tasks(exposures, rows)
-        has_tasks = has_tasks or drawable_tasks.num_rows > 0
-        preconditions.refuse_small_area(request.area, selection.select(drawable_tasks))
-        yield exposures, rows
-    if not has_tasks:
-        preconditions.require_renderable_tasks(exposures, rows)
-    selection.refuse_unknown()
+    with Mistakes() as mistakes:
+        for exposures, rows in planner.tables():
+            if request.bodies is not None:
+                mistakes.read(ephemeris_files, request.bodies, exposures)
+            drawable_tasks = preconditions.renderable_tasks(exposures, rows)
+            has_tasks = has_tasks or drawable_tasks.num_rows > 0
+            mistakes.read(preconditions.refuse_small_area, request.area, selection.select(drawable_tasks))
+            yield exposures, rows
+        if not has_tasks:
+            mistakes.read(preconditions.require_renderable_tasks, exposures, rows)
+        mistakes.read(selection.refuse_unknown)
 
 
 def check_catalogues(request: Request) -> None:
-    """Raise BadInput if the jobs that make catalogues and fluxes would refuse the request."""
-    inputs.select_passbands(request.bands, inputs.read(request.curves).passbands)
-    request_checks.check_request(request)
+    """Raise BadInput if the jobs that make catalogues and fluxes would refuse the request.
+
+    There is one line for each mistake.
+    """
+    with Mistakes() as mistakes:
+        user_inputs = mistakes.read(inputs.read, request.curves)
+        if user_inputs is not None:
+            mistakes.read(inputs.select_passbands, request.bands, user_inputs.passbands)
+        mistakes.read(request_checks.check_request, request)
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """Check a request, and print the forecast costs of its images and of its catalogues.
+    """Check a request, and print the forecast costs of its images and of a whole run.
 
     Return (), since no table is made. Raises BadInput if a job would refuse the request.
     """
-    plan_exposures.print_forecast(lake, request, checked_chunks(request, lake))
+    images = ImageCosts(request)
+    plan_exposures.print_forecast(lake, request, images.watch(checked_chunks(request, lake)))
     print()
-    for line in catalogue_forecast.format_table(
-        catalogue_forecast.for_request(request, speed.estimate_speed(lake).factor)
-    ):
+    for line in request_cost.format_table(request_cost.forecast(request, images, speed.estimate_speed(lake))):
         print(line)
     return ()
 

@@ -1,6 +1,6 @@
 """Report time, memory and size of all runs of a lake (the folder of a simulation), compared with the forecast.
 
-Usage: truesky report LAKE [--json], or python -m truesky.commands.report LAKE [--json].
+Usage: truesky report LAKE [--json].
 
 The report is a table with one line per job (such as "build_stars") and a last line with the totals.
 """
@@ -8,25 +8,30 @@ The report is a table with one line per job (such as "build_stars") and a last l
 from __future__ import annotations
 
 import argparse
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from lake_schema import __version__, command
+from lake_schema import command
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.provenance import canonical
-from truesky.render.forecasting import catalogue_forecast, speed
+from lake_schema.texts import text_tables
+from truesky.command_line import commands
+from truesky.render.forecasting import catalogue_forecast, request_cost, speed
 from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import run_log
 
-_DESCRIPTION = (
-    "Time, memory and size of all runs of a lake. seconds: wall time; CPU s: CPU time of all cores; failed: runs or "
-    "tasks (parts) that ended with an error; stopped: runs whose log has no end, killed or still running; forecast: "
-    "CPU s and GB to make the present content of the lake once, for all its requests"
+_HEADINGS = (
+    "job", "runs", "failed runs", "stopped runs", "parts", "failed parts", "rows", "seconds", "CPU s", "forecast CPU s",
+    "GB", "forecast GB", "peak GB",
+)  # fmt: skip
+_NOTES = (
+    "stopped runs: their log has no end, because they were killed or are still running; parts: tasks, each makes one "
+    "file;\nseconds: wall time; forecast: to make the present content of the lake once, for all its requests, with a "
+    "warm cache"
 )
 
 
@@ -155,7 +160,8 @@ def _forecast(root: Folder, factor: float) -> dict[str, tuple[float, float]]:
     except (LakeError, KeyError):
         return jobs
     seconds, size = (sum(task[name] for task in tasks_by_facts.values()) for name in ("seconds", "bytes"))
-    return {**jobs, "render_exposures": (factor * seconds, size / 1e9)}
+    rendering = request_cost.render_job(len(tasks_by_facts), seconds, size, factor)
+    return {**jobs, rendering.job: (rendering.cpu_s, rendering.bytes / 1e9)}
 
 
 def _add_log(line: JobTotals, lines: Sequence[run_log.Json]) -> None:
@@ -183,22 +189,22 @@ def _sum_jobs(lines: Sequence[JobTotals]) -> JobTotals:
     return total
 
 
-def text(totals: Sequence[JobTotals]) -> Iterator[str]:
-    """Yield the lines of the report as text: a header, then one line of fixed width per entry; "-" for NaN."""
-    yield (
-        f"{'job':20} {'runs':>5} {'failed':>7} {'stopped':>8} {'parts':>8} {'failed':>7} {'rows':>13} {'seconds':>10} "
-        f"{'CPU s':>10} {'forecast':>10} {'GB':>9} {'forecast':>9} {'peak GB':>8}"
-    )
-    for line in totals:
-        yield (
-            f"{line.job:20} {line.runs:5,} {line.failed_runs:7,} {line.stopped:8,} {line.parts:8,} {line.failed:7,} "
-            f"{line.rows:13,} {line.seconds:10,.1f} {line.cpu_s:10,.1f} {_format_number(line.forecast_s, 10, 1)} "
-            f"{_format_number(line.gb, 9, 3)} {_format_number(line.forecast_gb, 9, 3)} {line.peak_gb:8.2f}"
+def text(totals: Sequence[JobTotals]) -> list[str]:
+    """Return the lines of the report as text: a header, then one line per entry; "-" means that a value is unknown."""
+    rows = [
+        (
+            line.job, f"{line.runs:,}", f"{line.failed_runs:,}", f"{line.stopped:,}", f"{line.parts:,}",
+            f"{line.failed:,}", f"{line.rows:,}", f"{line.seconds:,.1f}", f"{line.cpu_s:,.1f}",
+            _format_number(line.forecast_s, 1), _format_number(line.gb, 3), _format_number(line.forecast_gb, 3),
+            f"{line.peak_gb:.2f}",
         )
+        for line in totals
+    ]  # fmt: skip
+    return text_tables.format_table(_HEADINGS, rows, _HEADINGS[1:])
 
 
-def _format_number(value: float, width: int, digits: int) -> str:
-    return f"{value:{width},.{digits}f}" if math.isfinite(value) else f"{'-':>{width}}"
+def _format_number(value: float, digits: int) -> str:
+    return f"{value:,.{digits}f}" if math.isfinite(value) else "-"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -207,23 +213,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     It is 0, 1 if a log is damaged, or 2 if there is no log or no such lake. Wrong options end the process with
     status 2.
     """
-    parser = argparse.ArgumentParser(prog="truesky report", description=_DESCRIPTION, epilog=f"truesky {__version__}")
-    parser.add_argument("lake", help="folder of the lake")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per line, null for unknown values")
-    options = parser.parse_args(argv)
+    return commands.run("report", run_command, argv)
 
-    def print_report() -> int:
-        lines = job_totals(layout.resolve_lake(options.lake))
-        for line in map(_json, lines) if options.json else text(lines):
+
+def run_command(options: argparse.Namespace) -> int:
+    """Print the report of the lake in the parsed arguments of `truesky report`, and return 0.
+
+    BadInput is raised if there is no log or no such lake, and Damaged if a log is damaged.
+    """
+    totals = job_totals(layout.resolve_lake(options.lake))
+    if options.json:
+        text_tables.print_json([asdict(line) for line in totals])
+    else:
+        for line in text(totals):
             print(line)
-        return 0
-
-    return command.run("report", print_report)
-
-
-def _json(line: JobTotals) -> str:
-    values = asdict(line).items()
-    return json.dumps({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values})
+        print(_NOTES)
+    return 0
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from types import FrameType
 from lake_schema import command
 from lake_schema.errors import BadInput
 from truesky.commands import prepare_spark
-from truesky.numerics import cache
+from truesky.numerics import cache, cache_entries
 
 # Script that spark-submit runs for every job. The name of the job's module is its first argument.
 _JOB_SCRIPT = Path(__file__).resolve().parents[1] / "running" / "spark_entry.py"
@@ -93,6 +93,7 @@ def _spark_environment() -> Path:
         if any(letter.isspace() for letter in str(path)):
             raise BadInput(f"{path}: Spark cannot be started from a folder with a space in its name")
     prepare_spark.prepare(folder, java, home, Path(sys.executable))
+    cache_entries.record_use(folder.parent, folder)
     return folder
 
 

@@ -1,6 +1,6 @@
 """Make master bias, dark and flat frames of each detector from the calibration frames of a lake.
 
-    python -m truesky.reduction.masters --lake LAKE [--name REQUEST] --out FOLDER [--detectors 3-4 ..]
+    truesky masters LAKE [--name REQUEST] --out FOLDER [--detectors 3-4 ..]
 
 Files of detector 3-4 of VIS are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and
 .._flat.fits (response; 1 if all light is counted). For each pixel, a file also has the uncertainty and the number of
@@ -25,6 +25,7 @@ from lake_schema import command, user_files
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
+from truesky.command_line import commands
 from truesky.reduction import amplifiers, calibration, files
 from truesky.reduction import frames as lake_frames
 from truesky.reduction.combining import CombinedFrame, clipped_mean
@@ -124,18 +125,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `argv` are the arguments of the command; None means the arguments of the process.
     """
-    parser = argparse.ArgumentParser(prog="truesky masters", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--lake", required=True, help="folder of the lake with rendered calibration frames")
-    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the masters")
-    parser.add_argument(
-        "--detectors", nargs="+", default=[], metavar="NAME", help="default: all with calibration frames"
-    )
-    options = parser.parse_args(argv)
-    return command.run("masters", lambda: _write_masters(options))
+    return commands.run("masters", run_command, argv)
 
 
-def _write_masters(options: argparse.Namespace) -> int:
+def run_command(options: argparse.Namespace) -> int:
+    """Run `truesky masters` with its parsed arguments, and return the exit status 0; errors are raised as LakeError."""
     out = user_files.check_folder(options.out)
     by_detector = lake_frames.from_lake(layout.resolve_lake(options.lake), options.detectors, request=options.name)
     selected = {

@@ -1,8 +1,8 @@
 """Calibrate the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
 
-    python -m truesky.reduction.reduce --lake LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
-                                 [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
-                                 [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
+    truesky reduce LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
+                        [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
+                        [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
 
 Each frame of the sky gives a FITS file with the extensions SCI, WHT (inverse variance) and FLG (flag bits). The unit of
 SCI is the electron, with --rate electrons per second, and with --level2 counts (electrons / mean gain of amplifiers).
@@ -22,6 +22,8 @@ from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card
 from lake_schema.store import layout
+from truesky.command_line import commands
+from truesky.command_line.parser import suggestion
 from truesky.reduction import calibration, cosmic_rays, files, level2
 from truesky.reduction import frames as lake_frames
 from truesky.reduction.calibration import Masters, ReducedImage
@@ -99,34 +101,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `argv` are the arguments of the command; None means the arguments of the process.
     """
-    parser = argparse.ArgumentParser(prog="truesky reduce", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--lake", required=True, help="folder of the lake with rendered frames")
-    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
-    parser.add_argument(
-        "--masters", type=Path, help="folder with masters of truesky.reduction.masters or other masters"
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the calibrated images")
-    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
-    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
-    parser.add_argument("--rate", action="store_true", help="write electrons per second instead of electrons")
-    parser.add_argument("--without", nargs="+", default=[], choices=files.CORRECTIONS, help="corrections to omit")
-    parser.add_argument(
-        "--cosmic-rays",
-        type=float,
-        metavar="SIGMA",
-        help=f"flag cosmic rays; default: {_COSMIC_RAY_SIGMA:g} with --level2, else 0 (no)",
-    )
-    parser.add_argument("--level2", action="store_true", help="write counts, with catalogue, PSF and .head files")
-    parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (default: 3 FWHM)")
-    parser.add_argument(
-        "--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="level of sources (1.5)"
-    )
-    parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="smallest source (5)")
-    options = parser.parse_args(argv)
-    return command.run("reduce", lambda: _write_images(options))
+    return commands.run("reduce", run_command, argv)
 
 
-def _write_images(options: argparse.Namespace) -> int:
+def run_command(options: argparse.Namespace) -> int:
+    """Run `truesky reduce` with its parsed arguments, and return the exit status 0; errors are raised as LakeError."""
     out = user_files.check_folder(options.out)
     reduction, settings = _reduction_options(options), _catalogue_settings(options)
     root = layout.resolve_lake(options.lake)
@@ -187,6 +166,10 @@ def _sees_sky(frame: Frame) -> bool:
 def _reduction_options(options: argparse.Namespace) -> ReductionOptions:
     if options.level2 and options.rate:
         raise BadInput("--rate is not allowed with --level2: its images are in counts")
+    for name in options.without:
+        if name not in files.CORRECTIONS:
+            similar = suggestion(name, files.CORRECTIONS)
+            raise BadInput(f"--without {name} is not one of {', '.join(files.CORRECTIONS)}{similar}")
     limit = options.cosmic_rays
     if limit is None:
         limit = _COSMIC_RAY_SIGMA if options.level2 else 0.0
@@ -197,8 +180,9 @@ def _reduction_options(options: argparse.Namespace) -> ReductionOptions:
 
 
 def _catalogue_settings(options: argparse.Namespace) -> level2.CatalogueSettings | None:
-    limits = Limits(options.threshold, options.least_pixels)
-    if not options.level2 and (limits != Limits() or options.aperture is not None):
+    default, threshold, pixels = Limits(), options.threshold, options.least_pixels
+    limits = Limits(default.threshold if threshold is None else threshold, default.pixels if pixels is None else pixels)
+    if not options.level2 and (limits != default or options.aperture is not None):
         raise BadInput("--aperture, --threshold, --least-pixels: without --level2 there is no catalogue")
     return level2.CatalogueSettings(limits, options.aperture) if options.level2 else None
 

@@ -1,6 +1,6 @@
 """Stack calibrated images of one field in one band on a common map of the sky.
 
-    python -m truesky.reduction.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
+    truesky stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
 
 The extensions of the stack are SCI (electrons per second in each pixel, including the sky), WHT and FLG (flag bits).
 The sum over n pixels has the variance n / WHT. The noise of neighbouring pixels is correlated, so the variance of a
@@ -23,6 +23,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card, Image
 from lake_schema.store import layout
+from truesky.command_line import commands
 from truesky.reduction import files, point_sources, stacking
 from truesky.reduction import frames as lake_frames
 from truesky.reduction.calibration import COSMIC_RAY, ReducedImage
@@ -93,17 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `argv` are the arguments of the command; None means the arguments of the process.
     """
-    parser = argparse.ArgumentParser(prog="truesky stack", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("images", nargs="+", type=Path, help="files of truesky.reduction.reduce")
-    parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
-    parser.add_argument("--scale", type=float, help="pixel scale in arcsec (default: the detectors')")
-    parser.add_argument("--lake", help="folder of the lake with the raw images, to add the PSF")
-    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
-    options = parser.parse_args(argv)
-    return command.run("stack", lambda: _write_stack(options))
+    return commands.run("stack", run_command, argv)
 
 
-def _write_stack(options: argparse.Namespace) -> int:
+def run_command(options: argparse.Namespace) -> int:
+    """Run `truesky stack` with its parsed arguments, and return the exit status 0; errors are raised as LakeError."""
     out = user_files.check_target(options.out, (".fits",))
     images = [files.read_image(path) for path in options.images]
     _refuse_different(options.images, images)

@@ -154,10 +154,12 @@ def jackknife_error(samples: Float | Sequence[float], min_patches: int = MIN_PAT
     Returns
     -------
     float array, shape (...)
-        Standard error; NaN if there are fewer patches than `min_patches`.
+        Standard error; NaN if there are fewer patches than `min_patches`, or a sample is not finite.
     """
     values = np.asarray(samples, float)
     if len(values) < min_patches:
         return np.full(values.shape[1:], np.nan)
     n = len(values)
-    return np.asarray(np.sqrt((n - 1) / n * np.sum((values - values.mean(0)) ** 2, axis=0)))
+    # The logarithm of an empty sample is infinite, and its error is NaN.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt((n - 1) / n * np.sum((values - values.mean(0)) ** 2, axis=0)))

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lake_schema import __version__, command
 from lake_schema.errors import BadInput, Damaged, Superseded
 from lake_schema.store import layout, manifest, request_links
 from lake_schema.store.object_storage import s3
@@ -384,36 +383,18 @@ def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: s
 # ------------------------------------- the command `truesky push`
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command `truesky push` and return its exit status.
+def run_command(options: argparse.Namespace) -> int:
+    """Run `truesky push` with its parsed arguments, and return the exit status 0.
 
-    The status is 0 for success, 1 for a damaged lake or if another push ended first, and 2 for wrong arguments.
+    BadInput is raised for wrong arguments, Damaged for a damaged lake, and Superseded if another push ended first.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m lake_schema.store.object_storage.push",
-        description="Push the published versions of a lake to object storage; existing objects are not sent again.",
-        epilog=f"truesky {__version__}",
-    )
-    parser.add_argument("lake", help="folder of the lake")
-    parser.add_argument("place", metavar="s3://BUCKET/PREFIX", help="address of the lake on object storage")
-    parser.add_argument("--endpoint-url", help="URL of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="TABLE", help="tables to push; other tables stay")
-    parser.add_argument("--threads", type=int, default=THREADS, help=f"objects at a time (default: {THREADS})")
-    options = parser.parse_args(argv)
-    return command.run("push", lambda: _run_push(options))
-
-
-def _run_push(options: argparse.Namespace) -> int:
     root, address = layout.resolve_lake(options.lake), s3.parse_address(options.place, options.endpoint_url)
-    if not 1 <= options.threads <= 256:
-        raise BadInput(f"--threads {options.threads}: must be 1 to 256")
-    for report in push(root, address, options.only, options.threads):
+    threads = THREADS if options.threads is None else options.threads
+    if not 1 <= threads <= 256:
+        raise BadInput(f"--threads {threads}: must be 1 to 256")
+    for report in push(root, address, options.only, threads):
         sent = f"sent {report.sent:6,} {report.sent_size / 1e6:10.1f} MB"
         totals = f"{report.objects:6,} objects {report.size / 1e6:10.1f} MB, {sent}"
         print(f"{report.table:16} v-{report.key} {totals}", flush=True)
     print(f"{address} is published")
     return 0
-
-
-if __name__ == "__main__":
-    command.exit_with_status(main)

@@ -221,7 +221,7 @@ class ObjectStore:
     def __init__(self, address: Address) -> None:
         self.address = address
         self.small_objects: dict[str, bytes] = {}
-        # Cache by key of a version: True if the version exists.
+        # Cache by path of a version's folder, relative to the lake: True if the version exists.
         self.version_exists: dict[str, bool] = {}
 
     @cached_property
@@ -345,11 +345,11 @@ class ObjectPath:
         if (table := self.store.tables.get(version)) is not None and table != self.parent.name:
             # The key belongs to one table only, so the version cannot exist in the folder of another table.
             return False
-        if version not in self.store.version_exists:
+        if self.relative not in self.store.version_exists:
             # Assume without a query that a published version exists; if it has been removed, reading fails later. A
             # version that is not published may exist, so look for its manifest.
-            self.store.version_exists[version] = table is not None or (self / MANIFEST).exists()
-        return self.store.version_exists[version]
+            self.store.version_exists[self.relative] = table is not None or (self / MANIFEST).exists()
+        return self.store.version_exists[self.relative]
 
     def stat(self) -> SimpleNamespace:
         """Return an object's size in bytes as `st_size`, and its time of modification as `st_mtime` (s since 1970).

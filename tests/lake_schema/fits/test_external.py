@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits as astropy_fits
 
 from lake_schema.errors import BadInput
+from lake_schema.external import rows
 from lake_schema.fits import external
 
 READERS = {
@@ -132,3 +133,24 @@ def test_good_files_are_read_plain_or_compressed(good):
         )
         assert external.read_table(good, "curve")["a"][2] == 2.0
         good.write_bytes(gzip.compress(good.read_bytes()))
+
+
+def test_missing_integers_are_not_numbers(tmp_path):
+    """TNULL is a stored value: a column with TSCAL and TZERO is compared before it is scaled."""
+    path = tmp_path / "x.fits"
+    columns = [
+        astropy_fits.Column("scaled", "I", null=-99, array=np.array([-99, 2, 3], np.int16)),
+        astropy_fits.Column("plain", "J", null=-1, array=np.array([5, -1, 7], np.int32)),
+    ]
+    table(*columns).writeto(path)
+    data = path.read_bytes()
+    end = data.index(b"END".ljust(80), 2880)
+    cards = b"TSCAL1  =                  0.5".ljust(80) + b"TZERO1  =                 10.0".ljust(80)
+    path.write_bytes(data[:end] + cards + data[end : end + 80] + data[end + 240 :])
+    scaled, plain = [np.nan, 11.0, 11.5], [5.0, np.nan, 7.0]
+    for read in (external.read_numbers(path, "catalogue"), next(external.read_batches(path, ["scaled", "plain"]))[0]):
+        np.testing.assert_array_equal(read["scaled"], scaled)
+        np.testing.assert_array_equal(read["plain"], plain)
+    (batch,) = rows.read_batches(path, ["scaled"], text_columns=["plain"])
+    assert batch.columns["plain"].tolist() == ["5", "", "7"]
+    assert external.column_names(path, "catalogue") == ["scaled", "plain"]

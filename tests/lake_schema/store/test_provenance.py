@@ -10,7 +10,19 @@ from tests.universe import plain_plan, plain_work
 
 PROJECT = Path(__file__).resolve().parents[3] / "pyproject.toml"
 # These packages transport, query or plot rows and do not change their bytes.
-HARMLESS = {"PyYAML", "duckdb", "fsspec", "h5py", "matplotlib", "pandas", "pyspark", "tqdm", "universal-pathlib"}
+HARMLESS = {
+    "rich",
+    "shtab",
+    "PyYAML",
+    "duckdb",
+    "fsspec",
+    "h5py",
+    "matplotlib",
+    "pandas",
+    "pyspark",
+    "tqdm",
+    "universal-pathlib",
+}
 
 
 def test_every_library_that_shapes_a_byte_is_in_the_fingerprint():

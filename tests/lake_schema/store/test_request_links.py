@@ -55,8 +55,8 @@ def test_a_missing_name_is_refused(two):
 def test_a_request_without_a_version_takes_the_last(two):
     assert read.input_version(two, "plain", "a").key == plain_plan(1).key
     assert read.input_version(two, "plain", "c").key == plain_plan(2).key
-    with pytest.raises(BadInput, match="no table halos"):
-        read.input_version(two, "halos", "a")
+    with pytest.raises(BadInput, match="has no table halos of request c; requests of the lake: a, b"):
+        read.input_version(two, "halos", "c")
 
 
 def test_a_request_of_one_lake_keeps_the_paths_that_users_hold(lake):

@@ -1,19 +1,20 @@
 """Errors and help of the demo. The jobs are tested with `truesky run`."""
 
-from pathlib import Path
-
 import pytest
 
 from lake_schema import __version__
-from truesky.commands import demo, run
+from truesky.commands import demo, examples
+from truesky.running import supervise
 
 
-def test_a_folder_that_is_none_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
-    monkeypatch.delattr(run, "run")
-    (tmp_path / "file").touch()
-    for out in (tmp_path / "file", Path("s3://bucket/x")):
-        assert demo.main(["--out", str(out)]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 2
+def test_the_demo_is_a_run_with_all_results_in_one_folder(monkeypatch):
+    calls = []
+    monkeypatch.setattr(supervise, "supervise", lambda *arguments: calls.append(arguments) or 3)
+    assert demo.main(["--out", "out/my demo"]) == 3
+    request = str(examples.request_file("demo"))
+    words = [request, "--lake", "out/my demo/lake", "--pictures", "out/my demo"]
+    again = f"python -m truesky.commands.demo --request {request} --out 'out/my demo'"
+    assert calls == [("demo", ["-m", "truesky.commands.local_run", *words], again)]
 
 
 def test_help_tells_the_version(capsys):

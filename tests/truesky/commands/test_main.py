@@ -11,9 +11,10 @@ import pytest
 
 from lake_schema import __version__
 from tests import requests
+from truesky.command_line import commands
 from truesky.commands import __main__ as truesky
 from truesky.commands import submit
-from truesky.running import submitted_job
+from truesky.running import submitted_job, supervise
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -35,9 +36,10 @@ def called(monkeypatch):
 def test_every_job_has_a_command():
     scripts = [path.read_text(encoding="utf-8") for path in ROOT.glob("jobs/*/*.py")]
     modules = {re.search(r"^from (\S+) import JOB$", script, re.MULTILINE)[1] for script in scripts}
-    assert {module for modules in truesky.JOBS.values() for module in modules} == modules
-    assert all(callable(import_module(module).main) for module, _ in truesky.MODULES.values())
-    assert all(f" {word} " in f"{truesky.__doc__} " for word in (*truesky.JOBS, *truesky.MODULES))
+    declared = commands.COMMANDS.values()
+    assert {module for one in declared if one.is_job for module in one.modules} == modules
+    for module in {module for one in declared if not one.is_job for module in one.modules}:
+        assert callable(import_module(module).run_command)
 
 
 @pytest.mark.parametrize("word", ["--help", "--version"])
@@ -51,26 +53,29 @@ def test_a_reader_of_the_help_may_close_the_pipe(word):
 
 
 def test_a_job_is_given_what_the_command_is(called):
-    assert truesky.main(["fluxes", "--lake", "a b", "--request", "r", "--", "--master", "local[1]"]) == 0
-    file = str(ROOT / "truesky" / "running" / "spark_entry.py")
-    assert called == [
-        ["--master", "local[1]", file, "truesky.fluxes.compute_fluxes", "--lake", "a b", "--request", "r"]
-    ]
+    options, spark = ["-v", "--bands", "x", "y"], ["--", "--master", "local[1]"]
+    for words in (["r", "a b"], ["--lake", "a b", "--request", "r"], ["r", "--lake=a b"]):
+        called.clear()
+        assert truesky.main(["fluxes", *words, *options, *spark]) == 0
+        file = str(ROOT / "truesky" / "running" / "spark_entry.py")
+        given = ["--lake", "a b", "--request", "r", "--bands", "x", "y", "--verbose"]
+        assert called == [["--master", "local[1]", file, "truesky.fluxes.compute_fluxes", *given]]
+        called.append([])
 
 
 def test_jobs_follow_one_another_until_one_fails(called):
-    words = ["build", "r.toml", "--lake", "x"]
+    words = ["build", "r.toml", "x"]
     assert truesky.main(words) == 7
     assert truesky.main(words) == 0
     assert [command[1].rpartition(".")[2] for command in called] == ["build_galaxies", "build_stars"] * 2
-    assert {tuple(command[2:]) for command in called} == {("--request", "r.toml", "--lake", "x")}
+    assert {tuple(command[2:]) for command in called} == {("--lake", "x", "--request", "r.toml")}
 
 
 def test_a_job_in_this_process_says_and_returns_the_same(tmp_path, capsys, called):
     path = requests.written(tmp_path, "colour = 3")
-    words = ["--lake", str(tmp_path / "lake"), "--request", str(path)]
-    assert truesky.main(["--local", "plan", *words]) == 2
+    assert truesky.main(["--local", "plan", str(path), str(tmp_path / "lake")]) == 2
     said = capsys.readouterr()
+    words = ["--lake", str(tmp_path / "lake"), "--request", str(path)]
     assert submitted_job.main(import_module("truesky.render.plan_exposures").JOB, words) == 2
     assert capsys.readouterr() == said
     assert "colour" in said.err
@@ -81,9 +86,9 @@ def test_help_and_forecasts_need_no_spark(capsys, called, tmp_path):
     with pytest.raises(SystemExit, match="0"):
         truesky.main(["render", "--help"])
     assert "--detectors" in capsys.readouterr().out
-    words = ["plan", str(ROOT / "requests" / "demo.toml"), "--lake", str(tmp_path / "lake"), "--dry-run"]
+    words = ["plan", str(ROOT / "requests" / "demo.toml"), str(tmp_path / "lake"), "--dry-run"]
     assert truesky.main(words) == 0
-    assert "core-hours" in capsys.readouterr().out
+    assert "cost of this request" in capsys.readouterr().out
     assert called == []
 
 
@@ -91,29 +96,49 @@ def test_commands_run_their_modules(capsys, tmp_path):
     assert truesky.main(["check", str(ROOT / "requests" / "demo.toml")]) == 0
     assert capsys.readouterr().out.startswith("demo: good")
     assert truesky.main(["mission", "diff", "CBE,BLT,DES,REQ,SIM", "CBE,BLT,DES,REQ,SIM"]) == 0
-    for words, start in ((["verify", str(tmp_path)], "lake_schema: "), (["sql", "--lake", "s3://x/y"], "explore: ")):
+    for words in (["verify", str(tmp_path)], ["sql", "s3://x/y"]):
         assert truesky.main(words) == 2
-        assert capsys.readouterr().err.startswith(start)
+        assert capsys.readouterr().err.startswith(f"truesky {words[0]}: ")
+
+
+@pytest.mark.parametrize("local", [[], ["--local"]])
+def test_a_run_is_supervised_unless_options_of_spark_are_given(monkeypatch, called, local):
+    supervised = []
+    monkeypatch.setattr(supervise, "supervise", lambda *arguments: supervised.append(arguments) or 4)
+    words = ["my request.toml", "--lake", "x"]
+    assert truesky.main([*local, "run", *words]) == 4
+    assert supervised == [
+        ("truesky run", ["-m", "truesky.commands.local_run", *words], "truesky run 'my request.toml' --lake x")
+    ]
+    assert truesky.main(["run", str(ROOT / "requests" / "none.toml"), "--lake", "x", "--", "--master", "local"]) == 2
+    assert len(supervised) == 1
+    assert called == []
 
 
 def test_unknown_commands_are_refused(capsys):
     assert truesky.main(["rendr"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("truesky: rendr is not a command; use one of build, check,")
-    assert truesky.main(["--local", "render", "--", "--master", "local"]) == 2
+    assert line == 'truesky: rendr is not a command; did you mean "render"?'
+    assert truesky.main(["xyz"]) == 2
+    assert "xyz is not a command; use one of build, cache, check, completion," in capsys.readouterr().err
+    assert truesky.main(["--local", "render", "r.toml", "lake", "--", "--master", "local"]) == 2
     assert "--local does not call spark-submit" in capsys.readouterr().err
     for words in ([], ["--help"], ["--version"]):
         assert truesky.main(words) == 0
         assert f"truesky {__version__}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("word", "extra"), sorted(truesky.EXTRAS.items()))
+_EXTRAS = sorted((name, declared.extra) for name, declared in commands.COMMANDS.items() if declared.extra)
+_OPTIONS = {"masters": ["--out", "x"], "push": ["s3://x/y"], "reduce": ["--out", "x"], "stack": ["--out", "x"]}
+
+
+@pytest.mark.parametrize(("word", "extra"), _EXTRAS)
 def test_a_missing_optional_package_is_named_with_its_remedy(word, extra, monkeypatch, capsys):
     def missing(module):
         raise ModuleNotFoundError("No module named 'drizzle'", name="drizzle")
 
     monkeypatch.setattr(truesky, "import_module", missing)
-    assert truesky.main([word, "lake"]) == 2
+    assert truesky.main([word, "lake", *_OPTIONS.get(word, [])]) == 2
     assert capsys.readouterr().err == (
         f"truesky: {word} requires the package drizzle, which is not installed: pip install 'truesky[{extra}]'\n"
     )

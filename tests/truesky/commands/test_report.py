@@ -12,6 +12,7 @@ from lake_schema.tables.tasks import TASKS
 from tests import requests
 from tests.universe import plain_plan, plain_work, rows_of
 from truesky.commands import report
+from truesky.render.forecasting import request_cost, speed
 from truesky.request.from_toml import parse
 from truesky.running.submitted_job import Job, Step
 from truesky.running.submitted_job import run as run_job
@@ -55,11 +56,12 @@ def test_a_run_makes_several_tables(lake):
 def test_unknown_values_are_marked(lake, capsys):
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows=10), {"seconds": 5.0, "status": "done"})
     assert report.main([str(lake)]) == 0
-    head, line, total = capsys.readouterr().out.splitlines()
+    head, line, total, *notes = capsys.readouterr().out.splitlines()
     assert len({len(head), len(line), len(total)}) == 1
+    assert all(";" in note for note in notes)
     assert line.split()[-4:] == ["-", "-", "-", "0.50"]
     assert report.main([str(lake), "--json"]) == 0
-    first, _ = map(json.loads, capsys.readouterr().out.splitlines())
+    first, _ = json.loads(capsys.readouterr().out)
     assert (first["job"], first["rows"], first["gb"], first["forecast_s"]) == ("draw", 10, None, None)
 
 
@@ -103,13 +105,18 @@ def test_the_forecast_is_of_all_requests(lake):
     """A detector that two requests share is rendered once."""
     log(lake, "1-products-1", {"job": "render_exposures"}, part("a", rows=1), {"seconds": 5.0, "status": "done"})
     rendered(lake, "a", [("3-4", "x"), ("3-5", "y")])
+    factor = speed.estimate_speed(lake).factor
+
+    def expected(detectors):
+        cost = request_cost.render_job(detectors, 10.0 * detectors, 1e9 * detectors, factor)
+        return pytest.approx((cost.cpu_s, cost.bytes / 1e9))
+
     line, _ = report.job_totals(lake)
-    factor = line.forecast_s / 20.0
-    assert line.forecast_gb == pytest.approx(2.0)
+    assert (line.forecast_s, line.forecast_gb) == expected(2)
     rendered(lake, "b", [("3-4", "x"), ("3-5", "z")])
     line, total = report.job_totals(lake)
-    assert (line.forecast_s, line.forecast_gb) == pytest.approx((30.0 * factor, 3.0))
-    assert total.forecast_gb == pytest.approx(3.0)
+    assert (line.forecast_s, line.forecast_gb) == expected(3)
+    assert (total.forecast_s, total.forecast_gb) == expected(3)
 
 
 def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):

@@ -15,6 +15,7 @@ from lake_schema.errors import BadInput, Damaged, Superseded
 from lake_schema.store import layout, publish, read, request_links
 from lake_schema.store.object_storage import push, s3
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+from truesky.commands import __main__
 
 ROOT = Path(__file__).resolve().parents[2]
 CELLS = ((1607, 60), (1608, 40))
@@ -283,7 +284,7 @@ def test_a_version_that_is_not_whole_is_not_pushed(filled, place, bucket):
 
 
 def told(capsys, *arguments):
-    status = push.main([*map(str, arguments)])
+    status = __main__.main(["push", *map(str, arguments)])
     said = capsys.readouterr()
     if status:
         assert said.out == ""
@@ -344,7 +345,7 @@ def test_without_credentials_nothing_is_sent(filled, place, capsys, monkeypatch,
 def test_a_push_that_is_killed_at_any_moment_is_completed(filled, place, bucket):
     pushed(filled, place)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "lake_schema.store.object_storage.push", str(filled), str(place), "--threads", "2"]
+    command = [sys.executable, "-m", "truesky.commands", "push", str(filled), str(place), "--threads", "2"]
     rng, killed = random.Random(7), 0
     for number in range(2, 14):
         publish.make_version(filled, plain_plan(number), plain_work, name="first")

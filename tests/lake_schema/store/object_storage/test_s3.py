@@ -1,14 +1,15 @@
 """Addresses of lakes on object storage, and errors if there is no lake."""
 
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from lake_schema import __main__
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout, publish, read
-from lake_schema.store.object_storage import push, s3
+from lake_schema.store.object_storage import s3
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+from truesky.commands import __main__
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,7 @@ def test_commands_work_on_a_pushed_lake(lake, bucket, capsys):
     publish.make_version(lake, toy_plan(cells=((1607, 30),)), toy_work)
     publish.make_version(lake, plain_plan(1), plain_work, name="first")
     place = f"s3://{bucket[1]}"
-    assert push.main([str(lake), place]) == 0
+    assert __main__.main(["push", str(lake), place]) == 0
     capsys.readouterr()
     for word in (["verify", "--deep"], ["describe"]):
         said = []
@@ -108,3 +109,16 @@ def test_commands_work_on_a_pushed_lake(lake, bucket, capsys):
     assert f"s3://{name}/{key}.more is not in the manifest" in said
     assert __main__.main(["gc", place]) == 2
     assert "POSIX" in capsys.readouterr().err
+
+
+def test_versions_of_two_tables_are_not_confused(monkeypatch):
+    """A version that is not published exists in the folder that has its manifest, and in no other one."""
+    lake = layout.open_lake("s3://sky/a")
+    lake.store.links = {}
+    manifest = lake / "stars" / ("v-" + "0" * 16) / "manifest.json"
+
+    def file_info(path):
+        return SimpleNamespace(type=SimpleNamespace(name="File" if path == manifest else "NotFound"))
+
+    monkeypatch.setattr(s3.ObjectPath, "_file_info", file_info)
+    assert [(lake / table / ("v-" + "0" * 16)).exists() for table in ("galaxies", "stars")] == [False, True]

@@ -171,7 +171,8 @@ def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
     mag of the median. A jackknife error that cannot be computed is ignored.
     """
     middle = float(np.median(values))
-    rest = [np.median(values[patch != left_out]) for left_out in range(n_patches)]
+    remaining = [values[patch != left_out] for left_out in range(n_patches)]
+    rest = [np.median(sample) if len(sample) else np.nan for sample in remaining]
     typical = values[np.isfinite(values)]
     typical = typical[np.abs(typical - middle) < 1.0]
     sample_error = 1.25 * float(np.std(typical)) / np.sqrt(max(len(typical), 1)) if len(typical) else 0.0

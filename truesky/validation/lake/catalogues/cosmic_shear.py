@@ -14,6 +14,7 @@ Kaiser 1995, ApJ 439, L1
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -135,9 +136,14 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
     angles = np.geomspace(_FIRST * ARCMIN, np.radians(20.0), _NODES)
     common = two_points.mean_over_pairs(field, angles, theory.shear_correlations(angles, theory.ELL, c_l)[0])
     rows = [
-        *_theory_rows(coarse, (plus, minus), (common, 0.0), note, nside),
-        *_b_mode_rows(fine, coarse, note),
-        *_convergence_rows(fine, wide, note),
+        row
+        if np.isfinite([row.value, row.error]).all()
+        else replace(row, note=f"too few pairs of galaxies; {row.note}")
+        for row in (
+            *_theory_rows(coarse, (plus, minus), (common, 0.0), note, nside),
+            *_b_mode_rows(fine, coarse, note),
+            *_convergence_rows(fine, wide, note),
+        )
     ]
     curve = np.geomspace(_FROM, wide[-1], _CURVE)
     series = {
@@ -230,9 +236,11 @@ def _convergence_rows(fine: TwoPointFunction, wide: list[float], note: str) -> l
     for low, high in pairwise(wide):
         in_bin = (fine.edges[:-1] > low * ARCMIN * 0.99) & (fine.edges[1:] < high * ARCMIN * 1.01)
         weight = fine.number * in_bin
-        ratio, ratios = (
-            np.sum(weight * measured, -1) / np.sum(weight * predicted, -1) for measured, predicted in curves
-        )  # fmt: skip
+        # Without pairs at this separation, the result is NaN.
+        with np.errstate(invalid="ignore"):
+            ratio, ratios = (
+                np.sum(weight * measured, -1) / np.sum(weight * predicted, -1) for measured, predicted in curves
+            )
         rows.append(
             Row(
                 NAME,

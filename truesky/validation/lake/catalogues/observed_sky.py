@@ -110,10 +110,23 @@ def compare(sample: GalaxySample, cell: Int) -> list[Row]:
     for check in checks.evaluate(figures):
         if (depth := _required_depth(check.name)) > deepest + _DEPTH_MARGIN:
             why = f"{check.name} requires galaxies to I_E = {depth:g}; 99 % are brighter than {deepest:.2f}"
+            why = why if len(cell) else "the table galaxies has no rows"
             out.append(replace(not_applicable(NAME, Place(), why, check.source), quantity=check.name))
             continue
-        out.append(row_of_check(NAME, check, errors.get(check.name, math.nan), ""))
+        error = errors.get(check.name, math.nan)
+        out.append(row_of_check(NAME, check, error, _note(check.value, error, len(np.unique(cell)))))
     return out
+
+
+def _note(value: float, error: float, number_of_cells: int) -> str:
+    """Return why a value or its error is unknown, "" if both are known."""
+    if not math.isfinite(value):
+        return "no galaxy of the catalogue is in this range"
+    if math.isfinite(error):
+        return ""
+    if number_of_cells < _MIN_PATCHES:
+        return f"too small an area: {number_of_cells} HEALPix cells < {_MIN_PATCHES}"
+    return f"too few galaxies in {number_of_cells} HEALPix cells"
 
 
 def _required_depth(name: str) -> float:
@@ -124,7 +137,7 @@ def _required_depth(name: str) -> float:
 
 def _groups(cell: Int) -> list[Int]:
     cells = np.unique(cell)
-    return [group for group in np.array_split(cells, min(_PATCHES, len(cells))) if len(group)]
+    return np.array_split(cells, min(_PATCHES, len(cells))) if len(cells) else []
 
 
 def _errors(sample: GalaxySample, cell: Int) -> dict[str, float]:

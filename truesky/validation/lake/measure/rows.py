@@ -138,6 +138,6 @@ def row_of_check(name: str, check: Check, error: float, note: str) -> Row:
         "",
         check.source,
         check.kind,
-        note or default_note,
+        "; ".join(filter(None, (note, default_note))),
         known_failure=check.known_failure,
     )

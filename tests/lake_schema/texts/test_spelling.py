@@ -1,0 +1,34 @@
+"""Names are suggested for names with another spelling, and for parts of names."""
+
+import pytest
+
+from lake_schema.texts import spelling
+
+BANDS = ("euclid_vis", "euclid_y", "lsst_r", "lsst_i")
+
+
+@pytest.mark.parametrize(
+    ("name", "existing", "closest"),
+    [
+        ("VIS", BANDS, ["euclid_vis"]),
+        ("euclid_viz", BANDS, ["euclid_vis"]),
+        ("r", BANDS, ["lsst_r"]),
+        ("LSSTCam", ("decam", "lsstcam"), ["lsstcam"]),
+        ("CCD_7", ("ccd70", "ccd7", "ccd1"), ["ccd7", "ccd70", "ccd1"]),
+        ("galaxy_limt", ("galaxy_band", "galaxy_limit"), ["galaxy_limit"]),
+        ("DET_22", ("DET12", "DET22"), ["DET22"]),
+        ("whatever", BANDS, []),
+        ("", BANDS, []),
+    ],
+)
+def test_the_closest_name_comes_first(name, existing, closest):
+    found = spelling.closest_names(name, existing)
+    assert found[: len(closest)] == closest
+    assert bool(found) == bool(closest)
+
+
+def test_a_suggestion_stands_before_the_allowed_names():
+    assert spelling.choices("VIS", BANDS) == f"did you mean euclid_vis? allowed: {', '.join(BANDS)}"
+    assert spelling.choices("whatever", BANDS) == f"allowed: {', '.join(BANDS)}"
+    many = [f"n{i:03}" for i in range(100)]
+    assert spelling.choices("x", many).endswith("n007, ... (100 names)")

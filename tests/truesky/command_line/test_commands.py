@@ -1,0 +1,135 @@
+"""Help, errors and completion of the commands of `truesky`, and how long they take."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from truesky.command_line import commands, simulation
+from truesky.commands import __main__ as truesky
+
+ROOT = Path(__file__).resolve().parents[3]
+# Modules that take long to import. Help and messages about wrong arguments must not need them.
+HEAVY = ("numpy", "pyarrow", "duckdb", "pandas", "pyspark", "scipy", "numba", "astropy", "matplotlib", "shtab")
+WORDS = {
+    "mission": ["list"], "push": ["s3://x/y"], "stack": ["--out", "x"], "masters": ["--out", "x"],
+    "reduce": ["--out", "x"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_the_help_of_every_command_has_its_usage_and_an_example(name, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        truesky.main([name, "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: truesky {name} [-h]")
+    assert f"Example: truesky {name}" in " ".join(text.split())
+    assert "python -m" not in text
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_examples_are_accepted(name):
+    words = re.findall(r'"[^"]*"|\S+', commands.COMMANDS[name].example.partition(">")[0])
+    assert commands.parse(name, [word.strip('"') for word in words]).command == name
+
+
+def test_the_help_lists_every_command_in_a_group():
+    text = commands.help_text()
+    assert max(map(len, text.splitlines())) <= 80
+    assert {declared.group for declared in commands.COMMANDS.values()} == set(commands.GROUPS)
+    for name, declared in commands.COMMANDS.items():
+        assert f"\n  {name} {declared.positions}" in text
+        assert declared.summary in text
+
+
+def test_the_lake_is_the_first_argument_or_follows_the_request():
+    for name in commands.COMMANDS:
+        usage = " ".join(commands.command_parser(name).format_usage().split())
+        if "LAKE" in usage and name != "stack":
+            assert re.search(r"\] (REQUEST )?(LAKE|\[LAKE\])", usage), usage
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        (["sql", "FROM x", "--lake", "l"], ("l", "FROM x")),
+        (["sql", "--lake=l", "FROM x"], ("l", "FROM x")),
+        (["sql", "l", "--", "--lake l"], ("l", "--lake l")),
+        (["sql", "--lake", "l"], ("l", None)),
+    ],
+)
+def test_the_lake_may_be_an_option(words, given):
+    options = commands.parse(words[0], words[1:])
+    assert (options.lake, options.sql) == given
+
+
+def test_request_and_lake_may_be_options_of_a_job():
+    for words in (
+        ["--lake", "l", "--request", "r"],
+        ["r", "--lake", "l", "--bands", "x"],
+        ["--bands", "x", "--", "r", "l"],
+    ):
+        options = commands.parse("fluxes", words)
+        assert simulation.job_words(options)[:4] == ["--lake", "l", "--request", "r"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["valdiate", "lake"], 'truesky: valdiate is not a command; did you mean "validate"?'),
+        (["run", "r", "l", "--limti", "3"], 'truesky run: there is no option --limti; did you mean "--limit"?'),
+        (["run", "r", "l", "--lim=3"], 'truesky run: there is no option --lim; did you mean "--limit"?'),
+        (["run", "r"], "truesky run: the following arguments are required: LAKE; see truesky run --help"),
+        (["sql", "l", "--lake"], "truesky sql: there is no option --lake"),
+        (["mission", "dif"], "truesky mission: argument list|diff|camera: invalid choice: 'dif'"),
+        (["render", "r", "l", "--limit", "x"], "truesky render: argument --limit: invalid int value: 'x'"),
+        (["list", "l", "galaxies", "stars"], "truesky list: unrecognized arguments: stars"),
+    ],
+)
+def test_mistakes_are_one_line_with_status_2(words, said, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        raise SystemExit(truesky.main(words))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(said)
+
+
+def test_help_and_mistakes_import_no_heavy_module():
+    code = f"""
+import sys
+from truesky.commands.__main__ import main
+for words in (["--help"], ["valdiate"], *([name, "--help"] for name in {sorted(commands.COMMANDS)}), ["run", "r"]):
+    try:
+        main(words)
+    except SystemExit:
+        pass
+print(*sorted(sys.modules.keys() & {set(HEAVY)}), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stderr.splitlines()[-1] == ""
+
+
+def test_limits_in_the_help_are_those_of_queries():
+    from truesky.explore import process
+
+    options = commands.parse("sql", ["lake"])
+    assert (options.memory * 1e9, options.timeout) == (process.MEMORY, process.TIMEOUT)
+
+
+def test_defaults_in_the_help_are_those_of_the_reduction_and_of_push():
+    from lake_schema.store.object_storage import push
+    from truesky.reduction import reduce
+
+    text = " ".join(commands.command_parser("reduce").format_help().split())
+    limits = reduce.Limits()
+    for value in (limits.threshold, limits.pixels):
+        assert f"(default: {value:g})" in text
+    assert f"default: {reduce._COSMIC_RAY_SIGMA:g} with --level2" in text
+    assert f"(default: {push.THREADS})" in commands.command_parser("push").format_help()
+
+
+def test_the_default_ladder_is_that_of_the_mission():
+    from lake_schema.tables.mission import LADDER
+
+    assert commands.parse("mission", ["list"]).of == ",".join(LADDER)
