@@ -18,5 +18,5 @@ In Python::
 
 On the command line::
 
-    python -m truesky.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--name REQUEST] [--out FILE]
+    truesky sql out/demo/lake "SELECT count(*) FROM galaxies" [--name REQUEST] [--out FILE]
 """

@@ -1,20 +1,23 @@
-"""Query the tables of a lake (a folder of the simulator) with SQL on the command line.
+"""Query the tables of a lake (a folder of the simulator) with SQL: the command `truesky sql LAKE [QUERY]`.
 
-Usage: python -m truesky.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE]. The name of FILE ends in .csv,
-.parquet, .fits or .vot. Without --out the rows are printed, at most 40 of them. Without SQL the tables are listed.
+Without --out or --json the rows are printed, at most 40 of them. Without QUERY the tables are listed.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
+from numbers import Integral
+from typing import TYPE_CHECKING
 
-from lake_schema import __version__, command, user_files
-from lake_schema.store import layout
-from truesky.explore import results
-from truesky.explore.explorer import Explorer
-from truesky.explore.process import MEMORY, TIMEOUT
+from lake_schema import command, user_files
+from lake_schema.errors import BadInput
+from lake_schema.pandas_import import hide_pandas
+from lake_schema.texts import text_tables
+from truesky.command_line import commands
+
+if TYPE_CHECKING:
+    from truesky.explore.explorer import Explorer
 
 _GIGABYTE = 1e9
 _MAX_ROWS_SHOWN = 40
@@ -27,50 +30,58 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     `argv` contains the command-line arguments without the name of the program; None means those of this process.
     """
-    options = _options(argv)
-    return command.run("explore", lambda: _answer(options))
+    return commands.run("sql", run_command, argv)
 
 
-def _answer(options: argparse.Namespace) -> int:
+def run_command(options: argparse.Namespace) -> int:
+    """Run `truesky sql` with its parsed arguments, and return the exit status.
+
+    It is 0, or 1 if the tables are listed and some of them are damaged. Errors are raised as LakeError.
+    """
+    if options.sql is not None:
+        hide_pandas()
+    # These imports take long, and must come after `hide_pandas`.
+    from lake_schema.store import layout
+    from truesky.explore import results
+    from truesky.explore.explorer import Explorer
+
     if options.out is not None:
         user_files.check_target(options.out, results.ENDINGS)
+        if options.json:
+            raise BadInput("--json must not be used with --out, whose ending selects the format")
     with Explorer(
         layout.open_lake(options.lake, options.endpoint_url), options.memory * _GIGABYTE, options.timeout, options.name
     ) as lake:
         if options.sql is None:
-            print(lake.tables().to_string())
+            _print_tables(lake, options.json)
             return int(bool(lake.damaged))
         rows = lake.sql(options.sql, into="arrow")
-    if options.out is None:
-        print(results.convert(rows, "pandas").to_string(max_rows=_MAX_ROWS_SHOWN, index=False))
-        print(f"{rows.num_rows:,} rows")
-    else:
+    if options.out is not None:
         results.write(rows, options.out)
         print(f"{options.out}: {rows.num_rows:,} rows, {options.out.stat().st_size / 1e6:.1f} MB")
+    elif options.json:
+        text_tables.print_json(rows.to_pylist())
+    else:
+        names, lines = results.to_cells(rows, _MAX_ROWS_SHOWN)
+        print(*text_tables.format_table(names, lines, names), sep="\n")
+        print(f"{rows.num_rows:,} rows")
     return 0
 
 
-def _options(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.explore",
-        description="Run one SELECT over the tables of a lake; without one, list the tables.",
-        epilog=f"truesky {__version__}",
-    )
-    parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
-    parser.add_argument("--lake", required=True, help="folder of the lake, or s3://BUCKET/PREFIX")
-    parser.add_argument(
-        "--endpoint-url", help="endpoint of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
-    )
-    parser.add_argument("--name", help="request whose tables are queried, if the lake contains several")
-    parser.add_argument("--out", type=Path, help="write to this .csv, .parquet, .fits or .vot file")
-    limit = MEMORY / _GIGABYTE
-    parser.add_argument(
-        "--memory", type=float, default=limit, help=f"memory limit of the query in GB (default {limit:g})"
-    )
-    parser.add_argument(
-        "--timeout", type=float, default=TIMEOUT, help=f"time limit of the query in s (default {TIMEOUT:g})"
-    )
-    return parser.parse_args(argv)
+def _print_tables(lake: Explorer, as_json: bool) -> None:
+    frame = lake.tables().reset_index()
+    if as_json:
+        text_tables.print_json(frame.astype(object).where(frame.notna(), None).to_dict("records"))
+        return
+    rows = [[_table_cell(value) for value in row] for row in frame.itertuples(index=False)]
+    for line in text_tables.format_table([*frame.columns], rows, {"rows", "MB", "files"}):
+        print(line)
+
+
+def _table_cell(value: object) -> str:
+    if isinstance(value, float):
+        return "-" if value != value else f"{value:,.1f}"
+    return f"{value:,}" if isinstance(value, Integral) else "-" if str(value) == "<NA>" else str(value)
 
 
 if __name__ == "__main__":

@@ -127,7 +127,8 @@ def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
     """
     if len(text) > _MAX_LENGTH:
         raise BadInput(f"ADQL: a query has at most {_MAX_LENGTH} characters")
-    tokens = [token for token in _TOKEN.findall(text) if not token.startswith(("--", "/*"))]
+    # A comment separates words, as a space does.
+    tokens = [" " if token.startswith(("--", "/*")) else token for token in _TOKEN.findall(text)]
     while tokens and (tokens[-1].isspace() or tokens[-1] == ";"):
         tokens.pop()
     return "".join(_top_to_limit(_translate_functions(tokens, _indices(tokens, catalogues))))
@@ -204,33 +205,57 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
 def _top_to_limit(tokens: Sequence[str]) -> list[str]:
     """Replace TOP n of every SELECT by LIMIT n at the end of the same SELECT, and return all tokens.
 
-    A SELECT ends before its OFFSET, at the closing bracket of its subquery, or at the end of the query. BadInput is
-    raised if a SELECT with TOP is followed by UNION, INTERSECT or EXCEPT, because LIMIT would apply to the whole union.
+    A SELECT ends before its OFFSET, at the closing bracket of its subquery, or at the end of the query. If it is a part
+    of UNION, INTERSECT or EXCEPT, it ends before the next of these words or ORDER. It is then put in brackets, because
+    LIMIT would else apply to the whole set.
     """
+    set_parts = _set_parts(tokens)
     out: list[str] = []
-    # Bracket depth and n of each SELECT with TOP n whose end has not been reached, innermost last.
-    open_selects: list[tuple[int, str]] = []
+    # For each SELECT with TOP n whose end has not been reached, innermost last: bracket depth, the text at its end, and
+    # True if it is a part of a set.
+    open_selects: list[tuple[int, str, bool]] = []
     depth, at = 0, 0
     while at < len(tokens):
         token = tokens[at]
         word = token.upper()
-        if token == "(":
-            depth += 1
-        ends = open_selects and open_selects[-1][0] == depth
-        if (token == ")" or word == "OFFSET") and ends:
-            out.append(f" LIMIT {open_selects.pop()[1]} ")
-        elif word in _SET and ends:
-            raise BadInput(f"ADQL: TOP in a part of {word} is not possible: put that part in a subquery")
-        if token == ")":
-            depth -= 1
+        depth += token == "("
+        if open_selects and open_selects[-1][0] == depth:
+            _, end, ends_early = open_selects[-1]
+            if token == ")" or word == "OFFSET" or (ends_early and word in _SET | {"ORDER"}):
+                out.append(f"{end} ")
+                open_selects.pop()
+        depth -= token == ")"
+        start, is_part = len(out), at in set_parts
         out.append(token)
         at += 1
         if word == "SELECT":
             at, limit = _top(tokens, at, out)
             if limit is not None:
-                open_selects.append((depth, limit))
-    out += [f" LIMIT {limit}" for _, limit in reversed(open_selects)]
+                open_selects.append((depth, f" LIMIT {limit}" + ")" * is_part, is_part))
+                if is_part:
+                    out.insert(start, "(")
+    out += [end for _, end, _ in reversed(open_selects)]
     return out
+
+
+def _set_parts(tokens: Sequence[str]) -> set[int]:
+    """Return the indices of all tokens SELECT whose query is a part of UNION, INTERSECT or EXCEPT."""
+    parts: set[int] = set()
+    # For each open bracket: the indices of SELECT directly in it, and True if there is a word such as UNION.
+    groups: list[tuple[list[int], bool]] = [([], False)]
+    for at, token in enumerate([*tokens, *[")"] * (tokens.count("(") + 1)]):
+        word = token.upper()
+        selects, is_set = groups[-1]
+        if token == "(":
+            groups.append(([], False))
+        elif token == ")":
+            parts.update(selects if is_set else ())
+            groups = groups[:-1] or [([], False)]
+        elif word == "SELECT":
+            selects.append(at)
+        elif word in _SET:
+            groups[-1] = (selects, True)
+    return parts
 
 
 def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | None]:

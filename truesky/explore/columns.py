@@ -9,7 +9,6 @@ together.
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -21,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from lake_schema.arrays import Array, Float32
-from truesky.numerics import cache
+from truesky.numerics import cache, cache_entries
 from truesky.numerics.code_fingerprints import code_key
 
 # Type of a function that runs a query. Its arguments are the SQL of the query, and the parts of this SQL that a user
@@ -139,19 +138,16 @@ def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes
 def trim(max_bytes: float = MAX_BYTES, folder: Path | None = None) -> int:
     """Remove stored columns (values of SQL expressions) from the disc cache until at most `max_bytes` bytes remain.
 
-    The oldest columns are removed first. Return the number of removed entries (folders of one or several columns).
-    `folder` is the cache folder; None means the cache folder of truesky.
+    The least recently used columns are removed first, also those that this process uses: it keeps their memory maps.
+    Return the number of removed entries (folders of one or several columns). `folder` is the cache folder; None means
+    the cache folder of truesky.
     """
-    folders = [path for path in (folder or cache.cache_dir()).glob(f"{_NAME}-*") if path.is_dir()]
-    sizes = {path: sum(file.stat().st_size for file in path.iterdir()) for path in folders}
-    removed, total = 0, sum(sizes.values())
-    for path in sorted(folders, key=_age):
+    root = folder or cache.cache_dir()
+    stored = [entry for entry in cache_entries.entries(root) if entry.folder.name.startswith(f"{_NAME}-")]
+    removed, total = 0, sum(entry.size for entry in stored)
+    for entry in stored:
         if total <= max_bytes:
             break
-        shutil.rmtree(path, ignore_errors=True)
-        removed, total = removed + 1, total - sizes[path]
+        cache_entries.remove(entry.folder, root)
+        removed, total = removed + 1, total - entry.size
     return removed
-
-
-def _age(folder: Path) -> float:
-    return folder.stat().st_mtime

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from lake_schema import arguments, sky, user_files
 from lake_schema.arrays import Float, Int
@@ -19,6 +18,9 @@ from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.explore import results
 from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Range = tuple[float, float]
 
@@ -128,6 +130,8 @@ class Explorer:
             identifies it) and `meaning`. If a table cannot be opened, `version` is "damaged" or "unreadable version",
             `meaning` is the error, and the numbers are missing.
         """
+        import pandas as pd
+
         rows = [
             {
                 "table": name,
@@ -189,6 +193,8 @@ class Explorer:
         LakeError
             If the table cannot be opened.
         """
+        import pandas as pd
+
         rows = []
         for field in self._version(table).schema:
             facts = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -211,8 +217,9 @@ class Explorer:
         Parameters
         ----------
         text : str
-            Query in DuckDB's SQL; $name is a parameter. Two functions are added: separation(ra1, dec1, ra2, dec2) is
-            the angle between two positions in deg, and mag_ab(f_nu) is the AB magnitude of a flux in microjansky.
+            Query in DuckDB's SQL; $name is a parameter. Three functions are added: separation(ra1, dec1, ra2, dec2) is
+            the angle between two positions in deg, mag_ab(f_nu) is the AB magnitude of a flux in microjansky, and
+            in_area(ra, dec) is true in the area of the request.
         into : str, optional
             Type of the result: "pandas", "astropy" (a Table with units) or "arrow".
         **parameters : object
@@ -427,7 +434,9 @@ class Explorer:
         lo, hi = extremes["lo"][0].as_py(), extremes["hi"][0].as_py()
         if lo is None or not np.isfinite([lo, hi]).all():
             raise BadInput(f"table {table}: {x} has no finite values here")
-        return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)
+        # Near large numbers, a float cannot represent half a unit.
+        half = max(0.5, 2.0 * float(np.spacing(abs(lo))))
+        return (lo, hi) if hi > lo else (lo - half, hi + half)
 
 
 def _pair(name: str, value: Any) -> tuple[Any, Any]:

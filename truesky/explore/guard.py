@@ -16,9 +16,11 @@ from typing import Any
 import duckdb
 
 from lake_schema.errors import BadInput
+from truesky.explore.suggestions import suggest_tables
 
 # Largest number of characters of a query.
 _MAX_CHARACTERS = 100_000
+TOO_LARGE = "SQL: the query or its result needs more memory than its limit: ask for less"
 # Longer messages of DuckDB are cut at this number of characters.
 _MAX_LENGTH = 500
 _QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
@@ -70,11 +72,14 @@ class Query:
         Sorted names of the tables of the lake that the query reads.
     columns : Origins
         Names of the result's columns that are unchanged columns of these tables.
+    tree : dict
+        Syntax tree of the query, from DuckDB.
     """
 
     text: str
     tables: tuple[str, ...]
     columns: Origins
+    tree: Tree
 
 
 def check_query(text: str, table_names: Collection[str], connection: duckdb.DuckDBPyConnection | None = None) -> Query:
@@ -119,7 +124,7 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
             used |= _source(node, table_names, visible)
         if node.get("class") == "FUNCTION":
             _refuse_function(str(node["function_name"]).lower())
-    return Query(text, tuple(sorted(used)), _origins(tree, used, {}))
+    return Query(text, tuple(sorted(used)), _origins(tree, used, {}), tree)
 
 
 def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = None) -> None:
@@ -228,7 +233,10 @@ def _source(node: Tree, table_names: Collection[str], with_names: Collection[str
         return {name}
     if not node.get("catalog_name") and name in with_names:
         return set()
-    raise BadInput(f"SQL: {one_line(repr(name))} is not a table of the lake ({', '.join(sorted(table_names))})")
+    problem = f"SQL: {one_line(repr(name))} is not a table of the lake"
+    if suggested := suggest_tables(name, table_names):
+        raise BadInput(f"{problem}; did you mean {' or '.join(suggested)}?")
+    raise BadInput(f"{problem} ({', '.join(sorted(table_names))})")
 
 
 def _refuse_function(name: str) -> None:

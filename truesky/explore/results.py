@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
@@ -20,20 +19,23 @@ import pyarrow.parquet as pq
 from lake_schema import user_files
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
-from truesky.explore import votables
 
 # Largest size in bytes of a FITS file that `stream_file` yields. Other file types have no limit there, because they are
 # sent while rows are read. The function `write` has no limit.
 MAX_FITS_BYTES = 8 << 30
 # Number of bytes of a FITS file that are sent at a time.
 _PIECE = 1 << 20
+# Largest number of characters of a value in a text table.
+_MAX_CELL = 50
 INTO = ("pandas", "astropy", "arrow")
-# Types of pandas columns with missing values, by Arrow type. By default pandas would convert such integers to floats,
+# Types of columns that get a pandas type for missing values. By default pandas would convert such integers to floats,
 # which would round identifiers.
-_NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
-_NULLABLE |= {
-    pa.type_for_alias(kind.lower()): pd.api.types.pandas_dtype(kind)
-    for kind in ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
+_NULLABLE = {
+    pa.bool_(): "boolean",
+    **{
+        pa.type_for_alias(kind.lower()): kind
+        for kind in ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
+    },
 }
 
 
@@ -48,13 +50,61 @@ def convert(rows: pa.Table, into: str) -> Any:
         If `into` is another text, or two columns have the same name, which an astropy Table cannot represent.
     """
     if into == "pandas":
-        gaps = {column.type for column in rows.columns if column.null_count}
-        return rows.to_pandas(types_mapper=lambda kind: _NULLABLE.get(kind) if kind in gaps else None)
+        return _pandas(rows)
     if into == "arrow":
         return rows
     if into == "astropy":
         return _astropy(rows)
     raise BadInput(f"into = {into!r} is not one of {', '.join(INTO)}")
+
+
+def _pandas(rows: pa.Table) -> Any:
+    # The import is delayed, because it takes longer than most answers.
+    import pandas as pd
+
+    gaps = {column.type for column in rows.columns if column.null_count} & _NULLABLE.keys()
+    types = {kind: pd.api.types.pandas_dtype(_NULLABLE[kind]) for kind in gaps}
+    return rows.to_pandas(types_mapper=types.get)
+
+
+def to_cells(rows: pa.Table, max_rows: int) -> tuple[list[str], list[list[str]]]:
+    """Return the names of columns and the values of rows as texts, with "..." between the first and last rows.
+
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows.
+    max_rows : int
+        Largest number of rows that are returned. If there are more, half of them are the first and half the last ones.
+
+    Returns
+    -------
+    names : list of str
+        Names of the columns.
+    cells : list of list of str
+        Values of each row. Floats have 10 significant digits (7 for 32 bits), a missing value is "<NA>", and longer
+        values than 50 characters are cut.
+    """
+    half = max_rows // 2
+    is_cut = rows.num_rows > max_rows
+    pieces = [rows.slice(0, half), rows.slice(rows.num_rows - half)] if is_cut else [rows]
+    columns = []
+    for number, field in enumerate(rows.schema):
+        digits = 10 if field.type == pa.float64() else 7
+        cells = [[_cell(value, digits) for value in piece.column(number).to_pylist()] for piece in pieces]
+        columns.append([*cells[0], *(["...", *cells[1]] if is_cut else [])])
+    return list(rows.schema.names), [list(line) for line in zip(*columns, strict=True)]
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None:
+        return "<NA>"
+    if isinstance(value, float):
+        number = f"{value:.{digits}g}"
+        # A float has a point, as in Python, so that it differs from an integer.
+        return f"{number}.0" if number.lstrip("-").isdigit() else number
+    text = " ".join(str(value).split())
+    return text if len(text) <= _MAX_CELL else f"{text[: _MAX_CELL - 3]}..."
 
 
 def _astropy(rows: pa.Table) -> Any:
@@ -158,6 +208,8 @@ def _kind(kind: pa.DataType) -> str:
 
 
 def _votable(rows: pa.Table, path: Path) -> None:
+    from truesky.explore import votables
+
     with path.open("wb") as file:
         for piece in votables.pieces([pa.RecordBatch.from_pylist([], rows.schema), *rows.to_batches()]):
             file.write(piece)
@@ -181,6 +233,8 @@ def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[byte
         If the ending is another one, two columns have the same name, or the file type cannot hold the result. A FITS
         file must not have more than 8 GiB.
     """
+    from truesky.explore import votables
+
     first = next(batches)
     _refuse_same_names(pa.Table.from_batches([first]))
     all_batches = itertools.chain([first], batches)

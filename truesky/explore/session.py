@@ -6,18 +6,19 @@ The session can reach nothing but these tables. It stays open between queries, a
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from lake_schema.errors import BadInput, Damaged
+from lake_schema import tables as declarations
+from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
-from truesky.explore import adql
-from truesky.explore.guard import Query, check_expression, check_query, one_line, parser
+from truesky.explore import adql, requested_area, shared_columns, suggestions
+from truesky.explore.guard import TOO_LARGE, Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
     # Angle between two positions in deg, computed with the haversine formula; the arguments are in deg.
@@ -38,7 +39,6 @@ _LOCKS = (
 )
 # Fraction of the memory limit of a query that DuckDB may fill; the rest is for the result.
 _SHARE = 0.5
-TOO_LARGE = "SQL: the query or its result needs more memory than its limit: ask for less"
 OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
@@ -102,7 +102,9 @@ class Session:
                 self._open(name)
                 for file in getattr(self._rows[name], "verified_files", ()):
                     file.forget()
-            relation = self._connect().sql(query.text, params=dict(parameters) or None)
+            columns = {name: rows.schema.names for name, rows in self._rows.items()}
+            text = shared_columns.qualify(query.text, query.tree, columns)
+            relation = self._connect().sql(text, params=dict(parameters) or None)
             if relation is None:
                 raise BadInput("SQL: the query returns no rows")
             batches = pa.RecordBatchReader.from_stream(relation)
@@ -118,10 +120,40 @@ class Session:
             # that reads the damaged table contains the reason.
             if fault := next((fault for rows in self._rows.values() if (fault := getattr(rows, "fault", ""))), ""):
                 raise Damaged(fault) from None
-            raise BadInput(f"SQL: {one_line(error)}") from None
+            raise BadInput(f"SQL: {one_line(self._explain(error, query))}") from None
         finally:
             if not finished:
                 self.close()
+
+    def _explain(self, error: Exception, query: Query) -> str:
+        """Return the message of an error, or a message with suggestions if a column of the query does not exist."""
+        if not isinstance(error, duckdb.BinderException):
+            return str(error)
+        columns = {table: self._rows[table].schema.names for table in query.tables if table in self._rows}
+        unrelated = shared_columns.unrelated_fluxes(columns)
+        requests = {table.rpartition(".")[0] for table in columns}
+        other_tables = {
+            name: names
+            for name in self.table_keys
+            for request, _, table in [name.rpartition(".")]
+            if name not in columns
+            and request in requests
+            and table not in unrelated
+            and (names := self._column_names(name))
+        }
+        return suggestions.explain_missing_column(str(error), columns, other_tables)
+
+    def _column_names(self, name: str) -> Sequence[str]:
+        """Return the names of the columns of a table of the lake, [] for others and if the table cannot be opened."""
+        table = name.rpartition(".")[2]
+        declaration = declarations.find_table(table)
+        if declaration is None or not table.endswith("_fluxes"):
+            return [] if declaration is None else list(declaration.names)
+        try:
+            # The declaration does not contain the passbands of the lake.
+            return list(_open_table(self.root, name, self.table_keys[name]).schema.names)
+        except LakeError:
+            return []
 
     def _connect(self) -> duckdb.DuckDBPyConnection:
         if self._database is None:
@@ -131,7 +163,7 @@ class Session:
                 "threads": os.cpu_count() or 1,
             }
             self._database = duckdb.connect(":memory:", config=config)
-            for command in (*_MACROS, *adql.MACROS, *_LOCKS):
+            for command in (*_MACROS, *adql.MACROS, *requested_area.macros(self.root, self.table_keys), *_LOCKS):
                 self._database.execute(command)
         return self._database
 

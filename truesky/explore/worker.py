@@ -16,14 +16,18 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import pyarrow as pa
 
 from lake_schema import command
 from lake_schema.errors import BadInput, Damaged, LakeError
+from lake_schema.pandas_import import hide_pandas
 from lake_schema.store import layout
-from truesky.explore.session import TOO_LARGE, Session
+from truesky.explore.guard import TOO_LARGE
+
+if TYPE_CHECKING:
+    from truesky.explore.session import Session
 
 # Memory in bytes that Python and the libraries need before any query; it is added to the memory limit of queries.
 _BASE_BYTES = 1 << 30
@@ -41,6 +45,10 @@ def main(argv: Sequence[str]) -> int:
     TABLE=?REQUEST means a table that could not be opened, so that a query of this table raises the error. TABLE=@FILE
     means the rows of an Arrow file.
     """
+    hide_pandas()
+    # This import must come after `hide_pandas`.
+    from truesky.explore.session import Session
+
     root, memory = layout.open_lake(argv[0]), int(argv[1])
     command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
     command.limit_resource("RLIMIT_CORE", 0)

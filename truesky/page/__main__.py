@@ -1,6 +1,6 @@
-"""Start the web page of a lake (the folder with all tables and images): python -m truesky.page --lake LAKE.
+"""Start the web page of a lake (the folder with all tables and images): the command `truesky page LAKE`.
 
-`truesky page LAKE` does the same. The address of the page is printed and opened in the browser.
+The address of the page is printed and opened in the browser.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 from aiohttp import web
 
-from lake_schema import __version__, command
+from lake_schema import command
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
-from truesky.explore.process import MEMORY, TIMEOUT
+from truesky.command_line import commands
 from truesky.page.access_control import AccessRules, new_token
 from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
@@ -34,12 +34,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     `argv` contains the command-line arguments without the name of the program; None means those of this process. The
     status is 0 after a stop with Ctrl-C, 1 if the lake is damaged or the port is in use, and 2 if an option is wrong.
     """
-    options = _options(argv)
-    return command.run("page", lambda: _serve(options))
+    return commands.run("page", run_command, argv)
 
 
-def _serve(options: argparse.Namespace) -> int:
-    root, host_names = layout.open_lake(_lake_folder(options), options.endpoint_url), _host_names(options)
+def run_command(options: argparse.Namespace) -> int:
+    """Serve the page with the parsed arguments of `truesky page` until it is stopped, and return 0.
+
+    BadInput is raised for wrong arguments, and OSError if the port is in use.
+    """
+    root, host_names = layout.open_lake(options.lake, options.endpoint_url), _host_names(options)
     if options.token is None and host_names != _LOCAL_NAMES:
         raise BadInput(f"--host {options.host}: other machines can reach the server, so --token is required")
     if options.token is not None and not _TOKEN.fullmatch(options.token):
@@ -64,12 +67,6 @@ def _serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _lake_folder(options: argparse.Namespace) -> str:
-    if (options.lake is None) == (options.folder is None):
-        raise BadInput("exactly one lake must be given: LAKE or --lake LAKE")
-    return str(options.folder if options.lake is None else options.lake)
-
-
 def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
     """Return the host names under which the server answers; the first name is part of the printed address.
 
@@ -86,39 +83,6 @@ def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
             raise BadInput(f"{problem}: give --called NAME, the name or address that they use")
         return (*other_names, *_LOCAL_NAMES)
     return (*other_names, *_LOCAL_NAMES) if options.host in _LOCAL_NAMES else (options.host.lower(), *other_names)
-
-
-def _options(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.page",
-        description="Show a lake in the browser and serve its tables by TAP. Stop with Ctrl-C.",
-        epilog=f"truesky {__version__}",
-    )
-    parser.add_argument("folder", nargs="?", metavar="LAKE", help="folder of the lake, or s3://BUCKET/PREFIX")
-    parser.add_argument("--lake", help="the same as LAKE")
-    parser.add_argument("--endpoint-url", help="object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
-    parser.add_argument("--name", help="show only the tables of the request with this name")
-    parser.add_argument("--port", type=int, default=0, help="port to listen on (default: a free port)")
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine only)"
-    )
-    parser.add_argument(
-        "--called",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="host name or address that other machines use (required with --host 0.0.0.0; can be repeated)",
-    )
-    parser.add_argument("--token", help="token in the printed address, 16 characters or more (default: a random one)")
-    parser.add_argument("--no-open", dest="open", action="store_false", help="do not open a browser")
-    limit = MEMORY / _GIGABYTE
-    parser.add_argument(
-        "--memory", type=float, default=limit, help=f"memory limit of a query in GB (default {limit:g})"
-    )
-    parser.add_argument(
-        "--timeout", type=float, default=TIMEOUT, help=f"time limit of a query in s (default {TIMEOUT:g})"
-    )
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

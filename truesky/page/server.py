@@ -258,6 +258,14 @@ async def _trace_strip(lake: LakeSession, request: web.Request) -> web.StreamRes
     return _binary_response(await lake.pixel_pool.run(sources.trace_strip, lake, number, source, int(order[0])))
 
 
+async def _trace_at(lake: LakeSession, request: web.Request) -> web.StreamResponse:
+    from truesky.page import sources
+
+    x, y = _float_parameters(request, "x", "y")
+    number = _integer_parameter(request, "number")
+    return answers.json_response(await lake.pixel_pool.run(sources.trace_at, lake, number, float(x), float(y)))
+
+
 async def _nearest(lake: LakeSession, request: web.Request) -> web.StreamResponse:
     from truesky.page import sources
 
@@ -356,6 +364,7 @@ _ROUTES: tuple[tuple[str, str, LakeHandler], ...] = (
     ("GET", "truth/{number}", _json_handler(_truth, "number", is_small=True)),
     ("GET", "cutout/{number}", _cutout),
     ("GET", "trace/{number}/{id}", _trace_strip),
+    ("GET", "trace_at/{number}", _trace_at),
     ("GET", "nearest", _nearest),
     ("GET", "source/{id}", _json_handler(_source, "id", is_small=True)),
     ("GET", "spectrum/{id}", _json_handler(_spectrum, "id")),

@@ -12,6 +12,7 @@ import pyarrow.dataset as ds
 from numpy.polynomial import polynomial
 
 from lake_schema import ids, sky
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.store import read
 from truesky.fluxes import band_fluxes, inputs, passbands
@@ -19,6 +20,7 @@ from truesky.fluxes.spectra import lines
 from truesky.page import pictures
 from truesky.page.answers import pack, to_json_value
 from truesky.page.lake_session import LakeSession, RequestTables
+from truesky.render.products.sidecar_files import spectra_file
 
 _TABLES_BY_KIND = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
 # Spectra are averaged to about this number of wavelengths.
@@ -29,6 +31,9 @@ _CUTOUT_SIDE = 64
 _STRIP_HALF_WIDTH = 12
 # Largest number of pixels that a straightened spectrum shows along its trace.
 _MAX_STRIP_LENGTH = 4096
+# Number of points at which a trace is computed to find those at a position, and largest distance of a trace, pixels.
+_TRACE_SAMPLES = 17
+_TRACE_REACH = 4.0
 Json = dict[str, Any]
 
 
@@ -366,6 +371,50 @@ def trace_strip(lake: LakeSession, number: int, identifier_text: str, order: int
     wavelength_range = {"first": traces[0]["wavelength_first"], "last": traces[0]["wavelength_last"]}
     header = {"rows": out.shape[0], "columns": out.shape[1], **wavelength_range}
     return pack(header, out)
+
+
+def trace_at(lake: LakeSession, number: int, x: float, y: float) -> Json:
+    """Find the source whose first order passes through a position on an image behind a grism.
+
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    number : int
+        Number of the image, see `pictures.pictures`.
+    x, y : float
+        Column and row of the position; 0 is the centre of the first pixel.
+
+    Returns
+    -------
+    dict
+        `id` (text) of the source with the most expected electrons among those whose traces are at most 4 pixels away.
+        Empty if no trace is that near, or the image has no spectra.
+
+    Notes
+    -----
+    BadInput is raised if there is no image with this number.
+    """
+    image = pictures.picture(lake, number)
+    path = spectra_file(image.row["exposure_id"], image.row["detector"])
+    if not image.version.has_file(path):
+        return {}
+    rows = image.version.read_sidecar(path)
+    rows = rows.filter(pc.equal(rows["order"], 1))
+    t = np.linspace(0.0, 1.0, _TRACE_SAMPLES)
+    best: tuple[float, int] | None = None
+    for trace in rows.select(["id", "trace_x", "trace_y", "expected"]).to_pylist():
+        column, row = (polynomial.polyval(t, np.array(trace[f"trace_{axis}"])) for axis in "xy")
+        if _distance_to_line(column - x, row - y) <= _TRACE_REACH and (best is None or trace["expected"] > best[0]):
+            best = trace["expected"], trace["id"]
+    return {} if best is None else {"id": str(best[1])}
+
+
+def _distance_to_line(x: Float, y: Float) -> float:
+    """Return the distance from the origin to a line through the points (x, y), each of shape (n,), in their order."""
+    dx, dy = np.diff(x), np.diff(y)
+    share = np.clip(-(x[:-1] * dx + y[:-1] * dy) / np.maximum(dx**2 + dy**2, 1e-12), 0.0, 1.0)
+    return float(np.hypot(x[:-1] + share * dx, y[:-1] + share * dy).min())
 
 
 def nearest_source(lake: LakeSession, ra: float, dec: float, radius: float) -> Json:

@@ -34,10 +34,33 @@ def database():
         ("SELECT 'TOP 3', \"POINT\" -- TOP 2\nFROM t", "SELECT 'TOP 3', \"POINT\" FROM t"),
         ('SELECT LOG(a), LOG10(a), "LOG"(a), log FROM t', 'SELECT ln(a), LOG10(a), "LOG"(a), log FROM t'),
         ("SELECT top FROM t", "SELECT top FROM t"),
+        ("SELECT/* all */a/**/FROM/**/t", "SELECT a FROM t"),
+        ("SELECT a FROM t UNION SELECT TOP 5 b FROM u", "SELECT a FROM t UNION ( SELECT b FROM u LIMIT 5)"),
+        (
+            "SELECT TOP 2 a FROM t UNION ALL SELECT TOP 5 b FROM u ORDER BY 1 OFFSET 1",
+            "( SELECT a FROM t LIMIT 2) UNION ALL ( SELECT b FROM u LIMIT 5) ORDER BY 1 OFFSET 1",
+        ),
+        (
+            "SELECT TOP 1 a FROM t WHERE a IN (SELECT b FROM u EXCEPT SELECT TOP 2 c FROM v) ORDER BY a",
+            "SELECT a FROM t WHERE a IN (SELECT b FROM u EXCEPT ( SELECT c FROM v LIMIT 2)) ORDER BY a LIMIT 1",
+        ),
     ],
 )
 def test_to_sql(query, sql):
-    assert adql.to_sql(query).split() == sql.split()
+    def spaced(text):
+        return text.replace("(", "( ").replace(")", " ) ").split()
+
+    assert spaced(adql.to_sql(query)) == spaced(sql)
+
+
+def test_top_limits_its_part_of_a_union(database):
+    numbers = "SELECT n FROM (VALUES (1), (2), (3)) AS t(n)"
+    first, both = (
+        numbers.replace("SELECT n", "SELECT TOP 1 n") + f" UNION ALL {numbers}",
+        f"{numbers} UNION ALL {numbers}".replace("SELECT n", "SELECT TOP 1 n"),
+    )
+    last = f"{numbers} UNION ALL " + numbers.replace("SELECT n", "SELECT TOP 1 n") + " ORDER BY n DESC"
+    assert [len(database.execute(adql.to_sql(query)).fetchall()) for query in (first, both, last)] == [4, 2, 4]
 
 
 CONE = "CONTAINS(POINT('ICRS', {0}ra, {0}dec), CIRCLE('ICRS', 40, -30, 3)) = 1"

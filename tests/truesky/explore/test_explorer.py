@@ -434,3 +434,10 @@ def test_expressions_may_end_in_a_comment(explorer):
         one, other = getattr(explorer, name), getattr(explorer, name)
         for a, b in zip(one("galaxies", *axes, **plain), other("galaxies -- all", *noted, **given), strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("value", [0.0, -1e17, 1e17, 1e300])
+def test_the_range_of_equal_values_contains_them(explorer, value):
+    counts, edges = explorer.hist("plain", f"{value!r}::DOUBLE", bins=4)
+    assert edges[0] < value < edges[-1]
+    assert counts.sum() == explorer.sql("SELECT count(*) AS n FROM plain")["n"][0]

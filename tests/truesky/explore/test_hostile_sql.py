@@ -167,7 +167,7 @@ def test_locked_session_is_a_second_protection(explored, outside, before, text, 
     part = galaxies.partition_path(galaxies.partitions[0])
     keys = {"galaxies": galaxies.key, "plain": read.version(explored, "plain").key}
     text = text.replace("{file}", str(outside / "secret.csv")).replace("{new}", str(outside / "new"))
-    query = guard.Query(text.replace("{part}", str(part)), ("galaxies", "plain"), guard.Origins(None))
+    query = guard.Query(text.replace("{part}", str(part)), ("galaxies", "plain"), guard.Origins(None), {})
     try:
         answer = str([batch.to_pylist() for batch in Session(explored, keys, 1 << 30).run(query, {})])
     except (BadInput, UnicodeError) as error:

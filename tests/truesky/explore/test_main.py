@@ -1,6 +1,9 @@
 """The explorer's command line."""
 
+import os
 import shutil
+import subprocess
+import sys
 
 import pandas as pd
 import pytest
@@ -20,6 +23,31 @@ def test_a_table_of_the_tables(explored, capsys):
 def test_a_query_prints_its_rows(explored, capsys):
     assert main(["SELECT count(*) AS n FROM galaxies", "--lake", str(explored)]) == 0
     assert capsys.readouterr().out.split() == ["n", "500", "1", "rows"]
+
+
+def test_values_are_printed_with_their_digits(explored, capsys):
+    query = "SELECT 53.123456789::DOUBLE AS a, 0.1::FLOAT AS b, NULL AS c, repeat('x', 99) AS d FROM range(99)"
+    assert main([query, "--lake", str(explored)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["a", "b", "c", "d"]
+    assert lines[1].split() == ["53.12345679", "0.1", "<NA>", "x" * 47 + "..."]
+    # The first and the last 20 rows are printed.
+    assert len(lines) == 1 + 20 + 1 + 20 + 1
+    assert lines[21].split() == ["..."] * 4
+
+
+def test_no_process_of_a_query_imports_pandas(explored):
+    """The import would take longer than most queries."""
+    code = "import sys\nfrom truesky.explore.__main__ import main\nmain(sys.argv[1:])\nprint('pandas' in sys.modules)"
+    query = ["SELECT count(*) AS n FROM galaxies", "--lake", str(explored)]
+    environment = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}
+    done = subprocess.run([sys.executable, "-c", code, *query], capture_output=True, text=True, env=environment)
+    assert done.stdout.split() == ["n", "500", "1", "rows", "False"]
+    worker = [sys.executable, "-m", "truesky.explore.worker", str(explored), "1000000000"]
+    done = subprocess.run(worker, input="", capture_output=True, text=True, env=environment)
+    modules = [line.rpartition("|")[2].strip() for line in done.stderr.splitlines()]
+    assert "pyarrow.dataset" in modules
+    assert not [name for name in modules if name.startswith("pandas.")]
 
 
 def test_a_query_into_a_file(explored, tmp_path, capsys):

@@ -39,7 +39,7 @@ def tab_of(browser, page, address="/", refused=None, **context):
     `refused` is a part of the addresses whose requests the test expects to fail.
     """
     faults = []
-    opened = browser.new_context(viewport={"width": 1280, "height": 800}, **context)
+    opened = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **context})
     tab = opened.new_page()
     tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
     tab.on("pageerror", lambda error: faults.append(str(error)))
@@ -66,6 +66,14 @@ def tab_of(browser, page, address="/", refused=None, **context):
     wrong = [one for one in faults if refused is None or not ("status of 400" in one or refused in one)]
     opened.close()
     assert wrong == []
+
+
+def write_query(tab, text):
+    """Replace the query in the editor, as a user does; a function of the browser for this would insert styles."""
+    tab.click("#sql-text")
+    tab.keyboard.press("Control+A")
+    tab.keyboard.press("Delete")
+    tab.keyboard.insert_text(text)
 
 
 def canvas_colours(tab, selector):

@@ -76,8 +76,11 @@ MARKUP = (
 def test_text_never_becomes_markup_and_nothing_is_loaded_from_elsewhere(file):
     """Files of the page never turn text into markup or code, and have no foreign addresses and no inline code."""
     text = file.read_text(encoding="utf-8")
-    assert re.findall(MARKUP, text) == []
-    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w{2,}", text.replace("// ", "")) == []
+    # The editor is a library. It sets styles of its own elements, and names the namespace of SVG. The content security
+    # policy of the page applies to it, too.
+    allowed = {".style.cssText", "http://www.w3.org"} if file.name == "codemirror.js" else set()
+    assert set(re.findall(MARKUP, text)) <= allowed
+    assert set(re.findall(r"(?:https?:)?//[\w.-]+\.\w{2,}", text.replace("// ", ""))) <= allowed
     if file.suffix == ".html":
         assert re.findall(r"<script(?![^>]*src=)|\son\w+=|\sstyle=", text) == []
 

@@ -58,6 +58,37 @@ def test_a_held_brush_sends_no_requests(tab):
     mouse.up()
 
 
+def test_an_error_clears_the_charts(browser, page):
+    with tab_of(browser, page, at(VIEW), refused="/charts") as tab:
+        until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
+        drawn = tab.locator("#plot-grid canvas").first.screenshot()
+        tab.fill("#plot-where", "redshift > 1")
+        tab.press("#plot-where", "Enter")
+        until(tab, "document.getElementById('plot-state').className === 'bad-text'")
+        assert "use z_obs" in tab.inner_text("#plot-state")
+        assert set(tab.evaluate(RANGES)) == {""}
+        assert tab.locator("#plot-grid canvas").first.screenshot() != drawn
+        assert tab.get_attribute("#plot-grid", "aria-busy") == "false"
+        tab.fill("#plot-where", "z_obs > 1")
+        tab.press("#plot-where", "Enter")
+        until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
+        assert tab.get_attribute("#plot-state", "class") == "quiet"
+
+
+def test_a_computation_is_shown(tab):
+    until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
+    waiting = []
+    tab.route("**/charts", lambda route: waiting.append(route))
+    tab.fill("#plot-where", "z_obs > 1")
+    tab.press("#plot-where", "Enter")
+    until(tab, "document.getElementById('plot-state').textContent === 'Computing…'")
+    assert tab.get_attribute("#plot-grid", "aria-busy") == "true"
+    until(tab, "document.getElementById('told').textContent === 'Computing the charts'")
+    waiting[0].continue_()
+    until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+    assert tab.get_attribute("#plot-grid", "aria-busy") == "false"
+
+
 def test_a_sample_is_counted_first_if_there_are_many_rows(browser, page, monkeypatch):
     monkeypatch.setattr(charts, "ROWS_PER_CORE", 10)
     with tab_of(browser, page, at(VIEW)) as tab:

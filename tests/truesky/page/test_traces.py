@@ -15,7 +15,7 @@ from tests.truesky.page.conftest import CENTRE, NX, NY, serving, system, unpacke
 from tests.universe import rows_of
 from truesky.fluxes.spectra import lines
 from truesky.render.camera import astrometry
-from truesky.render.products.sidecar_files import truth_file
+from truesky.render.products.sidecar_files import spectra_file, truth_file
 
 # Polynomials of a bent trace, its wavelength range (angstrom), and pixel values of the continuum and of the line.
 TRACE_X, TRACE_Y = [80.0, 500.0, 0.0], [300.0, -40.0, 12.0]
@@ -76,6 +76,7 @@ def published(root, trace_x=TRACE_X, name=None, band="nisp_red", seconds=0):
     files = {
         path: lambda to: images.write_images(to, [images.Image(pixels, cards)]),
         truth_file(7, "DET22"): lambda to: parquet.write(to, truth, RENDERED_TRUTH),
+        spectra_file(7, "DET22"): lambda to: parquet.write(to, spectra, RENDERED_SPECTRA),
     }
     part = Task("000007-det22.parquet", {"exposure_id": 7, "detector": "DET22"})
     cell = Task(layout.cell_file(5, 1607), {})
@@ -123,6 +124,20 @@ def test_pixels_along_a_trace(grism):
     step = (LAST - FIRST) / (head["columns"] - 1)
     assert FIRST + column * step == pytest.approx(wavelength, abs=1.5 * step)
     assert pixels[middle, column] == LINE
+
+
+def test_the_source_of_a_pixel_behind_a_grism(grism):
+    """A click anywhere on the first order finds its source, and none is found beside it."""
+    page, own, _ = grism
+    for t in (0.0, 0.31, 1.0):
+        x, y = (np.polynomial.polynomial.polyval(t, part) for part in (TRACE_X, TRACE_Y))
+        for shift in (0.0, 3.0):
+            assert page.json(f"trace_at/0?x={x}&y={y + shift}") == {"id": str(own)}
+        assert page.json(f"trace_at/0?x={x}&y={y + 6.0}") == {}
+    # The position of the source in an image without a grism.
+    assert page.json("trace_at/0?x=330&y=250") == {}
+    status, _, _ = page.of_lake("trace_at/9?x=1&y=1")
+    assert status == 400
 
 
 @pytest.mark.parametrize("path", ["trace/0/{}?order=2", "trace/0/{}", "trace/1/{}?order=1", "trace/0/5?order=1",

@@ -64,7 +64,9 @@ function theme(name) {
 }
 
 function keys(event) {
-  if (event.target.matches("input, textarea, select") || event.ctrlKey || event.metaKey || event.altKey) return;
+  // The editor of queries is in a shadow root, for which `event.target` is the host.
+  const [target] = event.composedPath();
+  if (target.isContentEditable || target.matches?.("input, textarea, select") || event.ctrlKey || event.metaKey || event.altKey) return;
   const number = "12345".indexOf(event.key);
   if (number >= 0) show(Object.keys(VIEWS)[number]);
   else VIEWS[shown].key?.(event);

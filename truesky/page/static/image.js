@@ -331,6 +331,10 @@ async function pinAt(x, y) {
   const image = current();
   let id = null, least = 1;
   try {
+    // Behind a grism, the light at a pixel belongs to the source whose spectrum passes through it.
+    if (image.row.channel === "NISP-S") ({ id } = await api.get(`trace_at/${image.number}?${new URLSearchParams({ x, y })}`));
+    if (id) return await pin(id);
+    id = null;
     const near = await truthOf(image);
     // If several sources are near, prefer bright ones: measure distances in radii of their marks.
     near.x.forEach((sx, k) => {

@@ -12,10 +12,12 @@ const MOST_POINTS = 20000;
 const MOST_CELLS = 8e6;
 // All rows are counted if no brush has moved for this time (ms).
 const IDLE = 400;
+// A computation that takes longer than this time (ms) is announced.
+const NOTICED = 250;
 // Largest number of rows of the table of a map, and the time (ms) without changes after which it is updated.
 const MOST_ROWS = 500, STILL = 120;
 // charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
-let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null, idle = 0;
+let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null, idle = 0, waiting = 0;
 
 export function start(given) {
   page = given;
@@ -108,7 +110,50 @@ function bins(chart) {
 
 const ask = api.newest(async () => {
   if (!charts.length) return;
-  const started = performance.now(), shown = charts, names = axes();
+  const shown = charts;
+  busy(true);
+  try {
+    await count(shown);
+  } catch (error) {
+    if (shown === charts) failed(error);
+  } finally {
+    if (shown === charts) busy(false);
+  }
+});
+
+/** Show that charts are being computed, unless the answer comes at once. */
+function busy(isBusy) {
+  clearTimeout(waiting);
+  $("plot-grid").setAttribute("aria-busy", String(isBusy));
+  if (isBusy) waiting = setTimeout(() => {
+    $("plot-grid").className = "slow";
+    $("plot-state").className = "quiet busy";
+    $("plot-state").textContent = "Computing…";
+    api.tell("Computing the charts");
+  }, NOTICED);
+  else $("plot-grid").className = "";
+}
+
+/** Show an error in place of all charts, because they would be taken for the charts of the current settings. */
+function failed(error) {
+  head = null;
+  for (const chart of charts) {
+    chart.counts = chart.whole = chart.places = null;
+    if (!chart.canvas) continue;
+    const [width, height] = api.fit(chart.canvas), context = chart.canvas.getContext("2d");
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, width * devicePixelRatio, height * devicePixelRatio);
+    chart.range.textContent = "";
+    chart.data.replaceChildren();
+    chart.canvas.setAttribute("aria-label", "no chart: see the message");
+  }
+  $("plot-state").className = "bad-text";
+  $("plot-state").textContent = error.message;
+  api.tell(error.message);
+}
+
+async function count(shown) {
+  const started = performance.now(), names = axes();
   const buffer = await api.post("charts", {
     source, where: where || "true", axes: names, part, limits: limits(),
     charts: shown.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans, own: own(chart), points: chart.points ? MOST_POINTS : 0 })),
@@ -143,7 +188,7 @@ const ask = api.newest(async () => {
     ask();
   }, IDLE);
   page.remember();
-});
+}
 
 /** Count after a move: first a sample if there are many rows, then all rows when nothing moves. */
 function sampled() {
@@ -155,6 +200,7 @@ function sampled() {
 function tell(ms) {
   const sample = head.part > 1 ? ` sample of 1 row in ${head.part}, counts scaled, with Poisson errors;` : "";
   const brushed = charts.some((chart) => chart.brush) ? "drag to brush, Escape clears a brush" : "drag in a chart to brush; the other charts show the selected rows";
+  $("plot-state").className = "quiet";
   $("plot-state").textContent = `${api.number(head.rows)} rows;${sample} counted and drawn in ${ms.toFixed(0)} ms; ${brushed}.`;
 }
 

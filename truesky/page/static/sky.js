@@ -186,7 +186,8 @@ const finer = api.newest(async () => {
 function whole(load_) {
   if (!cells?.head.cells) return;
   const { ra, dec, radius: far } = circleAround(cells.corners);
-  Object.assign(view, { ra, dec, height: Math.min(180, Math.max(0.2, 2.1 * far)) });
+  const canvas = $("sky-canvas"), portrait = Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
+  Object.assign(view, { ra, dec, height: Math.min(180, Math.max(0.2, 2.1 * far * portrait)) });
   if (load_) finer();
   page.remember();
 }

@@ -6,11 +6,12 @@ import { usePlot } from "/static/plots.js";
 const $ = (id) => document.getElementById(id);
 // Bytes of a download that are collected before the browser takes over a large one.
 const MOST_HELD = 32e6;
-let page, ran = null, runs = 0;
+// The editor is loaded when the view is first shown; until then, `text` is the query.
+let page, ran = null, runs = 0, editor = null, opening = null, text = "";
 
 export function start(given) {
   page = given;
-  $("sql-text").value = first();
+  text = first();
   for (const table of api.lake.tables) {
     const columns = table.columns.map((column) => api.h("button", { onclick: () => insert(column.name) },
       column.name, api.h("small", {}, ` ${[column.unit, column.type].filter(Boolean).join(", ")}${column.meaning ? `: ${column.meaning}` : ""}`), column.ucd ? api.h("small", { class: "ucd" }, ` ${column.ucd}`) : null));
@@ -18,17 +19,13 @@ export function start(given) {
       api.h("p", { class: "quiet" }, table.meaning), ...columns));
   }
   $("sql-run").addEventListener("click", run);
-  $("sql-text").addEventListener("keydown", (event) => {
-    if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) run();
-  });
-  $("sql-text").addEventListener("input", page.remember);
   $("sql-plot").addEventListener("click", plot);
   for (const button of document.querySelectorAll("#sql [data-format]")) button.addEventListener("click", () => download(button.dataset.format));
-  $("sql-python").addEventListener("click", () => api.copy(api.python($("sql-text").value), "Python"));
+  $("sql-python").addEventListener("click", () => api.copy(api.python(query()), "Python"));
   $("sql-command").addEventListener("click", () => api.copy(
-    `truesky sql ${quoted($("sql-text").value)} --lake ${quoted(api.lake.lake)}`, "Command"));
+    `truesky sql ${quoted(api.lake.lake)} ${quoted(query())}`, "Command"));
   $("sql-tap").addEventListener("click", () => api.copy(
-    `import pyvo\npyvo.dal.TAPService(${JSON.stringify(api.lake.tap)}).search(${JSON.stringify($("sql-text").value)}).to_table()\n`, "Python"));
+    `import pyvo\npyvo.dal.TAPService(${JSON.stringify(api.lake.tap)}).search(${JSON.stringify(query())}).to_table()\n`, "Python"));
 }
 
 const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
@@ -39,26 +36,40 @@ function first() {
   return names.length ? `SELECT * FROM ${api.sqlName(names[0])} LIMIT 100` : "SELECT 1";
 }
 
+const query = () => editor?.text() ?? text;
+
+async function openEditor() {
+  const { open } = await import("/static/codemirror.js");
+  editor = open($("sql-editor"), { text, id: "sql-text", label: $("sql-hint").textContent, tables: api.lake.tables, run, changed: page.remember });
+}
+
 function insert(name) {
-  const field = $("sql-text"), at = field.selectionStart;
-  field.setRangeText(name, at, field.selectionEnd, "end");
-  field.focus();
-  page.remember();
+  editor?.insert(name);
+}
+
+function showError(error) {
+  $("sql-state").className = "bad-text";
+  $("sql-state").textContent = error.message;
 }
 
 async function run() {
   // If queries overlap, show the last one, whichever is answered first.
   const mine = ++runs;
-  $("sql-state").textContent = "…";
+  $("sql-state").className = "quiet busy";
+  $("sql-state").textContent = "Running…";
+  $("sql-result").setAttribute("aria-busy", "true");
   try {
-    const found = await api.post("sql", { sql: $("sql-text").value });
+    const found = await api.post("sql", { sql: query() });
     if (mine !== runs) return;
     ran = found;
   } catch (error) {
     if (mine !== runs) return;
-    $("sql-state").textContent = error.message;
-    $("sql-state").className = "bad-text";
-    return;
+    // A result of an earlier query below this message would be taken for the result of this query.
+    ran = null;
+    $("sql-result").replaceChildren();
+    return showError(error);
+  } finally {
+    if (mine === runs) $("sql-result").setAttribute("aria-busy", "false");
   }
   $("sql-state").className = "quiet";
   const more = ran.more ? `first ${ran.rows.length} rows; downloads contain all rows` : `${ran.rows.length} rows`;
@@ -73,14 +84,14 @@ async function plot() {
   if (!ran) await run();
   const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => `"${c.name}"`);
   if (!numbers.length) return api.say("The result has no numeric column.", true);
-  const text = $("sql-text").value.trim().replace(/;$/, "");
+  const text = query().trim().replace(/;$/, "");
   usePlot(`(${text}\n) AS result`, numbers.length > 1 ? [[numbers[0]], [numbers[1]], [numbers[0], numbers[1]]] : [[numbers[0]]]);
   page.show("plots");
 }
 
 /** Save a small response as a file and show errors; let the browser download a large one. */
 async function download(format) {
-  const address = api.downloadAddress(format, $("sql-text").value), stop = new AbortController();
+  const address = api.downloadAddress(format, query()), stop = new AbortController();
   $("sql-state").className = "quiet";
   $("sql-state").textContent = `${format} …`;
   try {
@@ -88,8 +99,7 @@ async function download(format) {
     save(pieces ? URL.createObjectURL(new Blob(pieces)) : address, format);
     $("sql-state").textContent = `${format}: download started`;
   } catch (error) {
-    $("sql-state").className = "bad-text";
-    $("sql-state").textContent = error.message;
+    showError(error);
   } finally {
     stop.abort();
   }
@@ -103,10 +113,13 @@ function save(address, format) {
   if (address.startsWith("blob:")) setTimeout(() => URL.revokeObjectURL(address), 60000);
 }
 
-export function show() {
+export async function show() {
   if (!ran) run();
+  await (opening ??= openEditor());
 }
-export const state = () => ({ text: $("sql-text").value });
+export const state = () => ({ text: query() });
 export function restore(was) {
-  if (typeof was.text === "string") $("sql-text").value = was.text;
+  if (typeof was.text !== "string") return;
+  text = was.text;
+  editor?.replace(text);
 }

@@ -97,9 +97,9 @@ class Service:
         router.add_get(f"{path}/capabilities", self._errors_to_votable(self._capabilities))
         router.add_get(f"{path}/tables", self._errors_to_votable(self._tables))
         router.add_get(f"{path}/file/{{key}}/{{number}}", self._errors_to_votable(self._image))
-        uws_jobs.Routes(
-            self.jobs, self.service_address, self.check_parameters, lambda: self._current_lake().timeout
-        ).add(router, path, self._errors_to_votable)
+        uws_jobs.Routes(self.jobs, self.service_address, lambda: self._current_lake().timeout).add(
+            router, path, self._errors_to_votable
+        )
 
     async def close(self) -> None:
         """Stop all asynchronous jobs and query processes."""

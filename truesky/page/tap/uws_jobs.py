@@ -49,20 +49,12 @@ class Routes:
         All jobs of the service.
     address : callable
         Function that returns the URL of the service for an HTTP request.
-    check : callable
-        Function that raises BadInput if the parameters of TAP are not a valid query. It is stored, but not called.
     max_seconds : callable
         Function without arguments that returns the largest time limit of a query in seconds.
     """
 
-    def __init__(
-        self,
-        jobs: Jobs,
-        address: Callable[[web.Request], str],
-        check: Callable[[dict[str, str]], None],
-        max_seconds: Callable[[], float],
-    ) -> None:
-        self._jobs, self._address, self._check, self._max_seconds = jobs, address, check, max_seconds
+    def __init__(self, jobs: Jobs, address: Callable[[web.Request], str], max_seconds: Callable[[], float]) -> None:
+        self._jobs, self._address, self._max_seconds = jobs, address, max_seconds
 
     def add(self, router: web.UrlDispatcher, path: str, wrap: Callable[[Handler], Handler]) -> None:
         """Add the addresses below /async and their handlers to an application.
@@ -149,7 +141,10 @@ class Routes:
                 raise BadInput(f"PHASE = {phase[:40]!r} is not one of RUN, ABORT")
             (self._jobs.start if phase == "RUN" else self._jobs.abort)(job)
         elif attribute == "executionduration":
-            job.max_seconds = _parse_seconds(values.get("EXECUTIONDURATION", ""), self._max_seconds())
+            # A duration of 0 means the limit of the service.
+            job.max_seconds = _parse_seconds(
+                values.get("EXECUTIONDURATION", ""), self._max_seconds(), zero=self._max_seconds()
+            )
         elif attribute == "destruction":
             job.destruction_time = min(_parse_time(values.get("DESTRUCTION", "")), job.creation_time + RETENTION)
         elif attribute in ("", "parameters"):
@@ -189,15 +184,16 @@ class Routes:
 async def _wait_for_change(job: Job, request: web.Request) -> None:
     """Wait as the parameter WAIT of an HTTP request demands: until the phase of the job changes or the time is over.
 
-    WAIT is a number of seconds, at most 60; -1 means 60. The function returns at once if there is no WAIT, if the job
-    has not been started or has ended, or if its phase is not the parameter PHASE.
+    WAIT is a number of seconds, at most 60; -1 means 60, and 0 means no waiting. The function returns at once without
+    WAIT, if the job has not been started or has ended, or if its phase is not the parameter PHASE.
     """
-    wait = request.query.get("WAIT")
-    if wait is None or job.has_ended or request.query.get("PHASE", job.phase) != job.phase:
+    parameters = {name.upper(): value for name, value in request.query.items()}
+    wait = parameters.get("WAIT")
+    if wait is None or job.has_ended or parameters.get("PHASE", job.phase) != job.phase:
         return
     if job.phase == "PENDING":
         return
-    seconds = _MAX_WAIT if wait == "-1" else min(_parse_seconds(wait, _MAX_WAIT), _MAX_WAIT)
+    seconds = _MAX_WAIT if wait == "-1" else _parse_seconds(wait, _MAX_WAIT, zero=0.0)
     changed = job.phase_changed
     try:
         await asyncio.wait_for(changed.wait(), seconds)
@@ -205,14 +201,26 @@ async def _wait_for_change(job: Job, request: web.Request) -> None:
         return
 
 
-def _parse_seconds(text: str, max_seconds: float) -> float:
-    """Parse a whole number of seconds; 0 and numbers above `max_seconds` become `max_seconds`.
+def _parse_seconds(text: str, max_seconds: float, zero: float) -> float:
+    """Parse a whole number of seconds; 0 becomes `zero`, and numbers above `max_seconds` become `max_seconds`.
 
-    BadInput is raised for other texts.
+    Parameters
+    ----------
+    text : str
+        The number. BadInput is raised for other texts.
+    max_seconds : float
+        Largest result, s.
+    zero : float
+        Result for the number 0, s.
+
+    Returns
+    -------
+    float
+        The time, s.
     """
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise BadInput(f"{text[:40]!r} is not a number of seconds")
-    return min(float(text) or max_seconds, max_seconds)
+    return min(float(text) or zero, max_seconds)
 
 
 def _parse_time(text: str) -> datetime:

@@ -8,19 +8,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.wcs import WCS
 
 from lake_schema.arrays import Array, Bool, Float
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
 from lake_schema.store import read
-from truesky.numerics import matrices
+from truesky.numerics import activity, matrices
 from truesky.render.camera import astrometry
 from truesky.render.products import preview_labels, read_back
 from truesky.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
+from truesky.render.products.sidecar_files import spectra_file
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 # Width and height of a preview picture in inches.
 _INCHES = (13.2, 9.6)
@@ -49,15 +52,13 @@ _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
-def previews(root: Path, out: Path, max_images: int | None = None, request: str | None = None) -> list[Path]:
-    """Draw a PNG file in `out` for each science image of a request.
+def rows_to_draw(root: Path, max_images: int | None = None, request: str | None = None) -> list[dict[str, Any]]:
+    """Return the rows of table `products` of science images of a request of which previews are drawn.
 
     Parameters
     ----------
     root : Path
         Lake (folder of stored tables and images).
-    out : Path
-        Folder of the PNG files, which is made if necessary.
     max_images : int, optional
         Largest number of images, of as many channels and bands as possible; None means all images.
     request : str, optional
@@ -65,22 +66,47 @@ def previews(root: Path, out: Path, max_images: int | None = None, request: str 
 
     Returns
     -------
-    list of Path
-        The PNG files; [] if the request has no science images.
+    list of dict
+        The rows; [] if the request has no science images. The value of `cosmic_rays` is the path of the image of the
+        cosmic rays on the same detector, or None.
+    """
+    rows = read.version(root, "products", request=request).rows().to_pylist()
+    hits = {_detector_key(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
+    selected = select_images([row for row in rows if row["content"] == "science"], max_images)
+    return [{**row, "cosmic_rays": hits.get(_detector_key(row))} for row in selected]
+
+
+def draw(row: dict[str, Any], root: Path, out: Path, request: str | None = None) -> Path:
+    """Draw a PNG file of one science image, and return its path.
+
+    Parameters
+    ----------
+    row : dict
+        Row of table `products`, from `rows_to_draw`.
+    root : Path
+        Lake (folder of stored tables and images).
+    out : Path
+        Folder of the PNG file, which is made if necessary.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Returns
+    -------
+    Path
+        The PNG file.
     """
     version = read.version(root, "products", request=request)
-    input_keys = version.manifest["facts"]["inputs"]
-    paths, rows = [], version.rows().to_pylist()
-    hits = {_detector_key(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
-    for row in select_images([row for row in rows if row["content"] == "science"], max_images):
+    with activity.report(f"picture of detector {row['detector']}, exposure {row['exposure_id']}"):
         image = read_back.electrons(version.sidecar_path(row["path"]))
-        if _detector_key(row) in hits:
-            (truth,) = images.read_images(version.sidecar_path(hits[_detector_key(row)]))
+        if row["cosmic_rays"] is not None:
+            (truth,) = images.read_images(version.sidecar_path(row["cosmic_rays"]))
             image = images.Image(repair_cosmic_rays(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
         path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
-        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, input_keys))
-        paths.append(path)
-    return paths
+        spectra_path = spectra_file(row["exposure_id"], row["detector"])
+        spectra = version.read_sidecar(spectra_path) if version.has_file(spectra_path) else None
+        labels = preview_labels.labels(root, row, image, version.manifest["facts"]["inputs"], spectra)
+        picture(path, np.asarray(image.data), image.cards, labels)
+    return path
 
 
 def select_images(rows: Sequence[dict[str, Any]], max_images: int | None) -> list[dict[str, Any]]:
@@ -219,7 +245,7 @@ def _stretch(image: Array, level: float, noise: float) -> Float:
 
 
 def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_down: bool) -> None:
-    from matplotlib.patches import Circle
+    from matplotlib.patches import Circle, Rectangle
 
     for label in names:
         across, up = label.column / shape[1], label.row / shape[0]
@@ -229,10 +255,12 @@ def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_
             # Draw no label in the lower corners, which have the scale bar and the compass.
             continue
         colour = _GALAXY if label.kind == "galaxy" else _STAR
-        circle = Circle(
-            (label.column, label.row), shape[1] / 110, fill=False, edgecolor=colour, linewidth=0.9, alpha=0.9
-        )
-        axes.add_patch(circle)
+        style: dict[str, Any] = {"fill": False, "edgecolor": colour, "linewidth": 0.9, "alpha": 0.9}
+        if label.box is None:
+            axes.add_patch(Circle((label.column, label.row), shape[1] / 110, **style))
+        else:
+            x0, x1, y0, y1 = label.box
+            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, **style))
         text = axes.annotate(
             f"{label.kind} {label.text}",
             (label.column, label.row),
@@ -309,11 +337,16 @@ def _close_up(
 
     half_y = CLOSE_UP_ARCSEC / pixel_scale / 2
     half_x = half_y * CLOSE_UP_SHAPE
-    x0, x1 = max(round(label.column - half_x), 0), min(round(label.column + half_x), image.shape[1])
-    y0, y1 = max(round(label.row - half_y), 0), min(round(label.row + half_y), image.shape[0])
+    square = (label.column - half_x, label.column + half_x, label.row - half_y, label.row + half_y)
+    first_x, last_x, first_y, last_y = label.box or square
+    x0, x1 = max(round(first_x), 0), min(round(last_x), image.shape[1])
+    y0, y1 = max(round(first_y), 0), min(round(last_y), image.shape[0])
     stretched = _stretch(image[y0:y1, x0:x1], *_sky_and_noise(image[::_STRIDE, ::_STRIDE]))
     extent = (x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5)
     axes.imshow(stretched, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    if label.box is not None:
+        # A trace is much longer than wide: stretch it to fill the panel.
+        axes.set_aspect("auto")
     _frame(axes, extent[:2], extent[2:], upside_down)
     text = f"{letter}   {label.kind} {label.text}"
     axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(_outline())

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from scipy.ndimage import map_coordinates
+import scipy
 
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.store import read
@@ -135,7 +135,7 @@ def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Fl
     across, up = np.meshgrid(step, step)
     ra, dec = pointing.sky_of_plane(across.ravel(), up.ravel(), *place, 0.0)
     column, row = astrometry.pixel_of_sky(astrometry.from_cards(image.cards), ra, dec)
-    values = map_coordinates(data, [row, column], order=order, mode="constant", cval=np.nan)
+    values = scipy.ndimage.map_coordinates(data, [row, column], order=order, mode="constant", cval=np.nan)
     return np.asarray(values.reshape(pixels, pixels))
 
 

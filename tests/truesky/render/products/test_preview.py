@@ -1,6 +1,7 @@
 """Preview pictures show the image with its labels, north up."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from matplotlib.image import imread
 
@@ -85,3 +86,52 @@ def test_selection_shows_each_channel_and_band_first():
     assert numbers(3) == [0, 4, 5]
     assert numbers(5) == [0, 1, 4, 5, 6]
     assert numbers(None) == numbers(99) == list(range(7))
+
+
+def spectra_of(boxes):
+    """Rows of `rendered_spectra`: for each (id, order, columns, rows) a straight trace between two pixels."""
+    rows = [
+        {"id": source, "order": order, "trace_x": [x0, x1 - x0], "trace_y": [y0, y1 - y0]}
+        for source, order, (x0, x1), (y0, y1) in boxes
+    ]
+    return pa.Table.from_pylist(rows)
+
+
+def test_labels_of_a_grism_image_follow_first_orders():
+    margin = preview_labels.TRACE_MARGIN
+    spectra = spectra_of(
+        [(7, 1, (100.0, 600.0), (50.0, 54.0)), (7, 0, (10.0, 20.0), (50.0, 50.0)), (9, 2, (0, 9), (0, 9))]
+    )
+    boxes = preview_labels._first_orders(spectra)
+    assert boxes == {7: (100.0 - margin, 600.0 + margin, 50.0 - margin, 54.0 + margin)}
+    column, row = preview_labels._middles(np.array([7, 9]), boxes)
+    assert (column[0], row[0]) == (350.0, 52.0)
+    assert np.isnan([column[1], row[1]]).all()
+    catalogue = pa.table({"id": [7, 9], "z_obs": [1.0, 2.0]})
+    (label,) = preview_labels._labels_of("galaxy", catalogue, np.array([1.0, 2.0]), (column, row), (500, 700), boxes)
+    assert (label.column, label.row, label.box) == (350.0, 52.0, boxes[7])
+
+
+@pytest.mark.parametrize("is_vertical", [False, True])
+def test_close_ups_of_traces(is_vertical, tmp_path):
+    """A close-up shows the whole trace, and not a square at the position of its source."""
+    one = render("VIS", flux=0.0)
+    image = np.array(one.science, float)
+    ny, nx = image.shape
+    length = int(0.8 * min(nx, ny))
+    box = (5.0, 29.0, 5.0, 5.0 + length) if is_vertical else (5.0, 5.0 + length, 5.0, 29.0)
+    label = Label((box[0] + box[1]) / 2, (box[2] + box[3]) / 2, "galaxy", 20.0, "20.0", box)
+    outside = Label(nx - 5.0, 50.0, "galaxy", 19.0, "19.0", (nx - 9.0, nx + 400.0, 40.0, 60.0))
+    assert preview_labels.close_ups([outside, label], image.shape, 0.1) == [label]
+    drawn = []
+    for bright in (False, True):
+        if bright:
+            # Both ends of the trace are far from its middle.
+            image[5:29, 5:29] += 1e5
+            image[int(box[3]) - 24 : int(box[3]), int(box[1]) - 24 : int(box[1])] += 1e5
+        preview.picture(tmp_path / "a.png", image, headers.science_cards(one), [label])
+        drawn.append(imread(tmp_path / "a.png")[..., :3].mean(axis=2))
+    # The panel of the close-up is at the upper right; both ends of the trace appear at its ends.
+    panel = (drawn[1] - drawn[0])[70:340, 975:1300]
+    along = panel.mean(axis=1) if is_vertical else panel.mean(axis=0)
+    assert min(along[5], along[-6]) > 0.1 > along[len(along) // 2]

@@ -1,0 +1,120 @@
+"""Suggestions for names of tables and columns that do not exist."""
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.tables import all_tables
+from truesky.explore import suggestions
+
+BANDS = ["euclid_vis", "lsst_r", "des_r"]
+TABLES = {table.name: list(table.names) for table in all_tables(BANDS)}
+VIS = "f_nu_euclid_vis (flux density, microjansky; mag_ab(f_nu_euclid_vis) is its AB magnitude)"
+
+
+def missing(name):
+    """The message of DuckDB about a column."""
+    return f'Binder Error: Referenced column "{name}" not found in FROM clause!\nCandidate bindings: "zzz", "kind"'
+
+
+def explained(name, table="galaxies"):
+    others = {other: columns for other, columns in TABLES.items() if other != table}
+    return suggestions.explain_missing_column(missing(name), {table: TABLES[table]}, others)
+
+
+def test_targets_of_all_synonyms_exist():
+    synonyms = suggestions._synonyms()
+    assert len(synonyms) > 300
+    for name, targets in synonyms.items():
+        for target in targets:
+            assert target.table in TABLES
+            assert target.column in [*TABLES[target.table], ""]
+            assert bool(target.meaning) == bool(target.column)
+            # A name that exists needs no synonym.
+            assert name not in (TABLES[target.table] if target.column else TABLES)
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "columns"),
+    [
+        ("redshift", "galaxies", ["z_obs", "z_true"]),
+        ("z", "halos", ["z_obs", "z_true"]),
+        ("mag", "galaxies", ["mag_r01"]),
+        ("magnitude", "stars", ["mag_h"]),
+        ("shear1", "galaxies", ["gamma1"]),
+        ("g2", "galaxies", ["gamma2"]),
+        ("e1", "galaxies", ["disk_axis_ratio", "bulge_axis_ratio", "position_angle"]),
+        ("size", "galaxies", ["disk_half_light_radius", "bulge_half_light_radius"]),
+        ("r_e", "galaxies", ["disk_half_light_radius", "bulge_half_light_radius"]),
+        ("halo_mass", "galaxies", ["log_halo_mass"]),
+        ("halo_mass", "halos", ["log_mass"]),
+        ("stellar_mass", "galaxies", ["log_stellar_mass"]),
+        ("ra_deg", "stars", ["ra"]),
+        ("sersic_index", "galaxies", ["bulge_sersic_index"]),
+        ("n", "galaxies", ["bulge_sersic_index"]),
+        ("temperature", "stars", ["teff"]),
+        ("galaxy_id", "galaxies", ["id"]),
+        ("vis", "galaxy_fluxes", ["f_nu_euclid_vis"]),
+        ("mag_r", "star_fluxes", ["f_nu_lsst_r", "f_nu_des_r"]),
+        ("lsst_r_flux", "galaxy_fluxes", ["f_nu_lsst_r"]),
+    ],
+)
+def test_synonyms(name, table, columns):
+    message = explained(name, table)
+    assert message.startswith(f"column {name} does not exist; use {columns[0]} (")
+    assert all(f"{column} (" in message for column in columns)
+    assert len([part for part in message.split("; use ")[1].split(" or ") if "(" in part]) >= len(columns)
+
+
+def test_columns_of_other_tables():
+    assert explained("mag_vis", "star_fluxes") == f"column mag_vis does not exist; use {VIS}"
+    only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
+    assert suggestions.explain_missing_column(missing("flux_vis"), {"galaxies": TABLES["galaxies"]}, only) == (
+        f"column flux_vis does not exist; use galaxy_fluxes.{VIS}; add JOIN galaxy_fluxes USING (id)"
+    )
+    assert "use stars.teff (effective temperature)" in explained("teff")
+
+
+def test_similar_names_and_names_of_subqueries():
+    assert explained("z_ob") == "column z_ob does not exist; did you mean z_obs?"
+    assert explained("zz") == "column zz does not exist; did you mean zzz?"
+    assert explained("qqqq", "halos").startswith("column qqqq does not exist; use one of ")
+    both = {"galaxies": TABLES["galaxies"], "halos": TABLES["halos"]}
+    assert "use galaxies.z_obs (" in suggestions.explain_missing_column(missing("redshift"), both, {})
+
+
+@pytest.mark.parametrize("message", ["Binder Error: no such function", 'Table "x" does not exist'])
+def test_other_messages_are_unchanged(message):
+    assert suggestions.explain_missing_column(message, TABLES, {}) == message
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("galaxy", ["galaxies"]),
+        ("demo.galaxy", ["demo.galaxies"]),
+        ("fluxes", ["galaxy_fluxes", "star_fluxes"]),
+        ("images", ["products"]),
+        ("galxies", ["galaxies"]),
+        ("qqqq", []),
+    ],
+)
+def test_tables(name, found):
+    assert list(suggestions.suggest_tables(name, {*TABLES, "demo.galaxies"}))[: len(found) or None] == found
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("SELECT redshift FROM galaxies", r"redshift does not exist; use z_obs \(observed.*\) or z_true \("),
+        ("SELECT g.redshift FROM galaxies AS g", r"redshift does not exist; use z_obs \("),
+        ("SELECT 1 FROM galaxies JOIN galaxy_fluxes USING (redshift)", r"use galaxies.z_obs \("),
+        ("SELECT * EXCLUDE (redshift) FROM galaxies", r"redshift does not exist; use z_obs \("),
+        ("SELECT vis FROM galaxies", r"galaxy_fluxes.f_nu_euclid_vis \(.*; add JOIN galaxy_fluxes USING \(id\)"),
+        ("SELECT id FROM galaxy", "'galaxy' is not a table of the lake; did you mean galaxies?"),
+        ("SELECT id FROM nothing_like_it", r"is not a table of the lake \(galaxies, galaxy_fluxes"),
+    ],
+)
+def test_queries(explorer, query, words):
+    with pytest.raises(BadInput, match=f"^SQL: .*{words}") as error:
+        explorer.sql(query)
+    assert "\n" not in str(error.value)

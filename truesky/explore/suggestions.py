@@ -1,0 +1,165 @@
+"""Suggest names of tables and columns for names in a query that do not exist.
+
+A table of synonyms contains the names that other catalogues use, such as `redshift` for `z_obs` and `z_true`. Names of
+passbands, such as `mag_vis`, lead to columns of fluxes. For all other names, the most similar names are suggested.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from lake_schema import tables as declarations
+
+_SYNONYMS = Path(__file__).with_name("synonyms.csv")
+# Messages of DuckDB about a column that does not exist. The named group is the name of the column.
+_MISSING_COLUMN = (
+    re.compile(r'Referenced column "(?P<name>.+?)" (?:was )?not found'),
+    re.compile(r'does not have a column named "(?P<name>.+?)"'),
+    re.compile(r'Column "(?P<name>.+?)" does not exist on \w+ side of join'),
+    re.compile(r'Column "(?P<name>.+?)" in \w+ list not found'),
+)
+_QUOTED = re.compile(r'"([^"]+)"')
+# Largest number of suggestions in a message.
+_MAX_SUGGESTIONS = 3
+# Smallest similarity of two names, as `difflib` measures it, from 0 to 1.
+_MIN_SIMILARITY = 0.6
+# Parts of the name of a flux or magnitude that do not belong to the name of its passband.
+_FLUX_NAME = re.compile(r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$")
+_BAND_PREFIX = "f_nu_"
+
+
+@dataclass(frozen=True, slots=True)
+class _Synonym:
+    """Meaning of a name: a table, a column ("" if the name means the table), and a phrase that explains the column."""
+
+    table: str
+    column: str
+    meaning: str
+
+
+@lru_cache(maxsize=1)
+def _synonyms() -> Mapping[str, Sequence[_Synonym]]:
+    synonyms: dict[str, list[_Synonym]] = {}
+    with _SYNONYMS.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            for name in row["names"].split():
+                targets = [_Synonym(table, row["column"], row["meaning"]) for table in row["tables"].split()]
+                synonyms.setdefault(name, []).extend(targets)
+    return synonyms
+
+
+def _missing_column(message: str) -> str | None:
+    """Return the name of the column that does not exist according to a message of DuckDB, in lower case, else None."""
+    matches = (pattern.search(message) for pattern in _MISSING_COLUMN)
+    return next((match["name"].lower() for match in matches if match), None)
+
+
+def explain_missing_column(
+    message: str, columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
+) -> str:
+    """Return a message about a column that does not exist, with the columns that can be used in its place.
+
+    Parameters
+    ----------
+    message : str
+        Message of DuckDB. It is returned unchanged if it is not about a missing column.
+    columns : mapping of str to collection of str
+        Columns of each table that the query reads.
+    other_tables : mapping of str to collection of str
+        Columns of the other tables of the lake that may be suggested.
+
+    Returns
+    -------
+    str
+        The message, one line.
+    """
+    if (name := _missing_column(message)) is None or not columns:
+        return message
+    problem = f"column {name} does not exist"
+    if targets := _targets(name, columns):
+        return f"{problem}; use {_as_text(targets, with_tables=len(columns) > 1)}"
+    if targets := _targets(name, other_tables):
+        return f"{problem}; use {_as_text(targets, with_tables=True)}{_join_hint(targets, columns, other_tables)}"
+    # Names of columns of subqueries are in the message only.
+    candidates = _QUOTED.findall(message.partition("Candidate bindings")[2].partition("LINE")[0])
+    names = [*dict.fromkeys(column for table in columns.values() for column in table)]
+    if similar := _similar(name, [*candidates, *names]):
+        return f"{problem}; did you mean {' or '.join(similar)}?"
+    return f"{problem}; use one of {', '.join(names)}"
+
+
+def _join_hint(
+    targets: Sequence[_Synonym], columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
+) -> str:
+    """Return the JOIN that a query needs for columns of one other table, "" for several tables or without an id."""
+    tables = {target.table for target in targets}
+    if len(tables) > 1 or not all("id" in names for names in columns.values()):
+        return ""
+    (table,) = tables
+    return f"; add JOIN {table} USING (id)" if "id" in other_tables[table] else ""
+
+
+def suggest_tables(name: str, table_names: Collection[str]) -> Sequence[str]:
+    """Return the tables of a lake that can be meant by a name that is not a table; at most three, perhaps none.
+
+    Parameters
+    ----------
+    name : str
+        Name of the table in the query, perhaps with the name of a request before it: "demo.galaxy".
+    table_names : collection of str
+        Names of the lake's tables.
+
+    Returns
+    -------
+    sequence of str
+        Names of tables of the lake.
+    """
+    request, dot, table = name.rpartition(".")
+    meant = dict.fromkeys(synonym.table for synonym in _synonyms().get(table, ()) if not synonym.column)
+    existing = [request + dot + target for target in meant if request + dot + target in table_names]
+    return existing[:_MAX_SUGGESTIONS] or _similar(name, sorted(table_names))
+
+
+def _targets(name: str, tables: Mapping[str, Collection[str]]) -> Sequence[_Synonym]:
+    """Return the columns of tables that a name can mean, by the name itself, a synonym or a passband."""
+    targets: dict[tuple[str, str], _Synonym] = {}
+    for table, columns in tables.items():
+        plain_name = table.rpartition(".")[2]
+        meant = [synonym for synonym in _synonyms().get(name, ()) if synonym.table == plain_name]
+        for synonym in (*meant, *_same_name(name, plain_name, columns), *_band_columns(name, plain_name, columns)):
+            if synonym.column in columns:
+                targets.setdefault((synonym.table, synonym.column), _Synonym(table, synonym.column, synonym.meaning))
+    return list(targets.values())[:_MAX_SUGGESTIONS]
+
+
+def _same_name(name: str, table: str, columns: Collection[str]) -> Iterator[_Synonym]:
+    declaration = declarations.find_table(table)
+    if name in columns and declaration is not None and name in declaration.names:
+        yield _Synonym(table, name, declaration.column(name).doc)
+
+
+def _band_columns(name: str, table: str, columns: Collection[str]) -> Iterator[_Synonym]:
+    """Yield the columns f_nu_<band> of the passbands that a name such as "vis", "mag_r" or "lsst_r_flux" can mean."""
+    band = _FLUX_NAME.sub("", name)
+    for column in columns:
+        if column.startswith(_BAND_PREFIX):
+            full_name = column.removeprefix(_BAND_PREFIX)
+            if band == full_name or full_name.endswith(f"_{band}"):
+                yield _Synonym(table, column, f"flux density, microjansky; mag_ab({column}) is its AB magnitude")
+
+
+def _similar(name: str, names: Sequence[str]) -> list[str]:
+    return difflib.get_close_matches(name, dict.fromkeys(names), _MAX_SUGGESTIONS, _MIN_SIMILARITY)
+
+
+def _as_text(targets: Sequence[_Synonym], with_tables: bool) -> str:
+    return " or ".join(
+        f"{target.table}.{target.column} ({target.meaning})" if with_tables else f"{target.column} ({target.meaning})"
+        for target in targets
+    )
