@@ -158,9 +158,13 @@ def numba_target() -> tuple[str, str]:
         if host_features == chosen or (chosen is None and name != LEVEL):
             return name, chosen or ""
         return name, f"features:{hashlib.sha256(host_features.encode()).hexdigest()[:8]}"
+    return os.environ.get(_NUMBA_CPU) or _host_cpu(), os.environ.get(_NUMBA_FEATURES, "")
+
+
+def _host_cpu() -> str:
     import llvmlite.binding
 
-    return os.environ.get(_NUMBA_CPU) or llvmlite.binding.get_host_cpu_name(), os.environ.get(_NUMBA_FEATURES, "")
+    return str(llvmlite.binding.get_host_cpu_name())
 
 
 def _other_numba_settings() -> tuple[str, ...]:
@@ -249,9 +253,11 @@ def _linux_lists_level() -> bool:
 
 @cache
 def _has_level() -> bool:
-    """Return True if this CPU executes all x86-64-v3 instructions, according to llvmlite."""
+    """Return True if this CPU executes all x86-64-v3 instructions, according to Linux or llvmlite."""
     if not _is_x86():
         return False
+    if _linux_lists_level():
+        return True
     import llvmlite.binding
 
     features = llvmlite.binding.get_host_cpu_features()

@@ -12,9 +12,10 @@ from typing import Any
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import garbage, layout, manifest, request_links
 from lake_schema.store.object_storage.s3 import MANIFEST, Folder
+from lake_schema.texts import text_tables
 
 _HEADINGS = ("names", "table", "version", "current", "published", "rows", "bytes", "made of")
-_RIGHT_ALIGNED = {"rows", "bytes"}
+_NUMBERS = {"rows", "bytes"}
 # Number of hexadecimal digits of a version's key that are printed, out of 16. They suffice to tell versions apart.
 _KEY_DIGITS = 8
 
@@ -86,16 +87,7 @@ def _input_keys(root: Folder, facts: Mapping[str, Any], table_names: Sequence[st
 
 def format_table(version_rows: Sequence[Mapping[str, Any]]) -> str:
     """Format the dicts that `rows` returns as lines of text with aligned columns and a heading."""
-    lines = [_HEADINGS, *(_format_cells(row) for row in version_rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    aligned_right = [head in _RIGHT_ALIGNED for head in _HEADINGS]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(line, widths, aligned_right, strict=True)
-        ).rstrip()
-        for line in lines
-    )
+    return "\n".join(text_tables.format_table(_HEADINGS, [_format_cells(row) for row in version_rows], _NUMBERS))
 
 
 def _format_cells(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -31,7 +31,8 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.readout import quadrants
 from truesky.render.effects.scene import Frame, Lights, NeighbourCharge, Scene
 from truesky.render.exposure import sky_through_grism
-from truesky.request import accuracy, from_toml, observations, schema, toml_values
+from truesky.request import accuracy, from_toml, schema, sky_notation, toml_values
+from truesky.request.exposures import observations, pointings
 
 # Modules that users import, in the order of the page of the Python interface.
 API = (
@@ -56,7 +57,8 @@ _SAMPLE_REQUEST = {
     "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
     "observation": [{"channels": ["VIS"]}],
 }
-# Functions of truesky.request.toml_values that read one value of a request, and the type of the value for the page.
+# Functions of truesky.request.toml_values and sky_notation that read one value of a request, and the type of the value
+# for the page.
 _VALUE_KINDS = {
     "number": "number",
     "optional_number": "number",
@@ -65,6 +67,11 @@ _VALUE_KINDS = {
     "string": "text",
     "strings": "list of texts",
     "boolean": "true or false",
+    "ra_of": "number (deg) or text (hours)",
+    "optional_ra": "number (deg) or text (hours)",
+    "dec_of": "number or text (deg)",
+    "optional_dec": "number or text (deg)",
+    "optional_mjd": "number (MJD, UTC) or date",
 }
 
 
@@ -79,7 +86,7 @@ def request_page() -> str:
     lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
     for path, (kind, bounds, default) in sorted(_request_keys().items()):
         lines.append(f"| `{path}` | {kind} | {bounds} | {default} |")
-    for record in (schema.Universe, schema.Stars, observations.Pointing, observations.Observation):
+    for record in (schema.Universe, schema.Stars, pointings.Pointing, observations.Observation):
         text = inspect.cleandoc(record.__doc__ or "")
         lines += ["", f"## {record.__name__}", "", "```text", text, "```"]
     return "\n".join(lines) + "\n"
@@ -112,12 +119,12 @@ def _request_keys() -> dict[str, tuple[str, str, str]]:
         return record_and_read
 
     with ExitStack() as patched:
-        for module in (from_toml, observations):
+        for module in (from_toml, observations, pointings, sky_notation):
             for name in _VALUE_KINDS:
                 for alias in (name, f"_{name}"):
-                    if getattr(module, alias, None) is getattr(toml_values, name):
-                        reads = record_keys(name, getattr(toml_values, name))
-                        patched.enter_context(patch.object(module, alias, reads))
+                    defined = getattr(toml_values, name, None) or getattr(sky_notation, name)
+                    if getattr(module, alias, None) is defined:
+                        patched.enter_context(patch.object(module, alias, record_keys(name, defined)))
         from_toml.from_table(_SAMPLE_REQUEST)
     return keys
 

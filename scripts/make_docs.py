@@ -26,9 +26,10 @@ from lake_schema.mission.configuration import resolve
 from scripts import docs_references, page_pictures, structure_picture
 
 ROOT = Path(__file__).resolve().parents[1]
-# Chapters of the site: title and pages. "notebooks" means the pages of all notebooks, and "others" all pages of docs/
-# that no other chapter names.
+# Chapters of the site: title and pages. "walks" means the pages of docs/walks, "notebooks" those of all notebooks, and
+# "others" all pages of docs/ that no other chapter names.
 CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("First hour", ("walks",)),
     ("Tutorials", ("notebooks",)),
     ("How to", ("others",)),
     (
@@ -106,9 +107,12 @@ def pages(into: Path, run: bool) -> None:
     if run:
         _with_pictures(into)
     named = {page for _, names in CHAPTERS for page in names} | {"index.md"}
-    listed = {"notebooks": tutorials, "others": sorted({path.name for path in into.glob("*.md")} - named)}
-    for path in into.glob("*.md"):
-        text = _NOTEBOOK.sub(r"](tutorials/\1.md)", path.read_text(encoding="utf-8"))
+    other_pages = sorted({path.name for path in into.glob("*.md")} - named)
+    walks = sorted(into.glob("walks/*.md"))
+    listed = {"walks": [f"walks/{path.name}" for path in walks], "notebooks": tutorials, "others": other_pages}
+    for path in (*into.glob("*.md"), *walks):
+        folder = "tutorials" if path.parent == into else "../tutorials"
+        text = _NOTEBOOK.sub(rf"]({folder}/\1.md)", path.read_text(encoding="utf-8"))
         # Replace links to files of the repository that are not on the site by the text of the link.
         path.write_text(_FILE.sub(r"`\1`", text).replace("](docs/", "]("), encoding="utf-8")
     with (into / "index.md").open("a", encoding="utf-8") as home:

@@ -10,6 +10,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 os.environ.setdefault("TRUESKY_CACHE", str(Path(tempfile.gettempdir()) / f"truesky-tests-{os.getuid()}"))
+# All tests share the cache, with entries of many versions of the code.
+os.environ.setdefault("TRUESKY_CACHE_LIMIT", "none")
 
 import pytest
 from hypothesis import settings
@@ -109,6 +111,12 @@ def pytest_xdist_make_scheduler(config, log):
             return _scope(super()._split_scope(nodeid))
 
     return Sharing(config, log)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_terminal_width():
+    """Remove $COLUMNS, which processes of a parallel run of tests may have, and which sets the width of tables."""
+    os.environ.pop("COLUMNS", None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 # Names the folder of compiled code.
-import truesky.numerics.compiling  # noqa: F401
+import truesky.numerics.machine_code  # noqa: F401
 
 
 def is_valid(folder):

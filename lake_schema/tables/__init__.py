@@ -36,7 +36,7 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
 
 def to_markdown() -> str:
     """Return a page in Markdown that documents all tables and columns; "<band>" stands for the name of a passband."""
-    head = "# Tables of the lake\n\nWritten by `python -m lake_schema tables`; do not edit.\n"
+    head = "# Tables of the lake\n\nWritten by `truesky tables`; do not edit.\n"
     return "\n".join([head, *(table.to_markdown() for table in all_tables(["<band>"]))])
 
 

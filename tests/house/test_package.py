@@ -104,12 +104,12 @@ def test_an_installed_wheel_runs_a_request_from_an_empty_folder(built, tmp_path)
 
     assert "requests/demo.toml" in truesky("examples", ".")
     truesky("check", "requests/demo.toml")
-    said = truesky("run", "requests/demo.toml", "--lake", "lake", "--detectors", "R22_S11")
+    said = truesky("run", "requests/demo.toml", "lake", "--detectors", "R22_S11")
     (picture,) = (folder / "lake" / "pictures").glob("*.png")
     assert said.splitlines()[-1] == str(picture)
     assert "render_exposures" in said
     query = "SELECT count(*) FROM products WHERE content = 'science'"
-    assert truesky("sql", query, "--lake", "lake").split()[-3] == "1"
+    assert truesky("sql", "lake", query).split()[-3] == "1"
     truesky("verify", "lake")
     # A wheel's products have the keys of a clone's.
     manifest = json.loads((folder / "lake" / "galaxies" / "current" / "manifest.json").read_text())

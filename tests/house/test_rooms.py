@@ -169,8 +169,11 @@ def with_the_dummy(monkeypatch):
     """Add or change the files of TOUCHED in the renderer, and return the module of the dummy channel."""
     text = (ROOT / "truesky" / "render" / "channels" / "registry.py").read_text()
     for old, new in (
-        ("import ground", "import dummy, ground"),
-        ('= {\n    "VIS"', '= {\n    "DUMMY": dummy.CHANNEL,\n    "VIS"'),
+        (
+            "def _vis()",
+            "def _dummy():\n    from truesky.render.channels import dummy\n\n    return dummy.CHANNEL\n\n\ndef _vis()",
+        ),
+        ('_Channels({"VIS"', '_Channels({"DUMMY": _dummy, "VIS"'),
     ):
         assert text.count(old) == 1
         text = text.replace(old, new)

@@ -19,7 +19,7 @@ from truesky.commands import check as check_command
 from truesky.commands import run as run_command
 from truesky.commands import space, submit
 from truesky.request import accuracy, universe
-from truesky.request.from_toml import from_table, parse
+from truesky.request.from_toml import ValidParts, from_table, parse, parse_valid_parts, read_valid_parts
 from truesky.request.schema import Request
 from truesky.running import submitted_job
 
@@ -43,7 +43,8 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
     Raises
     ------
     BadInput
-        If a job would refuse the request. The message names the key and the allowed values.
+        If a job would refuse the request. The message names the key and the allowed values. The attribute ``messages``
+        of the error has one line for each mistake.
 
     Examples
     --------
@@ -52,12 +53,11 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
     >>> truesky.check({"name": "field", "seed": 1, "area": area, "fluxes": {"bands": ["euclid_vis"]}}).seed
     1
     """
-    parsed = _parse_request(request)
+    parts = _parse_valid_parts(request)
     try:
-        check_command.check_request(parsed)
+        return check_command.checked_request(parts)[0]
     except BadInput as error:
-        raise BadInput(f"{_describe_request(request)}: {error}") from None
-    return parsed
+        raise error.with_prefix(_describe_request(request)) from None
 
 
 def run(
@@ -111,7 +111,7 @@ def run(
     try:
         plan = run_command.checked_plan(root, parsed_request, stages)
     except BadInput as error:
-        raise BadInput(f"{_describe_request(request)}: {error}") from None
+        raise error.with_prefix(_describe_request(request)) from None
     space.check(root, parsed_request, plan)
     if not submitted_job.has_session():
         submit.use_environment()
@@ -146,6 +146,12 @@ def _parse_request(request: str | Path | Mapping[str, Any]) -> Request:
     if isinstance(request, Mapping):
         return from_table(_to_toml_value(request))
     return parse(user_files.expand_path(request))
+
+
+def _parse_valid_parts(request: str | Path | Mapping[str, Any]) -> ValidParts:
+    if isinstance(request, Mapping):
+        return read_valid_parts(_to_toml_value(request))
+    return parse_valid_parts(user_files.expand_path(request))
 
 
 def _to_toml_value(value: Any) -> Any:

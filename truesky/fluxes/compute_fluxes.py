@@ -25,6 +25,7 @@ from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
+from truesky.command_line import simulation
 from truesky.fluxes import band_fluxes, inputs
 from truesky.fluxes.inputs import FluxInputs
 from truesky.fluxes.tables import errors_measured
@@ -167,5 +168,5 @@ JOB = Job(
     "compute_fluxes",
     "Compute the band fluxes of galaxies and stars.",
     steps,
-    list_options=(("bands", "passbands that replace those of the request"),),
+    list_options=simulation.FLUX_LISTS,
 )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,7 @@ _LYMAN_ALPHA_SIGMA = 1.0
 _BLOCK = 64
 
 
+@cache
 def quasar_library() -> Library:
     """Return the nine quasar templates. Template 3 i + j has QUASAR_OFFSETS[i] and QUASAR_STRENGTHS[j].
 
@@ -75,6 +77,7 @@ def quasar_library() -> Library:
     return Library(wavelength, np.stack(flux).astype(np.float32), tuple(names))
 
 
+@cache
 def high_redshift_library() -> Library:
     """Return the 15 templates of high-redshift galaxies.
 

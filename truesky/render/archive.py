@@ -1,8 +1,8 @@
 """List the images of a lake and the failed detectors, and render a published product again.
 
-    python -m truesky.render.archive --lake LAKE [--name REQUEST] [--at RA DEC] [--sql "select .. from products"]
+    python -m truesky.render.archive LAKE [--name REQUEST] [--at RA DEC] [--sql "select .. from products"]
                                   [--failures | --exposures]
-    python -m truesky.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
+    python -m truesky.render.archive LAKE --again PATH --out FILE.fits [--version KEY]
 
 A product is an image file of a detector: science image or truth map. Products are listed with SHA-256, size, rendering
 time in seconds and peak memory. Their bytes depend only on their inputs, so that a product rendered again must be
@@ -27,6 +27,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.provenance import code_version, file_sha256
+from truesky.command_line.parser import Parser
 from truesky.explore.process import Process
 from truesky.numerics import matrices
 from truesky.render.products import run_log
@@ -240,10 +241,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     The list may be limited to a position or an SQL query. The exit status is 0; it is 1 if an image rendered again
     differs or the lake is damaged, or 2 if the arguments are invalid.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.render.archive", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser = Parser(prog="python -m truesky.render.archive", description=(__doc__ or "").splitlines()[0])
+    parser.add_lake()
     parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only products at this position, deg")
     parser.add_argument("--sql", help="SELECT statement on the table products")

@@ -1,13 +1,12 @@
 """Measure and map how many exposures observe each position of the sky.
 
-    python -m truesky.render.coverage --lake LAKE [--name REQUEST] --out coverage.png
+    python -m truesky.render.coverage LAKE [--name REQUEST] --out coverage.png
 
 The stored plan of a request (its tables `exposures` and `tasks`) is sufficient; no images are needed.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +20,7 @@ from lake_schema import command, sky, user_files
 from lake_schema.arrays import Bool, Int
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
+from truesky.command_line.parser import Parser
 from truesky.render.camera import footprints, pointing
 from truesky.render.channels.image_types import SKY_TYPES
 from truesky.render.planning import exposure_chunks
@@ -244,10 +244,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Return the exit status.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.render.coverage", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--lake", required=True, help="folder of the lake, with a plan")
+    parser = Parser(prog="python -m truesky.render.coverage", description=(__doc__ or "").splitlines()[0])
+    parser.add_lake("folder of the lake, with a plan")
     parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--out", type=Path, help="PNG of the maps")
     options = parser.parse_args(argv)

@@ -1,10 +1,10 @@
 """Write the traces and sensitivities of the grisms as configuration files for grismconf and slitlessutils.
 
-    python -m truesky.render.grisms --out FOLDER [--lake LAKE --exposure N [--name REQUEST]] [--detectors DET11 ..]
+    python -m truesky.render.grisms [LAKE --exposure N [--name REQUEST]] --out FOLDER [--detectors DET11 ..]
 
 The command writes a file such as FOLDER/RGS000_DET11.conf for every grism and detector, and next to it a table with the
 sensitivity of each spectral order. By default the values come from the mission database, and the grism wheel has no
-error. With --lake and --exposure, the values are the ones with which the spectra of this exposure were drawn, and names
+error. With LAKE and --exposure, the values are the ones with which the spectra of this exposure were drawn, and names
 are such as FOLDER/RGS000_000012_DET11.conf.
 """
 
@@ -20,6 +20,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.store import layout, read
 from lake_schema.units import LIGHT_ANGSTROM_S, UJY_CGS
+from truesky.command_line.parser import Parser
 from truesky.fluxes import passbands
 from truesky.render import detector_inputs
 from truesky.render.camera import detectors
@@ -142,11 +143,9 @@ def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, Mis
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command: write the configuration files and print their number. Return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.render.grisms", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = Parser(prog="python -m truesky.render.grisms", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder to write to; it is created if needed")
-    parser.add_argument("--lake", help="folder of a lake with rendered spectra")
+    parser.add_lake("folder of a lake with rendered spectra", is_optional=True)
     parser.add_argument("--exposure", type=int, help="number of the exposure in the lake")
     parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--detectors", nargs="+", metavar="NAME", help="only these detectors")
@@ -156,9 +155,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _write_configurations(options: argparse.Namespace) -> int:
     if bool(options.lake) != (options.exposure is not None):
-        raise BadInput("--lake and --exposure must be given together")
+        raise BadInput("LAKE and --exposure must be given together")
     if options.name and not options.lake:
-        raise BadInput("--name requires --lake")
+        raise BadInput("--name requires LAKE")
     folder = user_files.check_folder(options.out)
     # Make the whole list first, so that nothing is written if one configuration is invalid.
     configurations = list(_configurations(options))

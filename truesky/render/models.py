@@ -1,6 +1,6 @@
 """Draw single sources of a published image of spectra, for example to test deblending.
 
-    python -m truesky.render.models --lake LAKE [--name REQUEST] --exposure N --detector NAME --sources ID ..
+    python -m truesky.render.models LAKE [--name REQUEST] --exposure N --detector NAME --sources ID ..
                                  [--orders] --out FILE.fits
 
 Each source is drawn separately and exactly as in the image, without noise. The FITS file has one extension per source,
@@ -25,6 +25,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits.images import Image, write_images
 from lake_schema.store import layout, read
 from lake_schema.store.object_storage.s3 import Folder
+from truesky.command_line.parser import Parser
 from truesky.render import detector_inputs
 from truesky.render.exposure import single_source_spectra
 from truesky.render.exposure.single_source_spectra import SourceSpectrum
@@ -106,10 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Return the exit status.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--lake", required=True, help="folder or address of the lake, with rendered images of spectra")
+    parser = Parser(prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0])
+    parser.add_lake("folder or address of the lake, with rendered images of spectra")
     parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--exposure", type=int, required=True, help="number of the exposure")
     parser.add_argument("--detector", required=True, help="name of the detector")

@@ -9,6 +9,8 @@ from lake_schema.store import parquet, read, reuse
 from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
+from truesky.command_line import simulation
+from truesky.numerics import activity
 from truesky.render import detector_inputs, product_plan
 from truesky.render.channels import registry
 from truesky.render.exposure import render
@@ -94,8 +96,9 @@ def render_task(lake: Path, facts: Json) -> Output:
     request = facts["request"]
     with memory_reuse.retain_freed_memory():
         aim, source_rows, variant = detector_inputs.load_inputs(lake, facts)
-        noise = request["noise_seed"]
-        rendered = render.render(aim, source_rows, variant, request["seed"], request["truth"], noise_seed=noise)
+        noise, truth = request["noise_seed"], request["truth"]
+        with activity.report(f"detector {aim.detector.name}, exposure {aim.exposure.exposure_id}"):
+            rendered = render.render(aim, source_rows, variant, request["seed"], truth, noise_seed=noise)
     rice, wcs_convention = request["compression"] == "rice", request["wcs"]
     rows, files = fits_files.products(rendered, request["truth"], rice, wcs_convention)
     drawn = truth_table.truth(rendered)
@@ -131,6 +134,6 @@ JOB = Job(
     "render_exposures",
     "Render every planned detector to FITS.",
     steps,
-    list_options=(("detectors", "only these detectors of each exposure"),),
-    integer_options=(("limit", "only this number of detectors, the first by exposure and name"),),
+    list_options=simulation.RENDER_LISTS,
+    integer_options=simulation.RENDER_INTEGERS,
 )

@@ -159,7 +159,7 @@ def test_another_package_called_jobs_does_not_matter(tmp_path):
         "assert main(['check', sys.argv[1]]) == 0; main(['build', '--help'])"
     )
     script = str(ROOT / "jobs" / "catalogue" / "build_stars.py")
-    for arguments, said in ((["-c", code, str(path)], ": good: "), ([script, "--help"], "--request")):
+    for arguments, said in ((["-c", code, str(path)], ": good: "), ([script, "--help"], "REQUEST LAKE")):
         done = subprocess.run(
             [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True
         )

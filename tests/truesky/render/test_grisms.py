@@ -72,9 +72,9 @@ def test_sensitivity_agrees_with_the_zero_point():
     ("more", "message"),
     [
         (["--detectors", "DET99"], "DET99"),
-        (["--exposure", "3"], "--lake and --exposure must be given together"),
-        (["--lake", "nowhere"], "--lake and --exposure must be given together"),
-        (["--name", "a"], "--name requires --lake"),
+        (["--exposure", "3"], "LAKE and --exposure must be given together"),
+        (["nowhere"], "LAKE and --exposure must be given together"),
+        (["--name", "a"], "--name requires LAKE"),
     ],
 )
 def test_errors_are_one_line_and_no_file_is_written(tmp_path, capsys, more, message):

@@ -182,7 +182,11 @@ def test_a_camera_without_folder_is_refused(tmp_path, old, new, words):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('band = "narrow"', 'band = "wide"', r"pointing\[0\]\.band: camera mini has no band 'wide' \(narrow, s"),
+        (
+            'band = "narrow"',
+            'band = "wide"',
+            r"pointing\[0\]\.band: camera mini has no band 'wide': allowed: narrow, s",
+        ),
         (
             '"mini"\nband = "narrow"',
             '"maxi"\nband = "sdss_r"',

@@ -24,7 +24,7 @@ def found(monkeypatch):
 
 def test_all_as_expected(found, tmp_path, capsys):
     file = tmp_path / "figures.json"
-    assert __main__.main(["--json", str(file)]) == 0
+    assert __main__.main(["--results", str(file)]) == 0
     written = json.loads(file.read_text())
     assert {name: written[name] for name in GOOD} == GOOD
     assert (written["checks"], written["failed"]) == (2, "")
@@ -32,10 +32,17 @@ def test_all_as_expected(found, tmp_path, capsys):
     assert "2 of 2 as expected" in capsys.readouterr().out
 
 
+def test_json_has_every_figure_with_its_verdict(found, capsys):
+    assert __main__.main(["--json"]) == 0
+    rows = {row["figure"]: row for row in json.loads(capsys.readouterr().out)}
+    assert {name: row["value"] for name, row in rows.items()} == GOOD
+    assert (rows["sigma_8"]["verdict"], rows["galaxies"]["verdict"]) == ("pass", None)
+
+
 def test_failed_check_sets_exit_status(found, tmp_path, capsys):
     found["sigma_8"] = 0.7
     file = tmp_path / "figures.json"
-    assert __main__.main(["--json", str(file)]) == 1
+    assert __main__.main(["--results", str(file)]) == 1
     assert json.loads(file.read_text())["failed"] == "sigma_8"
     assert "  not: sigma_8\n" in capsys.readouterr().out
 
@@ -43,7 +50,7 @@ def test_failed_check_sets_exit_status(found, tmp_path, capsys):
 def test_nan_figure_fails(found, tmp_path):
     found["sigma_8"] = math.nan
     file = tmp_path / "figures.json"
-    assert __main__.main(["--json", str(file)]) == 1
+    assert __main__.main(["--results", str(file)]) == 1
     assert json.loads(file.read_text())["sigma_8"] is None
 
 
@@ -76,11 +83,11 @@ def test_numbers_quoted_from_memory_are_not_binding(found, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("option", "name", "said"),
     [
-        ("--json", "none/figures.json", "its folder does not exist"),
-        ("--json", ".", "is not a file"),
+        ("--results", "none/figures.json", "its folder does not exist"),
+        ("--results", ".", "is not a file"),
         ("--figures", "file", "is not a folder"),
         ("--figures", "file/below", "is not a folder"),
-        ("--json", "locked/figures.json", "is not writable"),
+        ("--results", "locked/figures.json", "is not writable"),
         ("--figures", "locked/figures", "is not writable"),
     ],
 )

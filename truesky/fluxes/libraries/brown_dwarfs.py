@@ -7,6 +7,7 @@ from z - Y with an adopted Y - J.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -55,18 +56,23 @@ class Subtypes:
 
 def subtypes() -> Subtypes:
     """Return the properties of the 19 whole subtypes L0 to T8 in the table of Pecaut & Mamajek 2013."""
-    names, column = stellar.table(_FIRST, _LAST)
-    # Leave out the half subtypes T4.5, T5.5 and T7.5 of the table.
-    is_whole_subtype = np.array(["." not in name for name in names])
-    names, column = (
-        tuple(np.array(names)[is_whole_subtype].tolist()),
-        {title: values[is_whole_subtype] for title, values in column.items()},
-    )
+    names, column = _whole_subtypes()
     j, h, ks = (_vega(band) for band in _BANDS[_J:])
     zj = column["z-Y"] + _COLOR_YJ
     jh, hk = column["J-H"] + j - h, column["H-Ks"] + h - ks
     colors = np.stack([column["i-z"] + zj, zj, 0.0 * zj, -jh, -jh - hk], 1)
-    return Subtypes(tuple(name.removesuffix("V") for name in names), column["Teff"], column["M_J"], colors)
+    return Subtypes(names, column["Teff"], column["M_J"], colors)
+
+
+def _whole_subtypes() -> tuple[tuple[str, ...], dict[str, Float]]:
+    """Return the names L0 to T8 of the whole subtypes, and the columns of the published table for them."""
+    names, column = stellar.table(_FIRST, _LAST)
+    # Leave out the half subtypes T4.5, T5.5 and T7.5 of the table.
+    is_whole_subtype = np.array(["." not in name for name in names])
+    return (
+        tuple(name.removesuffix("V") for name in names if "." not in name),
+        {title: values[is_whole_subtype] for title, values in column.items()},
+    )
 
 
 def template_names() -> tuple[str, ...]:
@@ -74,7 +80,7 @@ def template_names() -> tuple[str, ...]:
 
     Number 00 has the mean colours of the subtype; the others have random colours.
     """
-    names = subtypes().names
+    names, _ = _whole_subtypes()
     counts = [COUNT // len(names) + (k < COUNT % len(names)) for k in range(len(names))]
     return tuple(f"{name}-{m:02d}" for name, count in zip(names, counts, strict=True) for m in range(count))
 
@@ -160,6 +166,7 @@ def _band_transmission(wavelength: Float, position: float) -> Float:
     return transmission
 
 
+@cache
 def _vega(band: str) -> float:
     # Import here to avoid an import cycle.
     from truesky.fluxes.libraries.vega import vega_magnitude

@@ -19,7 +19,7 @@ from lake_schema.arrays import Float, Float32
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import brown_dwarfs, model_stars, rest_grid, standards, stellar, vega
 from truesky.fluxes.libraries.stellar import normalise, planck
-from truesky.numerics import cache
+from truesky.numerics import cache, cache_labels
 from truesky.numerics.code_fingerprints import code_key
 
 _ANCHORS = ("E", "Sbc", "Scd", "Im")
@@ -123,7 +123,9 @@ def stellar_library() -> Library:
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
     files = vega.spectrum_file("vega.txt").read_bytes(), model_stars.TABLE.read_bytes()
     key = cache.content_key(code_key(__name__), *files, stellar.fingerprint())
-    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _star_spectra(types)})
+    arrays = cache.cached_arrays(
+        "stellar_library", key, lambda: {"flux": _star_spectra(types)}, cache_labels.label_spectra()
+    )
     return Library(passbands.grid(), arrays["flux"], names, types)
 
 

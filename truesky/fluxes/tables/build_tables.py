@@ -18,7 +18,7 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, intergalactic, lines
 from truesky.fluxes.spectra.continuum import REFERENCE_BAND, dust_curves, rest_flux
-from truesky.numerics import cache, matrices
+from truesky.numerics import cache, cache_labels, matrices
 from truesky.numerics.code_fingerprints import code_key
 
 # Smallest and largest redshift of the tables of galaxies. Fluxes of galaxies at other redshifts are integrated.
@@ -109,6 +109,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
         f"galaxy_table_{band.name}",
         full_key,
         lambda: {"galaxies": _compute_galaxy_table(library, band, reference, setting)},
+        cache_labels.label_galaxy_table(band.name, *numbers),
     )
     return arrays["galaxies"]
 
@@ -136,7 +137,10 @@ def star_table(band: Passband, library: Library, key: str) -> Float32:
     """
     full_key = cache.content_key(code_key(__name__), key, *_curve_arrays(band))
     arrays = cache.cached_arrays(
-        f"star_table_{band.name}", full_key, lambda: {"stars": _compute_star_table(library, band)}
+        f"star_table_{band.name}",
+        full_key,
+        lambda: {"stars": _compute_star_table(library, band)},
+        cache_labels.label_star_table(band.name),
     )
     return arrays["stars"]
 

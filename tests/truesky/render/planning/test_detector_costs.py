@@ -137,11 +137,20 @@ def test_the_forecast_adds_up(tmp_path):
 def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     lake = tmp_path / "lake"
     assert submitted_job.main(plan.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
-    lines, catalogues = (table.splitlines() for table in capsys.readouterr().out.split("\n\n"))
-    assert [line.split()[0] for line in catalogues] == ["job", "build_galaxies", "build_stars", "compute_fluxes"]
+    lines, whole_run = (table.splitlines() for table in capsys.readouterr().out.split("\n\n"))
+    jobs = [
+        "start",
+        "build_galaxies",
+        "build_stars",
+        "compute_fluxes",
+        "plan_exposures",
+        "render_exposures",
+        "pictures",
+    ]
+    assert [line.split()[0] for line in whole_run[:8]] == ["cost", *jobs]
     assert lines[0].startswith("channel")
     assert lines[-2].split()[:2] == ["all", "all"]
-    assert lines[-1].startswith("core-hours are for this machine, from a calibration")
+    assert lines[-1].startswith("CPU times are for this machine, from a calibration")
     assert not lake.exists()
 
 

@@ -12,7 +12,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from truesky.render.planning import ground_surveys, planned_exposures
 from truesky.request.area import Area
-from truesky.request.observations import Observation
+from truesky.request.exposures.observations import Observation
 
 MISSION = resolve()
 BLOCK = Observation(("EXT",), survey="lsst", exposure_time_s=77.0, detectors=("R22_S11",))
@@ -47,11 +47,11 @@ def test_a_line_is_an_exposure(tmp_path):
         ("", "column ra is missing"),
         (HEAD.replace(",dec", "") + "\n", "column dec is missing"),
         (f"{HEAD},colour\n{ROW},red\n", "column colour is unknown"),
-        (f"# one\n# two\n{HEAD}\n{ROW}\n{ROW.replace('20.5', 'x')}\n", "line 5: dec = 'x' is not a number"),
-        (f"{HEAD}\n{ROW.replace('20.5', '90.1')}\n", "line 2: dec = 90.1 is outside -90 to 90"),
+        (f"# one\n# two\n{HEAD}\n{ROW}\n{ROW.replace('20.5', 'x')}\n", "line 5: dec = 'x' must be a number in degrees"),
+        (f"{HEAD}\n{ROW.replace('20.5', '90.1')}\n", "line 2: dec = 90.1 is outside [-90.0, 90.0]"),
         (f"{HEAD}\n{ROW.replace('20.5', 'nan')}\n", "line 2: dec = nan is outside"),
         (f"{HEAD}\n{ROW.replace('EXT', 'RADIO')}\n", "line 2: channel = 'RADIO'"),
-        (f"{HEAD}\n{ROW.replace('lsstcam', 'vis')}\n", "line 2: channel EXT has no camera 'vis'"),
+        (f"{HEAD}\n{ROW.replace('lsstcam', 'vis')}\n", "line 2: camera: channel EXT has no camera 'vis'"),
         (f"{HEAD}\n{ROW.replace('lsst_r', 'lsst_q')}\n", "line 2: camera lsstcam has no band 'lsst_q'"),
         (f"{HEAD},image_type\n{ROW},art\n", "line 2: image_type = 'art'"),
         (f"{HEAD},seeing\n{ROW},0\n", "line 2: seeing = 0.0 is outside"),

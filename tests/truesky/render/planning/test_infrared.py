@@ -16,7 +16,7 @@ from truesky.render.effects.light import calibration_lamp
 from truesky.render.plan_exposures import plan
 from truesky.render.planning import survey, variants
 from truesky.render.planning.planned_exposures import elapsed_time
-from truesky.request import observations
+from truesky.request.exposures import observations
 from truesky.request.from_toml import from_table
 
 MISSION = resolve()
@@ -313,7 +313,7 @@ def test_a_ramp_of_too_many_frames_is_refused_with_the_request():
 @pytest.mark.parametrize(("seconds", "message"), [(20.0, "takes 69.79 s without any drops"), (1e5, "more than 1000")])
 def test_an_exposure_time_without_a_ramp_is_refused(tmp_path, seconds, message):
     one = from_table({**BASE, "pointing": [{**POINTING, "exposure_time_s": seconds}]})
-    with pytest.raises(BadInput, match=rf"pointing\[0\]: exposure time .*{message}"):
+    with pytest.raises(BadInput, match=rf"pointing\[0\]\.exposure_time_s: exposure time .*{message}"):
         plan(tmp_path, one)
     with pytest.raises(BadInput, match=rf"observation\[0\]: exposure time .*{message}"):
         exposures({**FLAT, "exposures": 1, "exposure_time_s": seconds})

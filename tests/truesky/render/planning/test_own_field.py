@@ -12,8 +12,8 @@ from lake_schema.errors import BadInput
 from tests.house.test_names import ROOT
 from truesky.commands import plan
 from truesky.render import plan_exposures
-from truesky.request import pointing_tables
 from truesky.request.area import parse
+from truesky.request.exposures import pointing_tables
 from truesky.request.from_toml import from_table
 
 BASE = {"name": "x", "seed": 7}

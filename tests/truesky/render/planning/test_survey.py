@@ -25,7 +25,7 @@ from truesky.render.channels import image_types
 from truesky.render.plan_exposures import plan
 from truesky.render.planning import planned_exposures, reference_survey, source_counts, survey, tasks, variants
 from truesky.render.planning.observing_sequence import offsets
-from truesky.render.sky import solar_aspect
+from truesky.render.sky import observatory, solar_aspect
 from truesky.request import accuracy, schema
 from truesky.request.area import Area
 from truesky.request.from_toml import from_table, parse
@@ -370,3 +370,22 @@ def test_other_requests_can_be_planned():
     for path in files:
         assert parse(path).name == path.stem
         assert tomllib.loads(path.read_text())["name"] == path.stem
+
+
+@pytest.mark.parametrize(
+    "pointing",
+    [{"channel": "VIS"}, {"channel": "NISP-P"}, {"channel": "NISP-S"}, {"channel": "EXT", "camera": "lsstcam"}],
+    ids=lambda pointing: pointing["channel"],
+)
+def test_a_pointing_without_a_date_begins_when_its_field_can_be_observed(pointing):
+    request = made(pointing=[{**pointing, "ra": 53.117, "dec": -27.808}])
+    ((exposure, _),) = survey.exposures(request, MISSION)
+    launch = MISSION.value("svm.launch", "d")
+    assert launch <= exposure.mjd < launch + 400.0
+    if pointing["channel"] == "EXT":
+        site = observatory.Site.from_mission("ext.lsstcam", MISSION)
+        assert observatory.sun_altitude(np.array([exposure.mjd]), site)[0] < -12.0
+    else:
+        assert solar_aspect.is_allowed(53.117, -27.808, exposure.mjd, MISSION)
+        # The Sun forbids the day before, or the mission begins on this date.
+        assert exposure.mjd == launch or not solar_aspect.is_allowed(53.117, -27.808, exposure.mjd - 1.0, MISSION)

@@ -46,9 +46,10 @@ def test_report_requires_no_network(version):
 
 def test_second_run_reuses_the_table(lake, version, capsys, tmp_path):
     report = tmp_path / "r.html"
-    assert __main__.main(["--lake", str(lake), "--report", str(report)]) == 1
+    assert __main__.main([str(lake), "--report", str(report)]) == 1
     assert report.read_bytes() == version.sidecar_path(publishing.REPORT).read_bytes()
     said = capsys.readouterr().out
+    assert re.search(r"^skipped +\d+ figures? +\w+: ", said, re.M)
     assert re.search(r"^fail +VIS/euclid_vis/000002/1-1 +astrometry offset_x: -(9|10)\.", said, re.M)
 
 
@@ -73,6 +74,6 @@ def test_missing_inputs_are_refused(lake, tmp_path, capsys):
     with pytest.raises(BadInput, match="no image of exposure 7"):
         inventory.read_contents(lake, exposures=[7])
     (tmp_path / "empty").mkdir()
-    for words in (["--lake", str(tmp_path / "empty")], ["--lake", str(lake), "--processes", "0"], ["--exposures", "1"]):
+    for words in ([str(tmp_path / "empty")], [str(lake), "--processes", "0"], ["--exposures", "1"]):
         assert __main__.main(words) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
