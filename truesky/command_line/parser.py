@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from lake_schema import command
+from lake_schema.texts import spelling
 
 
 def suggestion(word: str, names: Iterable[str]) -> str:
     """Return '; did you mean "NAME"?' with the name that is most similar to a word, or "" if none is similar."""
-    matches = difflib.get_close_matches(word, list(names), n=1)
+    matches = spelling.closest_names(word, names, 1)
     return f'; did you mean "{matches[0]}"?' if matches else ""
 
 
