@@ -28,7 +28,7 @@ def add_job_arguments(
     lists, integers : tuple of (str, str)
         Name and help text of the options that replace a field of the request by texts or by an integer.
     can_forecast : bool
-        True if the job has the option --dry-run.
+        True if the job has the options --dry-run and --json.
     """
     parser.add_request()
     parser.add_lake(NEW_LAKE)
@@ -38,6 +38,7 @@ def add_job_arguments(
         parser.add_argument(f"--{name}", type=int, metavar="N", help=text)
     if can_forecast:
         parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
+        parser.add_argument("--json", action="store_true", help="with --dry-run: print the forecast as JSON")
     parser.add_argument("-v", "--verbose", action="store_true", help="print tracebacks and messages of Spark")
 
 

@@ -6,15 +6,16 @@ forecasts the cost of its images and of its catalogues.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from lake_schema.errors import Mistakes
 from truesky.catalogue import request_checks
 from truesky.fluxes import inputs
 from truesky.render import plan_exposures
-from truesky.render.forecasting import request_cost, speed
+from truesky.render.forecasting import forecast, request_cost
 from truesky.render.forecasting.image_costs import ImageCosts
 from truesky.render.plan_exposures import Planner, PlanRows
 from truesky.render.planning import preconditions, tasks
@@ -120,22 +121,24 @@ def check_catalogues(request: Request) -> None:
     There is one line for each mistake.
     """
     with Mistakes() as mistakes:
-        user_inputs = mistakes.read(inputs.read, request.curves)
-        if user_inputs is not None:
-            mistakes.read(inputs.select_passbands, request.bands, user_inputs.passbands)
+        user_passbands = mistakes.read(inputs.check_files, request.curves)
+        if user_passbands is not None:
+            mistakes.read(inputs.select_passbands, request.bands, user_passbands)
         mistakes.read(request_checks.check_request, request)
 
 
-def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """Check a request, and print the forecast costs of its images and of a whole run.
+def dry_run(lake: Path, request: Request, as_json: bool = False) -> Sequence[Step]:
+    """Check a request, and print the forecast costs of its images and of a whole run, as tables or as JSON.
 
     Return (), since no table is made. Raises BadInput if a job would refuse the request.
     """
     images = ImageCosts(request)
-    plan_exposures.print_forecast(lake, request, images.watch(checked_chunks(request, lake)))
-    print()
-    for line in request_cost.format_table(request_cost.forecast(request, images, speed.estimate_speed(lake))):
-        print(line)
+    lines, machine = plan_exposures.forecast_images(lake, request, images.watch(checked_chunks(request, lake)))
+    cost = request_cost.forecast(request, images, machine)
+    if as_json:
+        print(json.dumps({"images": [asdict(line) for line in lines], "cost": cost.as_json()}, indent=2))
+    else:
+        print(*forecast.format_table(lines, machine), "", *request_cost.format_table(cost), sep="\n")
     return ()
 
 

@@ -94,6 +94,24 @@ def read(user_curves: UserCurves) -> FluxInputs:
         If a file is absent or not valid. The message names the key of the request, the file and, if there is one, the
         row.
     """
+    user_passbands, library, origins = _read_galaxies(user_curves)
+    stars, star_origins, dwarf_origins = _read_stars(user_curves)
+    return FluxInputs(user_passbands, library, stars, origins | star_origins, dwarf_origins)
+
+
+def check_files(user_curves: UserCurves) -> dict[str, Passband]:
+    """Read the user's files, and return the user's passbands by name; raises BadInput as `read` does.
+
+    The built-in spectra of stars, which take about 12 s to compute once, are not needed.
+    """
+    user_passbands, _, _ = _read_galaxies(user_curves)
+    if user_curves.has_stars:
+        _read_stars(user_curves)
+    return user_passbands
+
+
+def _read_galaxies(user_curves: UserCurves) -> tuple[dict[str, Passband], Library, dict[str, Origin]]:
+    """Return the user's passbands by name, the library of galaxies, and the origin of each user file by request key."""
     user_passbands, origins = read_passbands(user_curves)
     library = templates.galaxy_library()
     if user_curves.templates is not None:
@@ -111,8 +129,7 @@ def read(user_curves: UserCurves) -> FluxInputs:
         library = replace(library, dust=dust, external=True)
     if user_curves.intergalactic:
         library = replace(library, intergalactic=True)
-    stars, star_origins, dwarf_origins = _read_stars(user_curves)
-    return FluxInputs(user_passbands, library, stars, origins | star_origins, dwarf_origins)
+    return user_passbands, library, origins
 
 
 def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
@@ -150,7 +167,7 @@ def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], li
     An origin is the file name, reference and checksum. Without user files the library is the built-in one, and both
     origins are empty.
     """
-    if user_curves.basel is None and not user_curves.irtf:
+    if not user_curves.has_stars:
         return templates.stellar_library(), {}, []
     low_resolution, reference, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
     with _prefix_errors("fluxes.stars"):

@@ -22,6 +22,7 @@ from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 from truesky.render.forecasting import forecast, speed
+from truesky.render.forecasting.speed import Speed
 from truesky.render.planning import ground_surveys, psf_files, source_counts, tasks, variants
 from truesky.render.planning.detector_costs import OutputFiles
 from truesky.render.planning.exposure_chunks import Chunk, Layout
@@ -199,8 +200,8 @@ def _print_published(lake: Path, version: read.Version) -> None:
     )
 
 
-def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> None:
-    """Print a forecast of CPU time, memory and disc space to render a plan that is not stored in the lake.
+def forecast_images(lake: Path, request: Request, parts: Iterable[PlanRows]) -> tuple[list[forecast.Line], Speed]:
+    """Forecast CPU time, memory and disc space to render a plan that is not stored in the lake.
 
     Parameters
     ----------
@@ -211,14 +212,23 @@ def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> N
     parts : iterable of (pyarrow.Table, pyarrow.Table)
         Rows of the tables `exposures` and `tasks` for each chunk of the plan.
 
+    Returns
+    -------
+    list of Line
+        Sums of each kind of image, of each channel, and of everything.
+    Speed
+        Speed of this machine, to which the CPU times belong.
+
     Notes
     -----
     Ground exposures in daylight cause a warning. BadInput is raised if the catalogues of the lake belong to another
     request.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
-    _print_forecast(lake, parts)
+    machine = speed.estimate_speed(lake)
+    lines = forecast.summarise_chunks(parts, machine.factor)
     _warn_daylight(Planner.from_request(lake, request))
+    return lines, machine
 
 
 def _print_forecast(lake: Path, parts: Iterable[PlanRows]) -> None:

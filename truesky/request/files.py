@@ -77,6 +77,11 @@ class UserCurves:
     irtf: tuple[Path, ...] = ()
     intergalactic: bool = False
 
+    @property
+    def has_stars(self) -> bool:
+        """True if spectra of stars come from a user's files."""
+        return self.basel is not None or bool(self.irtf)
+
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:

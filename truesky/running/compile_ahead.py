@@ -1,4 +1,4 @@
-"""Compile functions in a process with low priority, before the jobs of a run need them.
+"""Compile functions in a process with low priority, before the jobs of a run need them, and compute spectra of stars.
 
 Otherwise each worker would compile them itself, at the same time as the others, which takes about a minute. The list of
 functions with the types of their arguments is compiled_functions.json; scripts/list_compiled_functions.py makes it. A
@@ -19,13 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema import command
-from truesky.numerics import activity, cache
+from truesky.numerics import activity, cache, cache_labels
 from truesky.request.schema import Request
 from truesky.running import supervise
 
 # File with the functions "module:function" of each group, and the types of their arguments.
 LIST = Path(__file__).with_name("compiled_functions.json")
 CATALOGUES, CCD, INFRARED = "catalogues", "ccd", "infrared"
+# Function that computes the spectra of stars, which the fluxes need, in about 12 s and keeps them in the cache.
+_STELLAR_LIBRARY = "truesky.fluxes.libraries.templates:stellar_library"
 # Channels of the renderer whose detectors are infrared arrays; all others are CCDs.
 _INFRARED_CHANNELS = frozenset({"NISP-P", "NISP-S"})
 # Priority of the process: the higher the number, the lower the priority.
@@ -43,15 +45,21 @@ def groups_of_request(request: Request) -> list[str]:
 
 
 def missing_functions(groups: Sequence[str]) -> list[str]:
-    """Return the listed functions "module:function" of some groups of which the cache has no machine code."""
+    """Return the functions "module:function" of some groups that should be called ahead, in order.
+
+    These are the listed functions of which the cache has no machine code, and, after those of the catalogues, the
+    function that computes the spectra of stars if the cache does not contain them.
+    """
     listed, folder = json.loads(LIST.read_text()), cache.machine_code_dir()
     present = {f"{path.parent.name}.{path.name.rsplit('-', 1)[0]}" for path in folder.glob("*/*.nbi")}
-    return [
-        name
-        for group in groups
-        for name in listed.get(group, {})
-        if name.removeprefix("truesky.").replace(":", ".") not in present
-    ]
+    missing = []
+    for group in groups:
+        missing += [
+            name for name in listed.get(group, {}) if name.removeprefix("truesky.").replace(":", ".") not in present
+        ]
+        if group == CATALOGUES and not cache.has_label(cache_labels.label_spectra()):
+            missing.append(_STELLAR_LIBRARY)
+    return missing
 
 
 @contextmanager
@@ -71,10 +79,16 @@ def compile_in_background(functions: Sequence[str]) -> Iterator[None]:
 
 
 def compile_functions(functions: Sequence[str]) -> None:
-    """Compile listed functions "module:function" for all argument types in the list, unless the cache has them."""
+    """Compile functions "module:function" for all argument types in the list, unless the cache has them.
+
+    Functions without arguments that are not listed are called.
+    """
     listed = {name: types for group in json.loads(LIST.read_text()).values() for name, types in group.items()}
     for name in activity.track(functions, "compiling, function"):
         module, function = name.split(":")
+        if name not in listed:
+            getattr(import_module(module), function)()
+            continue
         compiled: Any = getattr(import_module(module), function).load()
         for arguments in listed[name]:
             compiled.compile(argument_types(arguments))

@@ -96,8 +96,8 @@ class Job:
     integer_options : tuple of (str, str)
         Names and help texts of options that replace fields of the request with an integer, such as `limit`.
     dry_run : callable, optional
-        Function (lake, request) -> steps that replaces `steps` if the option --dry-run is given. It prints a forecast.
-        With None the job has no such option.
+        Function (lake, request, as_json) -> () that replaces `steps` if the option --dry-run is given. It prints a
+        forecast, as JSON with the option --json. With None the job has no such options.
     """
 
     name: str
@@ -105,7 +105,7 @@ class Job:
     steps: Callable[[Path, Request], Sequence[Step]]
     list_options: tuple[tuple[str, str], ...] = ()
     integer_options: tuple[tuple[str, str], ...] = ()
-    dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
+    dry_run: Callable[[Path, Request, bool], Sequence[Step]] | None = None
 
 
 # Fields of a task's receipt (record of its files, time and memory) that a Spark worker sends to the main process.
@@ -132,7 +132,11 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
     def run_job() -> int:
         with _exit_on_signal(job):
             _refuse_mangled(options.lake, options.request)
-            chosen_job = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
+            chosen_job, dry_run = job, job.dry_run
+            if dry_run is not None and options.dry_run:
+                chosen_job = replace(job, steps=lambda lake, request: dry_run(lake, request, options.json))
+            elif dry_run is not None and options.json:
+                raise BadInput("--json needs --dry-run: it prints the forecast as JSON")
             run(chosen_job, layout.resolve_lake(options.lake), _request(job, options), options.verbose)
         return 0
 

@@ -13,6 +13,7 @@ from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
 from tests.truesky.fluxes.libraries.test_from_files import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
 from truesky.fluxes import inputs, passbands, sources
+from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.vega import spectrum_file, vega_magnitudes
 from truesky.fluxes.spectra import continuum, lines
 from truesky.request.files import Curves, UserCurves
@@ -136,8 +137,14 @@ def test_bad_files_are_refused_with_their_key(tmp_path, changes, message):
         name: made(value) if name == "templates" else tuple((key, made(curves)) for key, curves in value)
         for name, value in changes.items()
     }
-    with pytest.raises(BadInput, match=message):
-        inputs.read(UserCurves(**given))
+    for reader in (inputs.read, inputs.check_files):
+        with pytest.raises(BadInput, match=message):
+            reader(UserCurves(**given))
+
+
+def test_a_check_of_files_does_not_compute_spectra_of_stars(tmp_path, monkeypatch):
+    monkeypatch.setattr(templates, "stellar_library", None)
+    assert list(inputs.check_files(own(tmp_path))) == ["mine"]
 
 
 def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests import requests
+from truesky.fluxes.libraries import templates
 from truesky.numerics import cache
 from truesky.request.from_toml import parse
 from truesky.running import compile_ahead
@@ -50,6 +51,16 @@ def test_functions_without_machine_code_are_missing(code):
     (folder / "frame.accumulate-64.py311.nbi").touch()
     missing = compile_ahead.missing_functions(["ccd"])
     assert set(GROUPS["ccd"]) - set(missing) == {"truesky.render.drawing.kernels.frame:accumulate"}
+
+
+def test_spectra_of_stars_are_computed_after_the_functions_of_the_catalogues(code, tmp_path, monkeypatch):
+    monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
+    name = "truesky.fluxes.libraries.templates:stellar_library"
+    assert compile_ahead.missing_functions(["catalogues", "ccd"]) == [*GROUPS["catalogues"], name, *GROUPS["ccd"]]
+    called = []
+    monkeypatch.setattr(templates, "stellar_library", lambda: called.append(name))
+    compile_ahead.compile_functions([name])
+    assert called == [name]
 
 
 def test_a_process_compiles_functions(code):
