@@ -27,6 +27,9 @@ class Cost:
         Bytes of the file per pixel that is read out, including prescan and overscan.
     redraw_s : float
         Seconds to draw an earlier image of the sky again, because it leaves persistence; 0 without persistence.
+    lamp_s : float
+        Additional seconds per million pixels if a calibration lamp illuminates the detector. The charge of each frame
+        of a ramp is then drawn separately.
     """
 
     frame_s: float
@@ -38,3 +41,4 @@ class Cost:
     sky_bytes_per_pixel: float
     file_bytes_per_pixel: float
     redraw_s: float = 0.0
+    lamp_s: float = 0.0

@@ -163,6 +163,7 @@ COST = Cost(
     sky_bytes_per_pixel=240.0,
     file_bytes_per_pixel=3.0,
     redraw_s=0.65,
+    lamp_s=6.5,
 )
 
 CHANNEL = Channel(

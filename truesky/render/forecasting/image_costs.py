@@ -102,6 +102,8 @@ class ImageCosts:
         for row in sums.to_pylist():
             channel = registry.CHANNELS[row["channel"]]
             sees_sky = channel.sees_sky(row["image_type"])
+            if self.request.compression != "none":
+                self.seconds += row["bytes_sum"] * run_costs()["compression"]["byte_s"]
             self.bytes += row["bytes_sum"] * self._compression(row["channel"], row["image_type"], sees_sky)
             self.bytes += tables["image_bytes"] * row["bytes_count"]
             if sees_sky:
@@ -115,12 +117,11 @@ class ImageCosts:
         if self.request.compression == "none":
             return 1.0
         channel, ratios = registry.CHANNELS[name], run_costs()["compression"]
+        map_ratios = ratios["maps"]
         effects = channel.with_readout(self.request.readout).effects.get(image_type) or ()
         maps = truth_maps.available_maps(self.request.truth, [effect.name for effect in effects], sees_sky)
         parts = [(channel.cost.file_bytes_per_pixel, ratios[name])]
-        parts += [
-            (truth_maps.BYTES_PER_PIXEL[m], 1.0 if m in ratios["uncompressed_maps"] else ratios["maps"]) for m in maps
-        ]
+        parts += [(truth_maps.BYTES_PER_PIXEL[m], map_ratios.get(m, 1.0)) for m in maps]
         return float(sum(size * ratio for size, ratio in parts) / sum(size for size, _ in parts))
 
     def psfs(self) -> set[PsfKey]:

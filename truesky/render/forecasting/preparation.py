@@ -156,7 +156,9 @@ def _flux_items(request: Request) -> Iterator[Item]:
         labels = [cache_labels.label_star_table(band) for band in request.bands]
         yield _item("star_table", "flux tables of stars", labels)
     if request.bands:
-        yield _item("published", "spectra for fluxes", [cache_labels.label_published()])
+        # A user's spectra of stars are read from the lake.
+        if request.curves.has_stars:
+            yield _item("published", "spectra for fluxes", [cache_labels.label_published()])
         yield _compilation_item("fluxes")
 
 
@@ -200,7 +202,9 @@ def _item(kind: str, name: str, labels: Sequence[str], amount: float = 1.0, slow
     cpu = missing * amount * slower * cost["s"]
     used = max(1, min(missing, WORKERS)) if cost.get("in_workers") else 1
     memory = amount * cost.get("memory_bytes", 0.0) / 1e9 if missing else 0.0
-    return Item(name, len(labels), cached, cpu, cpu / used, missing * amount * cost["bytes"], memory)
+    # Products with `wall_s` are made while other jobs run.
+    wall = missing * cost["wall_s"] if "wall_s" in cost else cpu / used
+    return Item(name, len(labels), cached, cpu, wall, missing * amount * cost["bytes"], memory)
 
 
 def _compilation_item(group: str) -> Item:

@@ -231,8 +231,10 @@ def render_job(detectors: int, seconds: float, size: float, factor: float, longe
     cost = run_costs()["images"]
     times = factor / float(run_costs()["machine_factor"])
     used = max(1, min(WORKERS, detectors))
-    in_workers = factor * seconds + times * (used * cost["worker_s"] + detectors * cost["task_s"])
+    # Workers that render at the same time share the memory of the machine, which makes each of them slower.
+    shared = factor * (cost["shared_factor"] if used > 1 else 1.0)
+    in_workers = shared * seconds + times * (used * cost["worker_s"] + detectors * cost["task_s"])
     serial = times * (cost["start_s"] + detectors * cost["publish_s"])
-    longest = factor * longest_s + times * (cost["worker_s"] + cost["task_s"])
+    longest = shared * longest_s + times * (cost["worker_s"] + cost["task_s"])
     wall = serial + max(in_workers / used, longest)
     return JobCost("render_exposures", detectors, serial + in_workers, wall, size, 0.0)

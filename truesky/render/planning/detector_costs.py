@@ -15,6 +15,7 @@ from lake_schema.arrays import Float, Int
 from truesky.render.channels import registry
 from truesky.render.drawing import settings
 from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import calibration_lamp
 from truesky.render.exposure import truth_maps
 from truesky.request.accuracy import SURVEY, Accuracy
 
@@ -155,13 +156,16 @@ def cost_model(
     images = 2 if files.has_exposure_file else 1
     written_bytes = registry.CHANNELS[channel].with_readout(files.readout).readout.file_bytes_per_pixel
     effect_names = [effect.name for effect in applied]
+    has_lamp = calibration_lamp.EFFECT.name in effect_names
     map_seconds = sum(
         cost for name in maps for effect_name, cost in _FILLED_S.get(name, {}).items() if effect_name in effect_names
     )
     map_seconds += _STARS_S * ("stars" in maps)
     return CostModel(
         start_s=channel_cost.frame_s + sees_sky * channel_cost.sky_s,
-        pixel_s=1e-6 * sum(effect.cost for effect in applied) + _MAP_S * map_bytes + map_seconds,
+        pixel_s=1e-6 * (sum(effect.cost for effect in applied) + channel_cost.lamp_s * has_lamp)
+        + _MAP_S * map_bytes
+        + map_seconds,
         galaxy_s=sees_sky * channel_cost.galaxy_s * accuracy_factor,
         star_s=sees_sky * channel_cost.star_s * accuracy_factor * (1 + ("stars" in maps)),
         start_gb=channel_cost.base_gb,

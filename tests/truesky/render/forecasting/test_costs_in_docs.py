@@ -16,7 +16,7 @@ from truesky.request.from_toml import from_table, parse
 ROOT = Path(__file__).resolve().parents[4]
 DOCS = ROOT / "docs"
 # The machine whose costs are printed: an AMD EPYC.
-MACHINE = Speed(0.66, "")
+MACHINE = Speed(0.61, "")
 ERROR = 0.3
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 AMOUNT = r"([\d.,]+) (s|min|h|kB|MB|GB|TB)"

@@ -1,5 +1,6 @@
 """Forecast of a plan: costs of a detector, their sums, and a dry run that writes nothing."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -154,10 +155,22 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     assert not lake.exists()
 
 
+def test_the_forecast_of_a_dry_run_as_json(tmp_path, capsys):
+    words = ["--lake", str(tmp_path / "lake"), "--request", str(DEMO)]
+    assert submitted_job.main(plan.JOB, [*words, "--dry-run", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [line["channel"] for line in printed["images"]] == ["EXT", "VIS", "EXT", "VIS", "all"]
+    assert printed["images"][-1]["detectors"] == printed["cost"]["detectors"] == 2
+    assert submitted_job.main(plan.JOB, [*words, "--json"]) == 2
+    assert capsys.readouterr().err == "plan_exposures: --json needs --dry-run: it prints the forecast as JSON\n"
+    assert not (tmp_path / "lake").exists()
+
+
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
     own = registry.CHANNELS[channel]
-    assert min(getattr(own.cost, name) for name in own.cost.__slots__ if name != "redraw_s") > 0.0
+    assert min(getattr(own.cost, name) for name in own.cost.__slots__ if name not in ("redraw_s", "lamp_s")) > 0.0
+    assert (own.cost.lamp_s > 0.0) == bool(own.ramp_name)
     assert (own.cost.redraw_s > 0.0) == (own.persistence_effect is not None)
 
 
@@ -166,3 +179,10 @@ def test_every_channel_can_be_planned():
     for name in dict(CHANNELS):
         assert set(image_types.SKY_TYPES) <= set(registry.CHANNELS[name].sky_types)
     assert [name for name in dict(CHANNELS) if "flat" in registry.CHANNELS[name].sky_types] == ["VIS"]
+
+
+def test_a_lamp_costs_time_in_ramps():
+    effects = registry.CHANNELS["NISP-S"].effects
+    flat, dark = (detector_costs.cost_model("NISP-S", False, effects[kind]) for kind in ("flat", "dark"))
+    lamp_s = registry.CHANNELS["NISP-S"].cost.lamp_s
+    assert flat.pixel_s - dark.pixel_s > 1e-6 * lamp_s
