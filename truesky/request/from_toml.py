@@ -30,8 +30,8 @@ All keys::
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
                    for one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
                    cameras = ["my_camera/"]   user's ground cameras (lake_schema/mission/camera_folder.py)
-    [fluxes]       bands = [..]           default: the bands of the pointings and observations; without exposures
-                                          euclid_vis, euclid_y, euclid_j, euclid_h, lsst_u .. lsst_y
+    [fluxes]       bands = [..]           in addition to the bands of the pointings and observations; default without
+                                          exposures: euclid_vis, euclid_y, euclid_j, euclid_h, lsst_u .. lsst_y
                    intergalactic = true   intergalactic hydrogen absorbs the light of galaxies
     [fluxes.passbands.NAME]        user's filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
     [fluxes.templates]             user's galaxy spectra, earliest type first, counted by sed_1 and sed_2: files, format
@@ -288,8 +288,9 @@ def read_valid_parts(table: Toml, folder: Path = Path()) -> ValidParts:
     with_curves = read("fluxes", _with_camera_passbands, request) or request
     read("sources", checks.check_sources, with_curves)
     read("pointing", checks.check_bands, with_curves)
-    if mission is not None and not bands:
-        bands = read("observation", request_bands.requested_bands, with_curves, mission) or ()
+    if mission is not None:
+        # Images need the fluxes in their bands, also if the request names others.
+        bands = (*bands, *(read("observation", request_bands.requested_bands, with_curves, mission) or ()))
     added = (name for name, _ in with_curves.curves.passbands)
     all_bands = tuple(dict.fromkeys((*bands, *added))) or request_bands.DEFAULT_BANDS
     return ValidParts(replace(with_curves, bands=all_bands), reader.messages(), frozenset(invalid))

@@ -195,6 +195,12 @@ def test_the_demo():
     assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
 
 
+def test_fluxes_are_computed_in_the_bands_of_exposures_too():
+    table = tomllib.loads(DEMO.read_text())
+    table["fluxes"] = {"bands": ["euclid_h", "lsst_r"]}
+    assert from_table(table).bands == ("euclid_h", "lsst_r", "euclid_vis")
+
+
 def test_discs_have_structure_if_requested():
     """Facts about images mention structure only if it is requested."""
     assert structure.facts(from_table(GOOD).structure) == structure.facts(from_table(with_("structure", {})).structure)
