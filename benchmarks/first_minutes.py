@@ -1,6 +1,6 @@
 """Measure what a new user waits for: the first picture, the first catalogue and the answers of short commands.
 
-All times are wall times of commands in processes of their own, so they are comparable only on an idle machine. Each run
+All times are wall times of commands in separate processes, so they are comparable only on an idle machine. Each run
 is compared with the forecast that `truesky check` made directly before it.
 """
 
@@ -65,7 +65,7 @@ class Run:
     lake_bytes, forecast_lake : float
         Size of the lake without pictures.
     cache_bytes, forecast_cache : float
-        Size of what the run added to the cache.
+        Size of the entries that the run added to the cache.
     silence_s : float
         Longest time in s without output on a terminal.
     """
@@ -144,7 +144,7 @@ def measure(requests: Sequence[Path], folder: Path, repeats: int) -> dict[str, f
     Parameters
     ----------
     requests : sequence of Path
-        Requests, of which each gets an empty cache of its own.
+        Requests; each gets an empty cache.
     folder : Path
         Folder for lakes and caches.
     repeats : int
