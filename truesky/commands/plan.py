@@ -128,9 +128,26 @@ def check_catalogues(request: Request) -> None:
 
 
 def dry_run(lake: Path, request: Request, as_json: bool = False) -> Sequence[Step]:
-    """Check a request, and print the forecast costs of its images and of a whole run, as tables or as JSON.
+    """Check a request, and print the forecast costs of its images and of a whole run.
 
-    Return (), since no table is made. Raises BadInput if a job would refuse the request.
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake, which need not exist.
+    request : Request
+        The request.
+    as_json : bool, optional
+        True to print JSON instead of tables.
+
+    Returns
+    -------
+    sequence of Step
+        (), since no table is made.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request.
     """
     images = ImageCosts(request)
     lines, machine = plan_exposures.forecast_images(lake, request, images.watch(checked_chunks(request, lake)))
