@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Collection, Iterator, Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import duckdb
 
 from lake_schema.errors import BadInput
+from truesky.explore.duckdb_messages import plain_message
 from truesky.explore.suggestions import suggest_tables
 
 # Largest number of characters of a query.
@@ -32,6 +34,10 @@ _FUNCTIONS = {
     "json_serialize_sql", "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
 }  # fmt: skip
 _FUNCTION_PREFIXES = ("pg_", "duckdb_", "read_", "json_execute")
+# Functions of ADQL for geometry, which the TAP service translates. DuckDB has none with these names.
+_GEOMETRY = {"area", "box", "centroid", "circle", "coord1", "coord2", "distance", "intersects", "point", "polygon"}
+# TOP of ADQL, which DuckDB cannot parse.
+_TOP = re.compile(r"\bSELECT\s+(?:(?:DISTINCT|ALL)\s+)?TOP\s+(\d+)\b", re.IGNORECASE)
 
 Tree = dict[str, Any]
 
@@ -168,11 +174,15 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
         try:
             statement_types = [statement.type for statement in database.extract_statements(text)]
             if statement_types != [duckdb.StatementType.SELECT]:
-                names = ", ".join(str(kind).rpartition(".")[2] for kind in statement_types) or "nothing"
-                raise BadInput(f"SQL: exactly one SELECT is possible, got {names[:100]}")
+                raise BadInput(f"SQL: {_describe_statements(statement_types)}")
             row = database.execute("SELECT json_serialize_sql($text::VARCHAR)", {"text": text}).fetchone()
+        except duckdb.ParserException as error:
+            if top := _TOP.search(text):
+                problem = f"TOP is possible only in TAP queries: write LIMIT {top[1]} at the end of the query"
+                raise BadInput(f"SQL: {one_line(problem)}") from None
+            raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
         except (duckdb.Error, UnicodeError) as error:
-            raise BadInput(f"SQL: {one_line(error)}") from None
+            raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
     try:
         answer: Tree = json.loads(row[0]) if row else {"error": True}
     except RecursionError:
@@ -180,6 +190,17 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
     if answer.get("error") or len(answer["statements"]) != 1:
         raise BadInput(f"SQL: {one_line(answer.get('error_message', 'cannot be parsed'))}")
     return answer["statements"][0]["node"]  # type: ignore[no-any-return]
+
+
+def _describe_statements(types: Sequence[duckdb.StatementType]) -> str:
+    """Return the message for a text that is not a single SELECT; `types` are the types of its statements."""
+    names = [str(kind).rpartition(".")[2] for kind in types]
+    if len(names) == 1:
+        return f"{names[0]} is not possible: write a SELECT, because the tables can only be read"
+    contents = (
+        f"the text contains {len(names)} statements ({', '.join(names)[:100]})" if names else "the query is empty"
+    )
+    return f"{contents}: write a single SELECT"
 
 
 def one_line(error: BaseException | str) -> str:
@@ -242,6 +263,10 @@ def _source(node: Tree, table_names: Collection[str], with_names: Collection[str
 def _refuse_function(name: str) -> None:
     if name in _FUNCTIONS or name.startswith(_FUNCTION_PREFIXES):
         raise BadInput(f"SQL: the function {one_line(name)} is not possible here")
+    if name in _GEOMETRY:
+        circle, area = "separation(ra, dec, 53.1, -27.8) < 0.05", "in_area(ra, dec)"
+        remedy = f"write {circle} for a circle (deg), or {area} for the area of the request"
+        raise BadInput(f"SQL: the function {name.upper()} is possible only in TAP queries: {remedy}")
 
 
 def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) -> Origins:

@@ -18,6 +18,7 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.explore import adql, requested_area, shared_columns, suggestions
+from truesky.explore.duckdb_messages import plain_message
 from truesky.explore.guard import TOO_LARGE, Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
@@ -39,6 +40,8 @@ _LOCKS = (
 )
 # Fraction of the memory limit of a query that DuckDB may fill; the rest is for the result.
 _SHARE = 0.5
+# Largest number of missing columns that a message names.
+_MAX_MISSING = 3
 OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
@@ -120,16 +123,18 @@ class Session:
             # that reads the damaged table contains the reason.
             if fault := next((fault for rows in self._rows.values() if (fault := getattr(rows, "fault", ""))), ""):
                 raise Damaged(fault) from None
-            raise BadInput(f"SQL: {one_line(self._explain(error, query))}") from None
+            raise BadInput(f"SQL: {self._explain(error, query)}") from None
         finally:
             if not finished:
                 self.close()
 
     def _explain(self, error: Exception, query: Query) -> str:
-        """Return the message of an error, or a message with suggestions if a column of the query does not exist."""
-        if not isinstance(error, duckdb.BinderException):
-            return str(error)
+        """Return the message of an error, or a message with suggestions if columns of the query do not exist."""
         columns = {table: self._rows[table].schema.names for table in query.tables if table in self._rows}
+        first = suggestions.missing_column(str(error)) if isinstance(error, duckdb.BinderException) else None
+        if first is None or not columns:
+            return one_line(plain_message(str(error)))
+        texts = {text.lower(): text for text in shared_columns.quoted_texts(query.text, query.tree)}
         unrelated = shared_columns.unrelated_fluxes(columns)
         requests = {table.rpartition(".")[0] for table in columns}
         other_tables = {
@@ -141,7 +146,28 @@ class Session:
             and table not in unrelated
             and (names := self._column_names(name))
         }
-        return suggestions.explain_missing_column(str(error), columns, other_tables)
+        names = list(self._missing_names(query, columns))
+        names = names if first in names else [first]
+        return "; ".join(
+            f"\"{texts[name]}\" means a column, because it is in double quotes: write '{texts[name]}' for the text"
+            if name in texts
+            else suggestions.explain_missing_column(name, columns, other_tables, str(error))
+            for name in names[:_MAX_MISSING]
+        )
+
+    def _missing_names(self, query: Query, columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
+        """Yield the names of columns that do not exist in the tables of a query, in lower case; none with subqueries.
+
+        DuckDB reports only one of them.
+        """
+        for name in shared_columns.unknown_names(query.tree, columns):
+            # Some names, such as current_date, need no column.
+            try:
+                self._connect().sql(f'SELECT {shared_columns.quote([name])} FROM "{query.tables[0]}"')
+            except duckdb.BinderException:
+                yield name
+            except duckdb.Error:
+                return
 
     def _column_names(self, name: str) -> Sequence[str]:
         """Return the names of the columns of a table of the lake, [] for others and if the table cannot be opened."""

@@ -88,17 +88,83 @@ def unrelated_fluxes(tables: Collection[str]) -> set[str]:
     return {fluxes for fluxes, catalogue in _CATALOGUES.items() if catalogue not in read}
 
 
-def _inserts(tree: Tree, columns: Mapping[str, Collection[str]]) -> Iterator[tuple[int, str]]:
-    """Yield the place (bytes from the start of the text) and the text of each insertion."""
+def unknown_names(tree: Tree, columns: Mapping[str, Collection[str]]) -> list[str]:
+    """Return the names in a query that are neither columns of its tables nor aliases, in lower case and in order.
+
+    The result is [] for a query with subqueries, WITH clauses or functions in FROM, whose columns are not known.
+    """
+    sources = _read_from(tree["from_table"], columns).sources if tree.get("type") == "SELECT_NODE" else ()
+    if (
+        not all(source.table for source in sources)
+        or [node.get("type") for node in _nodes(tree)].count("SELECT_NODE") > 1
+    ):
+        return []
+    existing = {name.lower() for names in columns.values() for name in names}
+    existing |= {str(node["alias"]).lower() for node in _nodes(tree) if node.get("alias")}
+    references = sorted(_references({**tree, "type": ""}), key=lambda reference: reference["query_location"])
+    names = dict.fromkeys(str(reference["column_names"][0]).lower() for reference in references)
+    return [name for name in names if name not in existing]
+
+
+def quoted_texts(text: str, tree: Tree) -> list[str]:
+    """Return the names in double quotes that a query compares with =, <>, IN or LIKE: they are probably texts.
+
+    Names that are compared with a number are left out.
+
+    Parameters
+    ----------
+    text : str
+        SQL of the query.
+    tree : dict
+        Syntax tree of the query, from DuckDB.
+
+    Returns
+    -------
+    list of str
+        The names, without quotes.
+    """
+    data = text.encode()
+    return [
+        operand["column_names"][0]
+        for node in _nodes(tree)
+        for operand in _text_operands(node)
+        if operand.get("class") == "COLUMN_REF"
+        and len(operand["column_names"]) == 1
+        and data[operand["query_location"] :].startswith(b'"')
+    ]
+
+
+def _text_operands(node: Tree) -> list[Tree]:
+    """Return the operands of a comparison that may be a text, [] for another node and if an operand is a number."""
+    if node.get("type") in ("COMPARE_EQUAL", "COMPARE_NOTEQUAL"):
+        operands = [node["left"], node["right"]]
+    elif node.get("type") in ("COMPARE_IN", "COMPARE_NOT_IN"):
+        operands = node.get("children", [])[1:]
+    elif "~~" in str(node.get("function_name", "")):
+        operands = [argument["expression"] for argument in node["arguments"][1:]]
+    else:
+        return []
+    is_number = any(operand.get("literal", {}).get("kind", "STRING") != "STRING" for operand in operands)
+    return [] if is_number else operands
+
+
+def _nodes(tree: Tree) -> Iterator[Tree]:
+    """Yield all nodes of a syntax tree."""
     stack: list[Any] = [tree]
     while stack:
         node = stack.pop()
         if isinstance(node, dict):
-            if node.get("type") == "SELECT_NODE" and node["from_table"]["type"] == "JOIN":
-                yield from _inserts_of_select(node, columns)
+            yield node
             stack += node.values()
         elif isinstance(node, list):
             stack += node
+
+
+def _inserts(tree: Tree, columns: Mapping[str, Collection[str]]) -> Iterator[tuple[int, str]]:
+    """Yield the place (bytes from the start of the text) and the text of each insertion."""
+    for node in _nodes(tree):
+        if node.get("type") == "SELECT_NODE" and node["from_table"]["type"] == "JOIN":
+            yield from _inserts_of_select(node, columns)
 
 
 def _inserts_of_select(select: Tree, columns: Mapping[str, Collection[str]]) -> Iterator[tuple[int, str]]:
@@ -187,7 +253,7 @@ def _equal_keys(condition: Any) -> Iterator[tuple[str, str]]:
     elif condition["type"] == "COMPARE_EQUAL":
         sides = [[str(name) for name in condition[side].get("column_names", ())] for side in ("left", "right")]
         if all(len(names) > 1 and names[-1].lower() == _KEY for names in sides):
-            first, second = (_quote(names[:-1]) for names in sides)
+            first, second = (quote(names[:-1]) for names in sides)
             yield first, second
 
 
@@ -197,10 +263,10 @@ def _read_source(node: Tree, columns: Mapping[str, Collection[str]]) -> _Source:
         names = [str(node[key]).lower() for key in ("schema_name", "table_name") if node.get(key)]
         table = ".".join(names)
         if table in columns:
-            return _Source(_quote([alias] if alias else names), table, {name.lower() for name in columns[table]})
+            return _Source(quote([alias] if alias else names), table, {name.lower() for name in columns[table]})
     if node["type"] == "SUBQUERY" and not node.get("column_name_alias"):
-        return _Source(_quote([alias]), "", _result_names(node["subquery"]["node"]))
-    return _Source(_quote([alias]), "", None)
+        return _Source(quote([alias]), "", _result_names(node["subquery"]["node"]))
+    return _Source(quote([alias]), "", None)
 
 
 def _result_names(query: Tree) -> Collection[str] | None:
@@ -214,6 +280,7 @@ def _result_names(query: Tree) -> Collection[str] | None:
     }
 
 
-def _quote(names: Sequence[str]) -> str:
+def quote(names: Sequence[str]) -> str:
+    """Return the parts of a name in lower case and in double quotes, joined by dots."""
     quoted = ('"' + name.lower().replace('"', '""') + '"' for name in names)
     return ".".join(quoted)

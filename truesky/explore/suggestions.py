@@ -29,9 +29,13 @@ _QUOTED = re.compile(r'"([^"]+)"')
 _MAX_SUGGESTIONS = 3
 # Smallest similarity of two names, as `difflib` measures it, from 0 to 1.
 _MIN_SIMILARITY = 0.6
+# The same for names of fluxes and magnitudes in a band: mag_r1 is mag_r01, but mag_g is not mag_h.
+_MIN_BAND_SIMILARITY = 0.85
 # Parts of the name of a flux or magnitude that do not belong to the name of its passband.
 _FLUX_NAME = re.compile(r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$")
 _BAND_PREFIX = "f_nu_"
+# Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i" or "lsst_i_flux".
+_IN_BAND = re.compile(r"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,33 +58,36 @@ def _synonyms() -> Mapping[str, Sequence[_Synonym]]:
     return synonyms
 
 
-def _missing_column(message: str) -> str | None:
+def missing_column(message: str) -> str | None:
     """Return the name of the column that does not exist according to a message of DuckDB, in lower case, else None."""
     matches = (pattern.search(message) for pattern in _MISSING_COLUMN)
     return next((match["name"].lower() for match in matches if match), None)
 
 
 def explain_missing_column(
-    message: str, columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
+    name: str,
+    columns: Mapping[str, Collection[str]],
+    other_tables: Mapping[str, Collection[str]],
+    message: str = "",
 ) -> str:
     """Return a message about a column that does not exist, with the columns that can be used in its place.
 
     Parameters
     ----------
-    message : str
-        Message of DuckDB. It is returned unchanged if it is not about a missing column.
+    name : str
+        Name of the column in lower case.
     columns : mapping of str to collection of str
         Columns of each table that the query reads.
     other_tables : mapping of str to collection of str
         Columns of the other tables of the lake that may be suggested.
+    message : str, optional
+        Message of DuckDB about the column, which contains the names of columns of subqueries.
 
     Returns
     -------
     str
         The message, one line.
     """
-    if (name := _missing_column(message)) is None or not columns:
-        return message
     problem = f"column {name} does not exist"
     if targets := _targets(name, columns):
         return f"{problem}; use {_as_text(targets, with_tables=len(columns) > 1)}"
@@ -89,7 +96,10 @@ def explain_missing_column(
     # Names of columns of subqueries are in the message only.
     candidates = _QUOTED.findall(message.partition("Candidate bindings")[2].partition("LINE")[0])
     names = [*dict.fromkeys(column for table in columns.values() for column in table)]
-    if similar := _similar(name, [*candidates, *names]):
+    similar = _similar(name, [*candidates, *names])
+    if not similar and (bands := _bands_for(name, columns) or _bands_for(name, other_tables)):
+        return f"{problem}: the lake has fluxes in {', '.join(bands)}; fluxes.bands in the request adds other bands"
+    if similar:
         return f"{problem}; did you mean {' or '.join(similar)}?"
     return f"{problem}; use one of {', '.join(names)}"
 
@@ -154,8 +164,21 @@ def _band_columns(name: str, table: str, columns: Collection[str]) -> Iterator[_
                 yield _Synonym(table, column, f"flux density, microjansky; mag_ab({column}) is its AB magnitude")
 
 
+def _bands_for(name: str, tables: Mapping[str, Collection[str]]) -> list[str]:
+    """Return the bands of the fluxes in tables if a name means a flux or magnitude in a band, else []."""
+    columns = dict.fromkeys(column for names in tables.values() for column in names if column.startswith(_BAND_PREFIX))
+    return [column.removeprefix(_BAND_PREFIX) for column in columns] if _IN_BAND.search(name) else []
+
+
 def _similar(name: str, names: Sequence[str]) -> list[str]:
-    return difflib.get_close_matches(name, dict.fromkeys(names), _MAX_SUGGESTIONS, _MIN_SIMILARITY)
+    """Return the most similar names, but no flux or magnitude in another band."""
+    min_similarity = _MIN_BAND_SIMILARITY if _IN_BAND.search(name) else _MIN_SIMILARITY
+    similar = difflib.get_close_matches(name, dict.fromkeys(names), _MAX_SUGGESTIONS, min_similarity)
+    return [
+        other
+        for other in similar
+        if not other.startswith(_BAND_PREFIX) or name.endswith(other.removeprefix(_BAND_PREFIX))
+    ]
 
 
 def _as_text(targets: Sequence[_Synonym], with_tables: bool) -> str:

@@ -11,14 +11,12 @@ TABLES = {table.name: list(table.names) for table in all_tables(BANDS)}
 VIS = "f_nu_euclid_vis (flux density, microjansky; mag_ab(f_nu_euclid_vis) is its AB magnitude)"
 
 
-def missing(name):
-    """The message of DuckDB about a column."""
-    return f'Binder Error: Referenced column "{name}" not found in FROM clause!\nCandidate bindings: "zzz", "kind"'
+MESSAGE = 'Binder Error: Referenced column "{}" not found in FROM clause!\nCandidate bindings: "zzz", "kind"'
 
 
 def explained(name, table="galaxies"):
     others = {other: columns for other, columns in TABLES.items() if other != table}
-    return suggestions.explain_missing_column(missing(name), {table: TABLES[table]}, others)
+    return suggestions.explain_missing_column(name, {table: TABLES[table]}, others, MESSAGE.format(name))
 
 
 def test_targets_of_all_synonyms_exist():
@@ -68,7 +66,7 @@ def test_synonyms(name, table, columns):
 def test_columns_of_other_tables():
     assert explained("mag_vis", "star_fluxes") == f"column mag_vis does not exist; use {VIS}"
     only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
-    assert suggestions.explain_missing_column(missing("flux_vis"), {"galaxies": TABLES["galaxies"]}, only) == (
+    assert suggestions.explain_missing_column("flux_vis", {"galaxies": TABLES["galaxies"]}, only) == (
         f"column flux_vis does not exist; use galaxy_fluxes.{VIS}; add JOIN galaxy_fluxes USING (id)"
     )
     assert "use stars.teff (effective temperature)" in explained("teff")
@@ -79,12 +77,28 @@ def test_similar_names_and_names_of_subqueries():
     assert explained("zz") == "column zz does not exist; did you mean zzz?"
     assert explained("qqqq", "halos").startswith("column qqqq does not exist; use one of ")
     both = {"galaxies": TABLES["galaxies"], "halos": TABLES["halos"]}
-    assert "use galaxies.z_obs (" in suggestions.explain_missing_column(missing("redshift"), both, {})
+    assert "use galaxies.z_obs (" in suggestions.explain_missing_column("redshift", both, {})
 
 
-@pytest.mark.parametrize("message", ["Binder Error: no such function", 'Table "x" does not exist'])
-def test_other_messages_are_unchanged(message):
-    assert suggestions.explain_missing_column(message, TABLES, {}) == message
+@pytest.mark.parametrize(("message", "name"), [(MESSAGE.format("X"), "x"), ('Table "x" does not exist', None)])
+def test_the_missing_column_of_a_message(message, name):
+    assert suggestions.missing_column(message) == name
+
+
+@pytest.mark.parametrize("name", ["f_nu_lsst_i", "f_nu_euclid_vs", "mag_lsst_i", "lsst_i_flux", "flux_g"])
+def test_no_other_band_is_suggested(name):
+    remedy = "the lake has fluxes in euclid_vis, lsst_r, des_r; fluxes.bands in the request adds other bands"
+    assert explained(name, "galaxy_fluxes") == f"column {name} does not exist: {remedy}"
+    only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
+    assert suggestions.explain_missing_column("mag_i", {"galaxies": TABLES["galaxies"]}, only).endswith(remedy)
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "column"),
+    [("fnu_lsst_r", "galaxy_fluxes", "f_nu_lsst_r"), ("mag_r1", "galaxies", "mag_r01")],
+)
+def test_the_same_band_is_suggested(name, table, column):
+    assert explained(name, table) == f"column {name} does not exist; did you mean {column}?"
 
 
 @pytest.mark.parametrize(
@@ -110,11 +124,26 @@ def test_tables(name, found):
         ("SELECT 1 FROM galaxies JOIN galaxy_fluxes USING (redshift)", r"use galaxies.z_obs \("),
         ("SELECT * EXCLUDE (redshift) FROM galaxies", r"redshift does not exist; use z_obs \("),
         ("SELECT vis FROM galaxies", r"galaxy_fluxes.f_nu_euclid_vis \(.*; add JOIN galaxy_fluxes USING \(id\)"),
+        (
+            "SELECT mag FROM galaxies WHERE z < 1",
+            r"^SQL: column mag does .*mag_r01.*; column z does .* or z_true \([^)]*\)$",
+        ),
+        (
+            "SELECT redshift, current_date FROM galaxies WHERE mag_r01 > 1",
+            r"^SQL: column redshift [^;]*; use [^;]*$",
+        ),
+        ("SELECT ra FROM (SELECT z FROM galaxies)", "^SQL: column z does not exist; use z_obs [^;]*$"),
+        (
+            'SELECT id FROM galaxies WHERE kind = "Red"',
+            "\"Red\" means a column, .* double quotes: write 'Red' for the text$",
+        ),
+        ('SELECT id FROM galaxies WHERE kind IN ("Red", 1)', "column red does not exist"),
+        ('SELECT id FROM galaxies WHERE "redshift" = 1', "column redshift does not exist; use z_obs"),
         ("SELECT id FROM galaxy", "'galaxy' is not a table of the lake; did you mean galaxies?"),
         ("SELECT id FROM nothing_like_it", r"is not a table of the lake \(galaxies, galaxy_fluxes"),
     ],
 )
 def test_queries(explorer, query, words):
-    with pytest.raises(BadInput, match=f"^SQL: .*{words}") as error:
+    with pytest.raises(BadInput, match=words if words.startswith("^") else f"^SQL: .*{words}") as error:
         explorer.sql(query)
     assert "\n" not in str(error.value)
