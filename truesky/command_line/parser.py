@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
 from lake_schema import command
 from lake_schema.texts import spelling
+
+# Options with the same meaning in different commands or in other programs.
+_SYNONYMS = (
+    ("--delete", "--prune", "--remove", "--clean"),
+    ("--out", "--output"),
+    ("--dry-run", "--forecast", "--simulate"),
+    ("--bands", "--filters"),
+    ("--detectors", "--ccds", "--chips"),
+    ("--processes", "--threads", "--workers", "--jobs"),
+)
+# Messages of argparse, as patterns, and sentences that replace them.
+_SENTENCES = (
+    (r"argument (\S+): invalid int value: ('\d+(?:,\d*)+')", r"\1: write numbers without commas, got \2"),
+    (r"argument (\S+): invalid int value: (.*)", r"\1 must be a whole number, for example \1 3, got \2"),
+    (r"argument (\S+): invalid float value: (.*)", r"\1 must be a number, for example \1 2.5, got \2"),
+    (r"argument (\S+): expected one argument", r"\1 requires a value"),
+    (r"argument (\S+): expected at least one argument", r"\1 requires at least one value"),
+    (r"argument (\S+): ignored explicit argument (.*)", r"\1 takes no value, got \2"),
+    (r"argument (\S+): not allowed with argument (\S+)", r"\1 must not be used with \2"),
+    (r"unrecognized arguments: (\S+)$", r"there is no place for the argument \1"),
+    (r"unrecognized arguments: (.*)", r"there is no place for the arguments \1"),
+)
+_MISSING = "the following arguments are required: "
+_CHOICE = re.compile(r"argument (?P<name>\S+): invalid choice: '(?P<value>.*)' \(choose from (?P<choices>.*)\)")
+_REQUEST_ENDING = ".toml"
 
 
 def suggestion(word: str, names: Iterable[str]) -> str:
@@ -61,8 +88,39 @@ class Parser(argparse.ArgumentParser):
         parsed, rest = super().parse_known_args(words, namespace)
         if unknown := next((word for word in rest if word.startswith("-")), None):
             name = unknown.partition("=")[0]
-            self.error(f"there is no option {name}{suggestion(name, self._option_string_actions)}")
+            self.error(f"there is no option {name}{self._similar_option(name)}")
+        self._refuse_commas(parsed)
+        self._refuse_swapped(parsed)
         return parsed, rest
+
+    def _similar_option(self, name: str) -> str:
+        """Return the suggestion of an option with a similar name or with the same meaning, or ""."""
+        existing = self._option_string_actions
+        meant = [option for names in _SYNONYMS if name in names for option in names if option in existing]
+        return f'; did you mean "{meant[0]}"?' if meant else suggestion(name, existing)
+
+    def _refuse_commas(self, parsed: argparse.Namespace) -> None:
+        """End the process if a list of names has commas, because names are separated by blanks."""
+        for action in self._actions:
+            values = getattr(parsed, action.dest, None)
+            if action.nargs == "+" and action.option_strings and any("," in str(value) for value in values or ()):
+                names = " ".join(part for value in values for part in str(value).split(",") if part)
+                option = action.option_strings[0]
+                self._stop(f"{option}: names are separated by blanks, not by commas: write {option} {names}")
+
+    def _refuse_swapped(self, parsed: argparse.Namespace) -> None:
+        """End the process if the lake is a request file, or the request a folder."""
+        request, lake = (
+            str(getattr(parsed, name.strip("-"), None) or "") if name in self._names_of_positions else ""
+            for name in ("--request", "--lake")
+        )
+        is_request_file = lake.endswith(_REQUEST_ENDING) and not os.path.isdir(lake)
+        if is_request_file and request and not request.endswith(_REQUEST_ENDING):
+            self._stop(f"the request comes before the lake: write {self.prog} {lake} {request}")
+        if is_request_file:
+            self._stop(f"LAKE must be the folder of a lake, but {lake} is a request: truesky run {lake} LAKE makes one")
+        if request and lake and os.path.isdir(request):
+            self._stop(f"REQUEST must be a TOML file, but {request} is a folder")
 
     def _move_to_positions(self, words: list[str]) -> list[str]:
         """Replace the options --request FILE and --lake LAKE by positional arguments; the last of equal options counts.
@@ -86,5 +144,35 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End the process with status 2 after one line on stderr."""
-        hint = "" if message.endswith("?") else f"; see {self.prog} --help"
-        raise SystemExit(command.print_error(self.prog, f"{message}{hint}", 2))
+        text, needs_example = _plain_message(message)
+        example = (self.epilog or "").partition("Example: ")[2]
+        hint = f"; for example: {example}" if needs_example and example else f"; see {self.prog} --help"
+        self._stop(text if text.endswith("?") else text + hint)
+
+    def _stop(self, text: str) -> NoReturn:
+        raise SystemExit(command.print_error(self.prog, text, 2))
+
+
+def _plain_message(message: str) -> tuple[str, bool]:
+    """Return a message of argparse as a plain sentence, and True if an example of the command explains it.
+
+    Other messages are returned unchanged.
+    """
+    if message.startswith(_MISSING):
+        names = [_choices(name.split("|"), "or") for name in message.removeprefix(_MISSING).split(", ")]
+        return f"{_choices(names, 'and')} {'is' if len(names) == 1 else 'are'} missing", True
+    if match := _CHOICE.fullmatch(message):
+        names = re.findall(r"'([^']*)'", match["choices"])
+        subject = "ACTION" if "|" in match["name"] else match["name"]
+        problem = f"{subject} must be {_choices(names, 'or')}, got '{match['value']}'"
+        return f"{problem}{suggestion(match['value'], names)}", True
+    for pattern, sentence in _SENTENCES:
+        if match := re.fullmatch(pattern, message, re.DOTALL):
+            return re.sub(r"(?<!\S)-\w/(?=--)", "", match.expand(sentence)), False
+    return message, False
+
+
+def _choices(names: Sequence[str], word: str) -> str:
+    """Join names by commas, and the last two by a word such as "or"."""
+    *first, last = names
+    return f"{', '.join(first)} {word} {last}" if first else last

@@ -81,11 +81,40 @@ def test_request_and_lake_may_be_options_of_a_job():
         (["valdiate", "lake"], 'truesky: valdiate is not a command; did you mean "validate"?'),
         (["run", "r", "l", "--limti", "3"], 'truesky run: there is no option --limti; did you mean "--limit"?'),
         (["run", "r", "l", "--lim=3"], 'truesky run: there is no option --lim; did you mean "--limit"?'),
-        (["run", "r"], "truesky run: the following arguments are required: LAKE; see truesky run --help"),
+        (["run", "r"], "truesky run: LAKE is missing; for example: truesky run requests/demo.toml my_lake --dry-run"),
+        (
+            ["masters"],
+            "truesky masters: LAKE and --out are missing; for example: truesky masters my_lake --out masters",
+        ),
         (["sql", "l", "--lake"], "truesky sql: there is no option --lake"),
-        (["mission", "dif"], "truesky mission: argument list|diff|camera: invalid choice: 'dif'"),
-        (["render", "r", "l", "--limit", "x"], "truesky render: argument --limit: invalid int value: 'x'"),
-        (["list", "l", "galaxies", "stars"], "truesky list: unrecognized arguments: stars"),
+        (["mission", "dif"], "truesky mission: ACTION must be list, diff or camera, got 'dif'; did you mean \"diff\"?"),
+        (["mission"], "truesky mission: list, diff or camera is missing; for example: truesky mission list"),
+        (
+            ["completion", "powershell"],
+            "truesky completion: SHELL must be bash, zsh or fish, got 'powershell'; for example:",
+        ),
+        (
+            ["run", "r", "l", "--limit", "all"],
+            "truesky run: --limit must be a whole number, for example --limit 3, got 'all'",
+        ),
+        (["sql", "l", "--memory", "x"], "truesky sql: --memory must be a number, for example --memory 2.5, got 'x'"),
+        (["reduce", "l", "--exposures", "1,2"], "truesky reduce: --exposures: write numbers without commas, got '1,2'"),
+        (["render", "r", "l", "--limit"], "truesky render: --limit requires a value; see truesky render --help"),
+        (["render", "r", "l", "--detectors"], "truesky render: --detectors requires at least one value"),
+        (["run", "r", "l", "--dry-run=1"], "truesky run: --dry-run takes no value, got '1'"),
+        (["cache", "--prune", "--all", "--limit", "1"], "truesky cache: --limit must not be used with --all"),
+        (["list", "l", "galaxies", "stars"], "truesky list: there is no place for the argument stars"),
+        (["list", "l", "galaxies", "a", "b"], "truesky list: there is no place for the arguments a b"),
+        (["gc", "l", "--prune"], 'truesky gc: there is no option --prune; did you mean "--delete"?'),
+        (["cache", "--delete"], 'truesky cache: there is no option --delete; did you mean "--prune"?'),
+        (
+            ["page", "x.toml"],
+            "truesky page: LAKE must be the folder of a lake, but x.toml is a request: truesky run x.toml LAKE",
+        ),
+        (
+            ["run", "r.toml", "l", "--detectors", "3-4,R22_S11"],
+            "truesky run: --detectors: names are separated by blanks, not by commas: write --detectors 3-4 R22_S11",
+        ),
     ],
 )
 def test_mistakes_are_one_line_with_status_2(words, said, capsys):
@@ -93,6 +122,23 @@ def test_mistakes_are_one_line_with_status_2(words, said, capsys):
         raise SystemExit(truesky.main(words))
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(said)
+
+
+@pytest.mark.parametrize("name", ["run", "build", "fluxes", "plan", "render"])
+def test_the_request_comes_before_the_lake(name, tmp_path, capsys):
+    for words, message in (
+        (["new_lake", "good.toml"], f"the request comes before the lake: write truesky {name} good.toml new_lake"),
+        (
+            ["a.toml", "b.toml"],
+            "LAKE must be the folder of a lake, but b.toml is a request: truesky run b.toml LAKE makes",
+        ),
+        ([str(tmp_path), "lake"], f"REQUEST must be a TOML file, but {tmp_path} is a folder"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            truesky.main([name, *words])
+        assert capsys.readouterr().err.startswith(f"truesky {name}: {message}")
+    (tmp_path / "lake.toml").mkdir()
+    assert commands.parse(name, ["r.toml", str(tmp_path / "lake.toml")]).lake.endswith("lake.toml")
 
 
 def test_help_and_mistakes_import_no_heavy_module():
