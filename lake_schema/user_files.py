@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from lake_schema.errors import BadInput
+from lake_schema.texts import spelling
 
 _MB, _GB = 1 << 20, 1 << 30
 # Largest size in bytes of each type of file that a user can name. Catalogues are read in pieces; all other files must
@@ -209,7 +210,7 @@ def check_target(path: Path, endings: Sequence[str] = ()) -> Path:
     raised for another ending, or if the folder does not exist or is not writable, or the path is a folder or device.
     """
     if endings and path.suffix.lower() not in endings:
-        raise BadInput(f"{format_path(path)}: the ending is not one of {', '.join(endings)}")
+        raise BadInput(f"{format_path(path)}: the name of the file must end in {spelling.join_words(endings)}")
     with check_reachable(path):
         if not path.parent.is_dir():
             raise BadInput(f"{format_path(path)}: its folder does not exist")

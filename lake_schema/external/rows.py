@@ -24,6 +24,7 @@ from lake_schema.external import files as external_files
 from lake_schema.external import hdf5
 from lake_schema.external.mistakes import TableMistakes
 from lake_schema.fits import external
+from lake_schema.texts import spelling
 
 # Number of bytes of a CSV file that Arrow parses at a time.
 _BLOCK_BYTES = 8 << 20
@@ -83,7 +84,8 @@ def find_files(path: Path) -> list[Path]:
             raise BadInput(f"{path}: no Parquet or HDF5 file in this folder")
         return paths
     if path.suffix.lower() not in _ENDINGS:
-        raise BadInput(f"{user_files.format_path(path)}: the ending is not one of {', '.join(_ENDINGS)}")
+        endings = spelling.join_words(_ENDINGS)
+        raise BadInput(f"{user_files.format_path(path)}: the name of the file must end in {endings}")
     return [check_format(path)]
 
 

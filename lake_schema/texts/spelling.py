@@ -92,3 +92,9 @@ def choices(name: str, existing: Sequence[str], count: int = 1) -> str:
     rest = f", ... ({len(existing)} names)" if len(existing) > _MAX_LISTED else ""
     suggestion = did_you_mean(name, existing, count)
     return f"{suggestion} allowed: {listed}{rest}".strip()
+
+
+def join_words(words: Sequence[str], conjunction: str = "or") -> str:
+    """Return at least one word as a text such as "bias, dark or flat"."""
+    *first, last = words
+    return f"{', '.join(first)} {conjunction} {last}" if first else last

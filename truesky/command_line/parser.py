@@ -159,20 +159,14 @@ def _plain_message(message: str) -> tuple[str, bool]:
     Other messages are returned unchanged.
     """
     if message.startswith(_MISSING):
-        names = [_choices(name.split("|"), "or") for name in message.removeprefix(_MISSING).split(", ")]
-        return f"{_choices(names, 'and')} {'is' if len(names) == 1 else 'are'} missing", True
+        names = [spelling.join_words(name.split("|")) for name in message.removeprefix(_MISSING).split(", ")]
+        return f"{spelling.join_words(names, 'and')} {'is' if len(names) == 1 else 'are'} missing", True
     if match := _CHOICE.fullmatch(message):
         names = re.findall(r"'([^']*)'", match["choices"])
         subject = "ACTION" if "|" in match["name"] else match["name"]
-        problem = f"{subject} must be {_choices(names, 'or')}, got '{match['value']}'"
+        problem = f"{subject} must be {spelling.join_words(names)}, got '{match['value']}'"
         return f"{problem}{suggestion(match['value'], names)}", True
     for pattern, sentence in _SENTENCES:
         if match := re.fullmatch(pattern, message, re.DOTALL):
             return re.sub(r"(?<!\S)-\w/(?=--)", "", match.expand(sentence)), False
     return message, False
-
-
-def _choices(names: Sequence[str], word: str) -> str:
-    """Join names by commas, and the last two by a word such as "or"."""
-    *first, last = names
-    return f"{', '.join(first)} {word} {last}" if first else last

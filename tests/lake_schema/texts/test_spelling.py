@@ -27,6 +27,12 @@ def test_the_closest_name_comes_first(name, existing, closest):
     assert bool(found) == bool(closest)
 
 
+def test_words_are_joined():
+    assert spelling.join_words(["bias"]) == "bias"
+    assert spelling.join_words(["bias", "dark"]) == "bias or dark"
+    assert spelling.join_words(("LAKE", "--out", "--name"), "and") == "LAKE, --out and --name"
+
+
 def test_a_suggestion_stands_before_the_allowed_names():
     assert spelling.choices("VIS", BANDS) == f"did you mean euclid_vis? allowed: {', '.join(BANDS)}"
     assert spelling.choices("whatever", BANDS) == f"allowed: {', '.join(BANDS)}"

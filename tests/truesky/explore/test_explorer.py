@@ -306,7 +306,7 @@ def test_skymap_counts_cells(explorer, galaxies):
         (lambda e: e.skymap("plain"), "_healpix_29"),
         (lambda e: e.sql("SELECT 1", into="numpy"), "into"),
         (lambda e: e.cone("plain", 0, 0, 1), "no column ra"),
-        (lambda e: e.export("SELECT 1 AS a", "x.txt"), "ending"),
+        (lambda e: e.export("SELECT 1 AS a", "x.txt"), "must end in .csv"),
     ],
 )
 def test_refusals_name_what_is_wrong(explorer, call, words):

@@ -60,7 +60,7 @@ def test_a_query_into_a_file(explored, tmp_path, capsys):
     ("arguments", "words"),
     [
         (["DROP VIEW plain"], "SELECT"),
-        (["SELECT 1", "--out", "x.doc"], "ending"),
+        (["SELECT 1", "--out", "x.xlsx"], "x.xlsx: the name of the file must end in .csv, .parquet, .fits or .vot\n"),
         (["SELECT 1", "--memory", "nan"], "memory = nan"),
         (["SELECT 1", "--memory", "inf"], "memory = inf"),
         (["SELECT 1", "--timeout", "nan"], "timeout = nan"),

@@ -241,7 +241,7 @@ def drawn_first(root):
         ({"--sources": "12"}, "exposure 3, detector DET22: source 12 has no light on the detector"),
         ({"--exposure": "99"}, "table products has no detector DET22 of exposure 99"),
         ({"--exposure": "6"}, "exposure 6: NISP-S dark is no image of spectra"),
-        ({"--out": "models.txt"}, "the ending is not one of .fits"),
+        ({"--out": "models.txt"}, "must end in .fits"),
     ],
 )
 def test_invalid_models_are_refused_in_one_line(rendered, tmp_path, capsys, replaced, message):

@@ -24,6 +24,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
+from lake_schema.texts import spelling
 from truesky.render.camera import amplifiers, pointing
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels import registry
@@ -37,6 +38,8 @@ from truesky.render.planning.source_counts import Densities
 from truesky.request.accuracy import SURVEY, Accuracy
 from truesky.request.schema import Request
 
+# Largest number of planned detectors that a message lists.
+_MAX_EXAMPLES = 4
 _DETECTOR_FILES = OutputFiles()
 # The HEALPix cells that detectors see are searched at once for several successive pointings. They must be within this
 # distance (deg) of the first of them.
@@ -253,8 +256,10 @@ class TaskSelection:
         """
         if unknown := sorted({*self.request.detectors} - self._planned_names):
             plan_name = f"the plan of request {self.request.name}"
-            examples = ", ".join(sorted(self._planned_names)[:4])
-            raise BadInput(f"detectors: {unknown[0]} is not in {plan_name}, which has {examples}, ...")
+            names = sorted(self._planned_names)
+            examples = ", ".join([*names[:_MAX_EXAMPLES], *(["..."] if len(names) > _MAX_EXAMPLES else [])])
+            similar = spelling.suggestion(unknown[0], names)
+            raise BadInput(f"detectors: {unknown[0]} is not in {plan_name}, which has {examples}{similar}")
 
 
 @dataclass(frozen=True, slots=True)

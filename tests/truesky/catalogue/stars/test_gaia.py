@@ -238,7 +238,7 @@ def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
     assert table["bp_rp"][known] == pytest.approx(colour[known], abs=1e-5)
     assert fits.getheader(tmp_path / "gaia.fits", 1)["TUNIT5"] == "mas"
     assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.txt")]) == 2
-    assert "the ending is not one of .csv, .fits" in capsys.readouterr().err
+    assert "must end in .csv" in capsys.readouterr().err
     assert export_gaia.main(["--lake", str(tmp_path), "--out", str(tmp_path / "g.csv")]) == 2
     assert not (tmp_path / "g.csv").exists()
 

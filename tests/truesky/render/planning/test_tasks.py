@@ -42,7 +42,12 @@ def test_all_tasks_unless_detectors_or_a_limit_are_given(plan):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "said"), [({"detectors": ("3-4", "7-7")}, "7-7 is not in the plan"), ({"limit": 0}, "limit = 0")]
+    ("wanted", "said"),
+    [
+        ({"detectors": ("3-4", "7-7")}, r"7-7 is not in the plan of request \w+, which has [^ .]+, [^ .]+(, [^ .]+)*$"),
+        ({"detectors": ("3_4",)}, r"3_4 is not in .* \(did you mean 3-4\?\)$"),
+        ({"limit": 0}, "limit = 0"),
+    ],
 )
 def test_unplanned_detectors_are_refused(plan, wanted, said):
     with pytest.raises(BadInput, match=said):
