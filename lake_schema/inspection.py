@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema import command, listing, tables
-from lake_schema.errors import BadInput
 from lake_schema.store import garbage, layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.texts import text_tables
@@ -32,7 +31,7 @@ def run_command(options: argparse.Namespace) -> int:
     request = request_links.check_request(root, options.name) if options.name else None
     table_names = request_links.tables_of_request(root, request) if request else read.table_names(root)
     if not (selected := [options.table] if options.table else table_names):
-        raise BadInput(f"lake {root} holds no table")
+        raise layout.missing_table(root)
     rows_of_version: Callable[[read.Version], list[_Row]] = (
         _describe if options.command == "describe" else lambda version: [_verify(version, options.deep)]
     )
@@ -69,7 +68,7 @@ def _versions_of_table(root: Folder, name: str, request: str | None) -> list[rea
         return [read.version(root, name, request=request)]
     current, keys_by_request = layout.current_key(root, name), request_links.keys_by_request(root, name)
     if current is None and not keys_by_request:
-        raise BadInput(f"lake {root} has no table {name}")
+        raise layout.missing_table(root, name, read.table_names(root))
     versions_by_key = {keys_by_request[holder]: read.version(root, name, request=holder) for holder in keys_by_request}
     if current is not None and current not in versions_by_key:
         versions_by_key[current] = read.latest_version(root, name)
@@ -77,9 +76,10 @@ def _versions_of_table(root: Folder, name: str, request: str | None) -> list[rea
 
 
 def _list_versions(root: Folder, name: str | None, as_json: bool) -> int:
-    rows = [version_row for version_row in listing.rows(root) if name in (None, version_row["table"])]
+    all_rows = listing.rows(root)
+    rows = [version_row for version_row in all_rows if name in (None, version_row["table"])]
     if not rows:
-        raise BadInput(f"lake {root} has no table {name}")
+        raise layout.missing_table(root, name or "", list(dict.fromkeys(row["table"] for row in all_rows)))
     if as_json:
         text_tables.print_json(rows)
     else:
@@ -89,7 +89,7 @@ def _list_versions(root: Folder, name: str | None, as_json: bool) -> int:
 
 def _collect_garbage(root: Path, name: str | None, delete: bool) -> int:
     if not garbage.table_names(root):
-        raise BadInput(f"lake {root} holds no table")
+        raise layout.missing_table(root)
     paths = garbage.collect(root, name, delete)
     for path in paths:
         print(f"{'removed' if delete else 'would remove'} {path}")

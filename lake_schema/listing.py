@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import LakeError
 from lake_schema.store import garbage, layout, manifest, request_links
 from lake_schema.store.object_storage.s3 import MANIFEST, Folder
 from lake_schema.texts import text_tables
@@ -44,7 +44,7 @@ def rows(root: Folder) -> list[dict[str, Any]]:
         If the lake has no table.
     """
     if not (table_names := garbage.table_names(root)):
-        raise BadInput(f"lake {root} holds no table")
+        raise layout.missing_table(root)
     return [
         row
         for name in table_names

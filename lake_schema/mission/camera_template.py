@@ -25,6 +25,7 @@ from lake_schema.mission.camera_tables import (
 )
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS
+from lake_schema.texts import spelling
 
 
 def write_like(camera: str, folder: Path) -> list[Path]:
@@ -48,7 +49,7 @@ def write_like(camera: str, folder: Path) -> list[Path]:
         If there is no such camera, the folder already exists or cannot be created, or its name is not allowed.
     """
     if camera not in CAMERAS:
-        raise BadInput(f"--like {camera} is not one of {', '.join(CAMERAS)}")
+        raise BadInput(f"--like {camera} is not one of {', '.join(CAMERAS)}{spelling.suggestion(camera, CAMERAS)}")
     if os.path.lexists(folder):
         raise BadInput(f"{user_files.format_path(folder)}: already exists")
     check_name(folder)

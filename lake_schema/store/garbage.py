@@ -15,7 +15,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from lake_schema.errors import BadInput, Damaged, Superseded
+from lake_schema.errors import Damaged, Superseded
 from lake_schema.store import layout, locks, manifest, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.stage import receipts_folder
@@ -111,7 +111,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     existing_tables = table_names(root)
     selected = existing_tables if name is None else [layout.table_folder(root, name).name]
     if not set(selected) <= set(existing_tables):
-        raise BadInput(f"lake {root} has no table {name}")
+        raise layout.missing_table(root, selected[0], existing_tables)
     kept_keys = kept_versions(root)
     if not delete:
         return [path for table in selected for path in _removable_paths(root, table, kept_keys[table])]

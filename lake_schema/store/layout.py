@@ -20,13 +20,15 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
-from lake_schema import user_files
+from lake_schema import tables, user_files
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store.object_storage import s3
 from lake_schema.store.object_storage.s3 import Below, Folder, ObjectPath
+from lake_schema.texts import spelling
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL_PATH = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
@@ -288,6 +290,35 @@ def table_names(root: Folder) -> list[str]:
     return sorted(
         path.name for path in folders if path.is_dir() and any(entry.name == "current" for entry in path.iterdir())
     )
+
+
+def missing_table(root: Folder, table_name: str = "", existing: Sequence[str] = (), owner: str = "") -> BadInput:
+    """Return the error for a table that a lake does not have, or for a lake without tables.
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    table_name : str, optional
+        Name of the missing table. Without a name, the message says that there is no lake.
+    existing : sequence of str, optional
+        Names of the tables that exist.
+    owner : str, optional
+        End of the description of the table, such as " of request demo".
+
+    Returns
+    -------
+    BadInput
+        The error, with the most similar name or all names of tables.
+    """
+    if isinstance(root, Path) and not root.exists():
+        return BadInput(f"lake {root} does not exist; make it with truesky run REQUEST {root}")
+    if table_name:
+        # A table that truesky can make is not misspelt.
+        question = "" if tables.find_table(table_name) else spelling.did_you_mean(table_name, existing)
+        remedy = question or f"it has {', '.join(existing) or 'no tables'}"
+        return BadInput(f"lake {root} has no table {table_name}{owner}; {remedy}")
+    return BadInput(f"{root} is not a lake, because it has no tables; give a folder that truesky run has made")
 
 
 def current_key(root: Folder, table_name: str) -> str | None:

@@ -26,6 +26,7 @@ from lake_schema.errors import BadInput, Damaged, VersionMismatch
 from lake_schema.store import layout, manifest, parquet, request_links
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.provenance import digest
+from lake_schema.texts import spelling
 
 # Positions of a catalogue's sources by which rows can be selected: with and without the deflection by lensing.
 POSITION_KINDS = ("observed", "true")
@@ -34,6 +35,12 @@ POSITION_KINDS = ("observed", "true")
 _MAX_RANGES = 16
 # Safety margin (deg) added to the radius of a search around true positions, above the rounding error of deflections.
 _ROUNDING_DEG = 1e-9
+# Commands of truesky that make the inputs of later commands, in their order, with the tables.
+_COMMANDS = {
+    "build": ("galaxies", "halos", "halo_limits", "stars"),
+    "fluxes": ("galaxy_fluxes", "star_fluxes"),
+    "plan": ("mission", "exposures", "tasks"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -580,7 +587,8 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
     """
     selected_key = key or _select_key(root, name, request)
     if selected_key is None:
-        raise BadInput(f"lake {root} has no table {name}" + (f" of request {request}" if request else ""))
+        names = layout.table_names(root) if request is None else request_links.tables_of_request(root, request)
+        raise layout.missing_table(root, name, names, f" of request {request}" if request else "")
     return _open_version(root, name, selected_key, is_requested=key is not None, link=_link(root, name, request))
 
 
@@ -616,9 +624,19 @@ def input_version(root: Folder, name: str, request: str) -> Version:
     if request_links.linked_key(root, request, name) is not None:
         return version(root, name, request=request)
     if layout.current_key(root, name) is None:
-        existing = ", ".join(request_links.request_names(root)) or "none"
-        raise BadInput(f"lake {root} has no table {name} of request {request}; requests of the lake: {existing}")
+        raise _missing_input(root, name, request)
     return latest_version(root, name)
+
+
+def _missing_input(root: Folder, name: str, request: str) -> BadInput:
+    """Return the error for a missing input of a job, with the commands that make it."""
+    last_command = next((i for i, tables in enumerate(_COMMANDS.values(), 1) if name in tables), len(_COMMANDS))
+    commands = spelling.join_words(list(_COMMANDS)[:last_command], "and")
+    remedy = f"run truesky run REQUEST {root}, or first truesky {commands}"
+    if not layout.table_names(root):
+        return BadInput(f"lake {root} has no tables: {remedy}")
+    existing = ", ".join(request_links.request_names(root)) or "none"
+    return BadInput(f"lake {root} has no table {name} of request {request}: {remedy}; requests of the lake: {existing}")
 
 
 def latest_version(root: Folder, name: str) -> Version:
@@ -647,7 +665,7 @@ def latest_version(root: Folder, name: str) -> Version:
     """
     current_key = layout.current_key(root, name)
     if current_key is None:
-        raise BadInput(f"lake {root} has no table {name}")
+        raise layout.missing_table(root, name, layout.table_names(root))
     return _open_version(root, name, current_key, is_requested=False, link=layout.current_link(root, name))
 
 

@@ -167,4 +167,22 @@ def test_a_missing_table_is_a_wrong_call(lake, capsys, command):
     assert main([command, "s3://lake"]) == 2
     err = capsys.readouterr().err.splitlines()
     assert len(err) == 4
-    assert "holds no table" in err[0]
+    assert main([command, str(lake / "none")]) == 2
+    problem = f"lake {lake / 'none'} does not exist; make it with truesky run REQUEST {lake / 'none'}"
+    assert capsys.readouterr().err == f"truesky {command}: {problem}\n"
+
+
+@pytest.mark.parametrize("command", ["list", "verify", "gc", "describe"])
+def test_a_folder_without_tables_is_not_a_lake(tmp_path, capsys, command):
+    (tmp_path / "notes").mkdir()
+    assert main([command, str(tmp_path)]) == 2
+    problem = f"{tmp_path} is not a lake, because it has no tables; give a folder that truesky run has made"
+    assert capsys.readouterr().err == f"truesky {command}: {problem}\n"
+
+
+@pytest.mark.parametrize("command", ["list", "verify", "gc", "describe"])
+def test_a_similar_table_is_suggested(filled, capsys, command):
+    assert main([command, str(filled), "plains"]) == 2
+    assert capsys.readouterr().err == f"truesky {command}: lake {filled} has no table plains; did you mean plain?\n"
+    assert main([command, str(filled), "stars"]) == 2
+    assert capsys.readouterr().err.endswith("has no table stars; it has plain, toy\n")

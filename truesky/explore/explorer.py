@@ -78,7 +78,7 @@ class Explorer:
             for table in request_links.tables_of_request(self.root, request_name):
                 self._open(f"{request_name}.{table}", request_name, table)
         if not self.versions and not self.damaged:
-            raise BadInput(f"lake {self.root} holds no table")
+            raise layout.missing_table(self.root)
         versions = [f"{name}={version.key}" for name, version in self.versions.items()]
         # Tables that could not be opened are also declared to the process that runs queries, so that a query that uses
         # one of them raises the reason.
@@ -208,7 +208,7 @@ class Explorer:
         if error := self.damaged.get(table) or self._ambiguous.get(table):
             raise error
         if table not in self.versions:
-            raise BadInput(f"lake {self.root} has no table {table}; it has {', '.join(self.versions)}")
+            raise layout.missing_table(self.root, table, list(self.versions))
         return self.versions[table]
 
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:

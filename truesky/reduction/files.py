@@ -8,6 +8,7 @@ all extensions.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -203,6 +204,9 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     without this card, flats of ground cameras are assumed to contain it.
     """
     shape = (frame.scene.ny, frame.scene.nx)
+    if not os.path.exists(path):
+        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
+        raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
     user_plane, user_header = external.read_planes(
         user_files.check_file(path, "master frame"), "", "master frame", _MAX_PIXELS
     )

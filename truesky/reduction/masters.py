@@ -138,7 +138,8 @@ def run_command(options: argparse.Namespace) -> int:
         if options.detectors or lake_frames.select_types(frames, _required_types(frames[0]))
     }
     if not selected:
-        raise BadInput(f"lake {options.lake} has no frames of the image type bias, and no darks or flats of NISP")
+        remedy = 'add an [[observation]] with image_type = "bias" to the request, for NISP "dark" or "flat"'
+        raise BadInput(f"lake {options.lake} has no calibration frames for masters: {remedy}")
     out.mkdir(parents=True, exist_ok=True)
     for frames in selected.values():
         with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:

@@ -109,6 +109,9 @@ def run_command(options: argparse.Namespace) -> int:
     out = user_files.check_folder(options.out)
     reduction, settings = _reduction_options(options), _catalogue_settings(options)
     root = layout.resolve_lake(options.lake)
+    if options.masters is not None and not options.masters.is_dir():
+        remedy = f"make it with truesky masters {options.lake} --out {options.masters}"
+        raise BadInput(f"--masters {user_files.format_path(options.masters)}: there is no such folder: {remedy}")
     by_detector = lake_frames.from_lake(root, options.detectors, options.exposures, options.name)
     science = [
         sky_frames for frames in by_detector.values() if (sky_frames := [frame for frame in frames if _sees_sky(frame)])
@@ -117,7 +120,6 @@ def run_command(options: argparse.Namespace) -> int:
         raise BadInput(f"lake {options.lake} has no frame of the sky for these detectors and exposures")
     if settings is not None:
         level2.check_psfs([frame for frames in science for frame in frames])
-    out.mkdir(parents=True, exist_ok=True)
     all_frames = lake_frames.from_lake(root, options.detectors, (), options.name) if options.exposures else by_detector
     for frames in science:
         exposure, prediction = frames[0].exposure, None
@@ -125,6 +127,8 @@ def run_command(options: argparse.Namespace) -> int:
             prediction = PersistencePrediction(all_frames[exposure.camera, frames[0].detector])
         for frame, masters in _with_masters(frames, options.masters, reduction.without):
             image, cards = reduce_frame(frame, masters, reduction, prediction)
+            # Create the folder only now, so that missing masters leave no empty folder.
+            out.mkdir(parents=True, exist_ok=True)
             path = out / f"{frame.stem}.fits"
             suffix = ""
             if settings is None:

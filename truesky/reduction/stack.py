@@ -11,6 +11,7 @@ point source near the centre, with three samples per pixel along each axis.
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -100,6 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_command(options: argparse.Namespace) -> int:
     """Run `truesky stack` with its parsed arguments, and return the exit status 0; errors are raised as LakeError."""
     out = user_files.check_target(options.out, (".fits",))
+    _refuse_missing(options.images)
     images = [files.read_image(path) for path in options.images]
     _refuse_different(options.images, images)
     systems = [astrometry.from_cards(image.cards) for image in images]
@@ -125,6 +127,14 @@ def run_command(options: argparse.Namespace) -> int:
         f"variance of 8x8 sums {correlation:.2f} times that of independent pixels"
     )
     return 0
+
+
+def _refuse_missing(paths: Sequence[Path]) -> None:
+    for path in paths:
+        if not os.path.exists(path):
+            problem = "no file has such a name" if any(mark in path.name for mark in "*?[") else "no such file"
+            remedy = "give calibrated images, which truesky reduce LAKE --out FOLDER writes"
+            raise BadInput(f"{user_files.format_path(path)}: {problem}; {remedy}")
 
 
 def _refuse_different(paths: Sequence[Path], images: Sequence[ImageFile]) -> None:

@@ -316,9 +316,9 @@ def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
     Raise BadInput if the lake has no tables, or one of `only` does not exist.
     """
     if not (table_names := layout.table_names(root)):
-        raise BadInput(f"lake {root} holds no table")
+        raise layout.missing_table(root)
     if unknown := sorted(set(only) - set(table_names)):
-        raise BadInput(f"lake {root} has no table {unknown[0]}; it has {', '.join(table_names)}")
+        raise layout.missing_table(root, unknown[0], table_names)
     keys_by_request: dict[str, dict[str, str]] = {"": {}}
     for table in only or table_names:
         for name, key in {"": layout.current_key(root, table), **request_links.keys_by_request(root, table)}.items():
@@ -388,7 +388,7 @@ def run_command(options: argparse.Namespace) -> int:
 
     BadInput is raised for wrong arguments, Damaged for a damaged lake, and Superseded if another push ended first.
     """
-    root, address = layout.resolve_lake(options.lake), s3.parse_address(options.place, options.endpoint_url)
+    root, address = layout.resolve_lake(options.lake), s3.parse_address(options.place, options.endpoint_url, "target")
     threads = THREADS if options.threads is None else options.threads
     if not 1 <= threads <= 256:
         raise BadInput(f"--threads {threads}: must be 1 to 256")

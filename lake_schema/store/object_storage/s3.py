@@ -111,7 +111,7 @@ def remove_secrets(text: str) -> str:
     return _VALUE.sub(lambda found: found[0] if found[1] in _QUERY_KEYS else f"{found[1]}=..", masked)[:200]
 
 
-def parse_address(text: str, endpoint: str | None = None) -> Address:
+def parse_address(text: str, endpoint: str | None = None, place: str = "lake") -> Address:
     """Parse an address s3://BUCKET/PREFIX?endpoint_override=URL&region=REGION, in which the parameters are optional.
 
     Parameters
@@ -120,6 +120,8 @@ def parse_address(text: str, endpoint: str | None = None) -> Address:
         The address.
     endpoint : str, optional
         URL of the service. It takes precedence over the URL in the address and in the environment.
+    place : str, optional
+        Word for the address in messages.
 
     Returns
     -------
@@ -135,14 +137,15 @@ def parse_address(text: str, endpoint: str | None = None) -> Address:
     query = dict(parse_qsl(url.query))
     if url.fragment or not text.lower().startswith("s3://") or query.keys() - _QUERY_KEYS.keys():
         expected = "s3://BUCKET/PREFIX, optionally with ?endpoint_override=URL&region=REGION"
-        raise BadInput(f"lake {remove_secrets(text)}: must be {expected}")
+        example = f"; did you mean s3://{remove_secrets(text)}?" if re.fullmatch(r"[\w.-]+(/[\w.-]+)*/?", text) else ""
+        raise BadInput(f"{place} {remove_secrets(text)}: must be {expected}{example}")
     if "@" in url.netloc:
-        raise BadInput(f"lake {remove_secrets(text)}: credentials must not be in an address but in the environment")
+        raise BadInput(f"{place} {remove_secrets(text)}: credentials must not be in an address but in the environment")
     if not _BUCKET.fullmatch(url.netloc):
-        raise BadInput(f"lake {remove_secrets(text)}: {url.netloc[:80]!r} is not a valid name of a bucket")
+        raise BadInput(f"{place} {remove_secrets(text)}: {url.netloc[:80]!r} is not a valid name of a bucket")
     prefix = url.path.strip("/")
     if not prefix.isprintable() or ({"", ".", ".."} & set(prefix.split("/")) and prefix):
-        raise BadInput(f"lake {remove_secrets(text)}: the prefix has an empty part, . or ..")
+        raise BadInput(f"{place} {remove_secrets(text)}: the prefix has an empty part, . or ..")
     parsed = Address(url.netloc, prefix, endpoint or query.get("endpoint_override", ""), query.get("region", ""))
     # Get the URL of the service only to check it now: the property raises BadInput if it is not valid.
     assert parsed.service is not None

@@ -294,6 +294,9 @@ def test_the_command_writes_a_folder_and_never_over_another(tmp_path, capsys):
     assert capsys.readouterr().err.endswith("mine: already exists\n")
     assert __main__.main(["mission", "camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
     assert not (tmp_path / "No Name").exists()
+    assert __main__.main(["mission", "camera", str(tmp_path / "other"), "--like", "lsst"]) == 2
+    assert capsys.readouterr().err.endswith("hsc (did you mean lsstcam?)\n")
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_path_that_the_system_does_not_take_is_refused(tmp_path, monkeypatch, capsys):

@@ -46,7 +46,7 @@ def test_several_requests_require_a_name(two):
 def test_a_missing_name_is_refused(two):
     with pytest.raises(BadInput, match=r"has no request c; it has a, b"):
         read.version(two, "plain", request="c")
-    with pytest.raises(BadInput, match="no table halos of request a"):
+    with pytest.raises(BadInput, match=r"no table halos of request a; it has plain, toy$"):
         read.version(two, "halos", request="a")
     with pytest.raises(BadInput, match="name"):
         read.version(two, "plain", request="../a")
@@ -55,8 +55,16 @@ def test_a_missing_name_is_refused(two):
 def test_a_request_without_a_version_takes_the_last(two):
     assert read.input_version(two, "plain", "a").key == plain_plan(1).key
     assert read.input_version(two, "plain", "c").key == plain_plan(2).key
-    with pytest.raises(BadInput, match="has no table halos of request c; requests of the lake: a, b"):
+    with pytest.raises(
+        BadInput, match=r"no table halos of request c: run .* truesky build; requests of the lake: a, b$"
+    ):
         read.input_version(two, "halos", "c")
+
+
+def test_an_input_of_an_empty_lake_is_made_with_commands(lake):
+    words = rf"lake {lake} has no tables: run truesky run REQUEST {lake}, or first truesky build, fluxes and plan$"
+    with pytest.raises(BadInput, match=words):
+        read.input_version(lake, "mission", "c")
 
 
 def test_a_request_of_one_lake_keeps_the_paths_that_users_hold(lake):

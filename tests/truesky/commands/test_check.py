@@ -84,6 +84,16 @@ def test_all_mistakes_are_reported_in_the_order_of_the_file(tmp_path, capsys):
     ]  # fmt: skip
 
 
+def test_a_request_with_a_similar_name_is_suggested(tmp_path, capsys):
+    for name in ("my_field.toml", "other.toml", "my_field.csv"):
+        (tmp_path / name).touch()
+    assert check.main([str(tmp_path / "my_feild.toml")]) == 2
+    problem = f"{tmp_path / 'my_feild.toml'}: no such file; did you mean {tmp_path / 'my_field.toml'}?"
+    assert capsys.readouterr().err == f"truesky check: request {problem}\n"
+    assert check.main([str(tmp_path / "demo.toml")]) == 2
+    assert capsys.readouterr().err.endswith("demo.toml: no such file\n")
+
+
 def test_python_gets_all_mistakes(tmp_path):
     with pytest.raises(BadInput) as caught:
         simulate.check(written(tmp_path, MANY))

@@ -321,7 +321,7 @@ def test_a_constant_has_a_histogram(explorer):
 
 
 def test_a_lake_without_tables(lake):
-    with pytest.raises(BadInput, match="holds no table"):
+    with pytest.raises(BadInput, match="is not a lake"):
         Explorer(lake)
 
 

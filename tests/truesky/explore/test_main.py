@@ -114,7 +114,7 @@ def test_other_tables_remain_usable_beside_a_damaged_one(explored, capsys, tmp_p
 
 def test_a_lake_that_is_not_there(tmp_path, capsys):
     assert main(["SELECT 1", "--lake", str(tmp_path / "none")]) == 2
-    assert "holds no table" in capsys.readouterr().err
+    assert "does not exist" in capsys.readouterr().err
 
 
 def test_damage_ends_with_1(explored, capsys, tmp_path):

@@ -44,7 +44,7 @@ def test_refusals(shown, capsys, words, said):
 
 def test_a_folder_that_is_no_lake(tmp_path, capsys):
     assert main([str(tmp_path), "--no-open"]) == 2
-    assert "holds no table" in capsys.readouterr().err
+    assert "is not a lake" in capsys.readouterr().err
 
 
 def test_a_port_that_is_taken(page, shown, capsys):
@@ -55,7 +55,7 @@ def test_a_port_that_is_taken(page, shown, capsys):
 def test_no_lake(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["--no-open"])
-    assert "the following arguments are required: LAKE" in capsys.readouterr().err
+    assert "LAKE is missing" in capsys.readouterr().err
 
 
 def test_other_machines_may_only_use_the_given_name(shown):

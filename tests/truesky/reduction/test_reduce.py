@@ -178,7 +178,13 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
     assert "--masters FOLDER is required" in refused()
     assert "no image of detector '1-1'" in refused("--masters", str(made / "masters"), "--detectors", "1-1")
     assert "no image of exposure 999" in refused("--masters", str(made / "masters"), "--exposures", "999")
-    assert "VIS_3-4_bias.fits" in refused("--masters", str(tmp_path / "none"))
+    none = tmp_path / "none"
+    remedy = f"make it with truesky masters {made / 'lake'} --out {none}\n"
+    assert refused("--masters", str(none)).endswith(f"--masters {none}: there is no such folder: {remedy}")
+    none.mkdir()
+    remedy = f"make it with truesky masters LAKE --out {none}, or omit its correction with --without bias\n"
+    assert refused("--masters", str(none)).endswith(f"VIS_3-4_bias.fits: there is no such master: {remedy}")
+    assert not out.exists()
     # Refuse a master with the patterns of another seed, and a master of another kind.
     other = tmp_path / "other"
     shutil.copytree(made / "masters", other)
@@ -188,6 +194,16 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
     assert "SEED = 12, the frame has 7" in refused("--masters", str(other))
     shutil.copy(made / "masters" / "VIS_3-4_bias.fits", other / "VIS_3-4_dark.fits")
     assert "is not a master dark" in refused("--masters", str(other))
+
+
+def test_without_calibration_frames_the_remedy_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(masters.lake_frames, "from_lake", lambda root, names, request: {})
+    (tmp_path / "lake").mkdir()
+    assert masters.main([str(tmp_path / "lake"), "--out", str(tmp_path / "masters")]) == 2
+    remedy = 'add an [[observation]] with image_type = "bias" to the request, for NISP "dark" or "flat"'
+    problem = f"lake {tmp_path / 'lake'} has no calibration frames for masters: {remedy}"
+    assert capsys.readouterr().err == f"truesky masters: {problem}\n"
+    assert not (tmp_path / "masters").exists()
 
 
 def test_header_of_a_stack(made, tmp_path, capsys):

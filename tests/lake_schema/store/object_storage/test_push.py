@@ -309,7 +309,8 @@ def test_the_command_reports_its_work(filled, place, capsys):
         ("s3://Sky!/lake", "is not a valid name of a bucket"),
         ("s3://sky/a/../b", "empty part"),
         ("s3:lake", "must be s3://BUCKET/PREFIX"),
-        ("lake", "must be s3://BUCKET/PREFIX"),
+        ("bucket/lake", "truesky push: target bucket/lake: must be s3://BUCKET/PREFIX"),
+        ("bucket/lake", "; did you mean s3://bucket/lake?"),
     ],
 )
 def test_a_wrong_address_is_refused_in_one_line(filled, bucket, capsys, there, words):
@@ -323,9 +324,9 @@ def test_a_wrong_address_is_refused_in_one_line(filled, bucket, capsys, there, w
 def test_folders_that_are_not_lakes_are_refused(tmp_path, place, capsys):
     (tmp_path / "empty").mkdir()
     for lake, words in (
-        (tmp_path / "empty", "holds no table"),
+        (tmp_path / "empty", "is not a lake"),
         ("s3://sky/lake", "POSIX"),
-        (tmp_path / "no", "holds no"),
+        (tmp_path / "no", "does not exist"),
     ):
         status, said = told(capsys, lake, place)
         assert status == 2

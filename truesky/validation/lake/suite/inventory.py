@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.parameter import SPACE_CAMERAS
-from lake_schema.store import layout, read
+from lake_schema.store import layout, read, request_links
 from truesky.validation.lake.measure import references
 from truesky.validation.lake.measure.frame_context import SKY_TYPES
 from truesky.validation.lake.measure.frames import Instrument, NonlinearityCurve
@@ -98,10 +98,13 @@ def read_contents(root: Path, request: str | None = None, exposures: Sequence[in
     Raises
     ------
     BadInput
-        If the lake contains no table to validate, if its table `products` has no image of one of the given exposures,
-        or if no request is given although requests have different tables.
+        If the lake contains no table to validate or no such request, if its table `products` has no image of one of the
+        given exposures, or if no request is given although requests have different tables.
     """
-    names = layout.table_names(root)
+    if not (names := layout.table_names(root)):
+        raise layout.missing_table(root)
+    if request is not None:
+        request_links.check_request(root, request)
     versions = {name: _open_version(root, name, request) for name in TABLES if name in names}
     if not versions:
         raise BadInput(f"lake {root}: no table to validate, expected one of {', '.join(TABLES)}")

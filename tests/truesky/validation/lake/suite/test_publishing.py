@@ -73,6 +73,10 @@ def test_frames_in_several_processes_give_the_same(lake, version):
 def test_missing_inputs_are_refused(lake, tmp_path, capsys):
     with pytest.raises(BadInput, match="no image of exposure 7"):
         inventory.read_contents(lake, exposures=[7])
+    capsys.readouterr()
+    assert __main__.main([str(lake), "--name", "demoo"]) == 2
+    assert capsys.readouterr().err.startswith(f"truesky validate: lake {lake} has no request demoo")
+    assert not (lake / "names" / "demoo").exists()
     (tmp_path / "empty").mkdir()
     for words in ([str(tmp_path / "empty")], [str(lake), "--processes", "0"], ["--exposures", "1"]):
         assert __main__.main(words) == 2
