@@ -30,8 +30,8 @@ _SENTENCES = (
     (r"argument (\S+): expected at least one argument", r"\1 requires at least one value"),
     (r"argument (\S+): ignored explicit argument (.*)", r"\1 takes no value, got \2"),
     (r"argument (\S+): not allowed with argument (\S+)", r"\1 must not be used with \2"),
-    (r"unrecognized arguments: (\S+)$", r"there is no place for the argument \1"),
-    (r"unrecognized arguments: (.*)", r"there is no place for the arguments \1"),
+    (r"unrecognized arguments: (\S+)$", r"unexpected argument \1"),
+    (r"unrecognized arguments: (.*)", r"unexpected arguments \1"),
 )
 _MISSING = "the following arguments are required: "
 _CHOICE = re.compile(r"argument (?P<name>\S+): invalid choice: '(?P<value>.*)' \(choose from (?P<choices>.*)\)")
@@ -89,9 +89,17 @@ class Parser(argparse.ArgumentParser):
         if unknown := next((word for word in rest if word.startswith("-")), None):
             name = unknown.partition("=")[0]
             self.error(f"there is no option {name}{self._similar_option(name)}")
+        self._fill_positions(parsed, rest)
         self._refuse_commas(parsed)
         self._refuse_swapped(parsed)
         return parsed, rest
+
+    def _fill_positions(self, parsed: argparse.Namespace, rest: list[str]) -> None:
+        """Move words that follow options to optional positional arguments, which argparse fills only before options."""
+        for action in self._actions:
+            is_optional = not action.option_strings and action.nargs == "?"
+            if is_optional and rest and getattr(parsed, action.dest, None) == action.default:
+                setattr(parsed, action.dest, rest.pop(0))
 
     def _similar_option(self, name: str) -> str:
         """Return the suggestion of an option with a similar name or with the same meaning, or ""."""
@@ -102,9 +110,10 @@ class Parser(argparse.ArgumentParser):
     def _refuse_commas(self, parsed: argparse.Namespace) -> None:
         """End the process if a list of names has commas, because names are separated by blanks."""
         for action in self._actions:
-            values = getattr(parsed, action.dest, None)
-            if action.nargs == "+" and action.option_strings and any("," in str(value) for value in values or ()):
-                names = " ".join(part for value in values for part in str(value).split(",") if part)
+            is_list = action.nargs == "+" and action.option_strings
+            values = [str(value) for value in getattr(parsed, action.dest, None) or ()] if is_list else []
+            if any("," in value for value in values):
+                names = " ".join(part for value in values for part in value.split(",") if part)
                 option = action.option_strings[0]
                 self._stop(f"{option}: names are separated by blanks, not by commas: write {option} {names}")
 
@@ -119,7 +128,7 @@ class Parser(argparse.ArgumentParser):
             self._stop(f"the request comes before the lake: write {self.prog} {lake} {request}")
         if is_request_file:
             self._stop(f"LAKE must be the folder of a lake, but {lake} is a request: truesky run {lake} LAKE makes one")
-        if request and lake and os.path.isdir(request):
+        if os.path.isdir(request):
             self._stop(f"REQUEST must be a TOML file, but {request} is a folder")
 
     def _move_to_positions(self, words: list[str]) -> list[str]:

@@ -122,7 +122,7 @@ def job_totals(root: Folder) -> list[JobTotals]:
             tables_in_run.add(table)
             _add_log(line, lines)
     if not totals_by_job:
-        raise BadInput(f"lake {root} has no log of a run")
+        raise BadInput(f"lake {root} has no log of a run") if root.exists() else layout.missing_table(root)
     forecasts = _forecast(root, speed.estimate_speed(root).factor)
     job_lines = [
         replace(line, forecast_s=forecasts[job][0], forecast_gb=forecasts[job][1]) if job in forecasts else line

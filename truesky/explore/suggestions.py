@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from lake_schema import tables as declarations
+from lake_schema.texts import spelling
 
 _SYNONYMS = Path(__file__).with_name("synonyms.csv")
 # Messages of DuckDB about a column that does not exist. The named group is the name of the column.
@@ -98,7 +99,8 @@ def explain_missing_column(
     names = [*dict.fromkeys(column for table in columns.values() for column in table)]
     similar = _similar(name, [*candidates, *names])
     if not similar and (bands := _bands_for(name, columns) or _bands_for(name, other_tables)):
-        return f"{problem}: the lake has fluxes in {', '.join(bands)}; fluxes.bands in the request adds other bands"
+        listed = spelling.join_words(bands, "and")
+        return f"{problem}: the lake has fluxes only in {listed}; fluxes.bands in the request adds other bands"
     if similar:
         return f"{problem}; did you mean {' or '.join(similar)}?"
     return f"{problem}; use one of {', '.join(names)}"

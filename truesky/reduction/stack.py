@@ -132,7 +132,7 @@ def run_command(options: argparse.Namespace) -> int:
 def _refuse_missing(paths: Sequence[Path]) -> None:
     for path in paths:
         if not os.path.exists(path):
-            problem = "no file has such a name" if any(mark in path.name for mark in "*?[") else "no such file"
+            problem = "no file matches this pattern" if any(mark in path.name for mark in "*?[") else "no such file"
             remedy = "give calibrated images, which truesky reduce LAKE --out FOLDER writes"
             raise BadInput(f"{user_files.format_path(path)}: {problem}; {remedy}")
 

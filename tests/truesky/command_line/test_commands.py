@@ -65,6 +65,12 @@ def test_the_lake_may_be_an_option(words, given):
     assert (options.lake, options.sql) == given
 
 
+def test_optional_positions_may_follow_options():
+    assert commands.parse("describe", ["l", "--name", "demo", "galaxies"]).table == "galaxies"
+    assert commands.parse("sql", ["l", "--name", "demo", "FROM x", "--json"]).sql == "FROM x"
+    assert commands.parse("mission", ["list", "--json", "vis.*"]).pattern == "vis.*"
+
+
 def test_request_and_lake_may_be_options_of_a_job():
     for words in (
         ["--lake", "l", "--request", "r"],
@@ -103,8 +109,8 @@ def test_request_and_lake_may_be_options_of_a_job():
         (["render", "r", "l", "--detectors"], "truesky render: --detectors requires at least one value"),
         (["run", "r", "l", "--dry-run=1"], "truesky run: --dry-run takes no value, got '1'"),
         (["cache", "--prune", "--all", "--limit", "1"], "truesky cache: --limit must not be used with --all"),
-        (["list", "l", "galaxies", "stars"], "truesky list: there is no place for the argument stars"),
-        (["list", "l", "galaxies", "a", "b"], "truesky list: there is no place for the arguments a b"),
+        (["list", "l", "galaxies", "stars"], "truesky list: unexpected argument stars"),
+        (["list", "l", "galaxies", "a", "b"], "truesky list: unexpected arguments a b"),
         (["gc", "l", "--prune"], 'truesky gc: there is no option --prune; did you mean "--delete"?'),
         (["cache", "--delete"], 'truesky cache: there is no option --delete; did you mean "--prune"?'),
         (

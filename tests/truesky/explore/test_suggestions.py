@@ -87,7 +87,7 @@ def test_the_missing_column_of_a_message(message, name):
 
 @pytest.mark.parametrize("name", ["f_nu_lsst_i", "f_nu_euclid_vs", "mag_lsst_i", "lsst_i_flux", "flux_g"])
 def test_no_other_band_is_suggested(name):
-    remedy = "the lake has fluxes in euclid_vis, lsst_r, des_r; fluxes.bands in the request adds other bands"
+    remedy = "the lake has fluxes only in euclid_vis, lsst_r and des_r; fluxes.bands in the request adds other bands"
     assert explained(name, "galaxy_fluxes") == f"column {name} does not exist: {remedy}"
     only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
     assert suggestions.explain_missing_column("mag_i", {"galaxies": TABLES["galaxies"]}, only).endswith(remedy)

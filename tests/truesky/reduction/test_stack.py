@@ -224,7 +224,9 @@ def test_files_other_than_calibrated_images_are_refused(tmp_path, capsys, change
     assert (words in said, said.count("\n")) == (True, 1)
 
 
-@pytest.mark.parametrize(("name", "problem"), [("*.fits", "no file has such a name"), ("none.fits", "no such file")])
+@pytest.mark.parametrize(
+    ("name", "problem"), [("*.fits", "no file matches this pattern"), ("none.fits", "no such file")]
+)
 def test_missing_images_are_refused_with_their_origin(tmp_path, capsys, name, problem):
     assert stack.main([str(tmp_path / name), "--out", str(tmp_path / "b.fits")]) == 2
     remedy = "give calibrated images, which truesky reduce LAKE --out FOLDER writes"
