@@ -203,6 +203,19 @@ def check_reachable(path: Path) -> Iterator[None]:
         raise BadInput(f"{format_path(path)}: {getattr(error, 'strerror', None) or error}") from None
 
 
+def suggest_similar(path: Path, ending: str) -> str:
+    """Return "; did you mean X?" for a missing file, or "" if the file exists or no name in its folder is similar.
+
+    X is the file with the most similar name among those with an ending such as ".toml".
+    """
+    try:
+        stems = {} if path.exists() else {other.stem: other for other in sorted(path.parent.glob(f"*{ending}"))}
+    except (OSError, ValueError):
+        return ""
+    names = spelling.closest_names(path.stem, stems, 1)
+    return f"; did you mean {format_path(stems[names[0]])}?" if names else ""
+
+
 def check_target(path: Path, endings: Sequence[str] = ()) -> Path:
     """Check that a file can be written at a path, and return the path. The file itself may exist and be replaced.
 

@@ -17,8 +17,7 @@ from typing import Any
 import duckdb
 
 from lake_schema.errors import BadInput
-from truesky.explore.duckdb_messages import plain_message
-from truesky.explore.suggestions import suggest_tables
+from truesky.explore.suggestions import plain_message, suggest_tables
 
 # Largest number of characters of a query.
 _MAX_CHARACTERS = 100_000

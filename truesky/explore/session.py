@@ -18,7 +18,6 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.explore import adql, requested_area, shared_columns, suggestions
-from truesky.explore.duckdb_messages import plain_message
 from truesky.explore.guard import TOO_LARGE, Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
@@ -133,7 +132,7 @@ class Session:
         columns = {table: self._rows[table].schema.names for table in query.tables if table in self._rows}
         first = suggestions.missing_column(str(error)) if isinstance(error, duckdb.BinderException) else None
         if first is None or not columns:
-            return one_line(plain_message(str(error)))
+            return one_line(suggestions.plain_message(str(error)))
         texts = {text.lower(): text for text in shared_columns.quoted_texts(query.text, query.tree)}
         unrelated = shared_columns.unrelated_fluxes(columns)
         requests = {table.rpartition(".")[0] for table in columns}

@@ -2,6 +2,7 @@
 
 A table of synonyms contains the names that other catalogues use, such as `redshift` for `z_obs` and `z_true`. Names of
 passbands, such as `mag_vis`, lead to columns of fluxes. For all other names, the most similar names are suggested.
+Other messages of DuckDB become plain sentences.
 """
 
 from __future__ import annotations
@@ -37,6 +38,40 @@ _FLUX_NAME = re.compile(r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|
 _BAND_PREFIX = "f_nu_"
 # Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i" or "lsst_i_flux".
 _IN_BAND = re.compile(r"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$")
+# End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
+_EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")
+_ERROR_CLASS = re.compile(r"\A(?:[A-Z][\w-]* ?){1,4}Error: ")
+_UNKNOWN_FUNCTION = re.compile(
+    r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
+)
+# Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
+_SENTENCES = (
+    (
+        r'column "(.+?)" must appear in the GROUP BY clause',
+        r"column \1 must be in GROUP BY, or in an aggregate function such as any_value(\1)",
+    ),
+    (
+        r"WHERE clause cannot contain aggregates",
+        "WHERE cannot contain aggregate functions such as avg: write this condition in HAVING, after GROUP BY",
+    ),
+    (
+        r"WHERE clause cannot contain window functions",
+        "WHERE cannot contain window functions: write this condition in QUALIFY, after WHERE and GROUP BY",
+    ),
+    (
+        r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)",
+        r"'\1' is text where a number is required",
+    ),
+    (r'Referenced table "(.+?)" not found!\s*Candidate tables: ([^\n]*)', r"FROM has no table or alias \1; it has \2"),
+    (
+        r"No function matches the given name and argument types '(.+?)\((.*?)\)'",
+        r"\1 does not accept arguments of type \2",
+    ),
+    (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
+    (r'syntax error at or near "(.+?)"', r"syntax error near \1"),
+)
+# Largest number of characters of the wrong word.
+_MAX_WORD = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,3 +223,34 @@ def _as_text(targets: Sequence[_Synonym], with_tables: bool) -> str:
         f"{target.table}.{target.column} ({target.meaning})" if with_tables else f"{target.column} ({target.meaning})"
         for target in targets
     )
+
+
+def plain_message(message: str) -> str:
+    """Return a message of DuckDB as one plain sentence; a message of another origin changes little or not at all.
+
+    Parameters
+    ----------
+    message : str
+        The message, perhaps with an extract of the query that has carets below the wrong word.
+
+    Returns
+    -------
+    str
+        The sentence. The wrong word of the query is at its end if the message does not contain it.
+    """
+    extract = _EXTRACT.search(message)
+    body = _ERROR_CLASS.sub("", message[: extract.start()] if extract else message)
+    if unknown := _UNKNOWN_FUNCTION.search(body):
+        question = spelling.did_you_mean(unknown["name"], filter(None, [unknown["other"]]))
+        return f"function {unknown['name']} does not exist{question and f'; {question}'}"
+    for pattern, sentence in _SENTENCES:
+        if match := re.match(pattern, body, re.DOTALL):
+            return match.expand(sentence).replace("_LITERAL", "").replace('"', "").strip()
+    word = _wrong_word(extract) if extract else ""
+    place = f" (near {word})" if word and word not in body else ""
+    return body.strip().rstrip("!") + place
+
+
+def _wrong_word(extract: re.Match[str]) -> str:
+    start = len(extract["blanks"])
+    return extract["line"][start : start + len(extract["carets"])].strip()[:_MAX_WORD]

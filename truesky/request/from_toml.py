@@ -96,7 +96,6 @@ from typing import Any
 from lake_schema import user_files
 from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import layout
-from lake_schema.texts import spelling
 from truesky.request import area as areas
 from truesky.request import bands as request_bands
 from truesky.request import checks, files, lensing_resolution, structure
@@ -199,17 +198,7 @@ def read_file(path: Path) -> Toml:
     try:
         return user_files.read_toml(path, "request")
     except BadInput as error:
-        raise BadInput(f"request {error}{_similar_file(path)}") from None
-
-
-def _similar_file(path: Path) -> str:
-    """Return "; did you mean X?" with the TOML file whose name is most similar to that of a missing file, or ""."""
-    try:
-        stems = {} if path.exists() else {other.stem: other for other in sorted(path.parent.glob("*.toml"))}
-    except (OSError, ValueError):
-        return ""
-    names = spelling.closest_names(path.stem, stems, 1)
-    return f"; did you mean {user_files.format_path(stems[names[0]])}?" if names else ""
+        raise BadInput(f"request {error}{user_files.suggest_similar(path, '.toml')}") from None
 
 
 def _name(table: Toml) -> str:

@@ -90,6 +90,8 @@ def test_a_request_with_a_similar_name_is_suggested(tmp_path, capsys):
     assert check.main([str(tmp_path / "my_feild.toml")]) == 2
     problem = f"{tmp_path / 'my_feild.toml'}: no such file; did you mean {tmp_path / 'my_field.toml'}?"
     assert capsys.readouterr().err == f"truesky check: request {problem}\n"
+    assert check.main([str(tmp_path / "my_field")]) == 2
+    assert capsys.readouterr().err.endswith("my_field.toml?\n")
     assert check.main([str(tmp_path / "demo.toml")]) == 2
     assert capsys.readouterr().err.endswith("demo.toml: no such file\n")
 
