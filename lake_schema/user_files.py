@@ -155,7 +155,8 @@ def _open_descriptor(path: Path, kind: str) -> int:
 def _check_regular_file(path: Path, kind: str, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
         file_type = next((word for word, test in _FILE_TYPES if test(status.st_mode)), "not a regular file")
-        raise BadInput(f"{format_path(path)}: is {file_type}, but must be a file: a {kind}")
+        form = "TOML file" if kind == "request" else f"file: a {kind}"
+        raise BadInput(f"{format_path(path)}: is {file_type}, but must be a {form}")
     if status.st_size > MAX_BYTES[kind]:
         raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the limit for a {kind}")
 

@@ -118,7 +118,7 @@ class Parser(argparse.ArgumentParser):
                 self._stop(f"{option}: names are separated by blanks, not by commas: write {option} {names}")
 
     def _refuse_swapped(self, parsed: argparse.Namespace) -> None:
-        """End the process if the lake is a request file, or the request a folder."""
+        """End the process if the lake is a request file."""
         request, lake = (
             str(getattr(parsed, name.strip("-"), None) or "") if name in self._names_of_positions else ""
             for name in ("--request", "--lake")
@@ -128,8 +128,6 @@ class Parser(argparse.ArgumentParser):
             self._stop(f"the request comes before the lake: write {self.prog} {lake} {request}")
         if is_request_file:
             self._stop(f"LAKE must be the folder of a lake, but {lake} is a request: truesky run {lake} LAKE makes one")
-        if os.path.isdir(request):
-            self._stop(f"REQUEST must be a TOML file, but {request} is a folder")
 
     def _move_to_positions(self, words: list[str]) -> list[str]:
         """Replace the options --request FILE and --lake LAKE by positional arguments; the last of equal options counts.

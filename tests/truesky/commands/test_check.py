@@ -96,6 +96,11 @@ def test_a_request_with_a_similar_name_is_suggested(tmp_path, capsys):
     assert capsys.readouterr().err.endswith("demo.toml: no such file\n")
 
 
+def test_a_folder_is_not_a_request(tmp_path, capsys):
+    assert check.main([str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"truesky check: request {tmp_path}: is a folder, but must be a TOML file\n"
+
+
 def test_python_gets_all_mistakes(tmp_path):
     with pytest.raises(BadInput) as caught:
         simulate.check(written(tmp_path, MANY))

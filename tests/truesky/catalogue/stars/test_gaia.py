@@ -244,7 +244,7 @@ def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
 
 
 def test_missing_inputs_are_named(lake):
-    with pytest.raises(BadInput, match="no table stars"):
+    with pytest.raises(BadInput, match=r"has no tables: run truesky run REQUEST .*, or first truesky build$"):
         build_gaia.steps(lake, asked())
     filled(lake)
     flux = fluxes("star", ["lsst_r"])
