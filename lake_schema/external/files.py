@@ -278,7 +278,7 @@ def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str])
     if missing := [column for column in dict.fromkeys(columns) if not count[column]]:
         has = " ".join(", ".join(names).split())[:300]
         absent = ", ".join(f"{column}{spelling.suggestion(column, names)}" for column in missing)
-        raise BadInput(f"{path}: has no column {absent}; it has {has}")
+        raise BadInput(f"{path} has no column {absent}; it has {has}")
     for column in columns:
         if count[column] > 1:
             raise BadInput(f"{path}: has column {column} more than once")

@@ -64,7 +64,14 @@ class TableMistakes:
         entry.files.add(file)
 
     def add_rows(
-        self, file: Path, first_row: int, column: str, is_wrong: Bool, values: Array | str, allowed: str
+        self,
+        file: Path,
+        first_row: int,
+        column: str,
+        is_wrong: Bool,
+        values: Array | str,
+        allowed: str,
+        noun: str = "column",
     ) -> None:
         """Add those rows of a batch that have a wrong value.
 
@@ -81,16 +88,19 @@ class TableMistakes:
         values : array, shape (n,), or str
             The values; or a text about the row that replaces "is <value>", such as "are near a caustic".
         allowed : str
-            What is allowed, such as "must be in [0, 1]". It is also the kind of the mistake: all rows of a column with
-            the same text are reported in one line.
+            What is allowed, such as "must be from 0 to 1". It is also the kind of the mistake: all rows of a column
+            with the same text are reported in one line.
+        noun : str, optional
+            Words before the name of the column, such as "the sum of columns".
         """
         count = int(np.count_nonzero(is_wrong))
         if not count:
             return
         if (entry := self._entries.get((column, allowed))) is None:
             row = int(np.argmax(is_wrong))
-            problem = values if isinstance(values, str) else f"is {values[row]:g}"
-            text = f"{user_files.format_path(file)}: column {column} of row {first_row + row} {problem}, {allowed}"
+            problem = values if isinstance(values, str) else f"is {format_number(values[row])}"
+            place = f"{user_files.format_path(file)}: {noun} {column} of row {first_row + row}"
+            text = f"{place} {problem}, but {allowed}"
             self._entries[column, allowed] = _WrongRows(text, count, {file})
         else:
             entry.count += count
@@ -124,5 +134,15 @@ def find_out_of_bounds(
     for column, values in columns.items():
         low, high = bounds[column]
         is_wrong = ~((values >= low) & (values <= high))
-        mistakes.add_rows(file, 1, column, is_wrong, values, f"must be in [{low:g}, {high:g}]")
+        mistakes.add_rows(file, 1, column, is_wrong, values, f"must be {format_range(low, high)}")
     return mistakes
+
+
+def format_number(value: float) -> str:
+    """Return a number for an error message; a missing value is "NaN"."""
+    return "NaN" if value != value else f"{value:g}"
+
+
+def format_range(low: float, high: float, unit: str = "") -> str:
+    """Return the allowed range of a number for an error message, such as "a number from -90 to 90 deg"."""
+    return f"a number from {low:g} to {high:g}{' ' if unit else ''}{unit}"

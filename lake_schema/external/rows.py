@@ -7,6 +7,7 @@ determines its format, or its first bytes if the ending is unknown.
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ from pyarrow import csv
 from lake_schema import user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
+from lake_schema.external import csv_headers, hdf5
 from lake_schema.external import files as external_files
-from lake_schema.external import hdf5
 from lake_schema.external.mistakes import TableMistakes
 from lake_schema.fits import external
 from lake_schema.texts import spelling
@@ -37,6 +38,8 @@ _NULL_VALUES = ["", "NaN", "nan", "null", "NULL", "\\N"]
 # Patterns of the numbers that Arrow reads from a CSV file.
 _INTEGER = r"^-?[0-9]+$"
 _NUMBER = r"(?i)^[-+]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?|inf(inity)?|nan)$"
+# Start of an angle in hours or degrees, minutes and seconds.
+_SEXAGESIMAL = re.compile(r"[-+]?\d+\s*[:hd°\s]\s*\d")
 # Largest number of columns of a CSV file.
 _MAX_COLUMNS = 4096
 # Endings of the files of each format, in lower case.
@@ -180,7 +183,7 @@ def read_batches(
     elif endings == _PARQUET:
         batches = external_files.read_batches(file, columns, text_columns)
     else:
-        batches = _csv_batches(file, columns, integer_columns, text_columns)
+        batches = _csv_batches(file, columns, integer_columns, text_columns, kind)
     for batch in batches:
         arrays = {name: _to_numbers(file, first_row, name, batch.column(name), integer_columns) for name in columns}
         text_values = {
@@ -208,11 +211,22 @@ def column_names(file: Path, kind: str = "catalogue") -> list[str]:
         return external_files.column_names(file)
     try:
         with user_files.open_file(file, kind) as stream, csv.open_csv(stream) as table:
-            return list(table.schema.names)
+            names = list(table.schema.names)
+        _check_first_line(file, kind)
+        return names
     except UnicodeDecodeError:
         raise BadInput(f"{file}: is not CSV in UTF-8") from None
+    except pa.ArrowInvalid as error:
+        _check_first_line(file, kind)
+        raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _check_first_line(file: Path, kind: str) -> None:
+    with user_files.open_file(file, kind) as stream:
+        line = stream.readline(_HEADER_BYTES).decode("utf-8-sig", errors="replace")
+    csv_headers.check_header(file, line.rstrip("\r\n").split(","))
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
@@ -258,12 +272,14 @@ def _endings_of_format(file: Path, kind: str) -> tuple[str, ...]:
 
 
 def _csv_batches(
-    file: Path, columns: Sequence[str], integer_columns: Sequence[str], text_columns: Sequence[str]
+    file: Path, columns: Sequence[str], integer_columns: Sequence[str], text_columns: Sequence[str], kind: str
 ) -> Iterator[pa.RecordBatch]:
     read_options = csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
     try:
         with csv.open_csv(file, read_options=read_options) as stream:
             names = stream.schema.names
+        if not set(columns) <= set(names):
+            _check_first_line(file, kind)
         included = [*columns, *(name for name in text_columns if name in names)]
         external_files.check_column_names(file, names, included)
         types = {name: pa.int64() if name in integer_columns else pa.float64() for name in columns}
@@ -277,6 +293,7 @@ def _csv_batches(
     except UnicodeDecodeError:
         raise BadInput(f"{file}: is not CSV in UTF-8") from None
     except pa.ArrowInvalid as error:
+        _check_first_line(file, kind)
         _find_texts(file, columns, integer_columns).refuse()
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
     except (pa.ArrowException, OSError) as error:
@@ -301,8 +318,10 @@ def _find_texts(file: Path, columns: Sequence[str], integer_columns: Sequence[st
                     texts = pc.fill_null(pc.utf8_trim_whitespace(batch.column(name)), "0")
                     wrong = pc.invert(pc.match_substring_regex(texts, _INTEGER if is_integer else _NUMBER))
                     if (row := pc.index(wrong, True).as_py()) >= 0:
-                        problem = f"is {texts[row].as_py()[:40]!r}"
-                        allowed = f"must be {'an integer' if is_integer else 'a number'}"
+                        text = texts[row].as_py()[:40]
+                        problem = f"is {text!r}"
+                        unit = " in degrees" if _SEXAGESIMAL.match(text) else ""
+                        allowed = f"must be {'an integer' if is_integer else f'a number{unit}'}"
                         mistakes.add_rows(file, first_row, name, wrong.to_numpy(zero_copy_only=False), problem, allowed)
                 first_row += batch.num_rows
     except (pa.ArrowException, UnicodeDecodeError):

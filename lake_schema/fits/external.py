@@ -119,7 +119,7 @@ def read_batches(
         if missing := [name for name in dict.fromkeys(columns) if name not in columns_by_name]:
             has = ", ".join(map(str, columns_by_name))[:300]
             absent = ", ".join(f"{name}{spelling.suggestion(name, columns_by_name)}" for name in missing)
-            raise BadInput(f"{path}: has no column {absent}; it has {has}")
+            raise BadInput(f"{path} has no column {absent}; it has {has}")
         for name in columns:
             _refuse_no_numbers(path, hdu, columns_by_name, name)
         column_units = {name: str(columns_by_name[name].unit) for name in columns if columns_by_name[name].unit}
@@ -234,7 +234,7 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
         hdu = _first_table(path, hdus)
         columns_by_name = {item.name: item for item in hdu.columns}
         if column not in columns_by_name:
-            raise BadInput(f"{path}: has no column {column}; it has {', '.join(map(str, columns_by_name))}"[:500])
+            raise BadInput(f"{path} has no column {column}; it has {', '.join(map(str, columns_by_name))}"[:500])
         _refuse_lists(path, columns_by_name[column])
         values = hdu.data[column]
         if values.dtype.kind not in "fiu" or not values.size <= _MAX_PIXELS:

@@ -26,7 +26,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical
 from lake_schema.texts import spelling
-from truesky.catalogue.external import mapping, reading
+from truesky.catalogue.external import ingest, mapping, reading
 from truesky.catalogue.external.ingest import Split
 from truesky.catalogue.external.mapping import GALAXY_BOUNDS, Columns, Field
 from truesky.catalogue.galaxies import band_ratios, from_catalogue, lensing
@@ -57,6 +57,8 @@ _GALAXY_BOUNDS = {
     "sed": (0.0, 30.0),
 }
 _STAR_BOUNDS = {**{name: KEYS[name] for name in (*_POSITION, "teff", "a_v")}, "mag": GALAXY_BOUNDS["mag"]}
+# Words that describe a mapping, for error messages: a property and the name of its column.
+_MAPPING = 'all columns with {{ file = "..", columns = {{ {} = "{}", .. }} }}'
 # Settings of the columns of galaxies.
 _SETTINGS = ("ellipticity", "frame")
 # Largest number of grid positions in the square around the area.
@@ -220,14 +222,20 @@ def _known_titles(file: Path, bounds: Mapping[str, object], required: list[str])
     """Return the names of a file's columns; raise BadInput if they are not names of properties, or one is missing."""
     titles = external_rows.column_names(file, SOURCES_KIND)
     messages = []
-    if unknown := [f"{title}{spelling.suggestion(title, bounds)}" for title in titles if title not in bounds]:
-        names = ", ".join(bounds)
-        messages = [f"{file}: unknown column {', '.join(unknown)}; allowed are {names}, or a table {{ file, columns }}"]
-    messages += [
-        f"{file}: column {name} is missing{spelling.suggestion(name, [t for t in titles if t not in bounds])}"
-        for name in required
-        if name not in titles
-    ]
+    unknown = [title for title in titles if title not in bounds]
+    for name in required:
+        if name not in titles:
+            hint = ""
+            if similar := spelling.closest_names(name, unknown, 1):
+                unknown.remove(similar[0])
+                hint = f"; did you mean {similar[0]}? Rename it to {name}, or map {_MAPPING.format(name, similar[0])}"
+            messages.append(f"{file}: column {name} is missing{hint}")
+    if unknown:
+        listed = [f"{title}{spelling.suggestion(title, bounds)}" for title in unknown]
+        allowed = f"; allowed are {', '.join(bounds)}" if set(listed) & set(unknown) else ""
+        noun = "unknown columns" if len(unknown) > 1 else "unknown column"
+        remedy = f"remove or rename {'them' if len(unknown) > 1 else 'it'}, or map {_MAPPING.format('mag', 'MAG')}"
+        messages.append(f"{file}: {noun} {', '.join(listed)}{allowed}; {remedy}")
     messages += [f"{file}: has column {title} more than once" for title in titles if titles.count(title) > 1]
     refuse_mistakes(messages)
     return titles
@@ -244,22 +252,32 @@ def _read(file: Path | None, name: str, source_tables: UserSources, area: Area |
         defaults = GALAXIES if name == "galaxies" else STARS
         empty = {key: np.zeros(0) for key in (*(() if source_tables.spacing else _POSITION), *defaults)}
         return empty | {"origin_id": np.zeros(0, np.int64)}
-    pieces = list(reading.read([file], _columns(file, name, source_tables), SOURCES_KIND))
+    columns = _columns(file, name, source_tables)
+    pieces = list(reading.read([file], columns, SOURCES_KIND))
     count = sum(len(piece.values["mag"]) for piece in pieces)
     if count == 0:
         raise BadInput(f"{file}: the table has no rows")
     values = {key: np.concatenate([piece.values[key] for piece in pieces]) for key in pieces[0].values}
     mistakes = TableMistakes()
     if area is not None and not source_tables.spacing:
-        cell = sky.cell_at(sky.wrap_angle(values["ra"]), values["dec"], GENERATION_ORDER)
-        outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
-        mistakes.add_rows(file, 1, "ra and dec", outside, "is outside the area", "must be in the request's area")
+        _add_outside(file, values, reading.column_titles(columns, *_POSITION), area, mistakes)
     if name == "galaxies":
         _add_caustics(file, values, mistakes)
         if area is not None:
             _add_magnitudes(file, values, source_tables.band, mistakes)
     mistakes.refuse()
     return values | {"origin_id": np.arange(1, count + 1)}
+
+
+def _add_outside(file: Path, values: Mapping[str, Array], titles: str, area: Area, mistakes: TableMistakes) -> None:
+    """Add sources outside the area to `mistakes`; `titles` are the names of the columns with the positions."""
+    ra, dec = (values[name] for name in _POSITION)
+    outside = ~np.isin(sky.cell_at(sky.wrap_angle(ra), dec, GENERATION_ORDER), area.cells(GENERATION_ORDER))
+    if outside.any():
+        first = int(np.argmax(outside))
+        hint = ingest.radians_hint(np.abs(ra).max(), np.abs(dec).max())
+        problem = f"are {ra[first]:g} and {dec[first]:g} deg"
+        mistakes.add_rows(file, 1, titles, outside, problem, f"must be in the area, {area.describe()}{hint}", "columns")
 
 
 def _add_caustics(file: Path, values: Mapping[str, Array], mistakes: TableMistakes) -> None:
@@ -270,8 +288,8 @@ def _add_caustics(file: Path, values: Mapping[str, Array], mistakes: TableMistak
     kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
     bad = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
     bad |= np.hypot(gamma1, gamma2) > MAX_SHEAR * np.abs(1.0 - kappa)
-    allowed = f"images are ellipses up to |g| = {MAX_SHEAR}"
-    mistakes.add_rows(file, 1, "kappa, gamma1, gamma2", bad, "is near a caustic", allowed)
+    allowed = f"images are ellipses only up to |g| = {MAX_SHEAR}"
+    mistakes.add_rows(file, 1, "kappa, gamma1 and gamma2", bad, "give an image near a caustic", allowed, "columns")
 
 
 def _add_magnitudes(file: Path, values: Mapping[str, Array], band: str, mistakes: TableMistakes) -> None:
@@ -282,8 +300,8 @@ def _add_magnitudes(file: Path, values: Mapping[str, Array], band: str, mistakes
     absolute = values["mag"] - cosmology.distance_modulus(z) - offset
     lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
     is_wrong = ~((absolute >= lo) & (absolute <= hi))
-    column = "mag, z_true, sed (absolute magnitude)"
-    mistakes.add_rows(file, 1, column, is_wrong, absolute, f"must be in [{lo:g}, {hi:g}]")
+    noun, allowed = "the absolute magnitude from columns", f"must be from {lo:g} to {hi:g}"
+    mistakes.add_rows(file, 1, "mag, z_true and sed", is_wrong, absolute, allowed, noun)
 
 
 def _split(galaxies: Mapping[str, Array]) -> Split:

@@ -52,13 +52,15 @@ def _check_galaxies(request: Request) -> None:
     if (catalogue := request.ingest.galaxies) is not None:
         replaces_lensing = request.universe.lensing is not None
         columns = _with_existing_files(catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing))
-        ingest.split_by_cell(*ingest.files_with_checksums(catalogue.files, columns), columns)
+        files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
+        split = ingest.split_by_cell(files, sha256, columns)
+        ingest.check_area(split, files, columns, request.area)
 
 
 def _check_halos(request: Request) -> None:
     if (catalogue := request.ingest.halos) is not None:
         columns = _with_existing_files(catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
-        ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)
+        ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns, request.area)
 
 
 def _check_training(request: Request) -> None:

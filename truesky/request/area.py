@@ -148,6 +148,22 @@ class Area:
             return _polygon_depth(self.vertices, lon, lat)
         return self.radius - sky.separation(lon, lat, self.ra, self.dec)
 
+    def describe(self) -> str:
+        """Return a description of the area for error messages, such as "the circle of 0.2 deg at ra 5, dec 9"."""
+        if self.wide:
+            return "the sky of the wide survey"
+        if self.patches:
+            ra, dec, radius = self.patches[0]
+            rest = f" and {len(self.patches) - 1} more" if len(self.patches) > 1 else ""
+            return f"the circle of {radius:g} deg at ra {ra:g}, dec {dec:g}{rest}"
+        if self.box is not None:
+            west, east, south, north = self.box
+            return f"the box of ra {west:g} to {east:g} and dec {south:g} to {north:g}"
+        if self.vertices:
+            ra, dec, radius = self.bounding_circle()
+            return f"a polygon within {radius:.4g} deg of ra {ra:g}, dec {dec:g}"
+        return f"the circle of {self.radius:g} deg at ra {self.ra:g}, dec {self.dec:g}"
+
     def square_degrees(self) -> float:
         """Return the size of the area in square degrees; circles that overlap count twice.
 

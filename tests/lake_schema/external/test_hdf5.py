@@ -41,7 +41,7 @@ def test_a_piece_is_bounded(tmp_path):
 
 def test_all_missing_columns_are_named_at_once(tmp_path):
     path = opencosmo.write(tmp_path / "few.hdf5", {"ra": np.zeros(3), "x": np.zeros(3)})
-    with pytest.raises(BadInput, match=r"few\.hdf5: has no column gal_id, lsst_r; it has ra, x$"):
+    with pytest.raises(BadInput, match=r"few\.hdf5 has no column gal_id, lsst_r; it has ra, x$"):
         read(path)
 
 

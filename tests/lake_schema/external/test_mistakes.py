@@ -13,14 +13,14 @@ def test_rows_of_one_kind_are_counted():
     mistakes = TableMistakes()
     for number, first_row in (("a", 1), ("b", 11)):
         values = np.array([0.5, 3.0, 4.0])
-        mistakes.add_rows(Path(number), first_row, "Z", values > 1.0, values, "must be in [0, 1]")
+        mistakes.add_rows(Path(number), first_row, "Z", values > 1.0, values, "must be from 0 to 1")
     mistakes.add_rows(Path("b"), 11, "Z", np.zeros(3, bool), np.zeros(3), "must be a number")
     mistakes.add(BadInput("c: no such file"))
     mistakes.add_row(Path("d"), "ra", "range", "d line 4: ra = 400 is outside -360 to 360")
     with pytest.raises(BadInput) as caught:
         mistakes.refuse()
     assert caught.value.messages == (
-        "a: column Z of row 2 is 3, must be in [0, 1] (3 more rows in 2 files)",
+        "a: column Z of row 2 is 3, but must be from 0 to 1 (3 more rows in 2 files)",
         "c: no such file",
         "d line 4: ra = 400 is outside -360 to 360",
     )
@@ -32,7 +32,7 @@ def test_all_columns_are_compared_with_their_bounds():
     with pytest.raises(BadInput) as caught:
         mistakes.refuse()
     assert caught.value.messages == (
-        "t.csv: column x of row 2 is nan, must be in [0, 2] (1 more row)",
-        "t.csv: column z of row 1 is 5, must be in [0, 2]",
+        "t.csv: column x of row 2 is NaN, but must be a number from 0 to 2 (1 more row)",
+        "t.csv: column z of row 1 is 5, but must be a number from 0 to 2",
     )
     find_out_of_bounds(Path("t.csv"), {"y": columns["y"]}, {"y": (0.0, 2.0)}).refuse()

@@ -99,23 +99,29 @@ def test_rows_stand_on_a_grid_in_turn(tmp_path):
 
 
 BAD = [
-    ({"galaxies": TWO.replace("24.5", "")}, r"galaxies.csv: column mag of row 2 is nan, must be a number in "),
-    ({"galaxies": TWO.replace("24.5", "faint")}, r"galaxies.csv: column mag of row 2 is 'faint', must be a number"),
+    ({"galaxies": TWO.replace("24.5", "")}, r"galaxies.csv: column mag of row 2 is NaN, but must be a number from "),
+    ({"galaxies": TWO.replace("24.5", "faint")}, r"galaxies.csv: column mag of row 2 is 'faint', but must be a number"),
     ({"galaxies": TWO.replace("-27.81", "-97.81")}, r"galaxies.csv: column dec of row 2 is -97.81"),
-    ({"galaxies": TWO.replace("53.11", "63.11")}, r"galaxies.csv: column ra and dec of row 2 is outside the area"),
-    ({"galaxies": TWO.replace("-0.02", "-0.95")}, r"column kappa, gamma1, gamma2 of row 2 is near a caustic"),
+    (
+        {"galaxies": TWO.replace("53.11", "63.11")},
+        r"galaxies.csv: columns ra and dec of row 2 are 63.11 and -27.81 deg, but must be in the area, the circle",
+    ),
+    (
+        {"galaxies": TWO.replace("-0.02", "-0.95")},
+        r"columns kappa, gamma1 and gamma2 of row 2 give an image near a caustic, but",
+    ),
     ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: unknown column shear; allowed are ra, dec, mag"),
     ({"galaxies": TWO.replace("gamma1", "mag")}, r"galaxies.csv: has column mag more than once"),
     (
         {"galaxies": TWO.replace("gamma1", "ext_law")},
         "ext_law of row 2 is -0.02",
     ),
-    ({"galaxies": TWO.replace("gamma1", "ext_law").replace("-0.02", "2")}, "row 1 is 0.05, must be a whole number"),
+    ({"galaxies": TWO.replace("gamma1", "ext_law").replace("-0.02", "2")}, "row 1 is 0.05, but must be a whole number"),
     ({"galaxies": "ra,dec\n53.1,-27.8\n"}, r"galaxies.csv: column mag is missing"),
     ({"galaxies": "ra,dec,mag\n"}, r"galaxies.csv: the table has no rows"),
     ({"galaxies": ""}, r"galaxies.csv: .*mpty"),
     ({"stars": STAR.replace("4000", "4")}, r"stars.csv: column teff of row 1 is 4"),
-    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown column ra, dec; allowed are mag"),
+    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown columns ra, dec; allowed are mag"),
     ({"more": 'only = "grid"'}, r"sources.spacing is missing"),
     ({"more": 'only = "table"\nspacing = 20.0'}, r"sources.spacing requires only"),
     ({"more": 'only = "some"'}, r"sources.only = 'some'"),
@@ -200,9 +206,9 @@ def test_all_mistakes_of_both_tables_are_reported_at_once(tmp_path):
     assert lines[0].startswith("sources.band = 'lsst_q' is not one of")
     assert "(did you mean lsst_" in lines[0]
     assert lines[1:] == [
-        "galaxies.csv: column z_true of row 2 is -1, must be in [0, 15] (2 more rows)",
-        "galaxies.csv: column bulge_fraction of row 2 is 2, must be in [0, 1] (2 more rows)",
-        "stars.csv: column teff of row 1 is 4, must be in [300, 100000]",
+        "galaxies.csv: column z_true of row 2 is -1, but must be from 0 to 15 (2 more rows)",
+        "galaxies.csv: column bulge_fraction of row 2 is 2, but must be from 0 to 1 (2 more rows)",
+        "stars.csv: column teff of row 1 is 4, but must be from 300 to 100000",
     ]
 
 
@@ -230,11 +236,40 @@ def test_a_wrong_mapping_is_refused(tmp_path, columns, message):
         given_sources.load(request.sources, request.area)
 
 
+def test_a_column_of_another_name_is_one_line(tmp_path):
+    request = asked(tmp_path, galaxies=TWO.replace("mag,", "MAG_AUTO,"), stars=None)
+    with pytest.raises(BadInput) as caught:
+        given_sources.load(request.sources, request.area)
+    (line,) = caught.value.messages
+    assert "galaxies.csv: column mag is missing; did you mean MAG_AUTO? Rename it to mag, or map all columns" in line
+    assert 'columns = { mag = "MAG_AUTO", .. }' in line
+
+
+def test_positions_in_radians_are_named(tmp_path):
+    request = asked(tmp_path, galaxies="ra,dec,mag\n0.927,-0.485,24\n0.9271,-0.4851,24\n", stars=None)
+    with pytest.raises(BadInput, match=r"of row 1 are 0.927 and -0.485 deg, .*in radians, convert .*\(1 more row\)"):
+        given_sources.load(request.sources, request.area)
+
+
+def test_sizes_in_another_unit_are_converted_or_refused(tmp_path):
+    request = asked(tmp_path, more='only = "table"\n[sources.galaxies]\nfile = "sizes.fits"', galaxies=None, stars=None)
+    for unit, factor in (("arcmin", 60.0), ("pix", None)):
+        table = Table({"ra": [53.1], "dec": [-27.8], "mag": [24.0], "disk_half_light_radius": [0.01]})
+        table["disk_half_light_radius"].unit = unit
+        table.write(tmp_path / "sizes.fits", overwrite=True)
+        if factor:
+            sources = given_sources.load(request.sources, request.area)
+            assert sources.galaxies["disk_half_light_radius"] == pytest.approx([0.01 * factor])
+            continue
+        with pytest.raises(BadInput, match="column disk_half_light_radius has the unit pix, but must be in arcsec or"):
+            given_sources.load(request.sources, request.area)
+
+
 def test_an_impossible_absolute_magnitude_is_named(tmp_path):
     """The job that computes fluxes would refuse it."""
     galaxies = "ra,dec,mag,z_true\n53.1,-27.8,24,0.2\n53.1,-27.8,28.5,0\n"
     request = asked(tmp_path, galaxies=galaxies, stars=None)
-    with pytest.raises(BadInput, match=r"column mag and z_true \(absolute magnitude\) of row 2 is 6\.\d+, must be in"):
+    with pytest.raises(BadInput, match=r"magnitude from columns mag and z_true of row 2 is 6\.\d+, but must be from"):
         given_sources.load(request.sources, request.area)
 
 

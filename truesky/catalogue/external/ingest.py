@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
-from lake_schema import sky
+from lake_schema import sky, user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.external import rows as external_rows
@@ -31,6 +31,7 @@ from truesky.fluxes.libraries import templates
 from truesky.numerics import cache, cache_entries
 from truesky.numerics.cache import cache_dir, content_key
 from truesky.numerics.code_fingerprints import code_key
+from truesky.request.area import Area
 from truesky.request.files import Catalogue
 
 # Number of rows that are collected in memory before they are written to the files of their cells.
@@ -39,6 +40,8 @@ _MAX_BUFFERED_ROWS = 2_000_000
 _LOT_COUNT = 64
 _ID_ENTRY = np.dtype([("id", np.int64), ("file", np.int32), ("row", np.int64)])
 _SUMMARY_FILE = "about.json"
+# Limits of right ascensions and declinations in radians.
+_MAX_RADIANS = (6.3, 1.6)
 # Columns (ra, dec) of true and of observed positions. The observed positions must be last, because `_write_cells` uses
 # the last pair that a catalogue has.
 _POSITION_COLUMNS = (("ra", "dec"), ("ra_lensed", "dec_lensed"))
@@ -146,7 +149,65 @@ def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns
     return Split(folder, checksums, **json.loads((folder / _SUMMARY_FILE).read_text()))
 
 
-def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> None:
+def radians_hint(largest_ra: float, largest_dec: float) -> str:
+    """Return words that ask for degrees if the largest absolute coordinates of all rows would fit radians, or ""."""
+    fit = largest_ra < _MAX_RADIANS[0] and largest_dec < _MAX_RADIANS[1]
+    return "; if the positions are in radians, convert them to degrees" if fit else ""
+
+
+def check_area(split: Split, files: Sequence[Path], columns: Columns, area: Area) -> None:
+    """Raise BadInput if a stored catalogue has no galaxy in the area of a request.
+
+    Parameters
+    ----------
+    split : Split
+        The stored catalogue.
+    files : sequence of Path
+        Files of the catalogue.
+    columns : Columns
+        Mapping from the columns of the files to the properties of galaxies.
+    area : Area
+        Area of the request. Galaxies in the order-8 cells that it touches are used.
+    """
+    pieces = [name for name in sorted(split.checksums) if name.endswith(".arrow")]
+    cells = np.asarray(area.cells(GENERATION_ORDER), np.int64)
+    parents = set((cells >> 2 * (GENERATION_ORDER - FILE_ORDER)).tolist())
+
+    def values(piece: str, column: str) -> Array:
+        return np.asarray(feather.read_table(split.folder / piece, [column], memory_map=True)[column])
+
+    for piece in pieces:
+        if int(piece.partition("/")[0]) in parents:
+            occupied = values(piece, "index") >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
+            if np.isin(occupied, cells).any():
+                return
+    if not pieces:
+        return
+    keys = next(keys for keys in reversed(_POSITION_COLUMNS) if keys[0] in columns.fields)
+    limits = []
+    for key in keys:
+        column = [values(piece, key) for piece in pieces]
+        limits.append((min(float(part.min()) for part in column), max(float(part.max()) for part in column)))
+    raise _outside_area(files, columns, keys, limits, area)
+
+
+def _outside_area(
+    files: Sequence[Path],
+    columns: Columns,
+    keys: Sequence[str],
+    limits: Sequence[tuple[float, float]],
+    area: Area,
+) -> BadInput:
+    """Return the error about a catalogue without rows in the area; `limits` are those of its positions (deg)."""
+    titles = [reading.column_titles(columns, key) for key in keys]
+    ranges = " and ".join(f"{title} from {lo:g} to {hi:g}" for title, (lo, hi) in zip(titles, limits, strict=True))
+    hint = radians_hint(*(max(map(abs, pair)) for pair in limits))
+    others = f" and {len(files) - 1} other file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
+    place = f"{user_files.format_path(files[0])}{others}"
+    return BadInput(f"{place}: no row is in the area, {area.describe()}: the rows have {ranges} deg{hint}")
+
+
+def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns, area: Area | None = None) -> None:
     """Check every row of a user's catalogue, unless the disc cache says that the same files have been checked before.
 
     Parameters
@@ -157,15 +218,19 @@ def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -
         SHA-256 of all files and companion files, by which the cache recognises the catalogue.
     columns : Columns
         Mapping from the columns of the files to properties.
+    area : Area, optional
+        Area of the request, in which at least one row must be; None for a table without positions.
 
     Raises
     ------
     BadInput
-        If a file cannot be read, has a missing, wrong or repeated value, or if there are no rows. The message names the
-        file, the column and the row.
+        If a file cannot be read, has a missing, wrong or repeated value, or if there are no rows, or none in the area.
+        The message names the file, the column and the row.
     """
+    keys = _POSITION_COLUMNS[0]
 
     def count_rows() -> dict[str, Array]:
+        cells, lows, highs = [np.zeros(0, np.int64)], [], []
         cache_dir().mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=cache_entries.MAKING, dir=cache_dir()) as folder:
             identifiers, rows = _IdentifierStore(Path(folder) / "seen"), 0
@@ -173,12 +238,20 @@ def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -
                 rows += len(next(iter(piece.values.values())))
                 if "origin_id" in piece.values:
                     identifiers.add(files.index(piece.file), piece)
+                if keys[0] in piece.values and piece.values[keys[0]].size:
+                    ra, dec = (piece.values[key] for key in keys)
+                    cells.append(np.unique(sky.cell_at(sky.wrap_angle(ra), dec, GENERATION_ORDER)))
+                    lows.append((ra.min(), dec.min()))
+                    highs.append((ra.max(), dec.max()))
             identifiers.refuse_duplicates(files, _identifier_title(columns))
         if not rows:
             raise BadInput(f"{files[0]}: the table has no rows")
-        return {"rows": np.array([rows])}
+        limits = np.array([np.min(lows, axis=0), np.max(highs, axis=0)]) if lows else np.zeros((2, 2))
+        return {"rows": np.array([rows]), "cells": np.unique(np.concatenate(cells)), "limits": limits}
 
-    cache.cached_arrays("checked_rows", _content_key(sha256, columns), count_rows)
+    checked = cache.cached_arrays("checked_rows", _content_key(sha256, columns), count_rows)
+    if area is not None and not np.isin(checked["cells"], area.cells(GENERATION_ORDER)).any():
+        raise _outside_area(files, columns, keys, [tuple(pair) for pair in checked["limits"].T.tolist()], area)
 
 
 def _content_key(sha256: Sequence[str], columns: Columns) -> str:
@@ -333,11 +406,12 @@ class _IdentifierStore:
             duplicates = np.flatnonzero(entries["id"][1:] == entries["id"][:-1])
             if duplicates.size:
                 first, second = entries[duplicates[0]], entries[duplicates[0] + 1]
-                second_place, first_place = (
-                    f"row {entry['row']} of {files[entry['file']]}" for entry in (second, first)
-                )
-                raise BadInput(
-                    f"{files[second['file']]}: column {column}: {second['id']} is in {second_place} and in "
-                    f"{first_place}"
-                )
+                file = user_files.format_path(files[second["file"]])
+                if first["file"] == second["file"]:
+                    places = f"rows {first['row']} and {second['row']}"
+                else:
+                    other = user_files.format_path(files[first["file"]])
+                    places = f"row {second['row']} and in row {first['row']} of {other}"
+                problem = f"the value {second['id']} is in {places}, but every value must be different"
+                raise BadInput(f"{file}: column {column}: {problem}")
         shutil.rmtree(self.folder)

@@ -8,6 +8,8 @@ halos and of training galaxies, the whole mapping is in the request.
 from __future__ import annotations
 
 import json
+import re
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,6 +26,8 @@ from truesky.fluxes import passbands
 Bounds = Mapping[str, tuple[float, float]]
 
 _FILE = Path(__file__).with_name("ingest_formats.toml")
+# Pattern of a unit of surface brightness.
+_PER_AREA = re.compile(r"/|arcsec|deg|sr")
 IDENTIFIER_KEYS = ("origin_id", "halo")
 _FIELD_KEYS = (
     "column", "plus", "minus", "over", "kpc_at", "power10", "log10", "scale", "offset", "unit", "value", "beside",
@@ -88,6 +92,11 @@ TRAINING_BOUNDS: Bounds = {
     "ebv": (0.0, 3.0),
 }
 INTEGER_KEYS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "stamp")
+# Units of properties that are not columns of table `galaxies`.
+_UNITS = {
+    "ra_lensed": "deg", "dec_lensed": "deg", "half_light_radius": "arcsec", "mag": "mag", "ebv": "mag",
+    "velocity": "km / s", "teff": "K",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +125,10 @@ class Field:
     def titles(self) -> list[str]:
         """Return the names of the file's columns from which the property is computed; none for a constant value."""
         return [title for title in (self.column, self.plus, self.minus, self.over, self.kpc_at) if title]
+
+    def is_plain(self) -> bool:
+        """Return True if the property is a column of the file, for which the mapping states no unit or computation."""
+        return bool(self.column) and self == Field(self.column, beside=self.beside)
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,6 +397,61 @@ def _wrong_settings(settings: Mapping[str, Any], path: str) -> list[str]:
         if wrong:
             messages.append(f"{path}.{key} = {value!r}"[:200] + f" must be {allowed}")
     return messages
+
+
+def unit_of(key: str) -> str:
+    """Return the unit of a property, such as "deg"; "" for a number without a unit."""
+    return _UNITS.get(key) or (GALAXIES.column(key).unit if key in GALAXIES.names else "")
+
+
+def factor_of_unit(key: str, stored: str) -> float:
+    """Return the factor that converts the numbers of a column with a unit to the unit of a property.
+
+    Parameters
+    ----------
+    key : str
+        Name of the property.
+    stored : str
+        Unit that the file gives; "" or "-" for none.
+
+    Returns
+    -------
+    float
+        The factor, such as 60 for a radius in arcmin. It is 1 for codes and logarithms, whose units are not checked.
+
+    Raises
+    ------
+    BadInput
+        If the stored unit does not convert to the unit of the property.
+    """
+    text, expected = stored.strip(), unit_of(key)
+    if key in (*IDENTIFIER_KEYS, *INTEGER_KEYS, "sed") or key.startswith("log_") or not text.strip("-"):
+        return 1.0
+    if expected == "mag" and "mag" in text.lower() and not _PER_AREA.search(text):
+        # Magnitudes have many spellings, such as "mag(AB)" and "ABmag".
+        return 1.0
+    from astropy import units
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", units.UnitsWarning)
+        for spelling_of_unit in (text, text.lower(), text.lower().rstrip("s")):
+            try:
+                return float(units.Unit(spelling_of_unit).to(expected))
+            except ValueError:
+                # The text is not a unit of astropy, or does not convert.
+                continue
+    if expected:
+        raise BadInput(f"has the unit {text[:40]}, but must be in {expected} or a unit that converts to it")
+    if _is_unit(text):
+        raise BadInput(f"has the unit {text[:40]}, but must be a number without a unit")
+    return 1.0
+
+
+def _is_unit(text: str) -> bool:
+    try:
+        return bool(parse_unit(text, ""))
+    except BadInput:
+        return False
 
 
 def parse_unit(text: str, where: str) -> Any:

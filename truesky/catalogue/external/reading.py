@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lake_schema import user_files
 from lake_schema.arrays import Array
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Mistakes
 from lake_schema.external import rows as external_rows
-from lake_schema.external.mistakes import TableMistakes
+from lake_schema.external.mistakes import TableMistakes, format_range
 from lake_schema.external.rows import RowBatch
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue.external import ellipticity
@@ -28,7 +29,9 @@ from truesky.catalogue.external.mapping import (
     Columns,
     Field,
     companion_file,
+    factor_of_unit,
     parse_unit,
+    unit_of,
 )
 from truesky.fluxes import cosmology
 
@@ -110,8 +113,7 @@ def _read_batches(file: Path, columns: Columns, kind: str) -> Iterator[tuple[Row
     identifier_columns = [columns.fields[key].column for key in IDENTIFIER_KEYS if key in columns.fields]
     pieces = external_rows.read_batches(file, columns.titles(in_companion=False), identifier_columns, kind=kind)
     for piece in _with_companion(file, pieces, columns) if columns.companion_prefixes else pieces:
-        _check_units(piece, columns)
-        yield piece, columns
+        yield piece, _with_stored_units(piece, columns)
 
 
 def _with_present_columns(file: Path, columns: Columns, kind: str) -> Columns:
@@ -127,14 +129,29 @@ def _with_present_columns(file: Path, columns: Columns, kind: str) -> Columns:
     )
 
 
-def _check_units(piece: RowBatch, columns: Columns) -> None:
-    for key, field in columns.fields.items():
-        file_unit = piece.units.get(field.column, "")
-        if not field.unit or not file_unit:
-            continue
-        where = f"{piece.file}: column {field.column}"
-        if parse_unit(file_unit, where) != parse_unit(field.unit, where):
-            raise BadInput(f"{where} ({key}) has unit {file_unit!r}, but the mapping has {field.unit!r}")
+def _with_stored_units(piece: RowBatch, columns: Columns) -> Columns:
+    """Return a mapping that converts the units of a file to those of the properties.
+
+    Raises BadInput if a unit does not convert, or if it is not the unit that the mapping states.
+    """
+    fields = dict(columns.fields)
+    with Mistakes() as mistakes:
+        for key, field in columns.fields.items():
+            if file_unit := piece.units.get(field.column, ""):
+                fields[key] = mistakes.read(_with_stored_unit, piece.file, key, field, file_unit)
+    return columns if fields == columns.fields else replace(columns, fields=fields)
+
+
+def _with_stored_unit(file: Path, key: str, field: Field, file_unit: str) -> Field:
+    where = f"{user_files.format_path(file)}: column {field.column}"
+    if field.is_plain():
+        try:
+            return replace(field, scale=factor_of_unit(key, file_unit))
+        except BadInput as error:
+            raise BadInput(f"{where}{'' if field.column == key else f' ({key})'} {error}") from None
+    if field.unit and parse_unit(file_unit, where) != parse_unit(field.unit, where):
+        raise BadInput(f"{where} ({key}) has unit {file_unit!r}, but the mapping has {field.unit!r}")
+    return field
 
 
 def _values(piece: RowBatch, columns: Columns, mistakes: TableMistakes) -> dict[str, Array]:
@@ -172,13 +189,13 @@ def _convert_ellipticities(
     is_wrong = ~(ratio >= MIN_AXIS_RATIO * (1.0 - 1e-6))
     limit = ellipticity.largest(columns.ellipticity, MIN_AXIS_RATIO)
     allowed = f"must be at most {limit:.4g}, for an axis ratio of {MIN_AXIS_RATIO:g}"
-    column = f"{_column_titles(columns, 'e1', 'e2')} (|e|)"
-    mistakes.add_rows(piece.file, piece.first_row, column, is_wrong, np.hypot(e1, e2), allowed)
+    titles, noun = column_titles(columns, "e1", "e2"), "the ellipticity |e| from columns"
+    mistakes.add_rows(piece.file, piece.first_row, titles, is_wrong, np.hypot(e1, e2), allowed, noun)
     by_key["axis_ratio"] = np.where(is_wrong, 1.0, np.clip(ratio, MIN_AXIS_RATIO, 1.0))
     by_key["position_angle"] = np.where(is_wrong, 0.0, ellipticity.position_angle(columns.frame, e1, e2))
 
 
-def _column_titles(columns: Columns, *keys: str) -> str:
+def column_titles(columns: Columns, *keys: str) -> str:
     """Return the names of the user's columns from which properties are computed, joined by "and"."""
     titles = [title for key in keys if key in columns.fields for title in columns.fields[key].titles()]
     return " and ".join(dict.fromkeys(titles)) or " and ".join(keys)
@@ -226,7 +243,7 @@ def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array, mi
     slack = 1e-6 * max(abs(lo), abs(hi)) if single and np.isfinite(hi - lo) else 0.0
     outside = ~((values >= lo - slack) & (values <= hi + slack))
     missing = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.size, bool)
-    titles = _column_titles(columns, key)
+    titles = column_titles(columns, key)
     column = titles if titles == key else f"{titles} ({key})"
 
     def add(is_wrong: Array, allowed: str) -> None:
@@ -235,9 +252,11 @@ def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array, mi
     if key in IDENTIFIER_KEYS:
         with np.errstate(invalid="ignore"):
             return add(outside | (values != np.floor(values)), "must be an integer")
+    unit = unit_of(key) if unit_of(key) in ("deg", "arcsec") else ""
     if key not in columns.nullable:
-        add(missing, f"must be a number in [{lo:g}, {hi:g}]")
-    add(outside & ~missing, f"must be in [{lo:g}, {hi:g}]")
+        # A missing value is another kind of mistake than a value out of bounds, so the texts differ.
+        add(missing, f"must be {format_range(lo, hi, unit)}")
+    add(outside & ~missing, f"must be {format_range(lo, hi, unit).removeprefix('a number ')}")
     if key in INTEGER_KEYS:
         add(~outside & (values != np.floor(values)), f"must be a whole number from {lo:g} to {hi:g}")
     if slack:
@@ -264,8 +283,8 @@ def _check_absolute_magnitude(
     absolute = apparent - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
     is_wrong = valid & ~((absolute >= lo) & (absolute <= hi))
-    column = f"{_column_titles(columns, magnitude, z_key)} (absolute magnitude)"
-    mistakes.add_rows(piece.file, piece.first_row, column, is_wrong, absolute, f"must be in [{lo:g}, {hi:g}]")
+    titles, noun = column_titles(columns, magnitude, z_key), "the absolute magnitude from columns"
+    mistakes.add_rows(piece.file, piece.first_row, titles, is_wrong, absolute, f"must be from {lo:g} to {hi:g}", noun)
 
 
 def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput, Mistakes
+from lake_schema.external import csv_headers
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables import exposures as declared
 from lake_schema.tables.exposures import EUCLID_BANDS
@@ -54,6 +55,11 @@ COLUMNS = (
 )
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
+# Names that other programs give to the columns, in lower case.
+_OTHER_NAMES = {
+    "filter": "band", "exptime": "exposure_time_s", "exposure": "exposure_time_s", "date": "mjd", "date-obs": "mjd",
+    "pa": "position_angle", "rotation": "position_angle", "instrument": "camera", "fwhm": "seeing",
+}  # fmt: skip
 _MAX_ROWS, _MAX_LENGTH = 1_000_000, 1000
 # Largest number of messages about the names of columns.
 _MAX_MESSAGES = 20
@@ -218,17 +224,32 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
 
 def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
     required = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
+    missing = [name for name in required if name not in names]
+    if missing:
+        csv_headers.check_header(path, names)
+    similar = {name: _similar_name(name) for name in names if name not in _NAMES}
+    renamed = {name: other for name, other in similar.items() if other and other not in names}
     with Mistakes() as mistakes:
-        for name in required:
-            if name not in names:
-                mistakes.add(BadInput(f"{path}: column {name} is missing; the first line must have the column names"))
-        for name in names:
-            if name not in _NAMES:
+        if renamed:
+            unknown = user_files.format_path(", ".join(renamed))
+            subject = f"columns {unknown} are" if len(renamed) > 1 else f"column {unknown} is"
+            mistakes.add(BadInput(f"{path}: {subject} unknown: did you mean {', '.join(renamed.values())}?"))
+        if absent := [name for name in missing if name not in renamed.values()]:
+            subject = f"column{'s' if len(absent) > 1 else ''} {', '.join(absent)}"
+            problem = f"{path}: {subject} {'are' if len(absent) > 1 else 'is'} missing"
+            mistakes.add(BadInput(f"{problem}; the first line must have the names of the columns"))
+        for name in similar:
+            if name not in renamed:
                 problem = f"{path}: column {user_files.format_path(name)} is unknown"
                 mistakes.add(BadInput(f"{problem}: {spelling.choices(name, _NAMES)}"))
         for name in dict.fromkeys(names):
             if list(names).count(name) > 1:
                 mistakes.add(BadInput(f"{path}: column {name} occurs twice"))
+
+
+def _similar_name(name: str) -> str:
+    """Return the name of the column that a user may have meant by an unknown name, "" if there is none."""
+    return _OTHER_NAMES.get(name.strip().lower()) or "".join(spelling.closest_names(name, _NAMES, 1))
 
 
 def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:

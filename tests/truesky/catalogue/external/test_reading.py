@@ -9,6 +9,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from truesky.catalogue.external import ingest, mapping, reading
+from truesky.request.area import Area
 
 GALAXIES = {"ra": "RA", "dec": "DEC", "z_true": "Z", "mag": "MAG", "band": "euclid_vis", "origin_id": "ID"}
 HALOS = {"ra": "RA", "dec": "DEC", "z_true": "Z", "log_mass": "M", "origin_id": "ID"}
@@ -57,8 +58,8 @@ def test_rows_beyond_the_first_batch_and_file_are_read(tmp_path):
     """A batch has at most 65,536 rows."""
     files = written(tmp_path, table(70_000, DEC=(66_001, -91.0)), table(Z=(7, np.nan), DEC=(8, 95.0)))
     assert mistakes(tmp_path, files, galaxies()) == [
-        "0.parquet: column DEC (dec) of row 66001 is -91, must be in [-90, 90] (1 more row in 2 files)",
-        "1.parquet: column Z (z_true) of row 7 is nan, must be a number in [0, 15]",
+        "0.parquet: column DEC (dec) of row 66001 is -91, but must be from -90 to 90 deg (1 more row in 2 files)",
+        "1.parquet: column Z (z_true) of row 7 is NaN, but must be a number from 0 to 15",
     ]
 
 
@@ -67,9 +68,9 @@ def test_missing_columns_and_wrong_values_are_reported_together(tmp_path):
     columns["Redshift"] = columns.pop("Z")
     lines = mistakes(tmp_path, written(tmp_path, columns), galaxies({**GALAXIES, "z_true": "redshift"}))
     assert lines == [
-        "0.parquet: has no column redshift (did you mean Redshift?); it has ID, RA, DEC, MAG, M, Redshift",
-        "0.parquet: column DEC (dec) of row 3 is 95, must be in [-90, 90]",
-        "0.parquet: column MAG (mag) of row 4 is 99, must be in [-5, 60]",
+        "0.parquet has no column redshift (did you mean Redshift?); it has ID, RA, DEC, MAG, M, Redshift",
+        "0.parquet: column DEC (dec) of row 3 is 95, but must be from -90 to 90 deg",
+        "0.parquet: column MAG (mag) of row 4 is 99, but must be from -5 to 60",
     ]
 
 
@@ -77,8 +78,8 @@ def test_texts_in_columns_of_numbers_are_named(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("RA,DEC,Z,MAG,ID\n53,-27,0.5,21,1\n53,-27,half,-,2\n53,-27,+.5e0,1e1,3\n53,-27,,n/a,4\n")
     assert mistakes(tmp_path, [path], galaxies()) == [
-        "x.csv: column Z of row 2 is 'half', must be a number",
-        "x.csv: column MAG of row 2 is '-', must be a number (1 more row)",
+        "x.csv: column Z of row 2 is 'half', but must be a number",
+        "x.csv: column MAG of row 2 is '-', but must be a number (1 more row)",
     ]
 
 
@@ -86,15 +87,16 @@ def test_an_ellipticity_without_an_axis_ratio_is_named(tmp_path):
     columns = {**table(3), "E1": np.array([0.1, 0.9, 0.6]), "E2": np.array([0.1, 0.0, 0.8])}
     shapes = {"e1": "E1", "e2": "E2", "ellipticity": "shear"}
     (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies(**shapes))
-    assert line == "0.parquet: column E1 and E2 (|e|) of row 3 is 1, must be at most 0.9608, for an axis ratio of 0.02"
+    said = "0.parquet: the ellipticity |e| from columns E1 and E2 of row 3 is 1, but must be at most 0.9608, for an axis "
+    assert line == f"{said}ratio of 0.02"
 
 
 def test_an_impossible_absolute_magnitude_is_named(tmp_path):
     """A galaxy of 29 mag at z = 0 would be fainter than any galaxy; the job that computes fluxes would refuse it."""
     columns = table(MAG=(2, 29.0), Z=(2, 0.0))
     (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies())
-    assert line.startswith("0.parquet: column MAG and Z (absolute magnitude) of row 2 is 6.")
-    assert line.endswith("must be in [-30, 5]")
+    assert line.startswith("0.parquet: the absolute magnitude from columns MAG and Z of row 2 is 6.")
+    assert line.endswith("must be from -30 to 5")
 
 
 def test_properties_of_a_whole_galaxy_become_those_of_its_components(tmp_path):
@@ -113,7 +115,9 @@ def test_a_table_is_checked_once(tmp_path, monkeypatch):
         context.setattr(reading, "read", lambda *arguments: pytest.fail("rows were read again"))
         ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
     written(tmp_path, table(), {**table(), "ID": np.arange(50) + 49})
-    with pytest.raises(BadInput, match=r"column ID: 49 is in row 1 of .*1\.parquet and in row 50 of .*0\.parquet"):
+    with pytest.raises(
+        BadInput, match=r"1\.parquet: column ID: the value 49 is in row 1 and in row 50 of .*0\.parquet"
+    ):
         ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos())
     written(tmp_path, table(0), table(0))
     with pytest.raises(BadInput, match="the table has no rows"):
@@ -150,3 +154,80 @@ def test_all_mistakes_of_a_mapping_are_reported_at_once():
     ]
     assert lines[0].startswith("ingest.galaxies.columns.mag.times is not one of column")
     assert lines[1].endswith("(did you mean bulge_fraction?)")
+
+
+def in_units(folder, **units):
+    """Return a Parquet file whose columns have units in their metadata."""
+    values = table(5)
+    fields = [
+        pa.field(name, pa.from_numpy_dtype(column.dtype), metadata={"unit": units[name]} if name in units else None)
+        for name, column in values.items()
+    ]
+    path = folder / "units.parquet"
+    pq.write_table(pa.table(values, schema=pa.schema(fields)), path)
+    return path, values
+
+
+SIZES = {**GALAXIES, "half_light_radius": "Z"}
+
+
+@pytest.mark.parametrize(
+    ("column", "unit", "key", "factor"),
+    [
+        ("Z", "arcmin", "disk_half_light_radius", 60.0),
+        ("Z", "mas", "disk_half_light_radius", 1e-3),
+        ("Z", "Arcsecs", "disk_half_light_radius", 1.0),
+        ("DEC", "arcmin", "dec", 1.0 / 60.0),
+        ("MAG", "mag(AB)", "mag", 1.0),
+        ("MAG", "--", "mag", 1.0),
+        ("ID", "count", "origin_id", 1.0),
+    ],
+)
+def test_stored_units_that_convert_are_converted(tmp_path, column, unit, key, factor):
+    path, values = in_units(tmp_path, **{column: unit})
+    entries = {**SIZES, "z_true": {"value": 0.5}}
+    (piece,) = reading.read([path], galaxies(entries))
+    assert piece.values[key] == pytest.approx(values[column] * factor, rel=1e-12, abs=0.0)
+
+
+def test_other_stored_units_are_refused_together(tmp_path):
+    path, _ = in_units(tmp_path, RA="pix", Z="kpc", MAG="uJy", M="pix")
+    entries = {**GALAXIES, "half_light_radius": "Z"}
+    assert mistakes(tmp_path, [path], galaxies(entries)) == [
+        "units.parquet: column RA (ra) has the unit pix, but must be in deg or a unit that converts to it",
+        "units.parquet: column Z (z_true) has the unit kpc, but must be a number without a unit",
+        "units.parquet: column MAG (mag) has the unit uJy, but must be in mag or a unit that converts to it",
+        "units.parquet: column Z (half_light_radius) has the unit kpc, but must be in arcsec or a unit that converts "
+        "to it",
+    ]
+
+
+def test_a_computed_column_is_not_converted(tmp_path):
+    path, values = in_units(tmp_path, Z="pix")
+    entries = {**SIZES, "z_true": {"value": 0.5}, "half_light_radius": {"column": "Z", "scale": 0.1}}
+    (piece,) = reading.read([path], galaxies(entries))
+    assert piece.values["disk_half_light_radius"] == pytest.approx(0.1 * values["Z"])
+
+
+@pytest.mark.parametrize(("shift", "hint"), [(100.0, False), (-53.0, True)])
+@pytest.mark.parametrize("kind", ["galaxies", "halos"])
+def test_a_catalogue_outside_the_area_is_refused(tmp_path, kind, shift, hint):
+    values = table()
+    values["RA"] += shift
+    values["DEC"] *= 0.02
+    files = written(tmp_path, values)
+    columns = galaxies() if kind == "galaxies" else halos()
+
+    def check(area):
+        files_and_sha256 = ingest.files_with_checksums(files, columns)
+        if kind == "halos":
+            return ingest.check_rows(*files_and_sha256, columns, area)
+        return ingest.check_area(ingest.split_by_cell(*files_and_sha256, columns), files, columns, area)
+
+    check(Area(ra=values["RA"][0], dec=values["DEC"][0], radius=0.1))
+    with pytest.raises(BadInput) as caught:
+        check(Area(ra=53.5, dec=-27.5, radius=0.2))
+    message = str(caught.value).replace(f"{tmp_path}/", "")
+    assert message.startswith("0.parquet: no row is in the area, the circle of 0.2 deg at ra 53.5, dec -27.5: the rows")
+    assert f"have RA from {values['RA'].min():g} to {values['RA'].max():g} and DEC from" in message
+    assert ("radians" in message) is hint
