@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from lake_schema.errors import BadInput
-from lake_schema.texts import spelling
+from lake_schema.texts import spelling, toml_mistakes
 
 _MB, _GB = 1 << 20, 1 << 30
 # Largest size in bytes of each type of file that a user can name. Catalogues are read in pieces; all other files must
@@ -277,11 +277,13 @@ def read_toml(path: Path, kind: str) -> dict[str, Any]:
 
     `kind` is the type of file, a key of `MAX_BYTES`, which determines the largest size.
     """
+    source = read_text(path, kind).replace("\r\n", "\n")
     try:
-        return parse_toml(read_text(path, kind).replace("\r\n", "\n"))
+        return parse_toml(source)
     except ValueError as error:
         # tomllib raises a ValueError for a syntax error and also for an invalid date.
-        raise BadInput(f"{format_path(path)}: {' '.join(str(error).split())}") from None
+        problem = toml_mistakes.explain(source, error)
+        raise BadInput(f"{format_path(path)}{' ' if problem.startswith('line ') else ': '}{problem}") from None
 
 
 def parse_toml(source: str) -> dict[str, Any]:

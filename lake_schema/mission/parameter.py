@@ -214,7 +214,8 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
         _check_unit(to, where)
     factor = _conversion_factor(unit, to)
     if factor is None:
-        raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}")
+        allowed = f"{to} or a unit that converts to it" if to else "empty, for a number without a unit"
+        raise BadInput(f"{where}: the unit must be {allowed}, got {unit or 'no unit'}")
     return value * factor
 
 

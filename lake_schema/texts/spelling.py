@@ -8,8 +8,11 @@ from collections.abc import Iterable, Sequence
 
 # Smallest similarity (0 to 1, by difflib) of a suggested name.
 _LEAST_SIMILARITY = 0.6
-# Largest number of names that are compared or listed, and the number of first names that stand for a longer list.
+# Largest number of names that are compared or listed, and the number of first names that stand for a longer list. After
+# a suggestion, a list of more than this number of names is left out.
 _MAX_COMPARED, _MAX_LISTED, _EXAMPLES = 10_000, 60, 8
+# Largest number of suggestions if the name is a part of several names.
+_MAX_WITH_PART = 3
 
 
 def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[str]:
@@ -35,9 +38,13 @@ def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[st
     if lower in by_lower_case:
         return [by_lower_case[lower]]
     similar = difflib.get_close_matches(lower, by_lower_case, count, _LEAST_SIMILARITY)
-    with_part = [other for other in by_lower_case if lower and lower in re.split("[-_.]", other)]
+    with_part = _names_with_part(lower, by_lower_case)
     without_marks = [other for other in by_lower_case if _letters(lower) and _letters(other) == _letters(lower)]
     return [by_lower_case[other] for other in dict.fromkeys((*without_marks, *with_part, *similar))][:count]
+
+
+def _names_with_part(lower: str, existing: Iterable[str]) -> list[str]:
+    return [other for other in existing if lower and lower in re.split("[-_.]", other)]
 
 
 def _letters(text: str) -> str:
@@ -54,14 +61,17 @@ def did_you_mean(name: str, existing: Iterable[str], count: int = 1) -> str:
     existing : iterable of str
         Names that exist.
     count : int, optional
-        Largest number of names to suggest.
+        Largest number of names to suggest. If the name is a part of several names, such as "NISP" of "NISP-P" and
+        "NISP-S", up to three are suggested.
 
     Returns
     -------
     str
         The question, without a blank at its end.
     """
-    names = closest_names(name, existing, count)
+    existing = list(existing)[:_MAX_COMPARED]
+    part_count = len(_names_with_part(name.lower(), [other.lower() for other in existing]))
+    names = closest_names(name, existing, max(count, min(part_count, _MAX_WITH_PART)))
     return f"did you mean {' or '.join(names)}?" if names else ""
 
 
@@ -79,7 +89,8 @@ def choices(name: str, existing: Sequence[str], count: int = 1) -> str:
     name : str
         A name that does not exist.
     existing : sequence of str
-        Names that exist. Of more than 60, only the first ones are listed.
+        Names that exist. Of more than 60, only the first ones are listed. After a suggestion, more than 8 names are not
+        listed.
     count : int, optional
         Largest number of names to suggest.
 
@@ -88,9 +99,11 @@ def choices(name: str, existing: Sequence[str], count: int = 1) -> str:
     str
         Text such as "did you mean des_r? allowed: des_g, des_r".
     """
+    suggestion = did_you_mean(name, existing, count)
+    if suggestion and len(existing) > _EXAMPLES:
+        return suggestion
     listed = ", ".join(existing if len(existing) <= _MAX_LISTED else existing[:_EXAMPLES])
     rest = f", ... ({len(existing)} names)" if len(existing) > _MAX_LISTED else ""
-    suggestion = did_you_mean(name, existing, count)
     return f"{suggestion} allowed: {listed}{rest}".strip()
 
 

@@ -39,6 +39,7 @@ from truesky.fluxes.sources import Stars
 from truesky.request.area import Area
 from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MAX_SHEAR
+from truesky.request.toml_values import refuse_name
 
 _POSITION = ("ra", "dec")
 # Properties of galaxies, and the default value of each one without a column; None if it is required. Units and frames
@@ -111,8 +112,7 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
         raise BadInput("sources: a table has changed since the job began")
     messages: list[str] = []
     if source_tables.band not in passbands.names():
-        allowed = f"{', '.join(passbands.names())}{spelling.suggestion(source_tables.band, passbands.names())}"
-        messages.append(f"sources.band = {source_tables.band!r} is not one of {allowed}")
+        messages.append(f"sources.band = {refuse_name(source_tables.band, passbands.names())}")
     tables = {}
     for name, file in (("galaxies", source_tables.galaxies), ("stars", source_tables.stars)):
         try:

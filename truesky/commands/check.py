@@ -13,10 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lake_schema import command, user_files
+from lake_schema import command
 from lake_schema.errors import BadInput, Mistakes
 from truesky.command_line import commands
-from truesky.request import checks, sky_notation
+from truesky.request import checks, request_lines, sky_notation
 from truesky.request.from_toml import ValidParts, read_file, read_valid_parts
 from truesky.request.schema import Request
 
@@ -46,7 +46,7 @@ def run_command(options: argparse.Namespace) -> int:
     try:
         request, cost = checked_request(read_valid_parts(table, path.resolve().parent), options.plan)
     except BadInput as error:
-        raise error.with_prefix(f"request {user_files.format_path(path)}") from None
+        raise request_lines.with_request_file(error, path) from None
     understood = list(sky_notation.understood_values(table))
     counts = {
         "pointings": len(request.pointings),

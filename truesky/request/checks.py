@@ -71,7 +71,7 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
     try:
         mission = resolve(ladder=choice.ladder, overrides=overrides, cameras=choice.cameras)
     except BadInput as error:
-        raise error.with_prefix("mission") from None
+        raise bad_input(_with_mission_key(message) for message in error.messages) from None
     with Mistakes() as mistakes:
         for i, camera in enumerate(choice.cameras):
             for fault in camera_faults(camera.name, mission):
@@ -79,6 +79,12 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
         for fault in ramp_faults(mission):
             mistakes.add(BadInput(f"mission: {fault}"))
     return mission
+
+
+def _with_mission_key(message: str) -> str:
+    """Return a message about the mission parameters with the key of the request at its start."""
+    override = "mission override "
+    return f"mission.overrides.{message[len(override) :]}" if message.startswith(override) else f"mission: {message}"
 
 
 def check_explored(explore: Sequence[tuple[str, Sequence[str]]], mission: MissionConfiguration) -> None:

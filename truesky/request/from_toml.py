@@ -98,7 +98,7 @@ from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import layout
 from truesky.request import area as areas
 from truesky.request import bands as request_bands
-from truesky.request import checks, files, lensing_resolution, structure
+from truesky.request import checks, files, lensing_resolution, request_lines, structure
 from truesky.request.accuracy import ALLOWED, SURVEY, Accuracy, fastest_row, preset
 from truesky.request.area import Area
 from truesky.request.exposures import observations, pointings
@@ -190,7 +190,7 @@ def parse(path: Path) -> Request:
     try:
         return parts.valid_request()
     except BadInput as error:
-        raise error.with_prefix(f"request {user_files.format_path(path)}") from None
+        raise request_lines.with_request_file(error, path) from None
 
 
 def read_file(path: Path) -> Toml:

@@ -10,7 +10,7 @@ from lake_schema.errors import Mistakes
 from truesky.request.files import UserSources
 from truesky.request.schema import EFFECTS, Stars, Universe
 from truesky.request.structure import Structure
-from truesky.request.toml_values import TOP_KEYS, Toml, check_keys, section
+from truesky.request.toml_values import LIST_KEYS, TOP_KEYS, Toml, check_keys, section
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -89,7 +89,7 @@ class RequestReader:
 
     def check_top_keys(self) -> None:
         """Check that the request has no unknown key outside sections."""
-        self.read("", check_keys, self.table, "", (*TOP_KEYS, "pointing", "observation", *_SECTIONS), _PLACES)
+        self.read("", check_keys, self.table, "", (*TOP_KEYS, *LIST_KEYS, *_SECTIONS), _PLACES)
 
     def messages(self) -> tuple[str, ...]:
         """Return the lines of all mistakes in the order of the file."""

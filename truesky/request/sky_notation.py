@@ -7,6 +7,7 @@ an MJD in UTC.
 
 from __future__ import annotations
 
+import calendar
 import math
 import re
 from collections.abc import Iterator
@@ -78,8 +79,20 @@ def _degrees(text: str, path: str, axis: str) -> float:
     try:
         degrees = float(Angle(text.strip(), unit=_SEXAGESIMAL_UNITS[axis]).deg)
     except ValueError:
-        raise problem from None
+        raise (_out_of_range(text, path, axis) or problem) from None
     return degrees
+
+
+def _out_of_range(text: str, path: str, axis: str) -> BadInput | None:
+    """Return an error about a sexagesimal text whose hours, minutes or seconds are out of range, else None."""
+    first, *minutes = map(float, re.findall(r"\d+(?:\.\d*)?", text))
+    value = f"{path} = {quote_value(text)}"
+    if any(number >= 60.0 for number in minutes):
+        return BadInput(f"{value}: minutes and seconds must be below 60")
+    if axis == "ra" and first >= 24.0:
+        degrees = first + sum(number / 60.0**power for power, number in enumerate(minutes, start=1))
+        return BadInput(f"{value} must be from 0 to 24 hours; if it is in degrees, write the number {degrees:.7g}")
+    return None
 
 
 def mjd(value: object, path: str) -> float:
@@ -108,7 +121,8 @@ def mjd(value: object, path: str) -> float:
         try:
             value = datetime.fromisoformat(value.strip())
         except ValueError:
-            raise BadInput(f"{path} = {quote_value(value)} must be {_FORMS['mjd']}") from None
+            problem = _no_such_day(value) or f" must be {_FORMS['mjd']}"
+            raise BadInput(f"{path} = {quote_value(value)}{problem}") from None
     if isinstance(value, date):
         return checked_number(_mjd_of_date(value), path, *MJD_LIMITS)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -116,6 +130,19 @@ def mjd(value: object, path: str) -> float:
     if MJD_LIMITS[0] <= value - 2_400_000.5 <= MJD_LIMITS[1]:
         raise BadInput(f"{path} = {value} is a Julian date: write the MJD {value - 2_400_000.5:.10g}")
     return checked_number(value, path, *MJD_LIMITS)
+
+
+def _no_such_day(text: str) -> str:
+    """Return the problem of a date whose month or day does not exist, or ""."""
+    date_match = re.match(r"(\d{4})-(\d\d)-(\d\d)(?!\d)", text.strip())
+    if date_match is None or not (year := int(date_match[1])):
+        return ""
+    month, day = int(date_match[2]), int(date_match[3])
+    if not 1 <= month <= 12:
+        return " is not a date: the month must be from 01 to 12"
+    if not 1 <= day <= (days := calendar.monthrange(year, month)[1]):
+        return f": there is no such day, {calendar.month_name[month]} {year} has {days} days"
+    return ""
 
 
 def _mjd_of_date(value: date) -> float:

@@ -16,6 +16,10 @@ from lake_schema.texts import spelling
 Toml = Mapping[str, Any]
 # Keys of a request that are in no section.
 TOP_KEYS = ("name", "seed", "noise_seed", "accuracy")
+# Keys of a request that are lists of tables.
+LIST_KEYS = ("pointing", "observation")
+# Largest number of allowed keys that are listed after a suggestion.
+_MAX_LISTED = 8
 _NO_PLACES: Mapping[str, str] = {}
 
 
@@ -52,14 +56,26 @@ def _hint(key: str, path: str, missing: Sequence[str], allowed: Sequence[str], p
         return "it belongs at the top of the file, before the first [section]; "
     if key in places:
         return f"it belongs in {places[key]}; "
-    suggestion = spelling.did_you_mean(key, missing) or spelling.did_you_mean(key, allowed)
-    return f"{suggestion} " if suggestion else ""
+    for names in (missing, allowed):
+        if similar := spelling.closest_names(key, names, 1):
+            listed = len(allowed) <= _MAX_LISTED
+            return f"did you mean {similar[0] if path else _as_written(similar[0])}?{' ' if listed else ''}"
+    return ""
+
+
+def _as_written(key: str) -> str:
+    """Return a key of the whole request as a user writes it: "seed", "[area]" or "[[pointing]]"."""
+    if key in TOP_KEYS:
+        return key
+    return f"[[{key}]]" if key in LIST_KEYS else f"[{key}]"
 
 
 def _describe_unknown(key: str, path: str, hint: str, allowed: Sequence[str]) -> str:
     printable_key = quote_value(key)[1:-1]
     key_path = f"{path}.{printable_key}" if path else printable_key
-    return f"{key_path} is not a key of a request: {hint}allowed here: {', '.join(allowed)}"
+    names = allowed if path else map(_as_written, allowed)
+    listed = "" if hint.endswith("?") else f"allowed here: {', '.join(names)}"
+    return f"{key_path} is not a key of a request: {hint}{listed}"
 
 
 def section(table: Toml, key: str, keys: Iterable[str] | None, places: Mapping[str, str] = _NO_PLACES) -> Toml:
@@ -223,8 +239,8 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
 
 def refuse_name(name: str, legal: Sequence[str]) -> str:
     """Return the end of an error message about a name: the most similar legal name, if any, and the legal names."""
-    if suggestion := spelling.did_you_mean(name, legal):
-        return f"{quote_value(name)} is not allowed: {suggestion} allowed: {', '.join(legal)}"
+    if spelling.did_you_mean(name, legal):
+        return f"{quote_value(name)} is not allowed: {spelling.choices(name, legal)}"
     return f"{quote_value(name)} is not one of {', '.join(legal)}"
 
 
@@ -353,12 +369,23 @@ def checked_number(value: object, path: str, lo: float, hi: float, unit: str = "
         If the number is outside its limits, NaN or infinite.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        hint = " in quotes" if isinstance(value, str) else ""
+        hint = _quotes_hint(value, path, float)
         raise BadInput(f"{path} must be {_describe_range(lo, hi, unit)}, got {quote_value(value)}{hint}")
     # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
     if not lo <= value <= hi or not math.isfinite(value):
         raise OutOfRange(path, quote_value(value), lo, hi)
     return float(value)
+
+
+def _quotes_hint(value: object, path: str, number_type: type[int] | type[float]) -> str:
+    """Return words about the quotes around a number, which a text has, or "" for another value."""
+    if not isinstance(value, str):
+        return ""
+    try:
+        number_type(value)
+    except ValueError:
+        return " in quotes"
+    return f" in quotes: write it without quotes, {path.rpartition('.')[2]} = {value[:40].strip()}"
 
 
 def _describe_range(lo: float, hi: float, unit: str) -> str:
@@ -397,7 +424,8 @@ def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None
         return default
     integer_value = required_value(table, path, f"it must be a whole number from {lo} to {hi}")
     if isinstance(integer_value, bool) or not isinstance(integer_value, int):
-        raise BadInput(f"{path} must be a whole number from {lo} to {hi}, got {quote_value(integer_value)}")
+        hint = _quotes_hint(integer_value, path, int)
+        raise BadInput(f"{path} must be a whole number from {lo} to {hi}, got {quote_value(integer_value)}{hint}")
     if not lo <= integer_value <= hi:
         raise OutOfRange(path, quote_value(integer_value), lo, hi)
     return integer_value

@@ -132,5 +132,5 @@ def test_a_ladder_without_a_needed_status_names_the_parameter():
 def test_an_unknown_name_is_refused():
     with pytest.raises(BadInput, match=r"vis\.psf"):
         resolve().value("vis.psf")
-    with pytest.raises(BadInput, match="does not convert"):
+    with pytest.raises(BadInput, match="the unit must be s or"):
         resolve().value("vis.gain", "s")

@@ -117,7 +117,7 @@ def test_names_in_only_one_configuration_are_listed():
     ("text", "words"),
     [
         ("[mission]\nladder = ['NEW']", "ladder"),
-        ("[mission]\noverrides = {'vis.gain' = {value = 3, unit = 's'}}", "does not convert"),
+        ("[mission]\noverrides = {'vis.gain' = {value = 3, unit = 's'}}", "the unit must be electron / adu or"),
         ("[mission]\noverrides = {'vis.gain' = 3}", "request"),
         ("mission = 3", "request"),
         ("[mission", "request"),

@@ -38,3 +38,9 @@ def test_a_suggestion_stands_before_the_allowed_names():
     assert spelling.choices("whatever", BANDS) == f"allowed: {', '.join(BANDS)}"
     many = [f"n{i:03}" for i in range(100)]
     assert spelling.choices("x", many).endswith("n007, ... (100 names)")
+    assert spelling.choices("n0001", many) == "did you mean n001?"
+
+
+def test_a_part_of_several_names_suggests_all_of_them():
+    assert spelling.did_you_mean("nisp", ("VIS", "NISP-P", "NISP-S")) == "did you mean NISP-P or NISP-S?"
+    assert spelling.did_you_mean("r", [f"survey{i}_r" for i in range(9)]).count(" or ") == 2

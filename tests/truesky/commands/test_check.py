@@ -69,7 +69,7 @@ def written(folder, text):
 
 
 def keys_of(lines):
-    return [re.match(r"truesky check: request \S+: ([\w.\[\]]+)", line)[1].rstrip(":") for line in lines]
+    return [re.match(r"truesky check: request \S+(?: line \d+)?: ([\w.\[\]]+)", line)[1].rstrip(":") for line in lines]
 
 
 def test_all_mistakes_are_reported_in_the_order_of_the_file(tmp_path, capsys):
@@ -80,7 +80,7 @@ def test_all_mistakes_are_reported_in_the_order_of_the_file(tmp_path, capsys):
     assert keys_of(lines) == KEYS
     suggestions = [match[1] for line in lines if (match := re.search(r"did you mean (\S+)\?", line))]
     assert suggestions == [
-        "name", "galaxy_limit", "euclid_vis", "3-4", "lsstcam", "lsst_r", "noise_free", "universe",
+        "name", "galaxy_limit", "euclid_vis", "3-4", "lsstcam", "lsst_r", "noise_free", "[universe]",
     ]  # fmt: skip
 
 

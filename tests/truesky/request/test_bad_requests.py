@@ -27,8 +27,8 @@ BLOCK = '[[observation]]\nchannels = ["VIS"]\n'
 BAD = {
     "empty": ("", "name is missing"),
     "no toml": ("<request/>", "line 1"),
-    "no end of a string": ('name = "x', "end of document"),
-    "the same key twice": ('name = "x"\n' + GOOD, "overwrite a value"),
+    "no end of a string": ('name = "x', 'line 1: the quote " is not closed'),
+    "the same key twice": ('name = "x"\n' + GOOD, "line 2: name is given twice, first in line 1"),
     "a million nested lists": ("x = " + "[" * 1_000_000, "x.toml: "),
     "ten megabytes": ("# " + "x" * 10_000_000, "larger than"),
     "zero bytes": ("\0" * 100, "line 1"),

@@ -166,8 +166,8 @@ def test_required_keys(key):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("name = ", "Invalid value"),
-        ("name = 'x'\nname = 'y'", "overwrite a value"),
+        ("name = ", "r.toml line 1: the value after the equals sign is missing"),
+        ("name = 'x'\nname = 'y'", "r.toml line 2: name is given twice, first in line 1"),
         ("\ud800", "surrogates|codec"),
         ("x = " + "[" * 100_000, "."),
         ("# " + "x" * 2_000_000, "larger than"),

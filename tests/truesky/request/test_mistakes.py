@@ -117,7 +117,7 @@ MISTAKES = {
         GROUND + 'dither = "S"\n', "observation[0].dither = 'S' is a Euclid pattern",
     ),
     "an offset of three numbers": (OWN + "dither = [[0, 0, 0]]\n", "observation[0].dither must be"),
-    "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: the pointing is 126."),
+    "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0].mjd: the pointing is 126."),
     "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
     "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT must be the only channel"),
     "no number of frames": (OWN + 'image_type = "bias"\n', "requires exposures"),
@@ -139,6 +139,12 @@ MISTAKES = {
 }  # fmt: skip
 TABLES = {
     "no declination": ("ra,mjd\n53.1,60905\n", "column dec is missing"),
+    "columns of other names": (
+        "RA,DEC,EXPTIME,FILTER\n53.1,-27.8,30,euclid_vis\n",
+        "p.csv: columns RA, DEC, EXPTIME, FILTER are unknown: did you mean ra, dec, exposure_time_s, band?",
+    ),
+    "a commented line of names": ("# ra,dec\n53.1,-27.8\n", "p.csv: the first line has numbers, but must have the"),
+    "semicolons": ("ra;dec\n53.1;-27.8\n", "p.csv: the columns are separated by semicolons"),
     "a column of no name": ("ra,dec,mjd,angle\n53.1,-27.8,60905,0\n", "column angle is unknown"),
     "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is not one of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
@@ -154,7 +160,7 @@ UNUSED = {
 }  # fmt: skip
 CASES |= {
     f"{key} of a table": (
-        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: used by "
+        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: keys for it "
     )
     for key, value in UNUSED.items()
 }  # fmt: skip

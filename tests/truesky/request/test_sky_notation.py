@@ -67,6 +67,36 @@ def test_wrong_dates_are_refused_with_their_key(value):
         sky_notation.mjd(value, "pointing[0].mjd")
 
 
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ("2027-02-30", ": there is no such day, February 2027 has 28 days"),
+        ("2027-04-31T12:00:00", ": there is no such day, April 2027 has 30 days"),
+        ("2027-13-01", " is not a date: the month must be from 01 to 12"),
+        ("2027-01-01T25:00:00", " must be a number (MJD, UTC), or a date"),
+    ],
+)
+def test_days_that_do_not_exist_are_explained(value, problem):
+    with pytest.raises(BadInput) as caught:
+        sky_notation.mjd(value, "mjd")
+    assert str(caught.value).startswith(f"mjd = '{value}'{problem}")
+
+
+@pytest.mark.parametrize(
+    ("axis", "value", "problem"),
+    [
+        ("ra", "53:07:30", "must be from 0 to 24 hours; if it is in degrees, write the number 53.125"),
+        ("ra", "03:72:30", "minutes and seconds must be below 60"),
+        ("dec", "-27:61:30", "minutes and seconds must be below 60"),
+    ],
+)
+def test_hours_and_minutes_out_of_range_are_explained(axis, value, problem):
+    with pytest.raises(BadInput) as caught:
+        sky_notation.angle(value, axis, axis, sky_notation.RA_LIMITS)
+    assert str(caught.value).startswith(f"{axis} = '{value}'")
+    assert str(caught.value).endswith(problem)
+
+
 def test_dates_agree_with_astropy():
     from astropy.time import Time
 

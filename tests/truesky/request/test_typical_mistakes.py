@@ -39,7 +39,12 @@ MISTAKES = {
     "no name": (changed('name = "x"\n', ""), "name is missing", "text in quotes"),
     "a name with blanks": (changed('"x"', '"My Field"'), "name = 'My Field'", "small letters, digits"),
     "no seed": (changed("seed = 1\n", ""), "seed is missing", "a whole number from 0"),
-    "a seed of text": (changed("seed = 1", 'seed = "1"'), "seed must be a whole number", "from 0 to"),
+    "a seed of text": (
+        changed("seed = 1", 'seed = "1"'),
+        "seed must be a whole number",
+        "write it without quotes, seed = 1",
+    ),
+    "pointings": (changed("[[pointing]]", "[[pointings]]"), "pointings is not a key", "did you mean [[pointing]]?"),
     "a negative seed": (changed("seed = 1", "seed = -1"), "seed = -1", "[0, 9223372036854775807]"),
     "noise seed": ("noiseseed = 1\n" + GOOD, "noiseseed is not a key", "did you mean noise_seed?"),
     "one number for the accuracy": (
@@ -52,6 +57,7 @@ MISTAKES = {
     "no area": (HEAD + POINT, "area must have exactly one of polygon, cone", "such as cone = { ra = 150.1"),
     "two areas": (changed("0.2 }", "0.2 }\ntile = 3"), "area must have exactly one", "it has cone, tile"),
     "a radius in arcmin": (changed("0.2 }", '"12 arcmin" }'), "area.cone.radius", "a number from 0 to 180 deg"),
+    "a radius in quotes": (changed("0.2 }", '"0.2" }'), "area.cone.radius", "write it without quotes, radius = 0.2"),
     "a radius above 180": (changed("0.2 }", "500 }"), "area.cone.radius = 500", "[0.0, 180.0]"),
     "no radius": (changed(", radius = 0.2", ""), "area.cone.radius is missing", "a number from 0 to 180 deg"),
     "rad": (changed("radius", "rad"), "area.cone.rad is not a key", "did you mean radius?"),
@@ -80,7 +86,7 @@ MISTAKES = {
     ),
     "too deep": (section("universe", "galaxy_limit = 99"), "universe.galaxy_limit = 99", "[10.0, 30.0]"),
     "a key above its section": ("galaxy_limit = 25\n" + GOOD, "galaxy_limit is not a key", "it belongs in [universe]"),
-    "a section in capitals": (section("Universe", "z_max = 2.0"), "Universe is not a key", "did you mean universe?"),
+    "a section in capitals": (section("Universe", "z_max = 2.0"), "Universe is not a key", "did you mean [universe]?"),
     "a box of another size": (section("universe", "box_cells = 200"), "universe.box_cells = 200", "192, 256, 384"),
     "lensing on": (section("universe", "lensing = true"), "universe.lensing", '"box", "none" or a table such as'),
     "one bracket": (
@@ -104,7 +110,7 @@ MISTAKES = {
         "pointing[0].channel",
         "did you mean VIS? allowed: VIS, NISP-P",
     ),
-    "half a channel": (changed('"VIS"', '"NISP"'), "pointing[0].channel", "did you mean NISP-P?"),
+    "half a channel": (changed('"VIS"', '"NISP"'), "pointing[0].channel", "did you mean NISP-P or NISP-S?"),
     "a detector of another name": (changed('"3-4"', '"CCD_7"'), "pointing[0].detectors", "allowed: 1-1, 1-2, 1-3"),
     "a detector misspelt": (changed('"3-4"', '"3_4"'), "pointing[0].detectors", "did you mean 3-4?"),
     "one detector": (changed('["3-4"]', '"3-4"'), "pointing[0].detectors", "a list of texts such as ['3-4']"),
@@ -146,7 +152,11 @@ MISTAKES = {
     ),
     "one band": (GROUND + 'bands = "lsst_r"\n', "observation[0].bands", "such as ['lsst_r']"),
     "a number of dithers": (EUCLID + "dither = 4\n", "observation[0].dither = 4", "S, J, none or a list of offsets"),
-    "exposures of a Euclid field": (EUCLID + "exposures = 3\n", "observation[0].exposures", "used by a ground survey"),
+    "exposures of a Euclid field": (
+        EUCLID + "exposures = 3\n",
+        "observation[0].exposures",
+        "keys for it are visits, dither",
+    ),
     "a detector of NISP": (EUCLID + 'detectors = ["DET22"]\n', "observation[0].detectors", "allowed: 1-1, 1-2"),
     "no file": (
         changed("ra = 53.117\ndec = -27.808\n", 'pointings = "q.csv"\n', EUCLID),
@@ -160,7 +170,7 @@ MISTAKES = {
     "an effect as key": (section("effects", "cosmic_rays = false"), "effects.cosmic_rays", "the lists on and off"),
     "a parameter misspelt": (
         section("mission.overrides", '"vis.gian" = { value = 3.0, unit = "" }'),
-        "override vis.gian",
+        "mission.overrides.vis.gian",
         "did you mean vis.gain?",
     ),
     "a parameter without a unit": (
@@ -175,8 +185,8 @@ MISTAKES = {
     ),
     "a wrong unit": (
         section("mission.overrides", '"vis.gain" = { value = 3.0, unit = "mm" }'),
-        "override vis.gain",
-        "to electron / adu",
+        "mission.overrides.vis.gain: the unit must be electron / adu",
+        "got mm",
     ),
     "a list of values": (
         section("explore", '"vis.gain" = [3.0, 3.5]'),
@@ -198,6 +208,26 @@ def test_one_line_names_the_key_and_the_remedy(tmp_path, text, key, remedy):
     assert key in line
     assert remedy in line
     assert len(line) <= 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (
+            section("effects", 'off = ["cosmic rays"]'),
+            "effects.off: 'cosmic rays' is not allowed: did you mean cosmic_rays?",
+        ),
+        (section("univers", "z_max = 2.0"), "univers is not a key of a request: did you mean [universe]?"),
+        (
+            changed('["3-4"]', '["3-7"]'),
+            "pointing[0].detectors: camera vis has no detector '3-7': did you mean 3-6 or 3-5",
+        ),
+    ],
+)
+def test_after_a_suggestion_long_lists_are_left_out(tmp_path, text, line):
+    (message,) = read_valid_parts(tomllib.loads(text), tmp_path).messages
+    assert message.startswith(line)
+    assert message.endswith("?")
 
 
 def test_there_are_more_than_60_mistakes():

@@ -198,12 +198,12 @@ def _outside_area(
     limits: Sequence[tuple[float, float]],
     area: Area,
 ) -> BadInput:
-    """Return the error about a catalogue without rows in the area; `limits` are those of its positions (deg)."""
+    """Return the error about a catalogue without rows in the area; `limits` are the ranges of its positions (deg)."""
     titles = [reading.column_titles(columns, key) for key in keys]
     ranges = " and ".join(f"{title} from {lo:g} to {hi:g}" for title, (lo, hi) in zip(titles, limits, strict=True))
     hint = radians_hint(*(max(map(abs, pair)) for pair in limits))
-    others = f" and {len(files) - 1} other file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
-    place = f"{user_files.format_path(files[0])}{others}"
+    more_files = f" and {len(files) - 1} more file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
+    place = f"{user_files.format_path(files[0])}{more_files}"
     return BadInput(f"{place}: no row is in the area, {area.describe()}: the rows have {ranges} deg{hint}")
 
 

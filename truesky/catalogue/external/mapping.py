@@ -266,7 +266,7 @@ def parse_columns(
     fields = {}
     for key, entry in entries.items():
         if key not in legal:
-            messages.append(f"{path}.{key} is not one of {', '.join(legal)}{spelling.suggestion(key, legal)}")
+            messages.append(f"{path}.{key} is not a known property: {spelling.choices(key, list(legal))}")
         elif key not in legal_settings:
             try:
                 fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
@@ -385,7 +385,10 @@ def _wrong_settings(settings: Mapping[str, Any], path: str) -> list[str]:
     for key, value in settings.items():
         if key in choices:
             wrong = value not in choices[key]
-            allowed = f"one of {', '.join(choices[key])}{spelling.suggestion(str(value), choices[key])}"
+            allowed = f"one of {', '.join(choices[key])}"
+            if (hint := spelling.suggestion(str(value), choices[key])) and key == "band":
+                # A suggestion replaces the list, because there are many passbands.
+                allowed = f"the name of a passband{hint}"
         elif key == "beside":
             wrong = not (isinstance(value, list) and len(value) == 2 and all(isinstance(text, str) for text in value))
             allowed = "the beginnings of two file names"

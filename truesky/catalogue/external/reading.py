@@ -130,7 +130,7 @@ def _with_present_columns(file: Path, columns: Columns, kind: str) -> Columns:
 
 
 def _with_stored_units(piece: RowBatch, columns: Columns) -> Columns:
-    """Return a mapping that converts the units of a file to those of the properties.
+    """Return a mapping that converts the units of a file to the units of the properties.
 
     Raises BadInput if a unit does not convert, or if it is not the unit that the mapping states.
     """

@@ -81,7 +81,7 @@ def check_columns(columns: Mapping[str, str]) -> None:
     """
     path = "stars.catalogue.columns"
     messages = [
-        f"{path}.{key} is not one of {', '.join(KEYS)}{spelling.suggestion(key, KEYS)}"
+        f"{path}.{key} is not a known property: {spelling.choices(key, list(KEYS))}"
         for key in columns
         if key not in KEYS
     ]

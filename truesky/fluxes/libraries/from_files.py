@@ -261,7 +261,10 @@ def check_curve(path: Path, wavelength: Float, value: Float, form: Mapping[str, 
     )
     steps = np.diff(wavelength)
     _refuse(path, np.append(False, steps == 0.0), "repeats the wavelength")
-    _refuse(path, np.append(False, steps < 0.0), "goes back in wavelength")
+    for row in np.flatnonzero(steps < 0.0)[:1].tolist():
+        first, second = wavelength[row : row + 2].tolist()
+        problem = f"wavelengths must increase, but row {row + 2} has {second:g} after {first:g} (A)"
+        raise BadInput(f"{path}: {problem}")
     _refuse(path, value < 0.0, "is negative")
     if not value.any():
         raise BadInput(f"{path}: all values are 0")

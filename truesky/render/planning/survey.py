@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.errors import BadInput, Mistakes
+from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.texts import spelling
 from truesky.randomness import rng
 from truesky.render.camera import detectors
 from truesky.render.camera.pointing import boresight_for
@@ -42,6 +43,8 @@ from truesky.request.exposures.pointings import Pointing
 from truesky.request.instruments import check_band, check_detectors
 from truesky.request.schema import Request
 
+# Keys of an observation with which a message about it may begin.
+_KEY_STARTS = ("mjd:", "detectors:", "pointings:", "pointings[")
 # Names of the Euclid Deep Fields.
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
 # Image types of calibrations, whose exposures the module `calibration_frames` plans.
@@ -186,8 +189,8 @@ def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[Exp
         bands = {exposure.band for block in blocks for exposure in block.base_exposures}
         for band in dict.fromkeys(band for band, _ in request.psfs):
             if band not in bands:
-                taken = ", ".join(sorted(bands))
-                mistakes.add(BadInput(f"psf.{band}: no exposure is taken in this band; exposures are in {taken}"))
+                problem = f"psf.{band}: no exposure is taken in a band of this name"
+                mistakes.add(BadInput(f"{problem}: {spelling.choices(band, sorted(bands))}"))
     return blocks
 
 
@@ -385,7 +388,9 @@ def _schedule_block(
                 check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
         return scheduled
     except BadInput as error:
-        raise error.with_prefix(where) from None
+        # A message that begins with a key of the observation continues its path.
+        paths = (f"{where}{'.' if message.startswith(_KEY_STARTS) else ': '}{message}" for message in error.messages)
+        raise bad_input(paths) from None
 
 
 def _first_visits(fields: Sequence[reference_survey.Field]) -> Iterator[reference_survey.Field]:

@@ -473,7 +473,15 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
             used_by = _BLOCKS_OF_KEY.get(key, (kind,))
             allowed_channels = _CHANNELS_OF_KEY.get(key, channels)
             if kind not in used_by and not (ground and key == "survey"):
-                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(used_by)}"))
+                keys = [
+                    other
+                    for other, kinds in _BLOCKS_OF_KEY.items()
+                    if kind in kinds
+                    and {*_CHANNELS_OF_KEY.get(other, channels)} & {*channels}
+                    and image_type in _TYPES_OF_KEY.get(other, (image_type,))
+                ]
+                usable = ", ".join([*keys, "realisations"])
+                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: keys for it are {usable}"))
             elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):
                 mistakes.add(BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(types)}"))
             elif not {*allowed_channels} & {*channels}:

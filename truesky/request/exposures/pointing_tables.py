@@ -248,7 +248,7 @@ def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -
 
 
 def _similar_name(name: str) -> str:
-    """Return the name of the column that a user may have meant by an unknown name, "" if there is none."""
+    """Return the name of the column that a user may have meant by an unknown name, or ""."""
     return _OTHER_NAMES.get(name.strip().lower()) or "".join(spelling.closest_names(name, _NAMES, 1))
 
 

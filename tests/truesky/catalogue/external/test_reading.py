@@ -87,8 +87,8 @@ def test_an_ellipticity_without_an_axis_ratio_is_named(tmp_path):
     columns = {**table(3), "E1": np.array([0.1, 0.9, 0.6]), "E2": np.array([0.1, 0.0, 0.8])}
     shapes = {"e1": "E1", "e2": "E2", "ellipticity": "shear"}
     (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies(**shapes))
-    said = "0.parquet: the ellipticity |e| from columns E1 and E2 of row 3 is 1, but must be at most 0.9608, for an axis "
-    assert line == f"{said}ratio of 0.02"
+    said = "0.parquet: the ellipticity |e| from columns E1 and E2 of row 3 is 1, but must be at most 0.9608, for an "
+    assert line == f"{said}axis ratio of 0.02"
 
 
 def test_an_impossible_absolute_magnitude_is_named(tmp_path):
@@ -130,7 +130,7 @@ def test_a_table_is_checked_once(tmp_path, monkeypatch):
         ({"origin_id": "", "beside": ["a", "b"]}, "beside requires origin_id"),
         ({"a_v": {"column": "AV", "beside": True}}, "columns.a_v: beside = true requires the setting beside"),
         ({"beside": "a"}, "columns.beside = 'a' must be the beginnings of two file names"),
-        ({"band": "euclid_viz"}, r"band = 'euclid_viz' must be one of .* \(did you mean euclid_vis\?\)"),
+        ({"band": "euclid_viz"}, r"band = 'euclid_viz' must be the name of a passband \(did you mean euclid_vis\?\)"),
         ({"band": ""}, "mag requires band"),
         ({"seen_over_v": True}, "seen_over_v = True must be a number"),
         ({"lines_magnified": 1}, "lines_magnified = 1 must be true or false"),
@@ -153,7 +153,7 @@ def test_all_mistakes_of_a_mapping_are_reported_at_once():
         ": kappa requires gamma2",
     ]
     assert lines[0].startswith("ingest.galaxies.columns.mag.times is not one of column")
-    assert lines[1].endswith("(did you mean bulge_fraction?)")
+    assert lines[1].endswith("did you mean bulge_fraction?")
 
 
 def in_units(folder, **units):

@@ -108,9 +108,9 @@ def broken(name):
     ("name", "message"),
     [
         ("one row", "a curve must have at least 2 rows, got 1"),
-        ("unsorted", "row 42 goes back in wavelength"),
+        ("unsorted", "wavelengths must increase, but row 42 has "),
         ("repeated", "row 42 repeats the wavelength"),
-        ("descending", "row 2 goes back"),
+        ("descending", "wavelengths must increase, but row 2 has "),
         ("negative", "row 8 is negative"),
         ("zero", "all values are 0"),
         ("nan", "row 4 is not a number"),
