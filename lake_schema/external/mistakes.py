@@ -144,5 +144,18 @@ def format_number(value: float) -> str:
 
 
 def format_range(low: float, high: float, unit: str = "") -> str:
-    """Return the allowed range of a number for an error message, such as "a number from -90 to 90 deg"."""
+    """Return the allowed range of a number for an error message.
+
+    Parameters
+    ----------
+    low, high : float
+        Smallest and largest number that is allowed.
+    unit : str, optional
+        Unit of the number.
+
+    Returns
+    -------
+    str
+        Text such as "a number from -90 to 90 deg".
+    """
     return f"a number from {low:g} to {high:g}{' ' if unit else ''}{unit}"

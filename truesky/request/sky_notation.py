@@ -118,11 +118,12 @@ def mjd(value: object, path: str) -> float:
         If the date is before 1968 or after 2132.
     """
     if isinstance(value, str):
+        text = value.strip()
         try:
-            value = datetime.fromisoformat(value.strip())
+            value = datetime.fromisoformat(text)
         except ValueError:
-            problem = _no_such_day(value) or f" must be {_FORMS['mjd']}"
-            raise BadInput(f"{path} = {quote_value(value)}{problem}") from None
+            problem = _no_such_day(text) or f" must be {_FORMS['mjd']}"
+            raise BadInput(f"{path} = {quote_value(text)}{problem}") from None
     if isinstance(value, date):
         return checked_number(_mjd_of_date(value), path, *MJD_LIMITS)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -134,7 +135,7 @@ def mjd(value: object, path: str) -> float:
 
 def _no_such_day(text: str) -> str:
     """Return the problem of a date whose month or day does not exist, or ""."""
-    date_match = re.match(r"(\d{4})-(\d\d)-(\d\d)(?!\d)", text.strip())
+    date_match = re.match(r"(\d{4})-(\d\d)-(\d\d)(?!\d)", text)
     if date_match is None or not (year := int(date_match[1])):
         return ""
     month, day = int(date_match[2]), int(date_match[3])

@@ -160,7 +160,7 @@ UNUSED = {
 }  # fmt: skip
 CASES |= {
     f"{key} of a table": (
-        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: keys for it "
+        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: its "
     )
     for key, value in UNUSED.items()
 }  # fmt: skip

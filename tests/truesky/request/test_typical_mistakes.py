@@ -155,7 +155,7 @@ MISTAKES = {
     "exposures of a Euclid field": (
         EUCLID + "exposures = 3\n",
         "observation[0].exposures",
-        "keys for it are visits, dither",
+        "its keys are visits, dither",
     ),
     "a detector of NISP": (EUCLID + 'detectors = ["DET22"]\n', "observation[0].detectors", "allowed: 1-1, 1-2"),
     "no file": (

@@ -156,7 +156,7 @@ def radians_hint(largest_ra: float, largest_dec: float) -> str:
 
 
 def check_area(split: Split, files: Sequence[Path], columns: Columns, area: Area) -> None:
-    """Raise BadInput if a stored catalogue has no galaxy in the area of a request.
+    """Check that a stored catalogue has a galaxy in the area of a request.
 
     Parameters
     ----------
@@ -168,6 +168,11 @@ def check_area(split: Split, files: Sequence[Path], columns: Columns, area: Area
         Mapping from the columns of the files to the properties of galaxies.
     area : Area
         Area of the request. Galaxies in the order-8 cells that it touches are used.
+
+    Raises
+    ------
+    BadInput
+        If no galaxy is in the area. The message names the file, the area and the range of the positions.
     """
     pieces = [name for name in sorted(split.checksums) if name.endswith(".arrow")]
     cells = np.asarray(area.cells(GENERATION_ORDER), np.int64)

@@ -470,23 +470,15 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
     kind = _block_kind(table, ground, image_type)
     with Mistakes() as mistakes:
         for key in table:
-            used_by = _BLOCKS_OF_KEY.get(key, (kind,))
-            allowed_channels = _CHANNELS_OF_KEY.get(key, channels)
-            if kind not in used_by and not (ground and key == "survey"):
-                keys = [
-                    other
-                    for other, kinds in _BLOCKS_OF_KEY.items()
-                    if kind in kinds
-                    and {*_CHANNELS_OF_KEY.get(other, channels)} & {*channels}
-                    and image_type in _TYPES_OF_KEY.get(other, (image_type,))
-                ]
-                usable = ", ".join([*keys, "realisations"])
-                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: keys for it are {usable}"))
+            if kind not in _BLOCKS_OF_KEY.get(key, (kind,)) and not (ground and key == "survey"):
+                useless = {other for other, users in _CHANNELS_OF_KEY.items() if not {*users} & {*channels}}
+                useless |= {other for other, types in _TYPES_OF_KEY.items() if image_type not in types}
+                keys = [other for other, kinds in _BLOCKS_OF_KEY.items() if kind in kinds and other not in useless]
+                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: its keys are {', '.join(keys)}, realisations"))
             elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):
                 mistakes.add(BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(types)}"))
-            elif not {*allowed_channels} & {*channels}:
-                problem = f"{path}.{key} is not for {', '.join(channels)}"
-                mistakes.add(BadInput(f"{problem}: used by {', '.join(allowed_channels)}"))
+            elif not {*(users := _CHANNELS_OF_KEY.get(key, channels))} & {*channels}:
+                mistakes.add(BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(users)}"))
 
 
 def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
