@@ -201,7 +201,7 @@ def test_a_request_with_invalid_content_is_refused(tmp_path, capsys, call):
             continue
         path = tmp_path / "r.toml"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        assert "r.toml: " in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new")), name
+        assert "r.toml" in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new")), name
 
 
 @pytest.mark.parametrize("call", OF_TARGET.values(), ids=OF_TARGET)

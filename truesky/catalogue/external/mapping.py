@@ -385,8 +385,9 @@ def _wrong_settings(settings: Mapping[str, Any], path: str) -> list[str]:
     for key, value in settings.items():
         if key in choices:
             wrong = value not in choices[key]
-            allowed = f"one of {', '.join(choices[key])}"
-            if (hint := spelling.suggestion(str(value), choices[key])) and key == "band":
+            hint = spelling.suggestion(str(value), choices[key])
+            allowed = f"one of {', '.join(choices[key])}{hint}"
+            if key == "band" and hint:
                 # A suggestion replaces the list, because there are many passbands.
                 allowed = f"the name of a passband{hint}"
         elif key == "beside":

@@ -81,8 +81,8 @@ def test_comma_separated_and_fits_tables_give_the_same_stars(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("3.763", "9.999"), r"LTef \(log_teff\) of row 1 is 9.999, must be in \[2.4, 5\]$"),
-        (("12.005", "nan   "), r"H \(mag_h_seen\) of row 1 is nan"),
+        (("3.763", "9.999"), r"LTef \(log_teff\) of row 1 is 9.999, but must be a number from 2.4 to 5$"),
+        (("12.005", "nan   "), r"H \(mag_h_seen\) of row 1 is NaN"),
         (("18.020", "18.x20"), r"H of row 2 is '18.x20', must be a number"),
         (("  Dist ", "  Far  "), "lines has the columns"),
         (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines has the columns"),

@@ -44,7 +44,7 @@ def test_a_line_is_an_exposure(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "column ra is missing"),
+        ("", "columns ra, dec are missing"),
         (HEAD.replace(",dec", "") + "\n", "column dec is missing"),
         (f"{HEAD},colour\n{ROW},red\n", "column colour is unknown"),
         (f"# one\n# two\n{HEAD}\n{ROW}\n{ROW.replace('20.5', 'x')}\n", "line 5: dec = 'x' must be a number in degrees"),

@@ -151,9 +151,9 @@ def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"lat": [0.0, 91.0]}, r"lat of row 2 is 91, must be in \[-90, 90\]$"),
-        ({"mag": [np.nan, 20.0]}, r"mag of row 1 is nan, must be in"),
-        ({"mjd": [-1.0, 2.0]}, r"mjd of row 1 is -1, must be in"),
+        ({"lat": [0.0, 91.0]}, r"lat of row 2 is 91, but must be a number from -90 to 90$"),
+        ({"mag": [np.nan, 20.0]}, r"mag of row 1 is NaN, but must be a number from"),
+        ({"mjd": [-1.0, 2.0]}, r"mjd of row 1 is -1, but must be a number from"),
         ({"north": None}, r"has no column north; it has mjd, lon, lat, east, mag"),
     ],
 )
@@ -164,7 +164,7 @@ def test_what_is_wrong_is_said_in_a_line(tmp_path, kind, change, said):
     file = written(tmp_path / f"bodies.{kind}", values)
     with pytest.raises(BadInput, match=said) as caught:
         ephemerides.read(file, "bad")
-    assert str(caught.value).startswith(f"{file}: ")
+    assert str(caught.value).startswith((f"{file}: ", f"{file} has"))
     assert "\n" not in str(caught.value)
 
 
