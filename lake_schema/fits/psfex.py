@@ -15,7 +15,13 @@ from lake_schema.fits import write as fits_file
 
 
 def write(
-    path: Path, planes: Float32, step: float, fwhm: float, centre: tuple[float, float], scale: tuple[float, float]
+    path: Path,
+    planes: Float32,
+    step: float,
+    fwhm: float,
+    centre: tuple[float, float],
+    scale: tuple[float, float],
+    light: float,
 ) -> None:
     """Write a PSF model to a PSFEx file, which is replaced in one rename.
 
@@ -34,6 +40,9 @@ def write(
         Column and row of the detector at which x = y = 0, in pixels; the centre of the first pixel is 1.
     scale : tuple of (float, float)
         Number of columns that correspond to x = 1, and of rows that correspond to y = 1.
+    light : float
+        Fraction of a star's light that the PSF at x = y = 0 contains, for the header card PSFLIGHT. PSFEx has no such
+        card, and programs that do not know it ignore it.
 
     Raises
     ------
@@ -58,6 +67,7 @@ def write(
     table.header["POLDEG1"] = (degree, "degree of the polynomials")
     table.header["PSF_FWHM"] = (fwhm, "[pix] FWHM of a star")
     table.header["PSF_SAMP"] = (step, "[pix] sampling step of the PSF")
+    table.header["PSFLIGHT"] = (light, "fraction of a star's light in PSF_MASK")
     table.header["PSFNAXIS"] = (3, "number of axes of PSF_MASK")
     for number, length in enumerate((side, side, len(planes)), start=1):
         table.header[f"PSFAXIS{number}"] = length

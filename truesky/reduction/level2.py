@@ -23,6 +23,7 @@ from truesky.reduction.calibration import ReducedImage
 from truesky.reduction.catalogue import Limits
 from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry
+from truesky.render.channels import registry
 from truesky.render.products import head_files
 
 # Default diameter of the aperture of MAG_APER, as a multiple of the FWHM of the PSF.
@@ -57,17 +58,17 @@ class CatalogueSettings:
 
 
 def check_psfs(frames: Sequence[Frame]) -> None:
-    """Check that the lake has a PSF file for every frame; raises BadInput for the first frame without one.
+    """Check that all frames are of ground cameras and have a PSF file in the lake; call this before files are written.
 
-    Call this before files are written. Usually only images of ground cameras have a PSF file.
+    BadInput is raised for the first frame of another camera or without a PSF file.
     """
     for frame in frames:
         _psf_file(frame)
 
 
 def _psf_file(frame: Frame) -> Path:
-    if frame.psf is None:
-        problem = f"the lake has no PSF for the image {frame.stem}"
+    if frame.psf is None or not registry.CHANNELS[frame.exposure.channel].on_ground:
+        problem = f"the lake has no PSF of a ground camera for the image {frame.stem}"
         raise BadInput(f"--level2: {problem}: choose images of ground cameras with --exposures")
     return frame.psf
 

@@ -107,7 +107,7 @@ def render_task(lake: Path, facts: Json) -> Output:
     spectra = truth_table.spectra(rendered)
     if spectra is not None:
         files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
-    if aim.channel.on_ground and rendered.psf is not None:
+    if rendered.psf is not None and aim.channel.dispersion is None:
         model, exposure = rendered.psf, aim.exposure
         psf_path = psf_file(exposure.exposure_id, exposure.channel, exposure.band, aim.detector.name)
         files[psf_path] = lambda path: to_psfex.write(model, aim.detector, path)

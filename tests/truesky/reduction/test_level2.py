@@ -20,6 +20,7 @@ from lake_schema.ids import kind_from_id
 from lake_schema.store import layout, publish, read
 from tests import requests
 from tests.truesky.reduction import ground_frames
+from tests.truesky.render import fields
 from tests.truesky.render.products import test_tools
 from tests.truesky.render.test_render_exposures_calibration import MODULES
 from truesky.reduction import calibration, files, masters, reduce, stack
@@ -304,8 +305,9 @@ def test_what_makes_no_level2_is_refused_in_a_line(jpcam, tmp_path, capsys, more
     assert not out.exists() or not list(out.iterdir())
 
 
-def test_without_a_psf_nothing_is_written(jpcam, tmp_path, capsys):
-    ground = replace(jpcam.ground, frame=replace(jpcam.ground.frame, psf=None))
+@pytest.mark.parametrize("change", [{"psf": None}, {"exposure": fields.exposure(channel="VIS")}])
+def test_without_a_psf_of_a_ground_camera_nothing_is_written(jpcam, tmp_path, capsys, change):
+    ground = replace(jpcam.ground, frame=replace(jpcam.ground.frame, **change))
     reduced(ground, tmp_path / "out", "--level2", wanted=2)
     said = capsys.readouterr().err
     assert ("choose images of ground cameras" in said, said.count("\n")) == (True, 1), said

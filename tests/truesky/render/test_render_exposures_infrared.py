@@ -1,5 +1,7 @@
 """All image types of NISP-P, made by the jobs: a star of AB 0, its persistence for an hour, and calibrations."""
 
+import galsim
+import galsim.des
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -109,6 +111,20 @@ def check(root):
         set(opened(root, "saturation")) == set(opened(root, "persistence")) == set(opened(root, "ramp")) == set(files)
     )
     check_persistence(root, files)
+    # Images of the sky have a file with the PSF.
+    psfs = {path.parent.name: path for path in psf_files(root)}
+    assert sorted(psfs) == ["000001", "000007"]
+    model = galsim.des.DES_PSFEx(str(psfs["000007"])).getPSF(galsim.PositionD(100.0, 100.0))
+    with fits.open(files[7]) as units:
+        assert 0.3 * model.calculateFWHM() == pytest.approx(units[0].header["PSFFWHM"], rel=0.05)
+    assert psfs["000007"].name == "NISP-P_euclid_j_DET22.psf"
+
+
+def psf_files(root):
+    """Return the paths of the PSF files of all images."""
+    version = read.version(root, "products")
+    files = [entry["path"] for entry in version.manifest["files"]]
+    return [version.sidecar_path(path) for path in files if path.endswith(".psf")]
 
 
 def check_persistence(root, files):

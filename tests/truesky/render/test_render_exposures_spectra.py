@@ -132,6 +132,8 @@ def check(root):
     assert set(opened(root, "order_1")) == set(files) - {6, 7}
     spectra = read.version(root, "rendered_spectra").rows().to_pylist()
     assert {row["exposure_id"] for row in spectra} == set(files) - {6, 7}
+    # The PSF of a spectrum changes along it, so there is no file with one PSF.
+    assert not [e for e in read.version(root, "products").manifest["files"] if e["path"].endswith(".psf")]
 
 
 def test_each_kind_is_planned_rendered_and_published(rendered):

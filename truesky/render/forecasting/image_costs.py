@@ -51,7 +51,7 @@ class ImageCosts:
     longest_s : float
         CPU seconds of the image that takes longest.
     bytes : float
-        Size of the image files, after compression if the request has it, and of the tables of drawn sources.
+        Size of the image files, after compression if the request has it, of the tables of drawn sources, and of PSFs.
     memory_gb : float
         Largest peak memory of a process that renders an image, in GB.
     channels : set of str
@@ -108,6 +108,8 @@ class ImageCosts:
             self.bytes += tables["image_bytes"] * row["bytes_count"]
             if sees_sky:
                 self.bytes += tables["source_bytes"] * row["sources_sum"]
+            if sees_sky and channel.dispersion is None:
+                self.bytes += tables["psf_bytes"] * row["bytes_count"]
             if sees_sky and channel.dispersion is not None:
                 spectra = min(row["sources_sum"], tables["most_spectra"] * row["bytes_count"])
                 self.bytes += tables["spectrum_bytes"] * spectra

@@ -10,7 +10,8 @@ each plane is the fraction of the light that it contains. The header cards are:
 
 The planes of a cube have the axes of the focal plane, with x to the right. They are rotated for detectors that are
 mounted rotated. A file of PSFEx has the axes and pixels of the detector, includes the average over a pixel, and
-contains polynomials of the position on the detector.
+contains polynomials of the position on the detector. Its optional card PSFLIGHT is the fraction of a star's light that
+its images contain, like the sum of a plane in a cube; by default 1. truesky writes this card, PSFEx does not.
 """
 
 from __future__ import annotations
@@ -45,11 +46,20 @@ _SPACING = (0.02, 2.0)
 _LARGEST = 1e300
 # Largest degree of the polynomials in a file of PSFEx that is accepted.
 _MOST_DEGREE = 20
-# Smallest side of the PSF images after resampling, samples: 66 pixels. Smaller images are extended by zeros.
-_LEAST_SIDE = 3 * 66 + 1
+# Smallest side of the PSF images after resampling, pixels. Smaller images are extended by zeros.
+_LEAST_SIDE = 66
 # Number of lobes of the Lanczos kernel with which images in a file of PSFEx are resampled. PSFEx fits its models with
 # this kernel.
 _OF_PSFEX = 3
+# Highest spatial frequency of a PSFEx model without its interpolation kernel that matters for a star, cycles per pixel.
+_DETAIL_OF_PSFEX = 1.75
+# Largest number of samples per detector pixel to which the images of a PSFEx file are resampled.
+_MOST_SAMPLES = 15
+# Largest number of samples of all resampled images of a PSFEx file (256 MB in double precision). If there would be
+# more, the images are resampled to fewer samples per pixel.
+_MOST_RESAMPLED = 1 << 25
+# Smallest side of a PSF that is read from a PSFEx file, pixels.
+_LEAST_PSFEX_SIDE = 64
 # Number of lobes of the Lanczos kernel with which the PSF images in a user's cube are resampled. With more lobes, the
 # interpolation is more accurate.
 _OF_CUBES = 15
@@ -63,8 +73,8 @@ def path_for_detector(name: str, detector: str) -> Path:
     return Path(name.replace("{detector}", detector))
 
 
-def read(path: Path, detector: Detector, band: Passband) -> Psf:
-    """Read the PSF of a detector in a band from a user's file, and resample it to three samples per pixel.
+def read(path: Path, detector: Detector, band: Passband | None) -> Psf:
+    """Read the PSF of a detector in a band from a user's file, and resample it to three or more samples per pixel.
 
     Parameters
     ----------
@@ -72,9 +82,10 @@ def read(path: Path, detector: Detector, band: Passband) -> Psf:
         FITS file with a cube of PSF images, or file of PSFEx.
     detector : Detector
         The detector.
-    band : Passband
+    band : Passband or None
         The passband. It is divided into sub-bands. A cube with several wavelengths must reach from the mean wavelength
-        of the first sub-band, or below, to that of the last sub-band, or above.
+        of the first sub-band, or below, to that of the last sub-band, or above. None if the passband is unknown; a cube
+        must then have one plane.
 
     Returns
     -------
@@ -91,21 +102,28 @@ def read(path: Path, detector: Detector, band: Passband) -> Psf:
     Notes
     -----
     For a cube, the interpolation has an error of 5e-5 of the peak if the spacing of its samples is less than half the
-    width of the PSF. For PSFEx the error is 1e-3, because its interpolation kernel adds high spatial frequencies, which
-    the resampled images do not contain.
+    width of the PSF.
+
+    For PSFEx, a star differs from `galsim.des.DES_PSFEx` by at most 1e-3 of its peak. Between the samples, a PSFEx
+    model is defined by a Lanczos kernel with three lobes. The kernel adds light at spatial frequencies near one cycle
+    per sample of the file. The images are therefore resampled to more than twice as many samples per pixel as the file
+    has. If the file has more than six samples per pixel, or its images are too large, there are fewer; the difference
+    is then up to 7e-3.
     """
     data, header = external.read_planes(path, "PSF_MASK")
     try:
         if not np.isfinite(data).all():
             raise BadInput("contains values that are not finite numbers")
         if "POLNAXIS" in header:
-            return from_planes(_psfex(data, header, detector), detector.pixel_scale, has_pixel=True)
+            planes = _psfex(data, header, detector)
+            side = 2 * int(np.ceil(_psfex_width(data.shape, _card(header, "PSF_SAMP")) / 2.0))
+            return from_planes(planes, detector.pixel_scale, has_pixel=True, side=side)
         return from_planes(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from None
 
 
-def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband) -> Planes:
+def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband | None) -> Planes:
     planes = data if data.ndim == 3 else data[None]
     for number, total in enumerate(planes.sum(axis=(1, 2)), start=1):
         if not _LEAST_SUM <= total <= _MOST_SUM:
@@ -130,13 +148,18 @@ def _has_pixel(header: Mapping[str, Any]) -> bool:
     return value
 
 
-def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Float, Float]:
+def _colours(header: Mapping[str, Any], count: int, band: Passband | None) -> tuple[Float, Float]:
     """Return the wavelengths (Angstrom) of PSF images of sub-bands, and weights [images, count] of the cube's planes.
 
     The cube has `count` planes, images of the PSF at one wavelength each. The PSF image of a sub-band of the passband
     is a weighted sum of these planes: the PSF interpolated linearly in wavelength and averaged over the sub-band's
-    photons. A cube with one plane gives one image, and the wavelength in its header is ignored.
+    photons. A cube with one plane gives one image, and the wavelength in its header is ignored. Raises BadInput for a
+    cube with several planes if the passband is unknown (None).
     """
+    if band is None:
+        if count > 1:
+            raise BadInput(f"has {count} planes (NAXIS3), but must have one for a frame whose passband is unknown")
+        return np.zeros(1), np.ones((1, 1))
     parts = sub_bands(band)
     means: Float = np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
     if count == 1:
@@ -161,9 +184,9 @@ def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Flo
 def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes:
     """Convert a PSFEx model to PSF images, with polynomials of the position relative to the detector's centre.
 
-    The images are normalised so that the sum of the PSF is 1 everywhere on the detector. The sum of a PSFEx model may
-    change with position. The shape of the normalised PSF is exact at the centre, and elsewhere correct to first order
-    in this change.
+    The images are normalised so that the sum of the PSF is the same everywhere on the detector: the header card
+    PSFLIGHT, or 1 for files without it. The sum of a PSFEx model may change with position. The shape of the normalised
+    PSF is exact at the centre, and elsewhere correct to first order in this change.
 
     References
     ----------
@@ -196,35 +219,69 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
             if i >= p and j >= q:
                 along = comb(i, p) * shift[0] ** (i - p) * stretch[0] ** p
                 planes[number] += along * comb(j, q) * shift[1] ** (j - q) * stretch[1] ** q * term
-    drawn = np.stack([_resample(plane, _card(header, "PSF_SAMP"), middle, _OF_PSFEX) for plane in planes])
+    spacing = _card(header, "PSF_SAMP")
+    samples = _psfex_samples(spacing, data.shape)
+    drawn = np.stack([_resample(plane, spacing, middle, _OF_PSFEX, samples) for plane in planes])
     totals = drawn.sum(axis=(1, 2))
     if not totals[0] > 0.0:
         raise BadInput(f"its PSF in the middle of the detector must have a positive sum, got {totals[0]:.4g}")
-    image = drawn[0] / totals[0]
-    drift = (drawn[1:] - totals[1:, None, None] * image) / totals[0]
+    light = _number(header, "PSFLIGHT", 1.0)
+    if not _LEAST_SUM <= light <= _MOST_SUM:
+        raise BadInput(f"PSFLIGHT = {light:.4g}, but {_LEAST_SUM:g} to {_MOST_SUM:g} is allowed")
+    image = drawn[0] * (light / totals[0])
+    drift = (drawn[1:] - (totals[1:] / totals[0])[:, None, None] * drawn[0]) * (light / totals[0])
     return Planes(
         np.zeros(1),
         image[None].astype(np.float32),
         drift.astype(np.float32),
         half,
         tuple((i, j, 0) for i, j in powers[1:]),
+        samples,
     )
 
 
-def _resample(plane: Float, spacing: float, middle: list[float], lobes: int) -> Float:
-    """Resample a PSF image to SAMPLES (3) samples per detector pixel, with a Lanczos kernel of `lobes` lobes.
+def _psfex_samples(spacing: float, shape: tuple[int, ...]) -> int:
+    """Return the number of samples per detector pixel to which the images of a PSFEx file are resampled.
+
+    `spacing` is the spacing of the file's samples in detector pixels, and `shape` the shape (n, rows, columns) of the
+    images. BadInput is raised if `spacing` is out of range.
+    """
+    _check_spacing(spacing)
+    # A star contains the PSF once more at frequencies around 1 / spacing, because of the interpolation kernel. The
+    # samples must reach these frequencies (cycles per pixel); `Planes.max_frequency` is 1/4 below their limit.
+    accurate = int(np.ceil(2.0 * (1.0 / spacing + _DETAIL_OF_PSFEX) + 0.5))
+    width = max(_psfex_width(shape, spacing), _LEAST_SIDE)
+    affordable = int(np.sqrt(_MOST_RESAMPLED / shape[0]) / width)
+    return max(min(accurate, _MOST_SAMPLES, affordable), SAMPLES)
+
+
+def _psfex_width(shape: tuple[int, ...], spacing: float) -> float:
+    """Return the width of the resampled images of a PSFEx file, 64 to SIDE (512) pixels.
+
+    `shape` is the shape (n, rows, columns) of the images in the file, and `spacing` the spacing of their samples in
+    pixels.
+    """
+    return min(max((max(shape[1:]) + 2 * _OF_PSFEX) * spacing, _LEAST_PSFEX_SIDE), SIDE)
+
+
+def _check_spacing(spacing: float) -> None:
+    if not _SPACING[0] <= spacing <= _SPACING[1]:
+        raise BadInput(f"its samples are {spacing:.4g} pixels apart, but {_SPACING[0]:g} to {_SPACING[1]:g} is allowed")
+
+
+def _resample(plane: Float, spacing: float, middle: list[float], lobes: int, samples: int = SAMPLES) -> Float:
+    """Resample a PSF image to `samples` samples per detector pixel, with a Lanczos kernel of `lobes` lobes.
 
     `spacing` is the spacing of the samples of `plane` in detector pixels; BadInput is raised if it is out of range.
     `middle` is the position (row, column, from 0) of the PSF in `plane`, which becomes the middle sample of the result.
     The sum of the image is preserved, except for light outside a square of SIDE (512) pixels, which is cut off.
     """
-    if not _SPACING[0] <= spacing <= _SPACING[1]:
-        raise BadInput(f"its samples are {spacing:.4g} pixels apart, but {_SPACING[0]:g} to {_SPACING[1]:g} is allowed")
+    _check_spacing(spacing)
     reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + lobes
-    half = max(min(int(reach * spacing * SAMPLES), SIDE * SAMPLES // 2), _LEAST_SIDE // 2)
-    at = np.arange(-half, half + 1) / (SAMPLES * spacing)
+    half = max(min(int(reach * spacing * samples), SIDE * samples // 2), _LEAST_SIDE * samples // 2)
+    at = np.arange(-half, half + 1) / (samples * spacing)
     rows, columns = (_interpolant(at + m, n, lobes) for m, n in zip(middle, plane.shape, strict=True))
-    return np.asarray(matrices.matmul(rows, matrices.matmul(plane, columns.T)) / (SAMPLES * spacing) ** 2)
+    return np.asarray(matrices.matmul(rows, matrices.matmul(plane, columns.T)) / (samples * spacing) ** 2)
 
 
 def _interpolant(at: Float, count: int, lobes: int) -> Float:

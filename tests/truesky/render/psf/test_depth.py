@@ -20,7 +20,7 @@ def depth(camera, band, ratio, seconds):
     detector = min(every, key=lambda one: np.hypot(one.x, one.y))
     air = ground.Air(MISSION.value(f"{section}.{band}.seeing", "arcsec"))
     psf = ground.atmospheric_psf(air, detector, passbands.load(band), MISSION, 1)
-    (model, *_), _ = to_psfex.psfex_planes(psf)
+    (model, *_), *_ = to_psfex.psfex_planes(psf)
     every_pixel = slice((len(model) // 2) % psf.planes.samples, None, psf.planes.samples)
     share = psf.planes.samples**2 * model[every_pixel, every_pixel].astype(float)
     assert share.sum() == pytest.approx(1.0, abs=2e-3)

@@ -44,10 +44,10 @@ def gaussian(*sigmas, side=161, x=0.0, y=0.0, stretch=1.0):
     return np.array([plane / plane.sum() for plane in planes])
 
 
-def star(psf, detector, column=80.3, row=77.6, photons=None):
+def star(psf, detector, column=80.3, row=77.6, photons=None, side=128):
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     one = one_source(detector, system, 1e5, column, row)
-    return stamps.draw(replace(one, photons=photons), np.array([128]), psf, 160, 160)
+    return stamps.draw(replace(one, photons=photons), np.array([side]), psf, 160, 160)
 
 
 def test_a_cube_of_one_plane(tmp_path):
@@ -105,6 +105,9 @@ def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
 # ------------------------------------------------------------------------------------------------ PSFEx
 
 
+LIGHT = {"PSFLIGHT": 0.9}
+
+
 def psfex(path, degree=2, samples=0.65, side=33, **cards):
     """Write a PSFEx file of a Moffat profile that changes across a detector of 160 pixels."""
     y, x = np.mgrid[:side, :side] - side // 2
@@ -132,11 +135,7 @@ def psfex(path, degree=2, samples=0.65, side=33, **cards):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize(("column", "row"), [(80.3, 77.6), (30.1, 120.4), (131.7, 25.2)])
 def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
-    """A small body and a star agree with galsim at each position, without an additional pixel.
-
-    The interpolant rings at frequencies above the limit of three samples per pixel. The star of galsim contains them,
-    so its tolerance is larger.
-    """
+    """A small body and a star agree with galsim at each position, without an additional pixel."""
     path, detector = psfex(tmp_path / "a.psf", degree), small("lsstcam", "R22_S11")
     psf, sigma = from_file.read(path, detector, GROUND), 0.6
     source = one_source(
@@ -152,7 +151,26 @@ def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
     np.testing.assert_allclose(ours, theirs, atol=1e-3 * theirs.max())
     assert ours.sum() == pytest.approx(1e5, rel=2e-3)
     sharp = 1e5 * galsim.des.DES_PSFEx(str(path)).getPSF(place).drawImage(image, method="no_pixel", center=place).array
-    np.testing.assert_allclose(star(psf, detector, column, row), sharp, atol=5e-3 * sharp.max())
+    drawn = star(psf, detector, column, row, side=psf.side)
+    np.testing.assert_allclose(drawn, sharp, atol=1e-3 * sharp.max())
+    assert drawn.sum() == pytest.approx(sharp.sum(), rel=1e-4)
+
+
+def test_the_light_of_a_psfex_file(tmp_path):
+    """The card PSFLIGHT is the fraction of a star's light in the images; without it they contain all light."""
+    detector = small("lsstcam", "R22_S11")
+    whole, most = (from_file.read(psfex(tmp_path / "a.psf", 1, **card), detector, GROUND) for card in ({}, LIGHT))
+    assert (whole.profile.flux, most.profile.flux) == pytest.approx((1.0, 0.9), rel=1e-6)
+    np.testing.assert_allclose(star(most, detector), 0.9 * star(whole, detector), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("spacing", "shape", "samples"),
+    [(0.65, (6, 33, 33), 8), (1 / 3, (15, 49, 49), 10), (0.1, (3, 101, 101), 15), (0.65, (10, 601, 601), 4)],
+)
+def test_samples_of_a_psfex_file(spacing, shape, samples):
+    """A star has more than twice the frequencies of the file, unless the resampled images would be too large."""
+    assert from_file._psfex_samples(spacing, shape) == samples
 
 
 def test_galaxies_through_a_psfex_file(tmp_path):
@@ -182,6 +200,7 @@ BAD = {
     "pixel": (lambda p: cube(p, gaussian(0.1), PIXEL="yes"), "PIXEL = 'yes' is not T or F"),
     "degree": (lambda p: psfex(p, 2, POLDEG1=3), r"PSF_MASK has \[6, 33, 33\] samples, but degree 3 requires 10"),
     "places": (lambda p: psfex(p, 1, POLNAME1="MAG_AUTO"), "polynomials are of MAG_AUTO, Y_IMAGE"),
+    "light": (lambda p: psfex(p, 1, PSFLIGHT=1.2), r"PSFLIGHT = 1.2, but 0.5 to 1.001 is allowed"),
     "scale": (lambda p: psfex(p, 1, POLSCAL1=0.0), "POLSCAL1 and POLSCAL2 must not be 0"),
     "four axes": (lambda p: cube(p, gaussian(0.1)[None]), "no image of two or three axes and no table with a column"),
     "no file": (lambda p: None, "no such file"),

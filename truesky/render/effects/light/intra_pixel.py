@@ -8,16 +8,11 @@ pixels: a filter on the final image would correct at most half of it.
 
 from __future__ import annotations
 
-import numpy as np
 import numpy.typing as npt
 
-from lake_schema.errors import OutOfRange
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
-
-# Below this value of pi times the spatial frequency (cycles per pixel), the closed form of `_second_moment` loses
-# digits by cancellation. A series of five terms is used there, with an error below 1e-12.
-_SMALL = 0.15
+from truesky.render.psf import pixel_response
 
 
 def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
@@ -40,27 +35,7 @@ def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
     OutOfRange
         If `strength` is outside its limits or NaN.
     """
-    if not 0.0 <= strength <= 0.5:
-        raise OutOfRange("intra-pixel strength", strength, 0.0, 0.5)
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    plain_x, plain_y = np.sinc(x), np.sinc(y)
-    dip = plain_x * _second_moment(y) + _second_moment(x) * plain_y
-    return np.asarray((plain_x * plain_y - strength * dip) / (1.0 - strength * 2.0 / 3.0))
-
-
-def _second_moment(x: Frame) -> Frame:
-    """Return the mean of u^2 cos(pi x u) over u from -1 to 1, for spatial frequencies x in cycles per pixel.
-
-    It is the Fourier transform of the term u^2 of the response inside a pixel, whose edges are at u = -1 and 1.
-    """
-    phase = np.pi * np.abs(x)
-    q = np.where(phase < _SMALL, 1.0, phase)
-    closed = np.sin(q) / q + 2.0 * np.cos(q) / q**2 - 2.0 * np.sin(q) / q**3
-    square = phase**2
-    series = 1.0 / 3.0 - square / 10.0 * (
-        1.0 - square / 16.8 * (1.0 - square / (270.0 / 7.0) * (1.0 - square / (616.0 / 9.0)))
-    )
-    return np.asarray(np.where(phase < _SMALL, series, closed))
+    return pixel_response.transform(x, y, strength)
 
 
 def _strength(scene: Scene) -> float:
