@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from lake_schema.fits.write import MAX_BYTES
 
 if TYPE_CHECKING:
     # Imported in the functions that use it, because its import takes half a second.
+    import pyarrow as pa
     from astropy.io import fits
 
 # Number of rows of an image per compressed tile. With one row per tile, astropy takes twice as long to write and three
@@ -113,6 +114,36 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
     else:
         first, remaining = [primary_hdu(images[0])], zip(make_hdu[1:], images[1:], strict=True)
     write.write_atomically(path, fits.HDUList([*first, *(make(image) for make, image in remaining)]))
+
+
+def write_images_and_table(
+    path: Path, units: Sequence[Image], name: str, columns: Mapping[str, pa.ChunkedArray]
+) -> None:
+    """Write images and one table to a FITS file, which is replaced in one rename.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    units : sequence of Image
+        Images; the first one is the primary unit.
+    name : str
+        Name of the extension with the table, which is the last one.
+    columns : mapping of str to pyarrow.ChunkedArray
+        Columns of numbers by name. Missing values become NaN.
+
+    Raises
+    ------
+    BadInput
+        If FITS cannot store an image or a card.
+    """
+    from astropy.io import fits
+    from astropy.table import Table
+
+    primary, *extensions = units
+    table = Table({title: np.asarray(column.to_pandas()) for title, column in columns.items()})
+    hdus = [primary_hdu(primary), *map(image_hdu, extensions), fits.BinTableHDU(table, name=name)]
+    write.write_atomically(path, fits.HDUList(hdus))
 
 
 def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -72,6 +72,40 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
             hdu.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
     hdu.header["TABLEVER"] = (declared.version, "version of the table's declaration")
     write.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), hdu]))
+
+
+def described_table(
+    name: str, columns: Sequence[tuple[str, Array, str, str]], cards: Sequence[tuple[str, Any, str]]
+) -> fits.BinTableHDU:
+    """Return columns in memory as a FITS binary table.
+
+    Parameters
+    ----------
+    name : str
+        Name of the extension.
+    columns : sequence of (str, array of shape (n,), str, str)
+        Name, values (integers, floating-point numbers, booleans or texts), unit ("" for none) and meaning of each
+        column.
+    cards : sequence of (str, object, str)
+        Keyword, value and comment of further header cards.
+
+    Returns
+    -------
+    astropy.io.fits.BinTableHDU
+        The table.
+    """
+    fits_columns = []
+    for title, values, unit, _ in columns:
+        texts = values.astype(str).astype("S") if values.dtype.kind in "OU" else values
+        width = max(texts.dtype.itemsize, 1)
+        form = {"i": "K", "b": "L", "f": "D"}.get(texts.dtype.kind, f"{width}A")
+        fits_columns.append(fits.Column(title, form, unit=unit or None, array=texts))
+    table = fits.BinTableHDU.from_columns(fits_columns, name=name)
+    for number, (_, _, _, meaning) in enumerate(columns, start=1):
+        table.header.comments[f"TTYPE{number}"] = meaning
+    for keyword, value, comment in cards:
+        table.header[keyword] = (value, comment)
+    return table
 
 
 def _check_column_name(name: str, where: str = "") -> None:

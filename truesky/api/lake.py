@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,9 @@ from truesky.api.tables import LakeTables
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
+
+    from truesky.api.lake_frames import LakeFrame
+    from truesky.api.sky_images import ImageOptions, SkyImage, SkyPainter
 
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
@@ -202,6 +206,76 @@ class Lake(LakeTables):
         ids = None if sources is None else arguments.check_integers("sources", sources, 0, _MAX_INT64)
         source_models = models.models(self._explorer.root, version, number, str(detector), ids)
         return ((source_model.id, source_model.frame) for source_model in source_models)
+
+    def render(
+        self,
+        ra: float | str,
+        dec: float | str,
+        size: float = 64.0,
+        band: str = "euclid_vis",
+        **options: Unpack[ImageOptions],
+    ) -> SkyImage:
+        """Draw an image of one place on the sky from the catalogues of the lake.
+
+        No Spark is needed, and nothing is written. Slitless spectra cannot be drawn.
+
+        Parameters
+        ----------
+        ra, dec : float or str
+            Position of the middle of the image, in degrees or sexagesimal. An image at the edge of a detector is
+            moved onto the detector.
+        size : float, optional
+            Side of the image in arcsec, at most that of a detector.
+        band : str, optional
+            Name of the passband, such as ``euclid_vis`` or ``lsst_r``. The lake must have fluxes in this band.
+        **options : ImageOptions
+            The exposure, the accuracy, the noise, and sources to add or to leave out: see `ImageOptions`.
+
+        Returns
+        -------
+        SkyImage
+            The image and its truth.
+
+        Raises
+        ------
+        BadInput
+            If an option is not valid, the place is outside the catalogues or on none of the detectors of the exposure,
+            or the lake has no fluxes in the band.
+        """
+        from truesky.api import sky_images
+
+        return self._painter.draw(sky_images.check_request((ra, dec), size, band, options))
+
+    def frame(self, exposure: int, detector: str) -> LakeFrame:
+        """Return the raw image of a detector in the lake, to which sources can be added.
+
+        Parameters
+        ----------
+        exposure : int
+            Number of an exposure of which the lake has an image.
+        detector : str
+            Name of the detector.
+
+        Returns
+        -------
+        LakeFrame
+            The image. Its method `with_sources` renders the detector again with additional sources.
+
+        Raises
+        ------
+        BadInput
+            If the lake has no image of this detector and exposure.
+        """
+        from truesky.api import lake_frames
+
+        number = arguments.check_integer("exposure", exposure, 0, _MAX_INT64)
+        return lake_frames.LakeFrame(self._explorer.root, self._explorer._version("products"), number, str(detector))
+
+    @cached_property
+    def _painter(self) -> SkyPainter:
+        from truesky.api import sky_images
+
+        return sky_images.painter(self._explorer.versions, self._explorer.root)
 
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.

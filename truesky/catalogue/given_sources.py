@@ -9,7 +9,7 @@ Way's extinction `a_v`. Galaxies have no emission lines.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ import pyarrow as pa
 
 from lake_schema import sky, units
 from lake_schema.arrays import Array, Float, Float32, Int
-from lake_schema.errors import BadInput, refuse_mistakes
+from lake_schema.errors import BadInput, Mistakes, refuse_mistakes
 from lake_schema.external import rows as external_rows
 from lake_schema.external.mistakes import TableMistakes
+from lake_schema.external.rows import RowBatch
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical
@@ -191,36 +192,135 @@ def stars(sources: SourceColumns, band: str) -> StarCatalogue:
     return StarCatalogue(values.pop("index"), values)
 
 
+def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]]) -> SourceColumns:
+    """Check tables in memory, and return their sources.
+
+    Parameters
+    ----------
+    tables : mapping of str to (Path, mapping of str to float array)
+        For "galaxies" and "stars", the name of the table for messages, and its columns with the names of the
+        properties.
+
+    Returns
+    -------
+    SourceColumns
+        The galaxies and stars.
+
+    Raises
+    ------
+    BadInput
+        If a column is unknown or a required one is missing, or a value is missing or out of range.
+    """
+    checked = {}
+    with Mistakes() as mistakes:
+        for name in ("galaxies", "stars"):
+            place, columns = tables.get(name, (Path(name), {}))
+            values = mistakes.read(check_arrays, columns, name, place, {}) if columns else _no_sources(name)
+            if values is not None:
+                checked[name] = {**values, "ra": sky.wrap_angle(values["ra"])}
+    for values in checked.values():
+        values["origin_id"] = np.arange(1, len(values["ra"]) + 1)
+        values["index"] = sky.healpix_29(values["ra"], values["dec"])
+    return SourceColumns(*(_sort_by_cell(checked[name]) for name in ("galaxies", "stars")))
+
+
+def _no_sources(name: str) -> dict[str, Array]:
+    return {key: np.zeros(0) for key in (*_POSITION, *_defaults_and_bounds(name)[0])}
+
+
+def check_arrays(
+    columns: Mapping[str, Array], name: str, place: Path, settings: Mapping[str, str], ignored: Collection[str] = ()
+) -> dict[str, Array]:
+    """Check the columns of a table in memory, and return its properties.
+
+    Parameters
+    ----------
+    columns : mapping of str to float array, shape (n,)
+        Columns, with the names of the properties.
+    name : str
+        Name of the table, "galaxies" or "stars".
+    place : Path
+        Name of the table, or of its file, for the messages.
+    settings : mapping of str to str
+        Settings `ellipticity` and `frame` of the columns e1 and e2; empty without these columns.
+    ignored : collection of str, optional
+        Properties that are allowed, but neither checked nor returned.
+
+    Returns
+    -------
+    dict of str to array, shape (n,)
+        Properties by name; properties without a column have their default values.
+
+    Raises
+    ------
+    BadInput
+        If a column is unknown or a required one is missing, a value is missing or out of range, or a galaxy is near a
+        caustic. There is one message for each column and kind of mistake.
+    """
+    defaults, bounds = _defaults_and_bounds(name)
+    required = [*_POSITION, *(key for key, value in defaults.items() if value is None)]
+    _check_titles(list(columns), place, bounds, required)
+    used = {title: title for title in columns if title not in ignored}
+    mapped = _parse({**settings, **used}, name, {k: v for k, v in defaults.items() if k not in ignored}, bounds, place)
+    mistakes = TableMistakes()
+    values = reading.check_batch(RowBatch(place, 1, {title: columns[title] for title in used}, {}), mapped, mistakes)
+    if name == "galaxies" and values:
+        _add_caustics(place, values, mistakes)
+    mistakes.refuse()
+    return values
+
+
+def _defaults_and_bounds(name: str) -> tuple[Mapping[str, float | None], Mapping[str, tuple[float, float]]]:
+    """Return default values and bounds of the properties of a table, "galaxies" or "stars"."""
+    return (GALAXIES, _GALAXY_BOUNDS) if name == "galaxies" else (STARS, _STAR_BOUNDS)
+
+
+def _parse(
+    entries: Mapping[str, Any],
+    name: str,
+    defaults: Mapping[str, float | None],
+    bounds: Mapping[str, tuple[float, float]],
+    place: object,
+    required: Sequence[tuple[str, ...]] = (),
+) -> Columns:
+    """Return the mapping of columns to properties; `place` is the beginning of the messages of BadInput."""
+    replaced = {key for whole, keys in mapping.WHOLE_GALAXY.items() if whole in entries for key in keys}
+    constants = {key: {"value": value} for key, value in defaults.items() if value is not None and key not in replaced}
+    settings = _SETTINGS if name == "galaxies" else ()
+    return mapping.parse_columns({**constants, **entries}, bounds, str(place), list(required), legal_settings=settings)
+
+
 def _columns(file: Path, name: str, source_tables: UserSources) -> Columns:
     """Return which columns of a table give which properties; properties without a column have their default values.
 
     `name` is the name of the table, "galaxies" or "stars". Raises BadInput if a column is unknown or a required one is
     missing.
     """
-    is_galaxies = name == "galaxies"
-    defaults = GALAXIES if is_galaxies else STARS
-    bounds: Mapping[str, tuple[float, float]] = _GALAXY_BOUNDS if is_galaxies else _STAR_BOUNDS
+    defaults, bounds = _defaults_and_bounds(name)
     required = [(key,) for key, value in defaults.items() if value is None]
     if source_tables.spacing:
         bounds = {key: limits for key, limits in bounds.items() if key not in _POSITION}
     else:
         required = [(key,) for key in _POSITION] + required
-    requested = source_tables.galaxy_columns if is_galaxies else source_tables.star_columns
+    requested = source_tables.galaxy_columns if name == "galaxies" else source_tables.star_columns
     entries: dict[str, Any] = {key: json.loads(text) for key, text in requested}
     path = f"sources.{name}.columns"
     if set(entries) <= set(_SETTINGS):
         # The request maps no column, so the columns of the file have the names of the properties.
-        entries |= {title: title for title in _known_titles(file, bounds, [key for (key,) in required])}
+        titles = external_rows.column_names(file, SOURCES_KIND)
+        _check_titles(titles, file, bounds, [key for (key,) in required], can_map=True)
+        entries |= {title: title for title in titles}
         path = f"sources.{name}: {file.name}"
-    replaced = {key for whole, keys in mapping.WHOLE_GALAXY.items() if whole in entries for key in keys}
-    constants = {key: {"value": value} for key, value in defaults.items() if value is not None and key not in replaced}
-    settings = _SETTINGS if is_galaxies else ()
-    return mapping.parse_columns({**constants, **entries}, bounds, path, required, legal_settings=settings)
+    return _parse(entries, name, defaults, bounds, path, required)
 
 
-def _known_titles(file: Path, bounds: Mapping[str, object], required: list[str]) -> list[str]:
-    """Return the names of a file's columns; raise BadInput if they are not names of properties, or one is missing."""
-    titles = external_rows.column_names(file, SOURCES_KIND)
+def _check_titles(
+    titles: Sequence[str], file: Path, bounds: Mapping[str, object], required: Sequence[str], can_map: bool = False
+) -> None:
+    """Raise BadInput if names of a file's columns are not names of properties, or one is missing or not unique.
+
+    `can_map` is True if the request can map the columns of the file to properties.
+    """
     messages = []
     unknown = [title for title in titles if title not in bounds]
     for name in required:
@@ -228,17 +328,17 @@ def _known_titles(file: Path, bounds: Mapping[str, object], required: list[str])
             hint = ""
             if similar := spelling.closest_names(name, unknown, 1):
                 unknown.remove(similar[0])
-                hint = f"; did you mean {similar[0]}? Rename it to {name}, or map {_MAPPING.format(name, similar[0])}"
+                mapped = f", or map {_MAPPING.format(name, similar[0])}" if can_map else ""
+                hint = f"; did you mean {similar[0]}? Rename it to {name}{mapped}"
             messages.append(f"{file}: column {name} is missing{hint}")
     if unknown:
         listed = [f"{title}{spelling.suggestion(title, bounds)}" for title in unknown]
         allowed = f"; allowed are {', '.join(bounds)}" if set(listed) & set(unknown) else ""
-        noun = "unknown columns" if len(unknown) > 1 else "unknown column"
-        remedy = f"remove or rename {'them' if len(unknown) > 1 else 'it'}, or map {_MAPPING.format('mag', 'MAG')}"
-        messages.append(f"{file}: {noun} {', '.join(listed)}{allowed}; {remedy}")
+        noun, them = ("unknown columns", "them") if len(unknown) > 1 else ("unknown column", "it")
+        mapped = f", or map {_MAPPING.format('mag', 'MAG')}" if can_map else ""
+        messages.append(f"{file}: {noun} {', '.join(listed)}{allowed}; remove or rename {them}{mapped}")
     messages += [f"{file}: has column {title} more than once" for title in titles if titles.count(title) > 1]
     refuse_mistakes(messages)
-    return titles
 
 
 def _read(file: Path | None, name: str, source_tables: UserSources, area: Area | None) -> dict[str, Array]:

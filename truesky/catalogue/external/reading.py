@@ -87,7 +87,7 @@ def read(files: Sequence[Path], columns: Columns, kind: str = "catalogue") -> It
     for file in files:
         try:
             for piece, present in _read_file(file, columns, kind, mistakes):
-                values = _values(piece, present, mistakes)
+                values = check_batch(piece, present, mistakes)
                 if not mistakes:
                     yield Rows(file, piece.first_row, values)
         except BadInput as error:
@@ -154,8 +154,23 @@ def _with_stored_unit(file: Path, key: str, field: Field, file_unit: str) -> Fie
     return field
 
 
-def _values(piece: RowBatch, columns: Columns, mistakes: TableMistakes) -> dict[str, Array]:
-    """Return the values of a batch by property, and add wrong values to `mistakes`."""
+def check_batch(piece: RowBatch, columns: Columns, mistakes: TableMistakes) -> dict[str, Array]:
+    """Return the values of a batch of rows by property; after a mistake, the result is empty.
+
+    Parameters
+    ----------
+    piece : RowBatch
+        The rows.
+    columns : Columns
+        Mapping from the columns of the rows to properties.
+    mistakes : TableMistakes
+        Wrong values are added to it.
+
+    Returns
+    -------
+    dict of str to array
+        Values by name of the property, as in `Rows`.
+    """
     rows = len(next(iter(piece.columns.values())))
     by_key = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
     for k in "12":

@@ -261,16 +261,20 @@ def undo_sip(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
         is_invertible = np.hypot(*distorted) < invertible_radius(a, b)
     estimate, target = undistorted[:, is_invertible], distorted[:, is_invertible]
     slopes = [np.asarray(polynomial.polyder(c, axis=axis), float) for c in (a, b) for axis in (0, 1)]
+    # Each position is iterated until it has converged, so that it does not depend on the other positions.
+    active = np.arange(estimate.shape[1])
     for _ in range(_MAX_STEPS):
-        residual = estimate + np.stack([_evaluate(estimate, c) for c in (a, b)]) - target
-        au, av, bu, bv = (_evaluate(estimate, c) for c in slopes)
+        moving = estimate[:, active]
+        residual = moving + np.stack([_evaluate(moving, c) for c in (a, b)]) - target[:, active]
+        au, av, bu, bv = (_evaluate(moving, c) for c in slopes)
         determinant = (1.0 + au) * (1.0 + bv) - av * bu
         step = (
             np.stack([(1.0 + bv) * residual[0] - av * residual[1], (1.0 + au) * residual[1] - bu * residual[0]])
             / determinant
         )
-        estimate = np.asarray(estimate - step)
-        if np.abs(step).max(initial=0.0) < _TOLERANCE:
+        estimate[:, active] = moving - step
+        active = active[~(np.abs(step).max(axis=0) < _TOLERANCE)]
+        if not len(active):
             break
     else:
         raise BadInput("the distortion is so strong that some sky positions appear on several pixels or on none")

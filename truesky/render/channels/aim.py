@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lake_schema import units
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
 from truesky.render.camera import astrometry, filter_wheel
 from truesky.render.camera.detectors import Detector
+from truesky.render.camera.windows import Window
 from truesky.render.channels import image_types, registry
 from truesky.render.channels.channel import Channel
 from truesky.render.effects.effect import Effect
@@ -37,6 +40,8 @@ class Aim:
         Channel (instrument mode) of the exposure.
     effects : tuple of Effect
         Detector effects that the channel defines for the image type, in the order in which they are applied.
+    window : Window, optional
+        Part of the detector that is drawn; None for the whole detector.
     """
 
     exposure: ExposureRow
@@ -45,6 +50,7 @@ class Aim:
     band: Passband
     channel: Channel
     effects: tuple[Effect, ...]
+    window: Window | None = None
 
     @classmethod
     def from_exposure(
@@ -97,6 +103,23 @@ class Aim:
     def sees_sky(self) -> bool:
         """True if light of astronomical sources reaches the detector; False for example for a dark."""
         return self.channel.sees_sky(self.exposure.image_type)
+
+    @property
+    def drawn(self) -> Window:
+        """Pixels of the detector that are drawn: the window, or all pixels."""
+        return self.window or Window(0, 0, self.detector.nx, self.detector.ny)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Right ascension and declination of the middle of the drawn pixels, deg."""
+        column, row = self.drawn.middle
+        ra, dec = astrometry.sky_of_pixel(self.wcs, [column], [row])
+        return float(ra[0]), float(dec[0])
+
+    @property
+    def half_diagonal(self) -> float:
+        """Distance from the middle of the drawn pixels to their corners, arcsec."""
+        return 0.5 * self.detector.pixel_scale * float(np.hypot(self.drawn.nx, self.drawn.ny))
 
     @property
     def electrons_per_microjansky(self) -> float:

@@ -38,11 +38,12 @@ _RINGS = 1e2
 # Largest side of a stamp, pixels, for which bright sources use frequencies above the usual limit.
 DEEP = 1024
 # On stamps with sides above this number of pixels, the PSF's planes (basis images) are summed before the transform, for
-# each source separately. The transforms of all planes would not fit into memory.
+# each source separately. The transforms of all planes would not fit into memory. The choice must not depend on other
+# sources, so that a source has the same light when it is drawn alone.
 _SHARED = 512
-# Number of sources with equal stamp size, divided by the number of the PSF's planes (basis images). Below this ratio,
-# transforming all planes takes longer than summing the planes for each source.
-_FEW = 0.5
+# Largest |k| on stamps that are wider than the stamps of stars, radian / pixel. Only a PSF from a PSFEx file reaches
+# higher frequencies. They matter for stars alone, and on large stamps they would need too much memory.
+_WIDE_REACH = 5.0 * np.pi
 # Number of stamp pixels that one call of the FFT transforms together. At least two stamps are transformed, also if they
 # have more pixels.
 _BATCH = 1 << 17
@@ -328,22 +329,22 @@ def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Itera
     and each is the only piece of its group.
     """
     sources, psf = prepared.sources, prepared.psf
+    own_reach = prepared.deep | (prepared.sizes > psf.side)
+    # Largest side of the stamp of a star whose PSF is given as images.
+    star_size = SIZES[min(int(np.searchsorted(SIZES, psf.side)), len(SIZES) - 1)]
     for size in np.unique(prepared.sizes).tolist():
         individual, sharing = (
             indices[on_frame[indices]] for indices in split_by_size(sources, prepared.sizes, psf, size, precise)
         )
+        reach = prepared.reach if size <= star_size else min(prepared.reach, _WIDE_REACH)
         if len(sharing):
-            shared, batch = transfer.transfer(psf, size, prepared.reach), max(_BATCH // size**2, 2)
+            shared, batch = transfer.transfer(psf, size, reach), max(_BATCH // size**2, 2)
             for i in range(0, len(sharing), batch):
                 chosen = sharing[i : i + batch]
                 yield chosen, shared, prepared.weights[chosen].astype(np.float32)
-        if len(individual):
-            default_grid = transfer.grid(
-                size, float(prepared.cut[individual].max()) if size > psf.side else prepared.reach
-            )
         for i in individual.tolist():
             dtype = np.float64 if precise[i] else np.float32
-            source_grid = transfer.grid(size, float(prepared.cut[i])) if prepared.deep[i] else default_grid
+            source_grid = transfer.grid(size, min(float(prepared.cut[i]), reach) if own_reach[i] else reach)
             psf_transfer = transfer.source_transfer(
                 psf, prepared.weights[i], source_grid, dtype, bool(prepared.has_far_light[i])
             )
@@ -446,9 +447,9 @@ def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bo
         Indices of sources with individual PSFs, and of sources that share the transformed planes; either may be empty.
     """
     of_size = sizes == size
-    few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
+    is_large = psf.planes is not None and size > _SHARED
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
-    individual = of_size & (few | precise | pictured | stamp_sizes.on_largest(sources.shape, sizes))
+    individual = of_size & (is_large | precise | pictured | stamp_sizes.on_largest(sources.shape, sizes))
     return np.flatnonzero(individual), np.flatnonzero(of_size & ~individual)
 
 

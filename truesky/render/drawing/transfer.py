@@ -59,7 +59,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
         Fraction of the source's photons in each of w sub-bands of the passband. w must be a multiple of the number of
         wavelengths of the PSF. None for equal fractions, as for a source with constant f_nu.
     column, row : float array, shape (n,)
-        Positions on the detector, 0-based pixels. Positions outside the detector are treated as on its border.
+        Positions on the drawn image, 0-based pixels. Positions outside the detector are treated as on its border.
 
     Returns
     -------
@@ -76,8 +76,10 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
     # image of the PSF are added.
     photons = photons.reshape(n, len(waves), photons.shape[1] // len(waves)).sum(axis=2)
     # The PSF varies as a polynomial of the position. Outside the detector it is kept at its value on the border.
-    x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
-    y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
+    x, y = (
+        np.clip((position + first - half) / (half + 0.5), -1.0, 1.0)
+        for position, first, half in zip((column, row), planes.origin, planes.half, strict=True)
+    )
     redder = matrices.matmul(photons, waves) - waves.mean()
     drift = [x**i * y**j * redder**colour for i, j, colour in planes.powers]
     return np.column_stack([photons, *drift])
@@ -197,7 +199,8 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
         planes = _on_grid(list(middle * window[:, None] * window), samples, probe, psf.intra_pixel, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
-    rings = np.asarray(scipy.ndimage.maximum(modulus, ring, np.arange(ring.max() + 1)), float)
+    rings = np.zeros(ring.max() + 1)
+    np.maximum.at(rings, ring, modulus.astype(float))
     above_minimum = np.flatnonzero(rings > min_value)
     return rings[: above_minimum[-1] + 1]
 

@@ -18,6 +18,7 @@ from truesky.fluxes.passbands import Passband
 from truesky.render.camera import amplifiers
 from truesky.render.camera.amplifiers import Layout
 from truesky.render.camera.detectors import Detector
+from truesky.render.camera.windows import Window
 from truesky.request.accuracy import SURVEY, Accuracy
 
 Frame = Float
@@ -164,6 +165,10 @@ class Scene:
         FWHM of the seeing in arcsec. Only used for ground cameras.
     zero_point : float
         AB magnitude of a source that gives 1 electron per second. Only used for ground cameras.
+    window : Window, optional
+        Part of the detector that is drawn; None for the whole detector.
+    amplifier : int
+        Number of the amplifier, from 0, that reads the window. All pixels of a window are read by one amplifier.
     """
 
     mission: MissionConfiguration
@@ -186,6 +191,8 @@ class Scene:
     neighbour_charge: NeighbourCharge | None = None
     seeing: float = 0.0
     zero_point: float = 0.0
+    window: Window | None = None
+    amplifier: int = 0
 
     def value(self, key: str, unit: str) -> float:
         """Return a parameter of the detector in the given unit.
@@ -209,20 +216,27 @@ class Scene:
         -------
         float, or float64 array, shape (q,)
             Values of the q amplifiers, in the order of the planes of a frame that is split into amplifiers. One number
-            if all amplifiers have the same value.
+            if all amplifiers have the same value, or if a window is drawn.
         """
-        if self.detector is not None and self.layout is not None:
-            return amplifiers.values(key, unit, self.detector, self.mission, self.layout)
-        values = self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name)
-        return np.array(values) if len(values) > 1 else values[0]
+        layout = None if self.detector is None else amplifiers.layout(self.detector, self.mission)
+        if self.detector is not None and layout is not None:
+            values = np.atleast_1d(amplifiers.values(key, unit, self.detector, self.mission, layout))
+        else:
+            values = np.array(self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name))
+        if self.window is not None and len(values) > 1:
+            return float(values[self.amplifier])
+        return values if len(values) > 1 else float(values[0])
 
     @property
     def layout(self) -> Layout | None:
         """Pixels that each amplifier of a ground camera's detector reads.
 
-        None if the detector is read in quadrants or as one frame, or if the scene has no detector.
+        None if the detector is read in quadrants or as one frame, if a window is drawn, or if the scene has no
+        detector.
         """
-        return None if self.detector is None else amplifiers.layout(self.detector, self.mission)
+        if self.detector is None or self.window is not None:
+            return None
+        return amplifiers.layout(self.detector, self.mission)
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
@@ -241,21 +255,25 @@ class Scene:
 
     @property
     def nx(self) -> int:
-        """Number of pixel columns of the detector."""
+        """Number of pixel columns of the drawn image."""
+        if self.window is not None:
+            return self.window.nx
         return self.detector.nx if self.detector is not None else int(self.value("fpa.nx", "pix"))
 
     @property
     def ny(self) -> int:
-        """Number of pixel rows of the detector, including rows between its halves that are not read."""
+        """Number of pixel rows of the drawn image, including rows between the halves that are not read."""
+        if self.window is not None:
+            return self.window.ny
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
     def injection_rows(self) -> int:
         """Number of charge-injection rows between the detector's halves, which are not read.
 
-        0 if the scene has no detector.
+        0 if the scene has no detector, or if a window is drawn.
         """
-        return self.detector.injection_rows if self.detector is not None else 0
+        return self.detector.injection_rows if self.detector is not None and self.window is None else 0
 
     @property
     def half_rows(self) -> int:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pyarrow as pa
 
 from lake_schema.arrays import Float
 from truesky.render.camera import astrometry
+from truesky.render.channels.aim import Aim
 from truesky.render.effects.scene import Lights
 from truesky.render.sources.source_list import Sources
-
-if TYPE_CHECKING:
-    from astropy.wcs import WCS
 
 # Ghosts and scattered light are computed for sources with more expected electrons per exposure than this.
 _MIN_ELECTRONS = 1e6
@@ -22,15 +18,15 @@ _MIN_ELECTRONS = 1e6
 _PIECE = 32.0
 
 
-def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], wcs: WCS) -> Lights:
+def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], aim: Aim) -> Lights:
     """Select bright catalogue sources on the detector and around it.
 
     Parameters
     ----------
     galaxies, stars : (Table, float array)
         Catalogue rows, and expected electrons of each.
-    wcs : WCS
-        World coordinates of the detector.
+    aim : Aim
+        Exposure and detector.
 
     Returns
     -------
@@ -42,8 +38,9 @@ def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Fl
     for rows, electrons in (galaxies, stars):
         bright = np.flatnonzero(electrons > _MIN_ELECTRONS)
         chosen = rows.select(["id", "ra", "dec"]).take(bright)
-        column, row = astrometry.pixel_of_sky(wcs, chosen["ra"].to_numpy(), chosen["dec"].to_numpy())
-        columns.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
+        column, row = astrometry.pixel_of_sky(aim.wcs, chosen["ra"].to_numpy(), chosen["dec"].to_numpy())
+        place = column - aim.drawn.column, row - aim.drawn.row
+        columns.append((chosen["id"].to_numpy(), *place, electrons[bright]))
     ids, column, row, electrons = (np.concatenate(part) for part in zip(*columns, strict=True))
     order = np.argsort(ids)
     return Lights(column[order], row[order], electrons[order])

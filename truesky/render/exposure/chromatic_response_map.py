@@ -65,7 +65,7 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
     change = chromatic_response.colour_changes(
         sources.electrons * peak_fraction, source_colours, components, chromatic_response.map_strength(scene)
     )
-    is_chosen = visible_sources.touches_detector(sources, light.sizes, aim.detector) & (
+    is_chosen = visible_sources.touches_frame(sources, light.sizes, aim.drawn) & (
         change > NOTICEABLE * scene.pixel_noise
     )
     if not is_chosen.any():

@@ -38,7 +38,7 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
     if light.psf is None or light.dispersed is not None:
         return
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes
-    on_detector = visible_sources.touches_detector(sources, sizes, detector)
+    on_detector = visible_sources.touches_frame(sources, sizes, aim.drawn)
     where = f"exposure {exposure.exposure_id}, detector {detector.name}: {int(on_detector.sum())} sources"
     base = aim.channel.cost.base_gb * 1e9
     available = max(_MAX_BYTES, base + aim.channel.cost.sky_bytes_per_pixel * detector.nx * detector.ny)

@@ -17,10 +17,11 @@ from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
 from truesky.render.camera import astrometry
 from truesky.render.camera.detectors import Detector
+from truesky.render.camera.windows import Window
 from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim, electron_rate
 from truesky.render.dispersing.draw import DispersedSources
-from truesky.render.drawing import outskirts, stamp_sizes
+from truesky.render.drawing import outskirts, stamp_sizes, wings
 from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.effects.effect import Decision, decide
 from truesky.render.effects.scene import NOTICEABLE, Lights, Scene
@@ -181,16 +182,16 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     )
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
     psf = exposure_psf(aim, scene, settings)
+    if psf.planes is not None:
+        psf = replace(psf, planes=replace(psf.planes, origin=(aim.drawn.column, aim.drawn.row)))
     sources, sizes = select_sources(rows, (galaxies, stars), aim, psf, noise, settings)
     moving_lights = Lights()
     if aim.channel.draws_moving_bodies:
         sources, sizes, moving_lights = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
     if aim.channel.has_scattered_light:
-        catalogue_lights = bright_lights.catalogue_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.wcs)
+        catalogue_lights = bright_lights.catalogue_lights((rows.galaxies, galaxies), (rows.stars, stars), aim)
         scene = replace(scene, lights=catalogue_lights.concatenate(moving_lights))
-    psf, decisions = _with_intra_pixel(
-        aim, scene, psf, sources.electrons[touches_detector(sources, sizes, aim.detector)]
-    )
+    psf, decisions = _with_intra_pixel(aim, scene, psf, sources.electrons[touches_frame(sources, sizes, aim.drawn)])
     neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
     return Light(sources, sizes, neglected, psf, scene, decisions)
 
@@ -380,16 +381,18 @@ def select_sources(
     sizes : int array, shape (n,)
         Sides of the stamps, pixels.
     """
-    detector, wcs, candidates = aim.detector, aim.wcs, list_candidates(rows, electrons)
+    detector, drawn, candidates = aim.detector, aim.drawn, list_candidates(rows, electrons)
     light, shape, picture, form = candidates.electrons, candidates.shape, candidates.picture, candidates.form
     extra_reach = np.where((shape < 0) & (picture < 0), _spike_reach(light, detector, psf, noise), 0.0)
     extra_reach[: len(form)] = _outskirt_reach(light[: len(form)], form, detector, noise)
-    reach = detector.half_diagonal + np.maximum(extra_reach, stamp_sizes.reach(detector.pixel_scale))
-    is_near = selection.within_radius(
-        candidates.ra, candidates.dec, astrometry.centre(detector, wcs), reach / 3600.0
-    ) & (light > 0)
+    stamp_reach, place = stamp_sizes.reach(detector.pixel_scale), (candidates.ra, candidates.dec)
+    reach = detector.half_diagonal + np.maximum(extra_reach, stamp_reach)
+    is_near = selection.within_radius(*place, astrometry.centre(detector, aim.wcs), reach / 3600.0) & (light > 0)
+    if aim.window is not None:
+        window_reach = (aim.half_diagonal + stamp_reach) / 3600.0
+        is_near &= selection.within_radius(*place, aim.centre, window_reach) | (extra_reach > 0.0)
     indices = np.flatnonzero(is_near)[np.argsort(candidates.ids[is_near], kind="stable")]
-    column, row = astrometry.pixel_of_sky(wcs, candidates.ra[indices], candidates.dec[indices])
+    column, row = astrometry.pixel_of_sky(aim.wcs, candidates.ra[indices], candidates.dec[indices])
     picture_sides = (
         np.array([0.0, *(arc_picture.diagonal for arc_picture in candidates.pictures)])[picture[indices] + 1]
         / detector.pixel_scale
@@ -410,12 +413,29 @@ def select_sources(
         candidates.pictures,
     )
     on_frame = stamp_sizes.touching_frame(sources, sizes, psf, noise, detector.nx, detector.ny)
+    sources = replace(sources, column=column - drawn.column, row=row - drawn.row)
+    if aim.window is not None:
+        on_frame &= _reaches_window(sources, sizes, psf, noise, drawn)
     indices, sources = indices[on_frame], sources.take(on_frame)
     is_chromatic = psf.planes is not None and len(psf.planes.wavelength) > 1
     photons = _photon_fractions(candidates.spectrum_rows[indices], rows, aim.band) if is_chromatic else None
-    jacobian = astrometry.jacobian(wcs, sources.column, sources.row)
+    jacobian = astrometry.jacobian(aim.wcs, column[on_frame], row[on_frame])
     sources = replace(sources, jacobian=jacobian, photons=photons)
     return disc_structure.add_structure(sources, _with_catalogue_bulges(form, rows), rows.discs), sizes[on_frame]
+
+
+def _reaches_window(sources: Sources, sizes: Int, psf: Psf, noise: float, window: Window) -> Bool:
+    """Return the mask [n] of the sources that may have light in a window, also light far below the `noise` of a pixel.
+
+    The image of the whole detector contains such light if it is noticeable elsewhere on the detector.
+    """
+    sides = wings.region_side(np.maximum(sizes, psf.side).astype(float))
+    return np.asarray(
+        selection.overlaps_frame(sources.column, sources.row, sides, window.nx, window.ny)
+        | stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf)
+        | stamp_sizes.on_largest(sources.shape, sizes)
+        | stamp_sizes.touching_frame(sources, sizes, psf, noise, window.nx, window.ny)
+    )
 
 
 def _with_catalogue_bulges(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
@@ -467,9 +487,10 @@ def _with_moving(
     Returns the sources, with moving bodies at the end, since they have the largest identifiers; the sizes of their
     stamps in pixels; and bright bodies on and around the detector, which cause scattered light.
     """
-    (sources, sizes), detector = fixed, aim.detector
-    reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
+    (sources, sizes), drawn = fixed, aim.drawn
+    reach = (aim.half_diagonal + stamp_sizes.reach(aim.detector.pixel_scale)) / 3600.0
     bodies = solar_system.trailed_sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    bodies = replace(bodies, column=bodies.column - drawn.column, row=bodies.row - drawn.row)
     length = stamp_sizes.piece_length(bodies.trail_length)
     body_sizes = stamp_sizes.stamp_sizes(
         bodies.electrons, bodies.shape, bodies.shapes, psf, scene.pixel_noise, settings, length
@@ -477,7 +498,7 @@ def _with_moving(
     body_reach = stamp_sizes.visible_sides(
         bodies.electrons, body_sizes, bodies.shape, None, psf, scene.pixel_noise, bodies.trail_length
     )
-    on_detector = selection.overlaps_frame(bodies.column, bodies.row, body_reach, detector.nx, detector.ny) & (
+    on_detector = selection.overlaps_frame(bodies.column, bodies.row, body_reach, drawn.nx, drawn.ny) & (
         bodies.electrons > 0
     )
     if not on_detector.any():
@@ -489,8 +510,8 @@ def _with_moving(
     )
 
 
-def touches_detector(sources: Sources, sizes: Int, detector: Detector) -> Bool:
-    """Find the sources whose stamps (square images around the sources) overlap a detector.
+def touches_frame(sources: Sources, sizes: Int, drawn: Window) -> Bool:
+    """Find the sources whose stamps (square images around the sources) overlap the drawn pixels of a detector.
 
     Parameters
     ----------
@@ -498,15 +519,15 @@ def touches_detector(sources: Sources, sizes: Int, detector: Detector) -> Bool:
         The n sources.
     sizes : int array, shape (n,)
         Sides of the stamps, pixels. They are enlarged by the displacement of moving sources.
-    detector : Detector
-        The detector.
+    drawn : Window
+        Pixels of the detector that are drawn, in which the positions of the sources are counted.
 
     Returns
     -------
     bool array, shape (n,)
-        True for sources whose stamps overlap the detector.
+        True for sources whose stamps overlap these pixels.
     """
-    return selection.overlaps_frame(sources.column, sources.row, sizes + sources.trail_length, detector.nx, detector.ny)
+    return selection.overlaps_frame(sources.column, sources.row, sizes + sources.trail_length, drawn.nx, drawn.ny)
 
 
 def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:

@@ -57,6 +57,8 @@ class Planes:
         notes.
     samples : int
         Samples per pixel of the detector.
+    origin : (int, int)
+        Column and row of the detector at which the drawn image begins, (0, 0) if the whole detector is drawn.
 
     Notes
     -----
@@ -75,6 +77,7 @@ class Planes:
     half: tuple[float, float]
     powers: tuple[tuple[int, int, int], ...] = ()
     samples: int = SAMPLES
+    origin: tuple[int, int] = (0, 0)
 
     @property
     def max_frequency(self) -> float:
@@ -205,6 +208,16 @@ def from_planes(planes: Planes, pixel_scale: float, has_pixel: bool, side: int =
     """
     mean = planes.images.mean(axis=0, dtype=float)
     return from_profile(galsim_profile(mean, pixel_scale / planes.samples), pixel_scale, planes, has_pixel, side)
+
+
+def gaussian(fwhm: float, pixel_scale: float) -> Psf:
+    """Return a round Gaussian PSF that already includes the average over a pixel.
+
+    `fwhm` is its FWHM in arcsec, and `pixel_scale` is in arcsec per pixel.
+    """
+    import galsim
+
+    return from_profile(galsim.Gaussian(fwhm=fwhm), pixel_scale, has_pixel=True)
 
 
 def from_profile(

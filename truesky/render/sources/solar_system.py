@@ -207,7 +207,7 @@ def trailed_sources(
     """
     exposure, system, band = aim.exposure, aim.wcs, aim.band
     start, seconds = exposure.mjd, exposure.exposure_time_s
-    centre = astrometry.centre(aim.detector, system)
+    centre = aim.centre
     # Use the bodies of the UTC day on which the exposure begins, even if it ends after midnight.
     day = int(np.floor(start))
     start_hours = 24.0 * (start - day - 0.5)

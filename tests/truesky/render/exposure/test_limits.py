@@ -8,6 +8,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from truesky.render.camera import detectors
+from truesky.render.camera.windows import Window
 from truesky.render.channels.registry import CHANNELS
 from truesky.render.drawing import cost
 from truesky.render.exposure import limits
@@ -28,7 +29,9 @@ def refused(camera, count, monkeypatch):
         trail=None,
         trail_length=np.zeros(count),
     )
-    aim = SimpleNamespace(channel=CHANNELS["EXT"], detector=detector, exposure=SimpleNamespace(exposure_id=1))
+    whole = Window(0, 0, detector.nx, detector.ny)
+    exposure = SimpleNamespace(exposure_id=1)
+    aim = SimpleNamespace(channel=CHANNELS["EXT"], detector=detector, drawn=whole, exposure=exposure)
     try:
         limits.refuse_too_large(aim, SimpleNamespace(psf=1, dispersed=None, sources=sources, sizes=sizes))
     except BadInput:

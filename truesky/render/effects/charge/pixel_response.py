@@ -172,6 +172,9 @@ def parameters(scene: Scene) -> Parameters:
     """
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
+    if scene.window is not None and scene.detector is not None:
+        # The number is that of the whole detector.
+        dark_columns *= scene.nx * scene.ny / (scene.detector.nx * scene.detector.ny)
     return rms, dead, dark_columns, dust, scene.column_segments
 
 

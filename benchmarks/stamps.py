@@ -1,0 +1,107 @@
+"""Measure images of single places (`Lake.render`) and sources that are added to an image of a lake (`Lake.frame`).
+
+The lake is that of `make demo`, by default out/demo/lake. CPU times are of one process and thread, without the first
+image unless stated. Each place is compared with the noise-free image of the same detector in the lake.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import truesky
+from benchmarks import report
+
+ROOT = Path(__file__).resolve().parents[1]
+# Places on the VIS detector of the demo request (deg), and size of the images (arcsec).
+_PLACES = ((53.117, -27.808), (53.137, -27.808), (53.117, -27.828), (53.097, -27.788), (53.102, -27.823))
+_SIZE, _SMALL = 64.0, 10.0
+_NEW = {"ra": [53.117], "dec": [-27.808], "mag": [20.0]}
+_NOTES = {
+    "import_s": "import truesky, in a process of its own (target 0.5)",
+    "first_s": "first image of a process, with the PSF in the cache (target 3)",
+    "vis_quicklook_s": "64 arcsec, VIS (target 0.2)",
+    "vis_survey_s": "(target 0.5)",
+    "vis_reference_s": "(target 0.8)",
+    "vis_noise_s": "64 arcsec, VIS, survey, with noise",
+    "lsst_r_s": "64 arcsec, LSST r, survey (target 0.25)",
+    "small_s": "10 arcsec, VIS, survey (target 1/30)",
+    "largest_difference": "from the noise-free image of the detector, in units of the noise of a pixel (target 1/320)",
+    "frame_s": "one source added to a raw VIS image (target 3)",
+    "frame_differences": "pixels that differ from the image in the lake if no source is added (target 0)",
+}
+
+
+def _cpu_of(work: Callable[[], Any], places: Sequence[Any]) -> float:
+    """Return the mean CPU time of a function of a place."""
+    started = time.process_time()
+    for place in places:
+        work(place)
+    return (time.process_time() - started) / len(places)
+
+
+def _process_s(code: str) -> float:
+    """Return the CPU time that Python code reports on its last line, when it runs in a separate process."""
+    text = f"import time; {code}; print(time.process_time())"
+    done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, check=True, capture_output=True, text=True)
+    return float(done.stdout.split()[-1])
+
+
+def measure(root: Path, quick: bool) -> dict[str, float]:
+    """Return CPU times in s, and differences from the images in the lake. With `quick`, only one place is drawn."""
+    places = _PLACES[:1] if quick else _PLACES
+    first = f"import truesky; truesky.open({str(root)!r}).render({places[0][0]}, {places[0][1]}, noise=False)"
+    figures = {"import_s": _process_s("import truesky"), "first_s": _process_s(first)}
+    with truesky.open(root) as lake:
+        draw = {
+            "vis_quicklook": {"accuracy": "quicklook"}, "vis_survey": {}, "vis_reference": {"accuracy": "reference"},
+            "vis_noise": {"noise": True}, "lsst_r": {"band": "lsst_r"}, "small": {"size": _SMALL},
+        }  # fmt: skip
+        for name, options in draw.items():
+            arguments: dict[str, Any] = {"size": _SIZE, "noise": False, **options}
+            lake.render(*places[0], **arguments)
+            figures[f"{name}_s"] = _cpu_of(lambda place, a=arguments: lake.render(*place, **a), places)  # type: ignore[misc]
+        figures |= _differences(lake, places) | _frames(lake)
+    return figures
+
+
+def _differences(lake: Any, places: Sequence[tuple[float, float]]) -> dict[str, float]:
+    files = lake.images("noise_free")
+    path = files[files["band"] == "euclid_vis"].iloc[0]
+    whole, largest = lake.image(path["path"]).data, 0.0
+    for place in places:
+        drawn = lake.render(*place, size=_SIZE, exposure=int(path["exposure_id"]), noise=False)
+        (column, row), (ny, nx) = drawn.first_pixel, drawn.electrons.shape
+        noise = np.sqrt(drawn.exposure["sky"] * drawn.exposure["exposure_time_s"])
+        part = whole[row : row + ny, column : column + nx]
+        # The stored image has single precision.
+        rounding = 2.0**-24 * np.abs(part)
+        largest = max(largest, float((np.abs(drawn.electrons - part) - rounding).max() / noise))
+    return {"largest_difference": largest}
+
+
+def _frames(lake: Any) -> dict[str, float]:
+    files = lake.images()
+    path = files[files["band"] == "euclid_vis"].iloc[0]
+    frame = lake.frame(int(path["exposure_id"]), path["detector"])
+    differences = int((frame.raw != lake.image(path["path"]).data).sum())
+    seconds = _cpu_of(lambda rows: frame.with_sources(rows).raw, [_NEW])
+    return {"frame_s": seconds, "frame_differences": differences}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark with the options `argv` (default: the command line), print the results, return 0."""
+    options = report.options("stamps", __doc__ or "", argv, lake="lake of make demo (default: out/demo/lake)")
+    root = options.lake or ROOT / "out" / "demo" / "lake"
+    report.print_and_write("stamps", 1, measure(root, options.quick), _NOTES, options.json)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

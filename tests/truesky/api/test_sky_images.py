@@ -1,0 +1,210 @@
+"""Images of single places, and sources added to the images of a lake."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
+
+import truesky
+from lake_schema.errors import BadInput
+from lake_schema.store import publish
+from tests import requests
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.render import plan_exposures, render_exposures
+from truesky.request.from_toml import parse
+
+RA, DEC = 53.117, -27.808
+REQUEST = f"""
+[sources]
+only = "table"
+band = "lsst_r"
+galaxies = "galaxies.csv"
+stars = "stars.csv"
+[fluxes]
+bands = ["euclid_vis", "euclid_h", "lsst_r"]
+[[pointing]]
+channel = "EXT"
+camera = "lsstcam"
+band = "lsst_r"
+ra = {RA}
+dec = {DEC}
+centre_on = "R22_S11"
+detectors = ["R22_S11"]
+mjd = 60905.25
+[products]
+truth = ["noise_free"]
+"""
+NEW = {"ra": [RA, RA + 0.001], "dec": [DEC, DEC - 0.001], "mag": [20.0, 21.0], "half_light_radius": [0.4, 0.5]}
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    """A lake with galaxies and stars of a table, and one image."""
+    folder, rng = tmp_path_factory.mktemp("places"), np.random.default_rng(3)
+    places = {"ra": RA + rng.uniform(-0.15, 0.15, 4000), "dec": DEC + rng.uniform(-0.15, 0.15, 4000)}
+    mags = {"mag": rng.uniform(18.0, 26.0, 4000)}
+    pd.DataFrame({**places, **mags, "half_light_radius": rng.uniform(0.2, 1.0, 4000)})[:3000].to_csv(
+        folder / "galaxies.csv", index=False
+    )
+    pd.DataFrame({**places, **mags})[3000:].to_csv(folder / "stars.csv", index=False)
+    wanted, root = parse(requests.written(folder, REQUEST, requests.FIELD.format(0.2), seed=7)), folder / "lake"
+    root.mkdir()
+    for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
+        for step in module.steps(root, wanted):
+            publish.make_version(root, step.plan, step.run_task)
+    with truesky.open(root) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def whole(lake):
+    """Noise-free image of the detector in the lake."""
+    return lake.image(lake.images("noise_free")["path"][0])
+
+
+def test_an_image_is_a_part_of_the_image_in_the_lake(lake, whole):
+    drawn = lake.render(RA + 0.01, DEC - 0.02, size=30.0, exposure=1)
+    column, row = drawn.first_pixel
+    part = whole.data[row : row + 150, column : column + 150]
+    assert drawn.electrons.shape == drawn.raw.shape == part.shape
+    noise = np.sqrt(drawn.exposure["sky"] * drawn.exposure["exposure_time_s"])
+    assert np.abs(drawn.electrons - part).max() < noise / 320.0
+    x, y = drawn.wcs.all_world2pix([RA + 0.01], [DEC - 0.02], 0)
+    assert abs(x[0] - 74.5) < 0.51
+    assert abs(y[0] - 74.5) < 0.51
+    truth = lake.truth(1, "R22_S11").set_index("id").loc[drawn.truth["id"]]
+    np.testing.assert_allclose(drawn.truth["x"] + column, truth["x"], atol=1e-7)
+    np.testing.assert_allclose(drawn.truth["expected"], truth["expected"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("band", ["euclid_vis", "euclid_h", "lsst_r"])
+def test_a_nominal_exposure_has_the_place_in_the_middle(lake, band):
+    drawn = lake.render(RA, DEC, size=12.0, band=band)
+    ny, nx = drawn.electrons.shape
+    x, y = drawn.wcs.all_world2pix([RA], [DEC], 0)
+    assert abs(x[0] - (nx - 1) / 2) < 0.51
+    assert abs(y[0] - (ny - 1) / 2) < 0.51
+    assert drawn.exposure["band"] == band
+    assert set(drawn.errors) == {"flux", "shape", "position", "background"}
+    # The median is the sky, since few pixels have sources.
+    sky = drawn.exposure["sky"] * drawn.exposure["exposure_time_s"]
+    assert np.median(drawn.signal) == pytest.approx(sky, rel=0.3)
+    again = lake.render(RA, DEC, size=12.0, band=band)
+    assert np.array_equal(again.raw, drawn.raw)
+    other = lake.render(RA, DEC, size=12.0, band=band, seed=99)
+    assert not np.array_equal(other.raw, drawn.raw)
+    assert np.array_equal(other.electrons, drawn.electrons)
+    assert lake.render(RA, DEC, size=12.0, band=band, noise=False).raw is None
+
+
+def test_sources_are_left_out_and_added(lake):
+    drawn = lake.render(RA, DEC, size=30.0, exposure=1, noise=False)
+    brightest = drawn.truth.sort_values("expected").iloc[-1]
+    without = lake.render(RA, DEC, size=30.0, exposure=1, noise=False, without=[int(brightest["id"])])
+    assert set(drawn.truth["id"]) - set(without.truth["id"]) == {brightest["id"]}
+    assert (drawn.electrons - without.electrons).sum() == pytest.approx(brightest["drawn"], rel=0.02)
+    added = lake.render(RA, DEC, size=30.0, exposure=1, noise=False, extra=NEW)
+    zero_point, seconds = (drawn.exposure[name] for name in ("zero_point", "exposure_time_s"))
+    expected = seconds * 10 ** (0.4 * (zero_point - np.array(NEW["mag"])))
+    new = added.truth[~added.truth["id"].isin(drawn.truth["id"])]
+    np.testing.assert_allclose(new["expected"], expected, rtol=1e-4)
+    # The stamps of the new sources contain nearly all of their light.
+    assert (added.electrons - drawn.electrons).sum() == pytest.approx(expected.sum(), rel=0.01)
+    star = pd.DataFrame({"ra": [RA], "dec": [DEC], "mag": [19.0]})
+    both = lake.render(RA, DEC, size=30.0, exposure=1, noise=False, extra={"galaxies": NEW, "stars": star})
+    assert len(both.truth) == len(added.truth) + 1
+    np.testing.assert_array_equal(
+        lake.render(RA, DEC, size=30.0, exposure=1, noise=False, extra=Table(star.to_dict("list"))).electrons,
+        lake.render(RA, DEC, size=30.0, exposure=1, noise=False, extra=star).electrons,
+    )
+
+
+def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
+    path = lake.images()["path"][0]
+    stored = lake.image(path)
+    frame = lake.frame(1, "R22_S11")
+    assert np.array_equal(frame.raw, stored.data)
+    new = frame.with_sources(NEW)
+    assert len(new.added_rows) == 2
+    x, y = new.added_rows["x"], new.added_rows["y"]
+    changed = np.argwhere(new.raw != stored.data)
+    # All effects see the sources; most changed pixels are at the sources, others on the way to the amplifiers.
+    near = np.hypot(changed[:, 1] - x[0], changed[:, 0] - y[0]) < 100.0
+    assert near.mean() > 0.3
+    file = new.write(tmp_path / "new.fits")
+    with fits.open(file) as units, fits.open(lake._explorer._version("products").sidecar_path(path)) as before:
+        assert [unit.shape for unit in units] == [unit.shape for unit in before]
+        assert units[0].header["EXPOSURE"] == before[0].header["EXPOSURE"] == 1
+    with pytest.raises(BadInput, match="additional sources already"):
+        new.with_sources(NEW)
+    with pytest.raises(BadInput, match="nothing was rendered for detector R22_S12 of exposure 1"):
+        lake.frame(1, "R22_S12")
+
+
+def test_the_psf_of_an_image(lake):
+    drawn = lake.render(RA, DEC, size=20.0, exposure=1, noise=False)
+    psf = drawn.psf()
+    assert psf.samples == 1
+    assert psf.image.sum() == psf.light == pytest.approx(1.0, abs=0.05)
+    middle = len(psf.image) // 2
+    assert np.unravel_index(psf.image.argmax(), psf.image.shape) == (middle, middle)
+    fine = drawn.psf(RA, DEC, oversampled=True)
+    assert fine.samples > 1
+    assert fine.light == pytest.approx(psf.light, abs=0.02)
+    # A star in the image has the PSF of its spectrum.
+    star = int(
+        lake.render(RA, DEC, size=20.0, exposure=1, extra={"ra": [RA], "dec": [DEC], "mag": [16.0]}).truth["id"].max()
+    )
+    with pytest.raises(BadInput, match=f"source {star} was not drawn in this image"):
+        drawn.psf(source=star)
+
+
+def test_an_image_is_written(lake, tmp_path):
+    drawn = lake.render(RA, DEC, size=20.0, exposure=1)
+    with fits.open(drawn.write(tmp_path / "stamp.fits"), checksum=True) as units:
+        assert [unit.name for unit in units[1:]] == ["ELECTRONS", "RAW", "TRUTH"]
+        np.testing.assert_array_equal(units["RAW"].data, drawn.raw)
+        ra, dec = WCS(units["RAW"].header).all_pix2world([10.0], [20.0], 0)
+        np.testing.assert_allclose((ra[0], dec[0]), [float(at[0]) for at in drawn.wcs.all_pix2world([10.0], [20.0], 0)])
+        assert len(units["TRUTH"].data) == len(drawn.truth)
+        assert units[0].header["GAIN"] == drawn.gain
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ra": 10.0, "dec": 10.0}, "ra 10.00000, dec 10.00000: outside the area of the catalogue"),
+        ({"size": 0.0}, "size = 0: must be 0.2 to 801 arcsec, at most a detector"),
+        ({"size": np.nan}, "size"),
+        ({"band": "euclid_vs"}, "band: 'euclid_vs' is not allowed: did you mean euclid_vis"),
+        ({"band": "nisp_red"}, "band nisp_red: spectra through a grism cannot be drawn"),
+        ({"band": "lsst_i"}, "band lsst_i: the lake has fluxes in .*; add the band to fluxes.bands"),
+        ({"camera": "lsscam"}, "camera: 'lsscam' is not allowed: did you mean lsstcam"),
+        ({"camera": "vis"}, "band: 'lsst_r' is not one of euclid_vis"),
+        ({"exposure": 9}, "exposure 9: the lake has no exposure with this number"),
+        ({"exposure": 1, "ra": 53.4, "dec": DEC}, "on none of the 1 planned detectors"),
+        ({"ra": "x"}, "ra = 'x' must be a number in degrees, or hours"),
+        ({"accuracy": "fast"}, "accuracy = 'fast' is not one of quicklook"),
+        ({"effects": ["ghosts"]}, "effects: 'ghosts' cannot be applied to a window"),
+        ({"date": "2001-02-30"}, "date"),
+        ({"extra": {"ra": [RA], "dec": [DEC]}}, "rows: column mag is missing"),
+        ({"extra": {"ra": [RA], "dec": [DEC], "mag": [99.0]}}, "rows: column mag of row 1 is 99, but must be"),
+    ],
+)
+def test_bad_options_are_refused(lake, options, message):
+    with pytest.raises(BadInput, match=message) as caught:
+        lake.render(**{"ra": RA, "dec": DEC, "size": 10.0, "band": "lsst_r", **options})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_place_at_the_edge_of_the_catalogue_is_refused(lake):
+
+    def draw_northwards():
+        for shift in np.arange(0.1, 1.0, 0.02):
+            lake.render(RA, DEC + shift, size=10.0, band="lsst_r", noise=False)
+
+    with pytest.raises(BadInput, match=r"cut by the edge of the catalogue, which has \d+ % of the surroundings"):
+        draw_northwards()

@@ -1,0 +1,132 @@
+"""Add sources to the raw image of a detector that is in a lake, exactly as if they had been in the catalogues."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from lake_schema.arrays import Array, Float32
+from lake_schema.errors import BadInput
+from lake_schema.store import read
+from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.tables.exposures import SELECTION_BANDS
+from truesky.api import added
+from truesky.render import detector_inputs
+from truesky.render.exposure import render
+from truesky.render.exposure.rendered_detector import RenderedDetector
+from truesky.render.products import fits_files, truth_table
+
+
+class LakeFrame:
+    """Raw image of a detector in a lake, with additional sources. `Lake.frame` returns it.
+
+    All pixels are simulated again, so that the image is the same, bit by bit, as if the sources had been in the
+    catalogues: their photon noise, saturation, charge transfer and all other effects are included. The random numbers
+    of everything else do not change.
+
+    Parameters
+    ----------
+    root : Folder
+        The lake.
+    version : Version
+        Version of the table `products`.
+    exposure : int
+        Number of the exposure.
+    detector : str
+        Name of the detector.
+
+    """
+
+    def __init__(self, root: Folder, version: read.Version, exposure: int, detector: str) -> None:
+        image_facts = {"exposure_id": exposure, "detector": detector}
+        parts = [part["facts"] for part in version.manifest["parts"] if image_facts.items() <= part["facts"].items()]
+        if not parts:
+            raise BadInput(f"lake {root}: nothing was rendered for detector {detector} of exposure {exposure}")
+        self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
+        self._extra: Any = None
+        self._rendered: RenderedDetector | None = None
+
+    def with_sources(self, rows: Any) -> LakeFrame:
+        """Return the image with additional sources.
+
+        Parameters
+        ----------
+        rows : table or mapping
+            Sources with the columns of the section ``[sources]`` of a request, as for `Lake.render`. ``mag`` is in the
+            band of the exposure; for slitless images, in H of Euclid.
+
+        Returns
+        -------
+        LakeFrame
+            The new image. It is computed when its pixels are first used.
+
+        Raises
+        ------
+        BadInput
+            If the image has additional sources already.
+        """
+        if self._extra is not None:
+            raise BadInput("rows: this image has additional sources already, give all of them in one call")
+        new = object.__new__(LakeFrame)
+        new._root, new._facts, new._extra, new._rendered = self._root, self._facts, rows, None
+        return new
+
+    def _result(self) -> RenderedDetector:
+        if self._rendered is None:
+            request = self._facts["request"]
+            aim, rows, variant = detector_inputs.load_inputs(self._root, self._facts)
+            if self._extra is not None:
+                band = SELECTION_BANDS.get(aim.exposure.channel, aim.exposure.band)
+                rows = added.add_sources(rows, self._extra, band)
+            self._rendered = render.render(
+                aim, rows, variant, request["seed"], request["truth"], noise_seed=request["noise_seed"]
+            )
+        return self._rendered
+
+    @property
+    def raw(self) -> Array:
+        """Raw pixels of the detector without prescan and overscan, ADU, shape (ny, nx)."""
+        return self._result().science
+
+    @property
+    def noise_free(self) -> Float32:
+        """Expected electrons of the sources alone, float32[ny, nx]."""
+        return self._result().noise_free
+
+    @property
+    def maps(self) -> Mapping[str, Array]:
+        """Truth maps (ny, nx) that the request asks for, by name."""
+        return self._result().maps
+
+    @property
+    def truth(self) -> pd.DataFrame:
+        """Drawn sources: the columns of the table ``rendered_truth``."""
+        frame: pd.DataFrame = truth_table.truth(self._result()).to_pandas()
+        return frame
+
+    @property
+    def added_rows(self) -> pd.DataFrame:
+        """Rows of `truth` of the additional sources. The last digits of their identifiers count the user's rows."""
+        truth = self.truth
+        return truth[added.is_added(truth["id"].to_numpy())].reset_index(drop=True)
+
+    def write(self, path: str | Path) -> Path:
+        """Write the raw image in the format of the images of the lake; an existing file is replaced.
+
+        Parameters
+        ----------
+        path : str or Path
+            The FITS file.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        request, file = self._facts["request"], Path(path)
+        rows, writers = fits_files.products(self._result(), (), request["compression"] == "rice", request["wcs"])
+        writers[rows["path"][0].as_py()](file)
+        return file

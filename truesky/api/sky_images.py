@@ -1,0 +1,498 @@
+"""Draw images of single places on the sky from the catalogues of a lake, without a request and without Spark."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import numpy as np
+import pandas as pd
+import pyarrow.compute as pc
+
+from lake_schema import arguments
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.fits import images
+from lake_schema.store import read
+from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.tables.exposures import ExposureRow
+from truesky.api import added
+from truesky.render.camera import astrometry, detectors
+from truesky.render.camera.windows import Window
+from truesky.render.channels.aim import Aim
+from truesky.render.drawing import stamps, transfer
+from truesky.render.exposure.records import Variant
+from truesky.render.planning import exposure_chunks, variants
+from truesky.render.sources.galaxy_shapes import Shapes
+from truesky.render.sources.source_list import Sources
+from truesky.render.windows import image as window_images
+from truesky.render.windows import inputs, nominal
+from truesky.render.windows.image import WindowImage
+from truesky.render.windows.inputs import SkyTables
+from truesky.request import accuracy as accuracies
+from truesky.request import sky_notation
+from truesky.request.accuracy import Accuracy
+from truesky.request.from_toml import from_table
+from truesky.request.toml_values import refuse_name
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
+
+# Largest and smallest size of an image in pixels.
+_MAX_PIXELS, _MIN_PIXELS = 4096, 1
+# Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
+_MAX_INT64 = 2**63 - 1
+# Electrons of the star that is drawn to show a PSF. They are many, so that rounding to 1e-6 electrons does not matter.
+_PSF_ELECTRONS = 1e9
+# Tables that are used if the lake has them, besides the catalogues and their fluxes.
+_CATALOGUES = ("galaxies", "galaxy_fluxes", "stars", "star_fluxes")
+_OPTIONAL = ("strong_lenses",)
+
+
+@dataclass(frozen=True, slots=True)
+class PsfImage:
+    """Image of a point-spread function.
+
+    Attributes
+    ----------
+    image : float array, shape (n, n)
+        Fraction of a star's light in each pixel or sample, centred on the middle one.
+    samples : int
+        Samples per pixel of the detector; 1 for an image in pixels.
+    light : float
+        Fraction of the light that the image contains.
+    """
+
+    image: Float
+    samples: int
+    light: float
+
+
+class SkyImage:
+    """Image of a place on the sky, with its truth. `Lake.render` returns it.
+
+    Attributes
+    ----------
+    electrons : ndarray of float64, shape (ny, nx)
+        Expected electrons of the sources alone, without sky and noise.
+    raw : ndarray of int or None, shape (ny, nx)
+        Pixels with sky and noise as the detector's converter gives them, ADU; None without noise.
+    truth : pandas.DataFrame
+        One row per drawn source: the columns of the table ``rendered_truth``.
+    wcs : astropy.wcs.WCS
+        World coordinate system of the pixels.
+    errors : dict of str to float
+        Measured errors of the drawing at this accuracy: ``flux`` (relative), ``shape`` (reduced shear), ``position``
+        (pixels) and ``background`` (in units of the noise of a sky pixel).
+    exposure : dict
+        Properties of the exposure: the columns of the table ``exposures``.
+    detector : str
+        Name of the detector.
+    first_pixel : (int, int)
+        Column and row of the detector, from 0, of the first pixel of the image.
+    gain : float
+        Electrons per ADU.
+    bias : float
+        Level of a pixel without electrons, ADU.
+    """
+
+    def __init__(self, drawn: WindowImage) -> None:
+        self._drawn, aim = drawn, drawn.aim
+        window = aim.drawn
+        self.electrons, self.raw, self.detector = drawn.electrons, drawn.raw, aim.detector.name
+        self.exposure = asdict(aim.exposure)
+        self.first_pixel = window.column, window.row
+        self.truth: pd.DataFrame = window_images.truth(drawn).to_pandas()
+        self.wcs: WCS = astrometry.shift_pixels(aim.wcs, -window.column, -window.row)
+        self.errors = asdict(accuracies.expected_errors(drawn.scene.accuracy))
+        self.gain = float(drawn.scene.amplifier_values("gain", "electron / adu"))
+        self.bias = float(drawn.scene.amplifier_values("bias", "adu"))
+
+    def __repr__(self) -> str:
+        ny, nx = self.electrons.shape
+        return f"<SkyImage {nx} x {ny} pixels, {self.exposure['band']}, {len(self.truth)} sources>"
+
+    @property
+    def signal(self) -> Float:
+        """Pixels with sky and noise in electrons above the bias, shape (ny, nx); raises BadInput without noise."""
+        if self.raw is None:
+            raise BadInput("signal: this image has no noise, draw it with noise=True")
+        return np.asarray((self.raw - self.bias) * self.gain)
+
+    def psf(
+        self, ra: float | None = None, dec: float | None = None, source: int | None = None, oversampled: bool = False
+    ) -> PsfImage:
+        """Return the PSF at a place of the image.
+
+        Parameters
+        ----------
+        ra, dec : float, optional
+            Position in degrees. By default the middle of the image.
+        source : int, optional
+            Identifier of a drawn source, whose spectrum and, without `ra` and `dec`, whose position is used. By
+            default the spectrum has constant f_nu.
+        oversampled : bool, optional
+            If True, return the samples of the model without the pixel of the detector, otherwise the light in pixels.
+
+        Returns
+        -------
+        PsfImage
+            The image of the PSF.
+
+        Raises
+        ------
+        BadInput
+            If the source was not drawn, or the model of the PSF has no samples.
+        """
+        drawn, photons = self._drawn, None
+        ny, nx = self.electrons.shape
+        column, row = (nx - 1) / 2, (ny - 1) / 2
+        if source is not None:
+            at = np.flatnonzero(drawn.sources.ids == source)
+            if not len(at):
+                raise BadInput(f"source {source} was not drawn in this image")
+            photons = None if drawn.sources.photons is None else drawn.sources.photons[at]
+            column, row = float(drawn.sources.column[at[0]]), float(drawn.sources.row[at[0]])
+        if ra is not None and dec is not None:
+            x, y = astrometry.pixel_of_sky(self.wcs, [ra], [dec])
+            column, row = float(x[0]), float(y[0])
+        model = drawn.psf
+        place = np.array([column]), np.array([row])
+        weights = transfer.basis_weights(model, photons, *place)[0]
+        if oversampled:
+            if model.planes is None:
+                raise BadInput("the model of this PSF is a profile without samples: use oversampled=False")
+            image = np.asarray(transfer.image_of(model.planes, weights), float)
+            return PsfImage(image, model.planes.samples, float(image.sum()))
+        return self._psf_in_pixels(model, photons, place)
+
+    def _psf_in_pixels(self, model: Any, photons: Float | None, place: tuple[Float, Float]) -> PsfImage:
+        side = model.side + 1
+        if model.planes is not None:
+            first = (self.first_pixel[0] + place[0][0] - side // 2, self.first_pixel[1] + place[1][0] - side // 2)
+            model = replace(model, planes=replace(model.planes, origin=first))
+        middle = np.array([float(side // 2)])
+        star = Sources(
+            np.zeros(1, np.int64), middle, middle, np.zeros((1, 2, 2)), np.array([_PSF_ELECTRONS]),
+            np.array([-1]), _no_shapes(self._drawn.sources.shapes), photons,
+        )  # fmt: skip
+        image = stamps.draw(star, np.array([model.side]), model, side, side) / _PSF_ELECTRONS
+        return PsfImage(image, 1, float(image.sum()))
+
+    def write(self, path: str | Path) -> Path:
+        """Write the image to a FITS file.
+
+        The extensions are ELECTRONS (expected electrons), RAW (with sky and noise, if there is noise), and TRUTH (the
+        table of drawn sources). An existing file is replaced.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        file, exposure = Path(path), self.exposure
+        place = astrometry.cards(self.wcs)
+        cards: tuple[images.Card, ...] = (
+            ("CAMERA", exposure["camera"], "camera"),
+            ("FILTER", exposure["band"], "passband"),
+            ("DETNAME", self.detector, "detector"),
+            ("MJD-OBS", exposure["mjd"], "[d] start of the exposure, UTC"),
+            ("EXPTIME", exposure["exposure_time_s"], "[s] exposure time"),
+            ("ZEROPNT", exposure["zero_point"], "[mag] AB magnitude of 1 electron/s"),
+            ("GAIN", self.gain, "[electron/adu] electrons per ADU"),
+            ("BIAS", self.bias, "[adu] level without electrons"),
+            ("SKYRATE", exposure["sky"], "[electron/(s pix)] rate of the sky"),
+            ("COLUMN0", self.first_pixel[0], "[pix] first column on the detector, from 0"),
+            ("ROW0", self.first_pixel[1], "[pix] first row on the detector, from 0"),
+        )
+        units = [images.Image(None, cards), images.Image(self.electrons.astype(np.float32), place, "ELECTRONS")]
+        if self.raw is not None:
+            units.append(images.Image(self.raw, place, "RAW"))
+        truth = window_images.truth(self._drawn).drop_columns("detector")
+        images.write_images_and_table(file, units, "TRUTH", {name: truth[name] for name in truth.column_names})
+        return file
+
+
+def _no_shapes(shapes: Shapes) -> Shapes:
+    return shapes.take(np.zeros(0, np.int64))
+
+
+class ImageOptions(TypedDict, total=False):
+    """Options of `Lake.render`. All may be left out.
+
+    Attributes
+    ----------
+    camera : str
+        Name of the camera. By default the first one that has the band.
+    exposure : int
+        Number of a planned exposure of the lake, whose band, pointing, PSF and sky are used. The band, `camera` and
+        `date` are then ignored. By default a nominal exposure of the band, in which the place is in the middle of the
+        central detector.
+    date : float or str
+        Start of a nominal exposure, as MJD or as an ISO date in UTC. By default the first date at which the place can
+        be observed.
+    accuracy : str or mapping
+        Name of an accuracy, such as ``survey`` (see `truesky.accuracies`), or its four errors. By default ``survey``.
+    noise : bool
+        If False, no raw image is made. By default True.
+    seed : int
+        Seed of the noise. By default the seed of the lake.
+    effects : collection of str
+        Names of the detector effects of the raw image, such as ``poisson`` and ``read_noise``. By default the effects
+        that are noticeable. Effects that depend on the rest of the detector, such as charge transfer and ghosts,
+        cannot be applied.
+    without : sequence of int
+        Identifiers of sources or of arcs of strong lenses that are left out.
+    extra : table
+        Sources to add, with the columns of the section ``[sources]`` of a request: stars with ``ra``, ``dec`` and
+        ``mag`` (AB, in the band of the image), galaxies also with ``half_light_radius``, ``axis_ratio`` and so on. A
+        DataFrame, an astropy or Arrow table, or a dictionary of arrays; or a dictionary with two such tables,
+        ``galaxies`` and ``stars``.
+    """
+
+    camera: str | None
+    exposure: int | None
+    date: float | str | None
+    accuracy: str | Mapping[str, float]
+    noise: bool
+    seed: int | None
+    effects: Collection[str] | None
+    without: Sequence[int]
+    extra: Any
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRequest:
+    """Arguments of `Lake.render`, after they have been checked.
+
+    Attributes
+    ----------
+    ra, dec : float
+        Position of the middle of the image, deg.
+    size : float
+        Side of the image, arcsec.
+    band : str
+        Name of the passband.
+    camera : str or None
+        Name of the camera; None for the first one with this band.
+    exposure : int or None
+        Number of a planned exposure; None for a nominal exposure.
+    mjd : float or None
+        Start of a nominal exposure, MJD.
+    accuracy : Accuracy
+        Errors that are accepted.
+    noise : bool
+        True to make a raw image.
+    noise_seed : int or None
+        Seed of the noise; None for the seed of the lake.
+    effects : tuple of str or None
+        Names of the effects of the raw image; None for those that are noticeable.
+    without : tuple of int
+        Identifiers of sources that are left out.
+    extra : object
+        Table of sources that are added; None for none.
+    """
+
+    ra: float
+    dec: float
+    size: float
+    band: str
+    camera: str | None
+    exposure: int | None
+    mjd: float | None
+    accuracy: Accuracy
+    noise: bool
+    noise_seed: int | None
+    effects: tuple[str, ...] | None
+    without: tuple[int, ...]
+    extra: Any
+
+
+def check_request(
+    place: tuple[float | str, float | str], size: float, band: str, options: ImageOptions
+) -> ImageRequest:
+    """Check the arguments of `Lake.render`.
+
+    Parameters
+    ----------
+    place : (float or str, float or str)
+        Right ascension and declination, in degrees or sexagesimal.
+    size : float
+        Side of the image, arcsec.
+    band : str
+        Name of the passband.
+    options : ImageOptions
+        The other arguments.
+
+    Returns
+    -------
+    ImageRequest
+        The arguments.
+
+    Raises
+    ------
+    BadInput
+        If an option is unknown or its value is not valid. The message names the option and the allowed values.
+    """
+    names = tuple(ImageOptions.__annotations__)
+    for name in options:
+        if name not in names:
+            raise BadInput(f"render: {refuse_name(name, names)}")
+    exposure, date, seed = (options.get(name) for name in ("exposure", "date", "seed"))
+    effects, without = options.get("effects"), options.get("without", ())
+    return ImageRequest(
+        sky_notation.angle(place[0], "ra", "ra", sky_notation.RA_LIMITS) % 360.0,
+        sky_notation.angle(place[1], "dec", "dec", sky_notation.DEC_LIMITS),
+        arguments.check_number("size", size, 0.0, 3600.0),
+        str(band),
+        options.get("camera"),
+        None if exposure is None else arguments.check_integer("exposure", exposure, 0, _MAX_INT64),
+        None if date is None else sky_notation.mjd(date, "date"),
+        parse_accuracy(options.get("accuracy", "survey")),
+        bool(options.get("noise", True)),
+        None if seed is None else arguments.check_integer("seed", seed, 0, _MAX_INT64),
+        None if effects is None else tuple(effects),
+        tuple(arguments.check_integers("without", without, 0, _MAX_INT64)) if len(without) else (),
+        options.get("extra"),
+    )
+
+
+def parse_accuracy(value: str | Mapping[str, float]) -> Accuracy:
+    """Return an accuracy from its name or its four errors; raises BadInput if it is not valid."""
+    area = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 0.1}}
+    return from_table({"name": "image", "seed": 0, "area": area, "accuracy": value}).accuracy
+
+
+class SkyPainter:
+    """Draws images of places on the sky from the tables of a lake.
+
+    Parameters
+    ----------
+    tables : SkyTables
+        Catalogues of the lake.
+    settings : mapping
+        Recorded settings of the images of the lake (`request` in the facts of the table products), or {} without
+        images.
+    planned : mapping of str to Version
+        The tables `exposures`, `tasks` and `mission` if the lake has them.
+    seed : int
+        Seed of the lake.
+    """
+
+    def __init__(
+        self, tables: SkyTables, settings: Mapping[str, Any], planned: Mapping[str, read.Version], seed: int
+    ) -> None:
+        self.tables, self.planned, self.seed = tables, planned, seed
+        self.mission = inputs.mission_of_lake(planned.get("mission"))
+        effects = settings.get("effects", {"on": (), "off": ()})
+        self.forced = {**dict.fromkeys(effects["on"], True), **dict.fromkeys(effects["off"], False)}
+        self.nominal = lru_cache(maxsize=64)(self._nominal)
+
+    def _nominal(self, band: str, camera: str | None, mjd: float | None, cell: tuple[float, float]) -> ExposureRow:
+        instrument = nominal.find_instrument(band, camera, self.mission)
+        return nominal.nominal_exposure(instrument, band, cell, self.seed, self.mission, mjd)
+
+    def aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
+        """Return the exposure, the detector and the window of an image, and its parameters and accuracy."""
+        if request.exposure is not None:
+            return self._planned_aim(request)
+        # The sky and the date belong to the middle of a 1 deg cell, so that neighbouring images share an exposure.
+        place = request.ra, request.dec
+        exposure = self.nominal(request.band, request.camera, request.mjd, (round(place[0]), round(place[1])))
+        detector = nominal.central_detector(exposure.camera, self.mission)
+        exposure = nominal.move_exposure(exposure, detector, place)
+        # The rows for charge injection, which are not read, would be in the middle of the image.
+        detector = replace(detector, injection_rows=0)
+        variant = Variant(self.mission, request.accuracy, self.forced)
+        aim = Aim.from_exposure(exposure, detector, None, self.seed)
+        return _with_window(aim, request), variant
+
+    def _planned_aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
+        number = int(request.exposure or 0)
+        for name in ("exposures", "tasks"):
+            if name not in self.planned:
+                raise BadInput(f"exposure {number}: the lake has no planned exposures (table {name})")
+        is_number = pc.field("exposure_id") == number
+        exposure_rows = exposure_chunks.rows(self.planned["exposures"], [number], where=is_number).to_pylist()
+        if not exposure_rows:
+            raise BadInput(f"exposure {number}: the lake has no exposure with this number")
+        exposure = ExposureRow.from_row(exposure_rows[0])
+        variant = variants.variant(exposure.settings, self.mission, request.accuracy, self.forced)
+        tasks = exposure_chunks.rows(self.planned["tasks"], [number], where=is_number).to_pylist()
+        for task in tasks:
+            detector = detectors.detector(exposure.camera, task["detector"], variant.mission)
+            aim = Aim.from_exposure(exposure, detector, None, self.seed)
+            column, row = (float(at[0]) for at in astrometry.pixel_of_sky(aim.wcs, [request.ra], [request.dec]))
+            if -0.5 <= column < detector.nx - 0.5 and -0.5 <= row < detector.ny - 0.5:
+                return _with_window(aim, request), variant
+        raise BadInput(f"ra {request.ra:.5f}, dec {request.dec:.5f}: on none of the {len(tasks)} planned detectors")
+
+    def draw(self, request: ImageRequest) -> SkyImage:
+        """Draw an image; see `Lake.render`."""
+        aim, variant = self.aim(request)
+        rows = inputs.select_rows(inputs.read_rows(self.tables, aim, variant), request.without)
+        if request.extra is not None:
+            rows = added.add_sources(rows, request.extra, aim.exposure.band)
+        drawn = window_images.draw_window(
+            aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise
+        )
+        return SkyImage(drawn)
+
+
+def _with_window(aim: Aim, request: ImageRequest) -> Aim:
+    detector = aim.detector
+    if aim.channel.dispersion is not None:
+        raise BadInput(f"band {aim.exposure.band}: spectra through a grism cannot be drawn in a part of a detector")
+    if not aim.sees_sky:
+        raise BadInput(f"exposure {aim.exposure.exposure_id}: its image type {aim.exposure.image_type} has no sky")
+    side = round(request.size / detector.pixel_scale)
+    if not _MIN_PIXELS <= side <= min(detector.nx, detector.ny, _MAX_PIXELS):
+        largest = min(detector.nx, detector.ny, _MAX_PIXELS) * detector.pixel_scale
+        raise BadInput(
+            f"size = {request.size:g}: must be {detector.pixel_scale:.2g} to {largest:.0f} arcsec, at most a detector"
+        )
+    column, row = (float(at[0]) for at in astrometry.pixel_of_sky(aim.wcs, [request.ra], [request.dec]))
+    first_column, first_row = (
+        min(max(round(place - (side - 1) / 2), 0), count - side)
+        for place, count in ((column, detector.nx), (row, detector.ny))
+    )
+    return replace(aim, window=Window(first_column, first_row, side, side))
+
+
+def painter(versions: Mapping[str, read.Version], root: Folder) -> SkyPainter:
+    """Return the painter of a lake.
+
+    Parameters
+    ----------
+    versions : mapping of str to Version
+        Versions of the tables of the lake, by name.
+    root : Folder
+        The lake.
+
+    Returns
+    -------
+    SkyPainter
+        The painter.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no catalogues or no fluxes.
+    """
+    for name in _CATALOGUES:
+        if name not in versions:
+            raise BadInput(f"lake {root}: has no table {name}, which images need")
+    names = (*_CATALOGUES, *(name for name in _OPTIONAL if name in versions))
+    products = versions.get("products")
+    settings = {} if products is None else products.manifest["facts"]["request"]
+    planned = {name: versions[name] for name in ("exposures", "tasks", "mission") if name in versions}
+    seed = settings.get("seed", versions["galaxies"].manifest["facts"].get("seed", 0))
+    return SkyPainter(SkyTables(root, {name: versions[name] for name in names}), settings, planned, seed)

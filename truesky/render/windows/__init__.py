@@ -1,0 +1,1 @@
+"""Draw windows: rectangles of pixels, without the rest of the detector."""

@@ -1,0 +1,219 @@
+"""Read from a lake (folder of stored tables) what is needed to draw windows, small parts of detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema import sky
+from lake_schema.errors import BadInput
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.store import read
+from lake_schema.store.object_storage.s3 import Folder
+from truesky.fluxes.inputs import galaxy_library_from_facts, stellar_library_from_facts
+from truesky.render.channels.aim import Aim
+from truesky.render.drawing import stamp_sizes
+from truesky.render.exposure import visible_sources
+from truesky.render.exposure.records import Rows, Variant
+from truesky.render.sources import catalogue_rows
+from truesky.render.sources.catalogue_rows import LENSES, BrightQuery
+
+# Order of the HEALPix cells (0.9 arcmin) in which the rows around a window are read.
+_READ_ORDER = 12
+# Smallest distance from a window, in arcsec, within which sources of any flux are read. Light beyond the stamps of
+# faint sources is drawn up to 26 arcsec from them.
+_MIN_MARGIN = 30.0
+_Tables = tuple[pa.Table, pa.Table]
+
+
+@dataclass(frozen=True, slots=True)
+class SkyTables:
+    """Tables of a lake from which windows are drawn.
+
+    Attributes
+    ----------
+    lake : Folder
+        Lake (folder of stored tables).
+    versions : mapping of str to Version
+        Versions of the tables galaxies, galaxy_fluxes, stars and star_fluxes, and of strong_lenses if there are any.
+    """
+
+    lake: Folder
+    versions: Mapping[str, read.Version]
+
+
+def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
+    """Read the catalogue rows of all sources whose light may reach a window.
+
+    Parameters
+    ----------
+    tables : SkyTables
+        Tables of the lake.
+    aim : Aim
+        Exposure and detector, with the window.
+    variant : Variant
+        Mission parameters and accuracy.
+
+    Returns
+    -------
+    Rows
+        All sources in the window and its surroundings, and bright sources farther away.
+
+    Raises
+    ------
+    BadInput
+        If the catalogues do not contain the whole window and its surroundings, or have no fluxes in the band.
+    """
+    exposure, detector, band = aim.exposure, aim.detector, aim.band
+    limits = visible_sources.flux_limits(exposure, detector, band, variant)
+    margin = max(variant.mission.value("survey.selection_margin", "arcsec"), _MIN_MARGIN)
+    ra, dec = aim.centre
+    task = {"ra": ra, "dec": dec, "radius": (aim.half_diagonal + margin) / 3600.0}
+    ring = max(stamp_sizes.reach(detector.pixel_scale) - margin, 0.0)
+    versions = tables.versions
+    refuse_uncovered(versions["galaxies"], task)
+    catalogues = {}
+    for rows, fluxes, columns, far_limit in (
+        ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, limits.far_galaxy),
+        ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, limits.spikes),
+    ):
+        check_band(versions[fluxes], exposure.band)
+        rings = [(ring, limits.min_flux), (catalogue_rows.FARTHEST, far_limit)]
+        catalogues[rows] = _read_sources(versions[rows], versions[fluxes], task, columns, exposure.band, rings)
+    lenses = None
+    if LENSES in versions:
+        deflection = catalogue_rows.max_deflection(versions["galaxies"])
+        lenses = catalogue_rows.read_lenses(versions[LENSES], task, deflection, ring, limits.min_flux)
+        pair = versions["galaxies"], versions["galaxy_fluxes"]
+        catalogues["galaxies"] = catalogue_rows.add_lensed_galaxies(catalogues["galaxies"], lenses, *pair, task, ring)
+    return Rows(
+        *catalogues["galaxies"],
+        *catalogues["stars"],
+        galaxy_library=galaxy_library_from_facts(tables.lake, versions["galaxy_fluxes"].manifest["facts"]),
+        stellar_library=stellar_library_from_facts(tables.lake, versions["star_fluxes"].manifest["facts"]),
+        complete_margin_arcsec=margin,
+        lenses=lenses,
+    )
+
+
+def check_band(fluxes: read.Version, band: str) -> None:
+    """Raise BadInput if a table of fluxes has no column for a band. The message lists the bands that it has."""
+    if f"f_nu_{band}" not in fluxes.schema.names:
+        present = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith("f_nu_")]
+        raise BadInput(f"band {band}: the lake has fluxes in {', '.join(present)}; add the band to fluxes.bands")
+
+
+def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
+    """Raise BadInput if a catalogue does not contain the circle of a task (`ra`, `dec`, `radius` in deg).
+
+    The message names the part of the circle that the catalogue contains.
+    """
+    cells = np.array(sorted(catalogue_rows.drawn_cells(catalogue)), np.int64)
+    nearby_cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"], _READ_ORDER)
+    inside = np.isin(sky.parent(nearby_cells, _READ_ORDER, GENERATION_ORDER), cells)
+    if not inside.all():
+        place = f"ra {task['ra']:.5f}, dec {task['dec']:.5f}"
+        if not inside.any():
+            raise BadInput(f"{place}: outside the area of the catalogue")
+        percent = 100.0 * inside.mean()
+        raise BadInput(f"{place}: cut by the edge of the catalogue, which has {percent:.0f} % of the surroundings")
+
+
+def _read_sources(
+    catalogue: read.Version,
+    fluxes: read.Version,
+    task: Mapping[str, Any],
+    columns: Sequence[str],
+    band: str,
+    rings: Sequence[tuple[float, float]],
+) -> _Tables:
+    """Read all sources in the circle of a task, and brighter sources around it, with their fluxes.
+
+    `rings` has a distance beyond the circle in arcsec, and the smallest flux in microjansky of the sources up to this
+    distance; the flux is infinite to read none.
+    """
+    deflection, flux = catalogue_rows.max_deflection(catalogue), ["id", f"f_nu_{band}"]
+    cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"] + deflection, _READ_ORDER).tolist()
+    rows = catalogue.rows_in_cells(cells, _READ_ORDER, columns)
+    light = fluxes.rows_in_cells(cells, _READ_ORDER, flux)
+    queries = [BrightQuery(task, columns, band, limit, reach) for reach, limit in rings if np.isfinite(limit)]
+    for bright_rows, bright_light in catalogue_rows.read_bright(catalogue, fluxes, queries):
+        new = pc.invert(pc.is_in(bright_rows["id"], rows["id"]))
+        new_light = pc.invert(pc.is_in(bright_light["id"], light["id"]))
+        rows = pa.concat_tables([rows, bright_rows.filter(new).select(rows.column_names)])
+        light = pa.concat_tables([light, bright_light.filter(new_light).select(light.column_names)])
+    return rows, light
+
+
+def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
+    """Return catalogue rows without the sources and arcs with given identifiers."""
+    if not len(without):
+        return rows
+    left_out = pa.array([int(number) for number in without], pa.int64())
+
+    def rest(table: pa.Table) -> pa.Table:
+        return table.filter(pc.invert(pc.is_in(table["id"], left_out)))
+
+    def rest_of_lenses(table: pa.Table) -> pa.Table:
+        # Without its galaxy, an arc has no light.
+        return rest(table.filter(pc.invert(pc.is_in(table["source_id"], left_out))))
+
+    return replace(
+        rows,
+        galaxies=rest(rows.galaxies),
+        galaxy_fluxes=rest(rows.galaxy_fluxes),
+        stars=rest(rows.stars),
+        star_fluxes=rest(rows.star_fluxes),
+        lenses=None if rows.lenses is None else rest_of_lenses(rows.lenses),
+    )
+
+
+def add_rows(rows: Rows, galaxies: _Tables, stars: _Tables) -> Rows:
+    """Add sources to catalogue rows.
+
+    Parameters
+    ----------
+    rows : Rows
+        Catalogue rows.
+    galaxies, stars : (pyarrow.Table, pyarrow.Table)
+        Rows of the tables `galaxies` and `stars`, and their fluxes.
+
+    Returns
+    -------
+    Rows
+        Catalogue rows with the additional sources at the end.
+
+    Raises
+    ------
+    BadInput
+        If the catalogue has a column that the additional sources lack.
+    """
+
+    def concatenate(table: pa.Table, new: pa.Table) -> pa.Table:
+        # Catalogues without optional columns, such as proper motions, stay without them.
+        columns = {name: new[name] for name in table.column_names if name in new.column_names}
+        if missing := [name for name in table.column_names if name not in columns]:
+            raise BadInput(f"sources cannot be added: the lake has a column {missing[0]} that they lack")
+        return pa.concat_tables([table, pa.table(columns).cast(table.schema)])
+
+    return replace(
+        rows,
+        galaxies=concatenate(rows.galaxies, galaxies[0]),
+        galaxy_fluxes=concatenate(rows.galaxy_fluxes, galaxies[1]),
+        stars=concatenate(rows.stars, stars[0]),
+        star_fluxes=concatenate(rows.star_fluxes, stars[1]),
+    )
+
+
+def mission_of_lake(mission: read.Version | None) -> MissionConfiguration:
+    """Return the mission parameters that a lake contains, or the built-in ones for a lake without them."""
+    from lake_schema.mission import configuration
+    from lake_schema.mission.published import read_back
+
+    return configuration.resolve() if mission is None else read_back(mission)
