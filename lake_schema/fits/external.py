@@ -20,6 +20,7 @@ import numpy as np
 from lake_schema import user_files
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.fits import write
 from lake_schema.texts import spelling
 
 if TYPE_CHECKING:
@@ -290,6 +291,119 @@ def read_planes(
     raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 
 
+def read_frame(path: Path, extension: int | str | None = None) -> tuple[Array, fits.Header, fits.Header, int]:
+    """Return a two-dimensional image of a FITS file, with its headers.
+
+    Parameters
+    ----------
+    path : Path
+        The file, plain or packed by gzip.
+    extension : int or str, optional
+        Number of the extension, 0 for the primary unit, or its name (EXTNAME). By default the first unit that contains
+        an image.
+
+    Returns
+    -------
+    pixels : array, shape (ny, nx)
+        Pixels in the type of the file and the byte order of this machine. Integers become floating-point numbers if
+        some are missing (BLANK); these are NaN.
+    cards, primary_cards : astropy.io.fits.Header
+        Header of the image, and that of the primary unit.
+    number : int
+        Number of the extension.
+
+    Raises
+    ------
+    BadInput
+        If the file does not exist, is cut short, too large or not FITS, has no such extension, or the extension is
+        compressed or not an image with two axes.
+    """
+    with _open_hdus(path, "calibrated image", is_mapped=False) as hdus:
+        number = _frame_number(path, hdus, extension)
+        hdu = hdus[number]
+        if hdu.header.get("ZIMAGE", False):
+            raise BadInput(f"{path}: extension {number} is compressed: unpack the file with funpack")
+        if not hdu.is_image or hdu.header["NAXIS"] != 2 or not hdu.size:
+            has = f"an image of {hdu.header['NAXIS']} axes" if hdu.is_image else "a table"
+            raise BadInput(f"{path}: extension {number} is {has}, but must be an image of 2 axes")
+        pixels = np.array(hdu.data)
+        blank = hdu.header.get("BLANK")
+        if blank is not None and pixels.dtype.kind in "iu":
+            missing = pixels == blank * hdu.header.get("BSCALE", 1) + hdu.header.get("BZERO", 0)
+            if missing.any():
+                pixels = np.where(missing, np.nan, pixels)
+        pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+        return pixels, hdu.header.copy(), hdus[0].header.copy(), number
+
+
+def _frame_number(path: Path, hdus: fits.HDUList, extension: int | str | None) -> int:
+    """Return the number of an extension with the given number or name, or of the first extension with an image."""
+    names = [str(hdu.header.get("EXTNAME", "")).strip() for hdu in hdus]
+    if isinstance(extension, str):
+        matches = [i for i, name in enumerate(names) if name and name.upper() == extension.strip().upper()]
+        if not matches:
+            listed = ", ".join(name for name in names if name) or "no names"
+            raise BadInput(f"{path}: has no extension {extension!r}; it has {listed}"[:500])
+        return matches[0]
+    if extension is not None:
+        if not 0 <= extension < len(hdus):
+            raise BadInput(f"{path}: has no extension {extension}; it has 0 to {len(hdus) - 1}")
+        return extension
+    for i, hdu in enumerate(hdus):
+        if hdu.header.get("ZIMAGE", False) or (hdu.is_image and hdu.header["NAXIS"]):
+            return i
+    raise BadInput(f"{path}: holds no image")
+
+
+def copy_with_frames(source: Path, target: Path, frames: Mapping[int, Array], tables: Sequence[Any] = ()) -> None:
+    """Write a copy of a FITS file in which the pixels of some images are replaced.
+
+    Parameters
+    ----------
+    source : Path
+        The original file, plain or packed by gzip.
+    target : Path
+        The file to write, without packing; it is replaced in one rename and may be the original file.
+    frames : mapping of int to array, shape (ny, nx)
+        New pixels by number of the extension. Their type may differ from that of the original.
+    tables : sequence of astropy.io.fits.BinTableHDU, optional
+        Tables that are appended as extensions. An extension of the original with the same name is left out.
+
+    Raises
+    ------
+    BadInput
+        If the original cannot be read, or an image has another number of pixels than its replacement.
+    OSError
+        If the file cannot be written.
+    """
+    from astropy.io import fits
+
+    failure: OSError | None = None
+    with _open_hdus(source, "calibrated image", is_mapped=False) as hdus:
+        names = {table.name for table in tables}
+        copied = []
+        for number, hdu in enumerate(hdus):
+            if number in frames and (not hdu.is_image or hdu.shape != frames[number].shape):
+                raise BadInput(f"{source}: extension {number} has changed: it must be an image of the same size")
+            if number in frames and frames[number].dtype.kind == "f":
+                header = hdu.header.copy()
+                # Without these cards, astropy does not scale the new pixels.
+                for keyword in ("BSCALE", "BZERO", "BLANK"):
+                    header.remove(keyword, ignore_missing=True)
+                hdu = (fits.PrimaryHDU if number == 0 else fits.ImageHDU)(frames[number], header)
+            elif number in frames:
+                hdu.data = frames[number]
+            if number in frames or hdu.name not in names:
+                copied.append(hdu)
+        try:
+            write.write_atomically(target, fits.HDUList([*copied, *tables]))
+        except OSError as error:
+            # Raise it after the block, which would report that the original cannot be read.
+            failure = error
+    if failure is not None:
+        raise failure
+
+
 def _number_columns(hdu: Any) -> dict[str, Float]:
     columns, every_row = {}, slice(None)
     for column in hdu.columns:
@@ -305,8 +419,10 @@ def _number_columns(hdu: Any) -> dict[str, Float]:
 
 
 @contextmanager
-def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
+def _open_hdus(path: Path, kind: str, is_mapped: bool = True) -> Iterator[fits.HDUList]:
     """Open a FITS file, plain or packed by gzip, for the body of a `with` statement, after checking its headers.
+
+    Data of plain files are mapped into memory if `is_mapped` is True. Scaled integers (BZERO) cannot be mapped.
 
     BadInput is raised in place of every exception in the body that is not a LakeError, because astropy raises many
     types of exceptions for damaged files.
@@ -324,7 +440,9 @@ def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
                 _check_headers(path, unpacked)
                 # Do not decompress images: astropy's code for it does not check its input. Compressed images then
                 # appear as tables.
-                with fits.open(unpacked, memmap=unpacked is stream, disable_image_compression=True) as hdus:
+                with fits.open(
+                    unpacked, memmap=is_mapped and unpacked is stream, disable_image_compression=True
+                ) as hdus:
                     yield hdus
         except LakeError:
             raise

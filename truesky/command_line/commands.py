@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from lake_schema import __version__, command
-from truesky.command_line import lakes, mission, reduction, simulation
+from truesky.command_line import injection, lakes, mission, reduction, simulation
 from truesky.command_line.parser import Parser, suggestion
 
 # Groups of commands in the help, with their titles.
@@ -96,6 +96,11 @@ COMMANDS = {
     "render": Command(
         "simulate", "REQUEST LAKE", "render the planned images only", "requests/demo.toml my_lake --limit 1",
         simulation.add_render_arguments, ("truesky.render.render_exposures",), True,
+    ),
+    "inject": Command(
+        "simulate", "IMAGE ROWS OUT", "add sources to a calibrated frame of a telescope",
+        "image.fits galaxies.csv injected.fits --psf image.psf", injection.add_inject_arguments,
+        ("truesky.api.inject",),
     ),
     "page": Command(
         "look", "LAKE", "show a lake in the browser, with a TAP service", "my_lake --port 8000",

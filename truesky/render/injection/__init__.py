@@ -1,0 +1,1 @@
+"""Add sources to calibrated frames of real telescopes, which are given as FITS images."""
