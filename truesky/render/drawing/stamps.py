@@ -336,7 +336,8 @@ def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Itera
         individual, sharing = (
             indices[on_frame[indices]] for indices in split_by_size(sources, prepared.sizes, psf, size, precise)
         )
-        reach = prepared.reach if size <= star_size else min(prepared.reach, _WIDE_REACH)
+        limit = np.inf if size <= star_size else _WIDE_REACH
+        reach = min(prepared.reach, limit)
         if len(sharing):
             shared, batch = transfer.transfer(psf, size, reach), max(_BATCH // size**2, 2)
             for i in range(0, len(sharing), batch):
@@ -344,7 +345,7 @@ def _batches(prepared: _PreparedSources, on_frame: Bool, precise: Bool) -> Itera
                 yield chosen, shared, prepared.weights[chosen].astype(np.float32)
         for i in individual.tolist():
             dtype = np.float64 if precise[i] else np.float32
-            source_grid = transfer.grid(size, min(float(prepared.cut[i]), reach) if own_reach[i] else reach)
+            source_grid = transfer.grid(size, min(float(prepared.cut[i]), limit) if own_reach[i] else reach)
             psf_transfer = transfer.source_transfer(
                 psf, prepared.weights[i], source_grid, dtype, bool(prepared.has_far_light[i])
             )
