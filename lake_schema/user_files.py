@@ -138,7 +138,7 @@ def _open_descriptor(path: Path, kind: str) -> int:
         _check_regular_file(path, kind, os.stat(path))
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
-        raise BadInput(f"{format_path(path)}: no such file") from None
+        raise BadInput(f"{format_path(path)}: no such file{suggest_similar(path, path.suffix)}") from None
     except OSError as error:
         raise BadInput(f"{format_path(path)}: {error.strerror}") from None
     except ValueError as error:

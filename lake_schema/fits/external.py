@@ -459,7 +459,8 @@ def _first_table(path: Path, hdus: fits.HDUList) -> Any:
             if not hdu.header["NAXIS1"]:
                 raise BadInput(f"{path}: the rows of its table are empty")
             return hdu
-    raise BadInput(f"{path}: holds no table")
+    contents = "only images" if any(hdu.header.get("NAXIS", 0) for hdu in hdus) else "no data"
+    raise BadInput(f"{path}: contains {contents}, but a catalogue must be a binary table")
 
 
 def _unpack(path: Path, stream: IO[bytes]) -> IO[bytes]:

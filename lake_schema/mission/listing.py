@@ -15,7 +15,7 @@ from lake_schema.mission.bounds import bounds_of_parameter
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter, convert
-from lake_schema.texts import text_tables
+from lake_schema.texts import spelling, text_tables
 
 _HEAD = ("name", "value", "unit", "bounds", "may differ by", "status", "source")
 
@@ -79,7 +79,9 @@ def list_entries(configuration: MissionConfiguration, pattern: str = "*") -> lis
     records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
     matching = [record for record in records if fnmatchcase(record.key.lower(), full_pattern.lower())]
     if not matching:
-        raise BadInput(f"no name of the mission database matches {pattern!r}")
+        names = [record.key for record in records]
+        hint = spelling.did_you_mean(pattern, names) or 'patterns such as "vis.*noise*" select several'
+        raise BadInput(f"no name of the mission database matches {pattern!r}; {hint}")
     return [_entry(record, configuration) for record in sorted(matching, key=lambda record: record.key)]
 
 

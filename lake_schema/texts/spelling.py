@@ -30,8 +30,8 @@ def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[st
     Returns
     -------
     list of str
-        Names with another spelling, and names of which `name` is a part between underscores or hyphens, such as
-        "euclid_vis" for "VIS".
+        Names with another spelling, such as the plural, and names of which `name` is a part between underscores or
+        hyphens, such as "euclid_vis" for "VIS".
     """
     by_lower_case = {other.lower(): other for other in list(existing)[:_MAX_COMPARED]}
     lower = name.lower()[:100]
@@ -39,8 +39,9 @@ def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[st
         return [by_lower_case[lower]]
     similar = difflib.get_close_matches(lower, by_lower_case, count, _LEAST_SIMILARITY)
     with_part = _names_with_part(lower, by_lower_case)
+    plurals = [other for other in (f"{lower}s", f"{lower.removesuffix('y')}ies") if other in by_lower_case]
     without_marks = [other for other in by_lower_case if _letters(lower) and _letters(other) == _letters(lower)]
-    return [by_lower_case[other] for other in dict.fromkeys((*without_marks, *with_part, *similar))][:count]
+    return [by_lower_case[other] for other in dict.fromkeys((*without_marks, *plurals, *with_part, *similar))][:count]
 
 
 def _names_with_part(lower: str, existing: Iterable[str]) -> list[str]:

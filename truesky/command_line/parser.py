@@ -175,5 +175,6 @@ def _plain_message(message: str) -> tuple[str, bool]:
         return f"{problem}{suggestion(match['value'], names)}", True
     for pattern, sentence in _SENTENCES:
         if match := re.fullmatch(pattern, message, re.DOTALL):
-            return re.sub(r"(?<!\S)-\w/(?=--)", "", match.expand(sentence)), False
+            is_unexpected = pattern.startswith("unrecognized arguments")
+            return re.sub(r"(?<!\S)-\w/(?=--)", "", match.expand(sentence)), is_unexpected
     return message, False

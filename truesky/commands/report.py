@@ -122,7 +122,9 @@ def job_totals(root: Folder) -> list[JobTotals]:
             tables_in_run.add(table)
             _add_log(line, lines)
     if not totals_by_job:
-        raise BadInput(f"lake {root} has no log of a run") if root.exists() else layout.missing_table(root)
+        if not read.table_names(root):
+            raise layout.missing_table(root)
+        raise BadInput(f"lake {root} has no log of a run, because no job has run in this folder")
     forecasts = _forecast(root, speed.estimate_speed(root).factor)
     job_lines = [
         replace(line, forecast_s=forecasts[job][0], forecast_gb=forecasts[job][1]) if job in forecasts else line

@@ -44,6 +44,10 @@ _ERROR_CLASS = re.compile(r"\A(?:[A-Z][\w-]* ?){1,4}Error: ")
 _UNKNOWN_FUNCTION = re.compile(
     r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
 )
+# Words that begin the parts of a query.
+_KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
+# Functions of DuckDB for names that users know from other languages.
+_FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
 # Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
 _SENTENCES = (
     (
@@ -68,7 +72,6 @@ _SENTENCES = (
         r"\1 does not accept arguments of type \2",
     ),
     (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
-    (r'syntax error at or near "(.+?)"', r"syntax error near \1"),
 )
 # Largest number of characters of the wrong word.
 _MAX_WORD = 60
@@ -241,14 +244,31 @@ def plain_message(message: str) -> str:
     extract = _EXTRACT.search(message)
     body = _ERROR_CLASS.sub("", message[: extract.start()] if extract else message)
     if unknown := _UNKNOWN_FUNCTION.search(body):
-        question = spelling.did_you_mean(unknown["name"], filter(None, [unknown["other"]]))
+        same = _FUNCTIONS.get(unknown["name"].lower())
+        question = (
+            f"did you mean {same}?"
+            if same
+            else spelling.did_you_mean(unknown["name"], filter(None, [unknown["other"]]))
+        )
         return f"function {unknown['name']} does not exist{question and f'; {question}'}"
+    if syntax := re.match(r'syntax error at or near "(.+?)"', body):
+        return f"syntax error near {syntax[1]}: {_syntax_hint(syntax[1], extract)}"
     for pattern, sentence in _SENTENCES:
         if match := re.match(pattern, body, re.DOTALL):
             return match.expand(sentence).replace("_LITERAL", "").replace('"', "").strip()
     word = _wrong_word(extract) if extract else ""
     place = f" (near {word})" if word and word not in body else ""
     return body.strip().rstrip("!") + place
+
+
+def _syntax_hint(word: str, extract: re.Match[str] | None) -> str:
+    """Return a remedy for a syntax error near a word of a query."""
+    words = re.findall(r"[A-Za-z_]+", extract["line"].partition(": ")[2]) if extract else [word]
+    for other in (word, *words):
+        similar = spelling.closest_names(other, _KEYWORDS, 1)
+        if similar and other.upper() not in _KEYWORDS:
+            return f"did you mean {similar[0]} for {other}?"
+    return "columns are separated by commas, text is in single quotes, and every bracket must be closed"
 
 
 def _wrong_word(extract: re.Match[str]) -> str:

@@ -373,7 +373,9 @@ def read_image(path: Path) -> ImageFile:
     """
     units = read_images(user_files.check_file(path, "calibrated image"))
     if [unit.name for unit in units[1:4]] != ["SCI", "WHT", "FLG"]:
-        raise BadInput(f"{user_files.format_path(path)}: is not a calibrated image (extensions SCI, WHT, FLG)")
+        raise BadInput(
+            f"{user_files.format_path(path)}: is not a calibrated image: truesky reduce LAKE --out FOLDER makes them"
+        )
     image, weight, flags = (np.asarray(unit.data) for unit in units[1:4])
     astrometry.from_cards(units[0].cards)
     return ImageFile(ReducedImage(image, weight, flags), units[0].cards)

@@ -14,6 +14,9 @@ from lake_schema.tables.exposures import RENDERED_TYPES
 from truesky.request.files import Ingest
 from truesky.request.schema import MissionChoice, Request, Stars
 
+# Largest distance in degrees from the area to a pointing that may belong to it.
+_NEAR_AREA = 3.0
+
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
 
@@ -31,6 +34,21 @@ def check_sources(request: Request) -> None:
     present = [key for key, is_present in other_sections.items() if is_present]
     if request.sources is not None and present:
         raise bad_input(f"sources: the tables contain all sources, the section {key} is not allowed" for key in present)
+
+
+def check_places(request: Request) -> None:
+    """Raise BadInput for pointings outside the area whose right ascension and declination seem to be exchanged."""
+    with Mistakes() as mistakes:
+        for i, pointing in enumerate(request.pointings):
+            # A declination that was given as right ascension may have been read as an angle from 0 to 360 deg.
+            exchanged_dec = (pointing.ra + 180.0) % 360.0 - 180.0
+            if abs(exchanged_dec) > 90.0:
+                continue
+            places = (pointing.ra % 360.0, pointing.dec), (pointing.dec % 360.0, exchanged_dec)
+            inside, exchanged_inside = (bool(request.area.contains([x], [y], _NEAR_AREA)[0]) for x, y in places)
+            if exchanged_inside and not inside:
+                place = f"ra = {pointing.ra:g}, dec = {pointing.dec:g}"
+                mistakes.add(BadInput(f"pointing[{i}]: {place} is outside the area: are ra and dec exchanged?"))
 
 
 def check_bands(request: Request) -> None:

@@ -198,7 +198,7 @@ def read_file(path: Path) -> Toml:
     try:
         return user_files.read_toml(path, "request")
     except BadInput as error:
-        raise BadInput(f"request {error}{user_files.suggest_similar(path, '.toml')}") from None
+        raise BadInput(f"request {error}") from None
 
 
 def _name(table: Toml) -> str:
@@ -288,6 +288,7 @@ def read_valid_parts(table: Toml, folder: Path = Path()) -> ValidParts:
     with_curves = read("fluxes", _with_camera_passbands, request) or request
     read("sources", checks.check_sources, with_curves)
     read("pointing", checks.check_bands, with_curves)
+    read("pointing", checks.check_places, with_curves)
     if mission is not None:
         # Images need the fluxes in their bands, also if the request names others.
         bands = (*bands, *(read("observation", request_bands.requested_bands, with_curves, mission) or ()))

@@ -343,7 +343,7 @@ def test_a_map_is_read_in_the_order_of_its_file(tmp_path):
         with pytest.raises(BadInput, match=words):
             external.read_map(path, name)
     astropy_fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "image.fits")
-    with pytest.raises(BadInput, match="holds no table"):
+    with pytest.raises(BadInput, match="but a catalogue must be a binary table"):
         external.read_map(tmp_path / "image.fits", "id")
 
 

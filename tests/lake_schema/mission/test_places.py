@@ -143,7 +143,10 @@ def test_the_list_is_aligned_and_filtered(capsys, tmp_path):
     assert found["vis.gain.E"]["value"] == 3.3
     assert "nisp.gain_spread" in found
     assert __main__.main(["mission", "list", "nothing"]) == 2
-    assert capsys.readouterr().err == "truesky mission: no name of the mission database matches 'nothing'\n"
+    assert capsys.readouterr().err == (
+        "truesky mission: no name of the mission database matches 'nothing'; "
+        'patterns such as "vis.*noise*" select several\n'
+    )
 
 
 def test_one_configuration_is_compared_with_the_default(capsys, tmp_path):

@@ -44,3 +44,9 @@ def test_a_suggestion_stands_before_the_allowed_names():
 def test_a_part_of_several_names_suggests_all_of_them():
     assert spelling.did_you_mean("nisp", ("VIS", "NISP-P", "NISP-S")) == "did you mean NISP-P or NISP-S?"
     assert spelling.did_you_mean("r", [f"survey{i}_r" for i in range(9)]).count(" or ") == 2
+
+
+def test_the_plural_comes_first():
+    names = ("galaxy_fluxes", "galaxies", "star_fluxes", "stars")
+    assert spelling.did_you_mean("galaxy", names) == "did you mean galaxies?"
+    assert spelling.did_you_mean("star", names) == "did you mean stars?"

@@ -121,7 +121,7 @@ def test_the_forecast_is_of_all_requests(lake):
 
 def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
     assert report.main([str(lake)]) == 2
-    assert "has no log of a run" in capsys.readouterr().err
+    assert "is not a lake, because it has no tables" in capsys.readouterr().err
     assert report.main([str(lake / "none")]) == 2
     assert "none does not exist; make it with truesky run" in capsys.readouterr().err
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})

@@ -254,3 +254,11 @@ irtf = ["G2V.txt", "M0V.txt"]
     assert asked.curves.basel == tmp_path / "lcbp00.cor"
     assert asked.curves.irtf == (tmp_path / "G2V.txt", tmp_path / "M0V.txt")
     assert parse(DEMO).curves == UserCurves()
+
+
+def test_exchanged_coordinates_of_a_pointing_are_named():
+    table = tomllib.loads(DEMO.read_text())
+    pointing = table["pointing"][0]
+    pointing["ra"], pointing["dec"] = pointing["dec"], pointing["ra"]
+    with pytest.raises(BadInput, match=r"pointing\[0\]: ra = 332.192, dec = 53.117 is outside .* ra and dec exchanged"):
+        from_table(table)
