@@ -101,11 +101,11 @@ def test_missing_input_tables_are_named(job, tmp_path, capsys):
     path.write_text(SMALL)
     assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
     missing = {
-        "compute_fluxes": "no table galaxies",
-        "build_strong_lenses": "no table galaxies",
-        "build_gaia": "no table stars",
+        "compute_fluxes": "has no tables: run truesky run REQUEST",
+        "build_strong_lenses": "has no tables: run truesky run REQUEST",
+        "build_gaia": "has no tables: run truesky run REQUEST",
         "plan_exposures": "it must have a pointing or an observation",
-        "render_exposures": "no table mission",
+        "render_exposures": "has no tables: run truesky run REQUEST",
     }
     assert missing[job.name] in capsys.readouterr().err
 
