@@ -157,6 +157,8 @@ LABELS = "truesky.numerics.cache_labels"
 RECORDS = {
     "truesky.request.files.Catalogue", "truesky.request.files.Curves", "truesky.request.files.DustMap",
     "truesky.request.files.UserCurves",
+    # Only checks use the area of a request, to refuse catalogues outside it.
+    "truesky.request.area.Area",
     "lake_schema.mission.configuration.MissionConfiguration", "lake_schema.mission.parameter.SPACE_CAMERAS",
     "lake_schema.mission.parameter.Parameter",
     "lake_schema.mission.detector_overrides", "lake_schema.mission.detector_overrides.DetectorPlace",

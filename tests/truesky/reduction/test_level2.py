@@ -294,7 +294,7 @@ def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):
         (["--level2", "--aperture", "-1"], "--aperture = -1.0 is outside"),
         (["--cosmic-rays", "0.1"], "--cosmic-rays = 0.1 is outside"),
         (["--threshold", "3"], "without --level2 there is no catalogue"),
-        (["--level2", "--masters", "nowhere"], "nowhere/jpcam_jedis_g_"),
+        (["--level2", "--masters", "nowhere"], "--masters nowhere: there is no such folder"),
     ],
 )
 def test_what_makes_no_level2_is_refused_in_a_line(jpcam, tmp_path, capsys, more, words):

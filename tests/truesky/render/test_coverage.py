@@ -90,4 +90,4 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     assert (middle >= 3).mean() > 0.9
     assert (middle >= 1).all()
     assert coverage.main(["--lake", str(lake / "none")]) == 2
-    assert "no table exposures" in capsys.readouterr().err
+    assert "none does not exist; make it with truesky run" in capsys.readouterr().err
