@@ -17,7 +17,7 @@ from lake_schema.arrays import Array, Float, Float32, Int
 from truesky.numerics import matrices
 from truesky.render.drawing import far_light
 from truesky.render.drawing.kernels import fourier
-from truesky.render.effects.light import intra_pixel
+from truesky.render.psf import pixel_response
 from truesky.render.psf.model import SIDE, Planes, Psf, galsim_profile, profile_spectrum
 
 # Width in radian / pixel of the intervals of |k| in which `max_transfer` finds the largest value of the PSF's Fourier
@@ -351,7 +351,7 @@ def _pixel(stamp_grid: Grid, strength: float | None) -> Float:
     )
     if strength is None:
         return np.ones((len(rows), len(columns)))
-    return intra_pixel.apply(columns / stamp_grid.size, rows[:, None] / stamp_grid.size, strength)
+    return pixel_response.transform(columns / stamp_grid.size, rows[:, None] / stamp_grid.size, strength)
 
 
 def _sum_planes(planes: Planes, weights: Float, side: int) -> Float32:

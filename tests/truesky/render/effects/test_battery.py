@@ -40,8 +40,9 @@ def test_no_effect_is_forgotten():
         for key, value in vars(import_module(module.name)).items():
             if key.startswith("apply") and key != "apply_all" and value.__module__ == module.name:
                 found.add(value)
-    # Part of the pixel's transfer function: it acts before there is a frame.
-    assert found == {case.apply for case in CASES.values()} | {intra_pixel.apply}
+    # The response inside a pixel acts before there is a frame, and is in the package of PSFs.
+    assert found == {case.apply for case in CASES.values()}
+    assert intra_pixel.EFFECT.apply.__module__ == "truesky.render.psf.pixel_response"
     assert {e.apply for kind in (vis, nisp_p, ground) for effects in kind.EFFECTS.values() for e in effects} <= found
 
 

@@ -408,16 +408,16 @@ def test_intra_pixel_response_against_the_integral_over_pixels():
     response /= response.mean()
     for x, y in ((0.0, 0.0), (1e-3, 0.0), (0.04, 0.05), (0.3, -0.2), (0.5, 0.5), (1.0, 0.7)):
         wanted = (response * np.cos(np.pi * x * u) * np.cos(np.pi * y * u[:, None])).mean()
-        assert intra_pixel.apply(x, y, 0.05) == pytest.approx(wanted, abs=1e-5)
-    assert intra_pixel.apply(0.0, 0.0, 0.3) == 1.0
+        assert intra_pixel.EFFECT.apply(x, y, 0.05) == pytest.approx(wanted, abs=1e-5)
+    assert intra_pixel.EFFECT.apply(0.0, 0.0, 0.3) == 1.0
     x, y = np.mgrid[-1:1:9j, -1:1:9j]
-    np.testing.assert_allclose(intra_pixel.apply(x, y, 0.0), np.sinc(x) * np.sinc(y), atol=1e-15)
+    np.testing.assert_allclose(intra_pixel.EFFECT.apply(x, y, 0.0), np.sinc(x) * np.sinc(y), atol=1e-15)
     # Series and closed form meet.
     edge = 0.15 / np.pi
-    below, above = (intra_pixel.apply(edge * (1 + step), 0.0, 0.5) for step in (-1e-9, 1e-9))
+    below, above = (intra_pixel.EFFECT.apply(edge * (1 + step), 0.0, 0.5) for step in (-1e-9, 1e-9))
     assert below == pytest.approx(above, abs=1e-10)
     with pytest.raises(OutOfRange, match="intra-pixel"):
-        intra_pixel.apply(0.0, 0.0, 0.7)
+        intra_pixel.EFFECT.apply(0.0, 0.0, 0.7)
 
 
 def test_intra_pixel_response_changes_a_star_as_stated():

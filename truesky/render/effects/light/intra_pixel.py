@@ -8,34 +8,9 @@ pixels: a filter on the final image would correct at most half of it.
 
 from __future__ import annotations
 
-import numpy.typing as npt
-
 from truesky.render.effects.effect import Effect
-from truesky.render.effects.scene import Frame, Scene
+from truesky.render.effects.scene import Scene
 from truesky.render.psf import pixel_response
-
-
-def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
-    """Return the transfer function of a pixel (Fourier transform of its response to light), normalised to 1 at 0.
-
-    Parameters
-    ----------
-    x, y : float array
-        Spatial frequencies along columns and rows in cycles per pixel.
-    strength : float
-        Parameter a of the response 1 - a (u^2 + v^2) inside a pixel, 0 to 0.5. With 0 the result is sinc x sinc y.
-
-    Returns
-    -------
-    float array
-        Transfer function, in the shape to which `x` and `y` are broadcast.
-
-    Raises
-    ------
-    OutOfRange
-        If `strength` is outside its limits or NaN.
-    """
-    return pixel_response.transform(x, y, strength)
 
 
 def _strength(scene: Scene) -> float:
@@ -47,7 +22,7 @@ def _strength(scene: Scene) -> float:
 _CHANGE = 0.07
 EFFECT = Effect(
     "intra_pixel",
-    apply,
+    pixel_response.transform,
     lambda scene: (_strength(scene),),
     lambda scene: _CHANGE * _strength(scene) * scene.peak_electrons,
 )
