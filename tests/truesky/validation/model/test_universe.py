@@ -146,6 +146,6 @@ def test_theory_agrees_with_lensing_sums():
 def test_full_report(tmp_path):
     """Run every expectation with the default settings of a request; this takes a quarter of an hour on one core."""
     file = tmp_path / "universe.json"
-    assert __main__.main(["--json", str(file), "--figures", str(tmp_path)]) == 0
+    assert __main__.main(["--results", str(file), "--figures", str(tmp_path)]) == 0
     assert json.loads(file.read_text())["checks"] > 130
     assert (tmp_path / "universe.png").stat().st_size > 10_000
