@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import pandas as pd
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
+# Largest number of processes that draw images.
+_MAX_PROCESSES = 1024
 
 
 class Lake(LakeTables):
@@ -246,6 +249,54 @@ class Lake(LakeTables):
 
         return self._painter.draw(sky_images.check_request((ra, dec), size, band, options))
 
+    def stamps(
+        self,
+        table: Any,
+        size: float = 64.0,
+        band: str = "euclid_vis",
+        processes: int | None = None,
+        **options: Unpack[ImageOptions],
+    ) -> Iterator[SkyImage]:
+        """Draw images of many places, in several processes.
+
+        Each image is the same as that of `render`, whatever the number of processes and the order of the places.
+        Neighbouring places share the rows of the catalogues and the PSF, so a table that is sorted by position is
+        drawn fastest.
+
+        Parameters
+        ----------
+        table : table, str, Path or mapping
+            Places: a table with the columns ``ra`` and ``dec`` (deg), or the path of one (Parquet, FITS, CSV or HDF5).
+            The columns ``size``, ``exposure``, ``seed`` and ``date`` (MJD) may replace the arguments of the same name.
+        size : float, optional
+            Side of the images in arcsec.
+        band : str, optional
+            Name of the passband.
+        processes : int, optional
+            Number of processes, by default one per processor core that this process may use.
+        **options : ImageOptions
+            As for `render`; they are the same for all images.
+
+        Returns
+        -------
+        iterator of SkyImage
+            The images, in the order of the table. Only some of them are in memory at the same time.
+
+        Raises
+        ------
+        BadInput
+            If the table or an option is not valid; this is raised before the first image. Later, if an image cannot be
+            drawn. The message names the row.
+        """
+        from truesky.api import stamp_series
+
+        requests = stamp_series.read_places(table, size, band, options)
+        for request in requests[:1]:
+            self._painter.check(request)
+        count = len(os.sched_getaffinity(0)) if processes is None else processes
+        number = arguments.check_integer("processes", count, 1, _MAX_PROCESSES)
+        return stamp_series.draw_all(self._painter, requests, number)
+
     def frame(self, exposure: int, detector: str) -> LakeFrame:
         """Return the raw image of a detector in the lake, to which sources can be added.
 
@@ -275,7 +326,7 @@ class Lake(LakeTables):
     def _painter(self) -> SkyPainter:
         from truesky.api import sky_images
 
-        return sky_images.painter(self._explorer.versions, self._explorer.root)
+        return sky_images.painter(sky_images.find_source(self._explorer.versions, self._explorer.root))
 
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -20,12 +20,17 @@ from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.tables.exposures import ExposureRow
 from truesky.api import added
+from truesky.fluxes import passbands
 from truesky.render.camera import astrometry, detectors
+from truesky.render.camera.detectors import Detector
 from truesky.render.camera.windows import Window
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamps, transfer
+from truesky.render.drawing.settings import settings_for
+from truesky.render.exposure import scene_factory, visible_sources
 from truesky.render.exposure.records import Variant
 from truesky.render.planning import exposure_chunks, variants
+from truesky.render.psf.model import Psf
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 from truesky.render.windows import image as window_images
@@ -47,9 +52,12 @@ _MAX_PIXELS, _MIN_PIXELS = 4096, 1
 _MAX_INT64 = 2**63 - 1
 # Electrons of the star that is drawn to show a PSF. They are many, so that rounding to 1e-6 electrons does not matter.
 _PSF_ELECTRONS = 1e9
+# Number of PSFs that are kept for the images that follow. One has up to 150 MB with its Fourier transforms.
+_PSFS = 4
 # Tables that are used if the lake has them, besides the catalogues and their fluxes.
 _CATALOGUES = ("galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 _OPTIONAL = ("strong_lenses",)
+_PLANNED = ("exposures", "tasks", "mission")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +74,7 @@ class PsfImage:
         Fraction of the light that the image contains.
     """
 
-    image: Float
+    image: Float = field(repr=False)
     samples: int
     light: float
 
@@ -99,17 +107,32 @@ class SkyImage:
         Level of a pixel without electrons, ADU.
     """
 
-    def __init__(self, drawn: WindowImage) -> None:
-        self._drawn, aim = drawn, drawn.aim
-        window = aim.drawn
+    def __init__(self, drawn: WindowImage, find_optics: Callable[[], tuple[Aim, Psf]]) -> None:
+        aim, window = drawn.aim, drawn.aim.drawn
+        self._sources, self._truth_table = drawn.sources, window_images.truth(drawn)
+        # These are not sent from the process that draws an image: astropy changes the numbers of a world coordinate
+        # system that is copied, and a PSF is much larger than the image.
+        self._find_optics: Callable[[], tuple[Aim, Psf]] | None = find_optics
+        self._response = drawn.psf.intra_pixel
         self.electrons, self.raw, self.detector = drawn.electrons, drawn.raw, aim.detector.name
         self.exposure = asdict(aim.exposure)
         self.first_pixel = window.column, window.row
-        self.truth: pd.DataFrame = window_images.truth(drawn).to_pandas()
-        self.wcs: WCS = astrometry.shift_pixels(aim.wcs, -window.column, -window.row)
+        self.truth: pd.DataFrame = self._truth_table.to_pandas()
         self.errors = asdict(accuracies.expected_errors(drawn.scene.accuracy))
         self.gain = float(drawn.scene.amplifier_values("gain", "electron / adu"))
         self.bias = float(drawn.scene.amplifier_values("bias", "adu"))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in ("_find_optics", "wcs")}
+
+    @cached_property
+    def wcs(self) -> WCS:
+        """World coordinate system of the pixels."""
+        return astrometry.shift_pixels(self._optics()[0].wcs, *(-first for first in self.first_pixel))
+
+    def _optics(self) -> tuple[Aim, Psf]:
+        assert self._find_optics is not None
+        return self._find_optics()
 
     def __repr__(self) -> str:
         ny, nx = self.electrons.shape
@@ -147,19 +170,19 @@ class SkyImage:
         BadInput
             If the source was not drawn, or the model of the PSF has no samples.
         """
-        drawn, photons = self._drawn, None
+        sources, photons = self._sources, None
         ny, nx = self.electrons.shape
         column, row = (nx - 1) / 2, (ny - 1) / 2
         if source is not None:
-            at = np.flatnonzero(drawn.sources.ids == source)
+            at = np.flatnonzero(sources.ids == source)
             if not len(at):
                 raise BadInput(f"source {source} was not drawn in this image")
-            photons = None if drawn.sources.photons is None else drawn.sources.photons[at]
-            column, row = float(drawn.sources.column[at[0]]), float(drawn.sources.row[at[0]])
+            photons = None if sources.photons is None else sources.photons[at]
+            column, row = float(sources.column[at[0]]), float(sources.row[at[0]])
         if ra is not None and dec is not None:
             x, y = astrometry.pixel_of_sky(self.wcs, [ra], [dec])
             column, row = float(x[0]), float(y[0])
-        model = drawn.psf
+        model = self._model()
         place = np.array([column]), np.array([row])
         weights = transfer.basis_weights(model, photons, *place)[0]
         if oversampled:
@@ -169,6 +192,10 @@ class SkyImage:
             return PsfImage(image, model.planes.samples, float(image.sum()))
         return self._psf_in_pixels(model, photons, place)
 
+    def _model(self) -> Psf:
+        psf = replace(self._optics()[1], intra_pixel=self._response)
+        return psf if psf.planes is None else replace(psf, planes=replace(psf.planes, origin=self.first_pixel))
+
     def _psf_in_pixels(self, model: Any, photons: Float | None, place: tuple[Float, Float]) -> PsfImage:
         side = model.side + 1
         if model.planes is not None:
@@ -177,7 +204,7 @@ class SkyImage:
         middle = np.array([float(side // 2)])
         star = Sources(
             np.zeros(1, np.int64), middle, middle, np.zeros((1, 2, 2)), np.array([_PSF_ELECTRONS]),
-            np.array([-1]), _no_shapes(self._drawn.sources.shapes), photons,
+            np.array([-1]), _no_shapes(self._sources.shapes), photons,
         )  # fmt: skip
         image = stamps.draw(star, np.array([model.side]), model, side, side) / _PSF_ELECTRONS
         return PsfImage(image, 1, float(image.sum()))
@@ -216,7 +243,7 @@ class SkyImage:
         units = [images.Image(None, cards), images.Image(self.electrons.astype(np.float32), place, "ELECTRONS")]
         if self.raw is not None:
             units.append(images.Image(self.raw, place, "RAW"))
-        truth = window_images.truth(self._drawn).drop_columns("detector")
+        truth = self._truth_table.drop_columns("detector")
         images.write_images_and_table(file, units, "TRUTH", {name: truth[name] for name in truth.column_names})
         return file
 
@@ -349,20 +376,37 @@ def check_request(
     exposure, date, seed = (options.get(name) for name in ("exposure", "date", "seed"))
     effects, without = options.get("effects"), options.get("without", ())
     return ImageRequest(
-        sky_notation.angle(place[0], "ra", "ra", sky_notation.RA_LIMITS) % 360.0,
-        sky_notation.angle(place[1], "dec", "dec", sky_notation.DEC_LIMITS),
-        arguments.check_number("size", size, 0.0, 3600.0),
+        *check_place(*place),
+        check_size(size),
         str(band),
         options.get("camera"),
-        None if exposure is None else arguments.check_integer("exposure", exposure, 0, _MAX_INT64),
+        None if exposure is None else check_count("exposure", exposure),
         None if date is None else sky_notation.mjd(date, "date"),
         parse_accuracy(options.get("accuracy", "survey")),
         bool(options.get("noise", True)),
-        None if seed is None else arguments.check_integer("seed", seed, 0, _MAX_INT64),
+        None if seed is None else check_count("seed", seed),
         None if effects is None else tuple(effects),
         tuple(arguments.check_integers("without", without, 0, _MAX_INT64)) if len(without) else (),
         options.get("extra"),
     )
+
+
+def check_place(ra: float | str, dec: float | str) -> tuple[float, float]:
+    """Return a position in degrees, with ra from 0 to 360; raises BadInput if the values are not allowed."""
+    return (
+        sky_notation.angle(ra, "ra", "ra", sky_notation.RA_LIMITS) % 360.0,
+        sky_notation.angle(dec, "dec", "dec", sky_notation.DEC_LIMITS),
+    )
+
+
+def check_size(size: float) -> float:
+    """Return the side of an image in arcsec; raises BadInput if it is not a number from 0 to 3600."""
+    return arguments.check_number("size", size, 0.0, 3600.0)
+
+
+def check_count(name: str, value: Any) -> int:
+    """Return a number of an exposure, or a seed; raises BadInput if it is not a 64-bit integer from 0 on."""
+    return arguments.check_integer(name, value, 0, _MAX_INT64)
 
 
 def parse_accuracy(value: str | Mapping[str, float]) -> Accuracy:
@@ -376,6 +420,8 @@ class SkyPainter:
 
     Parameters
     ----------
+    source : PainterSource
+        The lake, for other processes.
     tables : SkyTables
         Catalogues of the lake.
     settings : mapping
@@ -388,32 +434,47 @@ class SkyPainter:
     """
 
     def __init__(
-        self, tables: SkyTables, settings: Mapping[str, Any], planned: Mapping[str, read.Version], seed: int
+        self,
+        source: PainterSource,
+        tables: SkyTables,
+        settings: Mapping[str, Any],
+        planned: Mapping[str, read.Version],
+        seed: int,
     ) -> None:
-        self.tables, self.planned, self.seed = tables, planned, seed
+        self.source, self.tables, self.planned, self.seed = source, tables, planned, seed
         self.mission = inputs.mission_of_lake(planned.get("mission"))
         effects = settings.get("effects", {"on": (), "off": ()})
         self.forced = {**dict.fromkeys(effects["on"], True), **dict.fromkeys(effects["off"], False)}
         self.nominal = lru_cache(maxsize=64)(self._nominal)
+        self.psf = lru_cache(maxsize=_PSFS)(self._psf)
+        self.band = lru_cache(maxsize=64)(passbands.load)
 
     def _nominal(self, band: str, camera: str | None, mjd: float | None, cell: tuple[float, float]) -> ExposureRow:
         instrument = nominal.find_instrument(band, camera, self.mission)
         return nominal.nominal_exposure(instrument, band, cell, self.seed, self.mission, mjd)
 
-    def aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
-        """Return the exposure, the detector and the window of an image, and its parameters and accuracy."""
+    def _psf(self, exposure: ExposureRow, detector: Detector, accuracy: Accuracy) -> Psf:
+        """Return the PSF of a detector, which keeps its Fourier transforms for the images that follow."""
+        variant = variants.variant(exposure.settings, self.mission, accuracy, self.forced)
+        aim = Aim.from_exposure(exposure, detector, self.band(exposure.band), self.seed)
+        psf = visible_sources.exposure_psf(aim, scene_factory.from_aim(aim, variant), settings_for(accuracy))
+        return replace(psf, transforms={})
+
+    def aim(self, request: ImageRequest) -> tuple[Aim, Variant, Psf]:
+        """Return the exposure, the detector and the window of an image, its parameters and accuracy, and its PSF."""
         if request.exposure is not None:
-            return self._planned_aim(request)
-        # The sky and the date belong to the middle of a 1 deg cell, so that neighbouring images share an exposure.
+            aim, variant = self._planned_aim(request)
+            return aim, variant, self.psf(aim.exposure, aim.detector, request.accuracy)
+        # The sky, the date and the PSF belong to the middle of a 1 deg cell, so that neighbouring images share them.
         place = request.ra, request.dec
         exposure = self.nominal(request.band, request.camera, request.mjd, (round(place[0]), round(place[1])))
         detector = nominal.central_detector(exposure.camera, self.mission)
-        exposure = nominal.move_exposure(exposure, detector, place)
         # The rows for charge injection, which are not read, would be in the middle of the image.
         detector = replace(detector, injection_rows=0)
         variant = Variant(self.mission, request.accuracy, self.forced)
-        aim = Aim.from_exposure(exposure, detector, None, self.seed)
-        return _with_window(aim, request), variant
+        band, moved = self.band(exposure.band), nominal.move_exposure(exposure, detector, place)
+        aim = Aim.from_exposure(moved, detector, band, self.seed)
+        return _with_window(aim, request), variant, self.psf(exposure, detector, request.accuracy)
 
     def _planned_aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
         number = int(request.exposure or 0)
@@ -429,22 +490,38 @@ class SkyPainter:
         tasks = exposure_chunks.rows(self.planned["tasks"], [number], where=is_number).to_pylist()
         for task in tasks:
             detector = detectors.detector(exposure.camera, task["detector"], variant.mission)
-            aim = Aim.from_exposure(exposure, detector, None, self.seed)
+            aim = Aim.from_exposure(exposure, detector, self.band(exposure.band), self.seed)
             column, row = (float(at[0]) for at in astrometry.pixel_of_sky(aim.wcs, [request.ra], [request.dec]))
             if -0.5 <= column < detector.nx - 0.5 and -0.5 <= row < detector.ny - 0.5:
                 return _with_window(aim, request), variant
         raise BadInput(f"ra {request.ra:.5f}, dec {request.dec:.5f}: on none of the {len(tasks)} planned detectors")
 
+    def check(self, request: ImageRequest) -> None:
+        """Raise BadInput if the band or the camera of a nominal exposure is unknown, or the lake has no such fluxes."""
+        if request.exposure is None:
+            nominal.find_instrument(request.band, request.camera, self.mission)
+            inputs.check_band(self.tables.versions["galaxy_fluxes"], request.band)
+
+    def attach_optics(self, image: SkyImage, request: ImageRequest) -> SkyImage:
+        """Let an image that another process has drawn find its coordinates and PSF here; return the image."""
+
+        def find_optics() -> tuple[Aim, Psf]:
+            aim, _, psf = self.aim(request)
+            return aim, psf
+
+        image._find_optics = find_optics
+        return image
+
     def draw(self, request: ImageRequest) -> SkyImage:
         """Draw an image; see `Lake.render`."""
-        aim, variant = self.aim(request)
+        aim, variant, psf = self.aim(request)
         rows = inputs.select_rows(inputs.read_rows(self.tables, aim, variant), request.without)
         if request.extra is not None:
             rows = added.add_sources(rows, request.extra, aim.exposure.band)
         drawn = window_images.draw_window(
-            aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise
+            aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise, psf
         )
-        return SkyImage(drawn)
+        return SkyImage(drawn, lambda: (aim, psf))
 
 
 def _with_window(aim: Aim, request: ImageRequest) -> Aim:
@@ -467,32 +544,40 @@ def _with_window(aim: Aim, request: ImageRequest) -> Aim:
     return replace(aim, window=Window(first_column, first_row, side, side))
 
 
-def painter(versions: Mapping[str, read.Version], root: Folder) -> SkyPainter:
-    """Return the painter of a lake.
+@dataclass(frozen=True, slots=True)
+class PainterSource:
+    """Lake and versions of its tables, from which every process makes the same painter.
 
-    Parameters
+    Attributes
     ----------
-    versions : mapping of str to Version
-        Versions of the tables of the lake, by name.
     root : Folder
         The lake.
+    keys : tuple of (str, str)
+        Name and key of the version of each table.
+    """
 
-    Returns
-    -------
-    SkyPainter
-        The painter.
+    root: Folder
+    keys: tuple[tuple[str, str], ...]
 
-    Raises
-    ------
-    BadInput
-        If the lake has no catalogues or no fluxes.
+
+def find_source(versions: Mapping[str, read.Version], root: Folder) -> PainterSource:
+    """Return what a painter needs of a lake; raises BadInput if it lacks catalogues or fluxes.
+
+    `versions` are the versions of the tables of the lake `root`, by name.
     """
     for name in _CATALOGUES:
         if name not in versions:
             raise BadInput(f"lake {root}: has no table {name}, which images need")
-    names = (*_CATALOGUES, *(name for name in _OPTIONAL if name in versions))
+    names = [name for name in (*_CATALOGUES, *_OPTIONAL, *_PLANNED, "products") if name in versions]
+    return PainterSource(root, tuple((name, versions[name].key) for name in names))
+
+
+def painter(source: PainterSource) -> SkyPainter:
+    """Open the tables of a lake, and return its painter."""
+    versions = {name: read.version(source.root, name, key) for name, key in source.keys}
     products = versions.get("products")
     settings = {} if products is None else products.manifest["facts"]["request"]
-    planned = {name: versions[name] for name in ("exposures", "tasks", "mission") if name in versions}
+    tables = SkyTables(source.root, {name: versions[name] for name in (*_CATALOGUES, *_OPTIONAL) if name in versions})
+    planned = {name: versions[name] for name in _PLANNED if name in versions}
     seed = settings.get("seed", versions["galaxies"].manifest["facts"].get("seed", 0))
-    return SkyPainter(SkyTables(root, {name: versions[name] for name in names}), settings, planned, seed)
+    return SkyPainter(source, tables, settings, planned, seed)

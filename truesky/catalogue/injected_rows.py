@@ -115,7 +115,7 @@ def read_columns(rows: Any) -> dict[str, tuple[Path, dict[str, Float]]]:
     named = {}
     with Mistakes() as mistakes:
         for given_name, table in tables.items():
-            named_columns = mistakes.read(_columns, table, given_name or "rows")
+            named_columns = mistakes.read(table_columns, table, given_name or "rows")
             if named_columns is not None:
                 is_galaxies = not given_name and _GALAXY_COLUMNS & set(named_columns[1])
                 named[given_name or ("galaxies" if is_galaxies else "stars")] = named_columns
@@ -140,8 +140,26 @@ def _check(columns: Mapping[str, Array], name: str, place: Path, settings: Mappi
     return InjectedRows(name, ids.astype(np.int64), {key: np.asarray(v, float) for key, v in values.items()})
 
 
-def _columns(table: Any, name: str) -> tuple[Path, dict[str, Float]]:
-    """Return the name of a table for messages, and its columns as numbers."""
+def table_columns(table: Any, name: str) -> tuple[Path, dict[str, Float]]:
+    """Return the columns of a table as numbers.
+
+    Parameters
+    ----------
+    table : table, str, Path or mapping
+        A table (pandas, astropy, Arrow, or a mapping of columns), or the path of a Parquet, FITS, CSV or HDF5 file.
+    name : str
+        Name of the argument, for messages.
+
+    Returns
+    -------
+    (Path, dict of str to float array)
+        The name of the table for messages, and its columns by name; missing values are NaN.
+
+    Raises
+    ------
+    BadInput
+        If the table cannot be read, a column has no numbers, or columns have different numbers of rows.
+    """
     if isinstance(table, str | Path):
         return _columns_of_file(Path(table))
     place = Path(name)

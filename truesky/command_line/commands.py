@@ -102,6 +102,11 @@ COMMANDS = {
         "image.fits galaxies.csv injected.fits --psf image.psf", injection.add_inject_arguments,
         ("truesky.api.inject",),
     ),
+    "stamps": Command(
+        "simulate", "LAKE PLACES OUT", "draw images of many places from the catalogues of a lake",
+        "my_lake places.csv stamps --size 10 --band euclid_vis", injection.add_stamps_arguments,
+        ("truesky.api.stamps",),
+    ),
     "page": Command(
         "look", "LAKE", "show a lake in the browser, with a TAP service", "my_lake --port 8000",
         lakes.add_page_arguments, ("truesky.page.__main__",), extra="page",

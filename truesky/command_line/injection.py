@@ -1,4 +1,4 @@
-"""Arguments of the command that adds sources to a frame: inject."""
+"""Arguments of the commands that draw images without a request: inject, stamps."""
 
 from __future__ import annotations
 
@@ -23,3 +23,23 @@ def add_inject_arguments(parser: Parser) -> None:
     parser.add_argument("--axes", metavar="NAME", help="axes of e1 and e2 (default: east_north)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the noise (default: 1)")
     parser.add_argument("--no-noise", dest="noise", action="store_false", help="add the light without noise")
+
+
+def add_stamps_arguments(parser: Parser) -> None:
+    """Declare the arguments of `truesky stamps`."""
+    parser.add_lake()
+    parser.add_argument(
+        "places", metavar="PLACES",
+        help="table (Parquet, FITS, CSV or HDF5) with the columns ra and dec, deg; also size, exposure, seed, date",
+    )  # fmt: skip
+    parser.add_argument("out", metavar="OUT", help="new folder for the images")
+    parser.add_argument("--size", type=float, default=64.0, metavar="ARCSEC", help="side of the images (default: 64)")
+    parser.add_argument("--band", default="euclid_vis", metavar="NAME", help="passband (default: euclid_vis)")
+    parser.add_argument("--camera", metavar="NAME", help="camera (default: the first one with the band)")
+    parser.add_argument("--exposure", type=int, metavar="N", help="planned exposure (default: a nominal one)")
+    parser.add_argument("--date", metavar="DATE", help="MJD or ISO date of a nominal exposure")
+    parser.add_argument("--accuracy", default="survey", metavar="NAME", help="named accuracy (default: survey)")
+    parser.add_argument("--effects", nargs="+", metavar="NAME", help="detector effects (default: noticeable ones)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of the noise (default: the seed of the lake)")
+    parser.add_argument("--no-noise", dest="noise", action="store_false", help="write the expected electrons only")
+    parser.add_argument("--processes", type=int, metavar="N", help="number of processes (default: all cores)")

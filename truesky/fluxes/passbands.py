@@ -32,9 +32,11 @@ _LOGISTIC_REACH = 20.0
 TABLE = Path(__file__).with_suffix(".csv")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Passband:
     """Photon response of a telescope, filter and detector, as a function of wavelength.
+
+    Passbands are immutable, and are equal only if they are the same object.
 
     Attributes
     ----------

@@ -1,5 +1,7 @@
 """Images of single places, and sources added to the images of a lake."""
 
+import pickle
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +14,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import publish
 from tests import requests
 from truesky.catalogue import build_galaxies, build_stars
+from truesky.commands.__main__ import main
 from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import parse
@@ -171,6 +174,90 @@ def test_an_image_is_written(lake, tmp_path):
         np.testing.assert_allclose((ra[0], dec[0]), [float(at[0]) for at in drawn.wcs.all_pix2world([10.0], [20.0], 0)])
         assert len(units["TRUTH"].data) == len(drawn.truth)
         assert units[0].header["GAIN"] == drawn.gain
+
+
+PLACES = {"ra": RA + 0.004 * np.arange(20), "dec": np.full(20, DEC), "size": 6.0 + np.arange(20)}
+
+
+def as_drawn(image):
+    """Everything of an image that must not depend on the process that draws it."""
+    return image.electrons, image.raw, image.truth, image.exposure, image.first_pixel, image.psf().image
+
+
+def test_stamps_are_the_images_of_their_places(lake, tmp_path):
+    """Any order, other places before them, and a copy by pickle give the same images."""
+    pd.DataFrame(PLACES)[:3].to_csv(tmp_path / "places.csv", index=False)
+    stamps = list(lake.stamps(tmp_path / "places.csv", band="lsst_r", processes=1))
+    # Another object, which has read no rows and has no PSF yet, draws them in the opposite order.
+    with truesky.open(lake._explorer.root) as fresh:
+        backwards = [
+            fresh.render(*(float(PLACES[name][k]) for name in ("ra", "dec", "size")), band="lsst_r") for k in (2, 1, 0)
+        ]
+        for stamp, other in zip(stamps, backwards[::-1], strict=True):
+            for one, two in zip(as_drawn(stamp), as_drawn(other), strict=True):
+                assert np.array_equal(one, two)
+            copied = pickle.loads(pickle.dumps(stamp))
+            assert np.array_equal(copied.raw, stamp.raw)
+            assert copied.truth.equals(stamp.truth)
+
+
+@pytest.mark.nightly
+def test_processes_draw_the_same_stamps(lake, tmp_path):
+    one, two = (list(lake.stamps(PLACES, band="lsst_r", processes=count)) for count in (1, 2))
+    assert len(one) == len(two) == 20
+    for number, (stamp, other) in enumerate(zip(one, two, strict=True)):
+        for value, same in zip(as_drawn(stamp), as_drawn(other), strict=True):
+            assert np.array_equal(value, same)
+        files = [image.write(tmp_path / f"{number}_{k}.fits") for k, image in enumerate((stamp, other))]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(BadInput, match=r"table, row 2: ra 10.00000, dec 10.00000: outside the area"):
+        list(lake.stamps({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, size=5.0, band="lsst_r", processes=2))
+
+
+def test_the_command_writes_stamps(lake, tmp_path, capsys):
+    pd.DataFrame(PLACES)[:2].to_csv(tmp_path / "places.csv", index=False)
+    words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "new" / "stamps")]
+    options = ["--band", "lsst_r", "--processes", "1", "--effects", "poisson", "read_noise"]
+    assert main([*words, *options]) == 0
+    assert "2 images, listed in stamps.csv" in capsys.readouterr().out
+    rows = pd.read_csv(tmp_path / "new" / "stamps" / "stamps.csv")
+    np.testing.assert_allclose(rows["ra"], PLACES["ra"][:2], atol=0.2 / 3600.0)
+    for row, size in zip(rows.itertuples(), PLACES["size"], strict=False):
+        with fits.open(tmp_path / "new" / "stamps" / row.file) as units:
+            assert units["RAW"].shape == (round(size / 0.2),) * 2
+            assert len(units["TRUTH"].data) == row.sources
+    assert main([*words, *options]) == 2
+    assert "exists already; give the name of a new folder" in capsys.readouterr().err
+    # A place that cannot be drawn leaves nothing behind.
+    pd.DataFrame({"ra": [RA, 10.0], "dec": [DEC, 10.0]}).to_csv(tmp_path / "places.csv", index=False)
+    assert main([*words[:3], str(tmp_path / "other"), *options, "--size", "4"]) == 2
+    assert "table, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"places.csv", "new"}
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "message"),
+    [
+        ({"ra": [RA]}, {}, "table: has no column dec"),
+        ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes' is not allowed: did you mean size"),
+        ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),
+        ({"ra": [RA], "dec": [95.0]}, {}, "table, row 1: dec = 95.0 is outside"),
+        ({"ra": [RA], "dec": [DEC], "seed": [1.5]}, {}, "table, row 1: seed = 1.5: must be a whole number"),
+        ({"ra": [RA], "dec": [DEC]}, {"accuracy": "fast"}, "accuracy = 'fast' is not one of quicklook"),
+        (
+            {"ra": [RA], "dec": [DEC]},
+            {"band": "euclid_vs"},
+            "^band: 'euclid_vs' is not allowed: did you mean euclid_vis",
+        ),
+        ({"ra": [RA], "dec": [DEC]}, {"processes": 0}, "processes"),
+        ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows"),
+        (3, {}, "table must be a table"),
+    ],
+)
+def test_bad_tables_of_places_are_refused(lake, table, options, message):
+    with pytest.raises(BadInput, match=message) as caught:
+        lake.stamps(table, **{"size": 5.0, "band": "lsst_r", **options})
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from truesky.render.drawing.kernels import far_light
 from truesky.render.drawing.kernels.far_light import FOLDED, SPARED
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.psf import spikes
-from truesky.render.psf.spikes import ARCSEC, FARTHEST, LONG, STEP, Edges
+from truesky.render.psf.spikes import ARCSEC, FARTHEST, LONG, STEP, WIDE, Edges
 
 # Light of a star is drawn down to this fraction of `Star.negligible_electrons` (electrons per pixel that may be
 # neglected), so that the border of the drawn light is invisible.
@@ -108,13 +108,16 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     if len(x) > 1:
         farthest = min(farthest, FARTHEST / edges.pixel_scale)
     level = star.electrons * spikes.ring_light(edges, photons)
-    lines = star.electrons * spikes.spike_light(edges, photons, max(farthest, edges.period))
     faintest = _FAINTEST * star.negligible_electrons
     halo, core = star.electrons * edges.aureole[0], edges.aureole[1]
     # Distance from the star in pixels beyond which diffraction rings and aureole are both fainter than `faintest`.
     radius = max((level / faintest) ** (1.0 / 3.0), (halo / faintest) ** 0.5) if faintest > 0.0 else farthest
     radius = min(radius, farthest)
     inner = star.size / 2 - SPARED
+    if _misses_frame(frame, (x, y), max(radius, inner * np.sqrt(2.0)), bar_directions):
+        # The tables of the spikes take longer than everything else if the frame is a small part of a detector.
+        return
+    lines = star.electrons * spikes.spike_light(edges, photons, max(farthest, edges.period))
     # Outside the PSF image, diffraction spikes are drawn where they are brighter than `faintest` (electrons per pixel):
     # compute the distance from the star and the distance from the axis of a spike up to which they are, in pixels.
     visible = lines[:, int(inner / LONG) :] > faintest
@@ -127,6 +130,26 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
             frame, column, row, inner, level, halo, core, radius, bar_directions, lines, spike_reach, spike_half_width
         )
         far_light.add_inside(frame, column, row, inner, level, halo, core, bar_directions, lines)
+
+
+def _misses_frame(frame: Int, points: tuple[Float, Float], radius: float, bar_directions: Float) -> bool:
+    """Return True if neither the circles of a radius around points (columns, rows) nor their spikes reach the frame.
+
+    `bar_directions` [b, 2] are unit vectors along the bars of the pupil. The spike of a bar is perpendicular to it, and
+    its table ends at WIDE pixels from its axis.
+    """
+    ny, nx = frame.shape
+    x, y = points
+    across, down = (np.maximum(np.maximum(-at, at - (count - 1)), 0.0) for at, count in ((x, nx), (y, ny)))
+    if (np.hypot(across, down) <= radius).any():
+        return False
+    # Distances [b, point, corner] of the corners of the frame from the axis of a spike. If the axis crosses the frame,
+    # they have both signs.
+    corner_x, corner_y = np.array([0.0, nx - 1.0, 0.0, nx - 1.0]), np.array([0.0, 0.0, ny - 1.0, ny - 1.0])
+    distance = (corner_x - x[:, None]) * bar_directions[:, 0, None, None]
+    distance = distance + (corner_y - y[:, None]) * bar_directions[:, 1, None, None]
+    limit = WIDE + STEP
+    return bool(((distance.min(axis=2) > limit) | (distance.max(axis=2) < -limit)).all())
 
 
 def _farthest_corner(frame: Int, x: Float, y: Float) -> float:

@@ -110,11 +110,13 @@ class Outskirts:
         v = w sinh t_j along the minor axis, in scale lengths. The nodes t are equally spaced.
     across : float
         Factor w of the coordinate v, about the apparent axis ratio of the disc.
-    blurred : float array, shape (m, m)
-        Electrons by which the PSF changes a pixel (also negative), at nodes `block` pixels apart. The middle node is
-        the middle of the galaxy.
+    blurred : float array, shape (rows, columns)
+        Electrons by which the PSF changes a pixel (also negative), at nodes `block` pixels apart. One node is the
+        middle of the galaxy, or would be if the nodes continued.
     block : int
         Spacing of the nodes of `blurred`, pixels.
+    first : (int, int)
+        Column and row of the first node of `blurred`, counted in nodes from the middle of the galaxy.
     """
 
     light: Float
@@ -122,9 +124,12 @@ class Outskirts:
     across: float
     blurred: Float
     block: int
+    first: tuple[int, int]
 
 
-def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
+def from_galaxy(
+    shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, region: tuple[float, float, float, float]
+) -> Outskirts:
     """Compute the outer light of one galaxy.
 
     Parameters
@@ -138,8 +143,8 @@ def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights:
         PSF of the detector.
     weights : float array, shape (planes,)
         Weights of the PSF's planes (basis images) for this galaxy, from `transfer.basis_weights`.
-    farthest : float
-        Largest distance along columns or rows at which light is needed, pixels.
+    region : (float, float, float, float)
+        First and last column, and first and last row, at which light is needed, pixels from the middle of the galaxy.
 
     Returns
     -------
@@ -162,12 +167,20 @@ def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights:
         light[DISK_FORM : DISK_FORM + 4] = matrices.inverse(matrix).ravel()
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
-    block = _block(slimness(light, wide), farthest)
+    block = _block(slimness(light, wide), max(map(abs, region)))
     cells = _cells(psf, weights, block)
-    half = int(np.ceil(farthest / block)) + 1 + len(cells) // 2
-    unblurred = np.zeros((2 * half + 1, 2 * half + 1))
-    _sample(light, disk, wide, float(half * block), float(half * block), float(block), unblurred)
-    return Outskirts(light, disk, wide, scipy.signal.fftconvolve(unblurred, cells, mode="valid"), block)
+    first, end = (
+        tuple(int(edge(region[axis + k] / block)) + outward for axis in (0, 2))
+        for k, (edge, outward) in enumerate(((np.floor, -1), (np.ceil, 2)))
+    )
+    # Nodes around the region from which the PSF moves light into it.
+    margin = len(cells) // 2
+    columns, rows = (last - low + 2 * margin for low, last in zip(first, end, strict=True))
+    unblurred = np.zeros((rows, columns))
+    x, y = (float((margin - low) * block) for low in first)
+    _sample(light, disk, wide, x, y, float(block), unblurred)
+    blurred = scipy.signal.fftconvolve(unblurred, cells, mode="valid")
+    return Outskirts(light, disk, wide, blurred, block, (first[0], first[1]))
 
 
 @lru_cache(maxsize=16)
@@ -283,7 +296,8 @@ def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
     x, y : float
         Position of the galaxy in the stamp, pixels.
     """
-    size, middle = len(stamp), galaxy.block * (len(galaxy.blurred) // 2)
+    size = len(stamp)
+    x_first, y_first = (galaxy.block * node for node in galaxy.first)
     aliased, blurred, pixels = (
         distant_image_light(galaxy, size, x, y),
         _spline(galaxy.blurred, galaxy.block),
@@ -292,7 +306,7 @@ def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
     for up in (-size, 0, size):
         for right in (-size, 0, size):
             if up or right:
-                aliased += blurred(pixels - y - up + middle, pixels - x - right + middle)
+                aliased += blurred(pixels - y - up - y_first, pixels - x - right - x_first)
     _remove_aliased(galaxy.light, galaxy.disk, galaxy.across, aliased, x, y, stamp)
 
 
@@ -345,9 +359,9 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
 
 
 def _spline(values: Float, step: int) -> scipy.interpolate.RectBivariateSpline:
-    """Return the bicubic spline through the values [n, n] at nodes `step` pixels apart, the first of which is at 0."""
-    nodes = step * np.arange(len(values))
-    return scipy.interpolate.RectBivariateSpline(nodes, nodes, values)
+    """Return the bicubic spline through the values [y, x] at nodes `step` pixels apart, the first of which is at 0."""
+    rows, columns = (step * np.arange(count) for count in values.shape)
+    return scipy.interpolate.RectBivariateSpline(rows, columns, values)
 
 
 def slimness(light: Float, across: float) -> float:
@@ -392,21 +406,11 @@ def add(
     int
         Light that was added on read rows, in the integers of the frame.
     """
-    return int(
-        _add_galaxy(
-            galaxy.light,
-            galaxy.disk,
-            galaxy.across,
-            galaxy.blurred,
-            galaxy.block,
-            frame,
-            column,
-            row,
-            hole,
-            unread_rows,
-            unit,
-        )
-    )
+    added = _add_galaxy(
+        galaxy.light, galaxy.disk, galaxy.across, galaxy.blurred, galaxy.block, galaxy.first,
+        frame, column, row, hole, unread_rows, unit,
+    )  # fmt: skip
+    return int(added)
 
 
 def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, min_radius: float) -> Float:
@@ -563,15 +567,16 @@ def _bilinear(nodes: Float, x: float, y: float) -> Any:
 
 
 @jit
-def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
+def _pixel_light(
+    light: Float, disk: Float, across: float, blurred: Float, block: int, first: tuple[int, int], x: float, y: float
+) -> Any:
     """Return the electrons of a galaxy in a pixel at (x, y) pixels from its middle, with the effect of the PSF.
 
     `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light), `across` (factor of its minor
-    axis), `blurred` (change of the light by the PSF at the nodes of a grid) and `block` (spacing of the nodes, pixels)
-    are attributes of `Outskirts`. A negative result is replaced by 0.
+    axis), `blurred` (change of the light by the PSF at the nodes of a grid), `block` (spacing of the nodes, pixels) and
+    `first` (position of the first node) are attributes of `Outskirts`. A negative result is replaced by 0.
     """
-    middle = blurred.shape[0] // 2
-    blur_light = _bilinear(blurred, x / block + middle, y / block + middle)
+    blur_light = _bilinear(blurred, x / block - first[0], y / block - first[1])
     return max(_light(light, disk, across, x, y) + blur_light, 0.0)
 
 
@@ -603,8 +608,8 @@ def _remove_aliased(light: Float, disk: Float, across: float, aliased: Float, x:
 
 @jit
 def _add_galaxy(
-    light: Float, disk: Float, across: float, blurred: Float, block: int, frame: Int, x: float, y: float,
-    hole: tuple[int, int, int], unread_rows: tuple[int, int], unit: float,
+    light: Float, disk: Float, across: float, blurred: Float, block: int, first: tuple[int, int], frame: Int,
+    x: float, y: float, hole: tuple[int, int, int], unread_rows: tuple[int, int], unit: float,
 ) -> Any:  # fmt: skip
     ny, nx = frame.shape
     hole_x, hole_y, size = hole
@@ -615,7 +620,7 @@ def _add_galaxy(
         for c in range(nx):
             if inside and hole_x <= c < hole_x + size:
                 continue
-            units = np.int64(np.rint(_pixel_light(light, disk, across, blurred, block, c - x, r - y) * unit))
+            units = np.int64(np.rint(_pixel_light(light, disk, across, blurred, block, first, c - x, r - y) * unit))
             frame[r, c] += units
             if read:
                 total += units

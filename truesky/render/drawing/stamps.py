@@ -267,19 +267,23 @@ class _PreparedSources:
             self.psf.edges, self.trail[parts].sum(axis=0),
         )  # fmt: skip
 
-    def outskirts(self, i: int, nx: int, ny: int) -> outskirts.Outskirts:
-        """Return the light of galaxy `i` outside its stamp, up to the farthest pixel of a frame of ny x nx pixels."""
+    def outskirts(self, i: int, nx: int, ny: int, with_stamp: bool) -> outskirts.Outskirts:
+        """Return the light of galaxy `i` outside its stamp, on a frame of ny x nx pixels.
+
+        With `with_stamp`, it is also returned on the periodic copies of the stamp next to it.
+        """
         sources = self.sources
         shape_row = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
         x, y = sources.column[i], sources.row[i]
-        # Largest distance along columns or rows: to the corners of the periodic stamps next to the galaxy's stamp, and
-        # to the corners of the frame.
-        farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
+        region = (-x, nx - x, -y, ny - y)
+        if with_stamp:
+            # Largest distance along columns or rows: to the corners of the periodic stamps next to the galaxy's stamp,
+            # and to the corners of the frame.
+            farthest = max(1.5 * SIZES[-1] + 1.0, *map(abs, region))
+            region = (-farthest, farthest, -farthest, farthest)
         galaxy_form = Forms(*(getattr(self.form, part.name)[shape_row] for part in fields(Forms)))
         light = float(sources.electrons[i])
-        return outskirts.from_galaxy(
-            self.shapes.take(shape_row), galaxy_form, light, self.psf, self.weights[i], farthest
-        )
+        return outskirts.from_galaxy(self.shapes.take(shape_row), galaxy_form, light, self.psf, self.weights[i], region)
 
 
 def _prepare(
@@ -380,7 +384,7 @@ def _draw_light_beyond_stamps(
     """
     ny, nx = frame.shape
     for i in np.flatnonzero(prepared.largest & ~on_frame).tolist():
-        fallen[i] += _add_outskirts(prepared, i, prepared.outskirts(i, nx, ny), frame, unread_rows)
+        fallen[i] += _add_outskirts(prepared, i, prepared.outskirts(i, nx, ny, False), frame, unread_rows)
     bright = np.flatnonzero(prepared.has_far_light)
     for trailing in np.split(bright, np.flatnonzero(np.diff(prepared.parent[bright])) + 1) if len(bright) else []:
         far_light.add(frame, prepared.star(trailing), prepared.unit)
@@ -497,7 +501,7 @@ def _draw_batch(
     first, stamp_x, stamp_y, (ny, nx) = int(chosen[0]), int(x0[0]), int(y0[0]), frame.shape
     # A galaxy larger than the largest stamp is alone in its batch, and so is a star with light beyond its PSF images.
     # Aliased light of such a source is removed by a special function.
-    outer = prepared.outskirts(first, nx, ny) if prepared.largest[first] else None
+    outer = prepared.outskirts(first, nx, ny, True) if prepared.largest[first] else None
     if outer is not None:
         outskirts.remove_aliased(outer, stamps[0], float(column[0]) - stamp_x, float(row[0]) - stamp_y)
     elif prepared.has_far_light[first]:

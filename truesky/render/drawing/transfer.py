@@ -6,9 +6,10 @@ PSF of a source is a weighted sum of the planes, with weights that depend on its
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
@@ -46,6 +47,9 @@ _FOLDING = 0.1
 # Side, in pixels, of the stamp on which the Fourier transform of the PSF is computed to find the |k| beyond which it is
 # negligible (`max_transfer`).
 _PROBE = 64
+# Largest size of transforms that are kept for other images with the same PSF, bytes. It suffices for all stamps of VIS.
+_KEPT_BYTES = 1e8
+_T = TypeVar("_T")
 
 
 def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
@@ -187,6 +191,10 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
     float array, shape (i,)
         Element i is the largest modulus of all planes for |k| from i STEP to (i + 1) STEP radian / pixel.
     """
+    return _keep(psf, ("max", min_value), lambda: _max_transfer(psf, min_value))
+
+
+def _max_transfer(psf: Psf, min_value: float) -> Float:
     bright = min_value < NEGLIGIBLE
     probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else psf.planes.max_frequency if psf.planes else HIGHEST)
     if psf.planes is None:
@@ -232,7 +240,24 @@ def transfer(psf: Psf, size: int, reach: float) -> Transfer:
         The transforms times that of the pixel, in the order of the weights of `basis_weights`.
     """
     stamp_grid = grid(size, reach)
-    return Transfer(stamp_grid, _planes(psf, stamp_grid, np.float32))
+
+    def compute() -> Transfer:
+        return Transfer(stamp_grid, _planes(psf, stamp_grid, np.float32))
+
+    is_small = plane_count(psf) * 8.0 * len(stamp_grid.kx) <= _KEPT_BYTES
+    return _keep(psf, (size, reach), compute) if is_small else compute()
+
+
+def _keep(psf: Psf, key: tuple[Any, ...], compute: Callable[[], _T]) -> _T:
+    """Return the result of a function of a PSF, from `psf.transforms` if it has been computed before."""
+    if psf.transforms is None:
+        return compute()
+    # The copies of a PSF with another response inside the pixel share the dictionary.
+    full_key = (*key, psf.intra_pixel)
+    if full_key not in psf.transforms:
+        psf.transforms[full_key] = compute()
+    result: _T = psf.transforms[full_key]
+    return result
 
 
 def source_transfer(psf: Psf, weights: Float, stamp_grid: Grid, dtype: type[Any], fading: bool = False) -> Transfer:

@@ -48,6 +48,9 @@ STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Largest allowed number of expected electrons of a source. Light is summed in 64-bit integers, whose unit is coarser
 # for brighter sources; for this number it is 1/16 electron.
 _MAX_ELECTRONS = 1e17
+# Galaxies larger than the largest stamp are drawn in a window where they have more than this multiple of the light that
+# is noticeable on a detector (1e-2 of the noise of a pixel).
+_FAINT = 0.1
 # Smallest total light with which a spectrum counts as noticeable: its electrons divided by the noise of a pixel
 # (electrons rms). If all of this light is in one emission line, its signal-to-noise ratio is 0.7.
 MIN_SPECTRUM_NOISE = 2.0
@@ -153,7 +156,7 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
     )
 
 
-def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
+def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int, psf: Psf | None = None) -> Light:
     """Select all sources with light on a detector in a direct image, and choose the PSF and the stamp sizes.
 
     Parameters
@@ -166,6 +169,8 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
         Properties of the exposure before anything is drawn.
     seed : int
         Seed of the request, from which moving bodies are drawn.
+    psf : Psf, optional
+        PSF of the detector, if `exposure_psf` has computed it before.
 
     Returns
     -------
@@ -181,7 +186,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
         row_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs
     )
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
-    psf = exposure_psf(aim, scene, settings)
+    psf = psf or exposure_psf(aim, scene, settings)
     if psf.planes is not None:
         psf = replace(psf, planes=replace(psf.planes, origin=(aim.drawn.column, aim.drawn.row)))
     sources, sizes = select_sources(rows, (galaxies, stars), aim, psf, noise, settings)
@@ -427,14 +432,15 @@ def select_sources(
 def _reaches_window(sources: Sources, sizes: Int, psf: Psf, noise: float, window: Window) -> Bool:
     """Return the mask [n] of the sources that may have light in a window, also light far below the `noise` of a pixel.
 
-    The image of the whole detector contains such light if it is noticeable elsewhere on the detector.
+    The image of the whole detector contains such light if it is noticeable elsewhere on the detector. Galaxies larger
+    than the largest stamp are left out where they have less than 1e-3 of the noise, because their outskirts take as
+    long as all other sources of a small window.
     """
     sides = wings.region_side(np.maximum(sizes, psf.side).astype(float))
     return np.asarray(
         selection.overlaps_frame(sources.column, sources.row, sides, window.nx, window.ny)
         | stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf)
-        | stamp_sizes.on_largest(sources.shape, sizes)
-        | stamp_sizes.touching_frame(sources, sizes, psf, noise, window.nx, window.ny)
+        | stamp_sizes.touching_frame(sources, sizes, psf, _FAINT * noise, window.nx, window.ny)
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -115,6 +115,9 @@ class Psf:
         response. None if the PSF already includes the pixel.
     edges : Edges or None
         Edges of the pupil and aureole, which cause light beyond the border of `planes`; None if there is no such light.
+    transforms : dict or None
+        Fourier transforms of this PSF that `drawing.transfer` has computed before, so that many small images with the
+        same PSF share them; None to keep none.
     """
 
     profile: galsim.GSObject
@@ -126,6 +129,7 @@ class Psf:
     planes: Planes | None = None
     intra_pixel: float | None = 0.0
     edges: Edges | None = None
+    transforms: dict[Any, Any] | None = None
 
     @property
     def side(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from truesky.fluxes.passbands import Passband
@@ -11,6 +13,7 @@ from truesky.fluxes.passbands import Passband
 N_SUB_BANDS = 8
 
 
+@lru_cache(maxsize=32)
 def sub_bands(band: Passband, count: int = N_SUB_BANDS) -> tuple[Passband, ...]:
     """Divide a passband into `count` sub-bands, from blue to red, which do not overlap.
 

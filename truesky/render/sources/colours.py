@@ -6,7 +6,7 @@ fraction of its detected photons in each sub-band. Sources without a spectrum in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,7 @@ from truesky.fluxes.spectra.continuum import COMPONENTS
 from truesky.fluxes.spectra.lines import line_list
 from truesky.fluxes.tables import flux_tables
 from truesky.fluxes.tables.build_tables import Setting
+from truesky.fluxes.tables.flux_tables import Grid
 from truesky.render.psf import sub_bands
 from truesky.render.psf.sub_bands import N_SUB_BANDS
 
@@ -72,7 +73,7 @@ def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> 
     return _shares(f_nu, parts)
 
 
-def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
+def _library_fluxes(rows: pa.Table, parts: tuple[Passband, ...], library: Library) -> Float:
     """Return f_nu in each sub-band for galaxies with templates in the library, shape (n, number of sub-bands).
 
     Values are interpolated in tables where these cover the parameters of a galaxy, otherwise integrated.
@@ -81,11 +82,17 @@ def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library)
     tabulated = flux_tables.covered_galaxies(parameters)
     f_nu = np.empty((len(parameters), len(parts)))
     if tabulated.any():
-        grid = flux_tables.open_grid(parts, (_SETTING,) * len(parts), library)
+        grid = _grid(parts, library)
         f_nu[tabulated] = flux_tables.galaxy_fluxes(parameters.select(np.flatnonzero(tabulated)), grid)
     if not tabulated.all():
         f_nu[~tabulated] = integration.galaxy_fluxes(parameters.select(np.flatnonzero(~tabulated)), parts, library)
     return f_nu
+
+
+@lru_cache(maxsize=4)
+def _grid(parts: tuple[Passband, ...], library: Library) -> Grid:
+    """Return the flux tables of sub-bands for a library of galaxies. They are mapped from the disc, not read."""
+    return flux_tables.open_grid(parts, (_SETTING,) * len(parts), library)
 
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:

@@ -82,6 +82,7 @@ def draw_window(
     noise_seed: int | None = None,
     effects: Collection[str] | None = None,
     with_noise: bool = True,
+    psf: Psf | None = None,
 ) -> WindowImage:
     """Draw a window of a direct image.
 
@@ -102,6 +103,8 @@ def draw_window(
         default those that are noticeable.
     with_noise : bool, optional
         False to compute only the expected electrons.
+    psf : Psf, optional
+        PSF of the detector, if `visible_sources.exposure_psf` has computed it before.
 
     Returns
     -------
@@ -122,7 +125,7 @@ def draw_window(
     if aim.channel.transfer_effect is not None:
         # Whether this effect is noticeable depends on the brightest source on the detector, which the window may lack.
         scene = replace(scene, forced={aim.channel.transfer_effect.name: True, **scene.forced})
-    light = visible_light(replace(aim, window=outer), rows, scene, seed)
+    light = visible_light(replace(aim, window=outer), rows, scene, seed, psf)
     limits.refuse_too_large(replace(aim, window=outer), light)
     assert light.psf is not None
     electrons, drawn_electrons = _draw(light, outer, window)
@@ -139,11 +142,11 @@ def draw_window(
         raw, noise_decisions = _add_noise(aim, scene, electrons, (seed, noise_seed), effects)
         raw[first:end] = 0
         decisions += noise_decisions
-    psf = light.psf
-    if psf.planes is not None:
-        psf = replace(psf, planes=replace(psf.planes, origin=(window.column, window.row)))
+    drawn_psf = light.psf
+    if drawn_psf.planes is not None:
+        drawn_psf = replace(drawn_psf, planes=replace(drawn_psf.planes, origin=(window.column, window.row)))
     return WindowImage(
-        aim, electrons, raw, scene, psf, sources.take(is_listed), light.sizes[is_listed],
+        aim, electrons, raw, scene, drawn_psf, sources.take(is_listed), light.sizes[is_listed],
         drawn_electrons[is_listed], decisions,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,30 +22,39 @@ from truesky.render.drawing import stamp_sizes
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.sources import catalogue_rows
-from truesky.render.sources.catalogue_rows import LENSES, BrightQuery
+from truesky.render.sources.catalogue_rows import LENSES
+from truesky.render.windows.source_blocks import READ_ORDER, Pair, SourceBlocks
 
-# Order of the HEALPix cells (0.9 arcmin) in which the rows around a window are read.
-_READ_ORDER = 12
 # Smallest distance from a window, in arcsec, within which sources of any flux are read. Light beyond the stamps of
 # faint sources is drawn up to 26 arcsec from them.
 _MIN_MARGIN = 30.0
-_Tables = tuple[pa.Table, pa.Table]
 
 
-@dataclass(frozen=True, slots=True)
 class SkyTables:
     """Tables of a lake from which windows are drawn.
 
-    Attributes
+    Parameters
     ----------
     lake : Folder
         Lake (folder of stored tables).
     versions : mapping of str to Version
         Versions of the tables galaxies, galaxy_fluxes, stars and star_fluxes, and of strong_lenses if there are any.
+
+    Attributes
+    ----------
+    galaxies, stars : SourceBlocks
+        Catalogues with their fluxes. The rows around recent windows are kept in memory.
+    galaxy_library, stellar_library : Library
+        Templates with which the fluxes were computed.
     """
 
-    lake: Folder
-    versions: Mapping[str, read.Version]
+    def __init__(self, lake: Folder, versions: Mapping[str, read.Version]) -> None:
+        self.versions = versions
+        self.galaxies = SourceBlocks(versions["galaxies"], versions["galaxy_fluxes"], visible_sources.GALAXY_COLUMNS)
+        self.stars = SourceBlocks(versions["stars"], versions["star_fluxes"], visible_sources.STAR_COLUMNS)
+        # Flux tables are found by the object of a library, so that all windows must use the same object.
+        self.galaxy_library = galaxy_library_from_facts(lake, versions["galaxy_fluxes"].manifest["facts"])
+        self.stellar_library = stellar_library_from_facts(lake, versions["star_fluxes"].manifest["facts"])
 
 
 def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
@@ -78,25 +87,23 @@ def read_rows(tables: SkyTables, aim: Aim, variant: Variant) -> Rows:
     ring = max(stamp_sizes.reach(detector.pixel_scale) - margin, 0.0)
     versions = tables.versions
     refuse_uncovered(versions["galaxies"], task)
-    catalogues = {}
-    for rows, fluxes, columns, far_limit in (
-        ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, limits.far_galaxy),
-        ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, limits.spikes),
-    ):
+    for fluxes in ("galaxy_fluxes", "star_fluxes"):
         check_band(versions[fluxes], exposure.band)
-        rings = [(ring, limits.min_flux), (catalogue_rows.FARTHEST, far_limit)]
-        catalogues[rows] = _read_sources(versions[rows], versions[fluxes], task, columns, exposure.band, rings)
+    galaxies, stars = (
+        blocks.read(task, exposure.band, [(ring, limits.min_flux), (catalogue_rows.FARTHEST, far_limit)])
+        for blocks, far_limit in ((tables.galaxies, limits.far_galaxy), (tables.stars, limits.spikes))
+    )
     lenses = None
     if LENSES in versions:
         deflection = catalogue_rows.max_deflection(versions["galaxies"])
         lenses = catalogue_rows.read_lenses(versions[LENSES], task, deflection, ring, limits.min_flux)
         pair = versions["galaxies"], versions["galaxy_fluxes"]
-        catalogues["galaxies"] = catalogue_rows.add_lensed_galaxies(catalogues["galaxies"], lenses, *pair, task, ring)
+        galaxies = catalogue_rows.add_lensed_galaxies(galaxies, lenses, *pair, task, ring)
     return Rows(
-        *catalogues["galaxies"],
-        *catalogues["stars"],
-        galaxy_library=galaxy_library_from_facts(tables.lake, versions["galaxy_fluxes"].manifest["facts"]),
-        stellar_library=stellar_library_from_facts(tables.lake, versions["star_fluxes"].manifest["facts"]),
+        *galaxies,
+        *stars,
+        galaxy_library=tables.galaxy_library,
+        stellar_library=tables.stellar_library,
         complete_margin_arcsec=margin,
         lenses=lenses,
     )
@@ -115,40 +122,14 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
     The message names the part of the circle that the catalogue contains.
     """
     cells = np.array(sorted(catalogue_rows.drawn_cells(catalogue)), np.int64)
-    nearby_cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"], _READ_ORDER)
-    inside = np.isin(sky.parent(nearby_cells, _READ_ORDER, GENERATION_ORDER), cells)
+    nearby_cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"], READ_ORDER)
+    inside = np.isin(sky.parent(nearby_cells, READ_ORDER, GENERATION_ORDER), cells)
     if not inside.all():
         place = f"ra {task['ra']:.5f}, dec {task['dec']:.5f}"
         if not inside.any():
             raise BadInput(f"{place}: outside the area of the catalogue")
         percent = 100.0 * inside.mean()
         raise BadInput(f"{place}: cut by the edge of the catalogue, which has {percent:.0f} % of the surroundings")
-
-
-def _read_sources(
-    catalogue: read.Version,
-    fluxes: read.Version,
-    task: Mapping[str, Any],
-    columns: Sequence[str],
-    band: str,
-    rings: Sequence[tuple[float, float]],
-) -> _Tables:
-    """Read all sources in the circle of a task, and brighter sources around it, with their fluxes.
-
-    `rings` has a distance beyond the circle in arcsec, and the smallest flux in microjansky of the sources up to this
-    distance; the flux is infinite to read none.
-    """
-    deflection, flux = catalogue_rows.max_deflection(catalogue), ["id", f"f_nu_{band}"]
-    cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"] + deflection, _READ_ORDER).tolist()
-    rows = catalogue.rows_in_cells(cells, _READ_ORDER, columns)
-    light = fluxes.rows_in_cells(cells, _READ_ORDER, flux)
-    queries = [BrightQuery(task, columns, band, limit, reach) for reach, limit in rings if np.isfinite(limit)]
-    for bright_rows, bright_light in catalogue_rows.read_bright(catalogue, fluxes, queries):
-        new = pc.invert(pc.is_in(bright_rows["id"], rows["id"]))
-        new_light = pc.invert(pc.is_in(bright_light["id"], light["id"]))
-        rows = pa.concat_tables([rows, bright_rows.filter(new).select(rows.column_names)])
-        light = pa.concat_tables([light, bright_light.filter(new_light).select(light.column_names)])
-    return rows, light
 
 
 def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
@@ -174,7 +155,7 @@ def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
     )
 
 
-def add_rows(rows: Rows, galaxies: _Tables, stars: _Tables) -> Rows:
+def add_rows(rows: Rows, galaxies: Pair, stars: Pair) -> Rows:
     """Add sources to catalogue rows.
 
     Parameters

@@ -1,10 +1,13 @@
 """Wings of bright stars beyond the PSF's plane agree with the Airy pattern and the pupil, and keep the light."""
 
 from dataclasses import replace
+from unittest import mock
 
 import galsim
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from lake_schema.mission.configuration import resolve
 from tests.truesky.render.fields import one_source, small
@@ -261,6 +264,30 @@ def test_the_time_a_bright_trail_takes_is_foreseen(vis):
         assert took / 2 < cost.seconds(moving, sizes, vis, 4096, 4096) < 2 * took
     faint = replace(moving, electrons=np.array([1e6]))
     assert cost.seconds(faint, sizes, vis, 4096, 4096) < 0.5 * took
+
+
+@given(
+    st.tuples(st.integers(-2500, 2500), st.integers(-2500, 2500)),
+    st.sampled_from([1e8, 1e10]),
+    st.sampled_from([None, (40.0, -25.0)]),
+)
+@example((400, 390), 1e8, None)
+def test_a_window_has_the_light_of_its_pixels(vis, first, electrons, trail):
+    """A window that neither circle nor spikes reach is skipped; every other window has its part of the light."""
+    star = far_light.Star(0.3, 0.6, electrons, None, SIDE, 0.3, vis.edges, None if trail is None else np.array(trail))
+    wide, window = np.zeros((192, 192), np.int64), np.zeros((64, 64), np.int64)
+    for frame, margin in ((wide, 64), (window, 0)):
+        far_light.add(frame, replace(star, column=margin - first[0] + 0.3, row=margin - first[1] + 0.6))
+    # A trail is drawn up to a length that depends on the frame.
+    assert np.abs(wide[64:128, 64:128] - window).max() <= (0 if trail is None else 1)
+
+
+def test_most_windows_far_from_a_star_are_skipped(vis):
+    star = far_light.Star(0.0, 0.0, 1e8, None, SIDE, 0.3, vis.edges)
+    with mock.patch.object(far_light.spikes, "spike_light", wraps=spikes.spike_light) as made:
+        for column, row in np.random.default_rng(3).uniform(-2500.0, 2500.0, (100, 2)):
+            far_light.add(np.zeros((64, 64), np.int64), replace(star, column=column, row=row))
+    assert 0 < made.call_count < 50
 
 
 def test_colours_differ(vis):

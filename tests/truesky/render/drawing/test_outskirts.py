@@ -203,8 +203,10 @@ def test_aliased_light_of_a_stamp_is_the_sum_of_all_periodic_images(index, ratio
     form = galaxy_shapes.forms(source.shapes, source.jacobian)
     weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
     some = replace(
-        outskirts.from_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((9, 9))
-    )  # fmt: skip
+        outskirts.from_galaxy(source.shapes, form, electrons, psf, weights, (-1.0, 1.0, -1.0, 1.0)),
+        blurred=np.zeros((9, 9)),
+        first=(-4, -4),
+    )
     stamp = np.zeros((side, side))
     outskirts.remove_aliased(some, stamp, side / 2 + 0.3, side / 2 - 0.2)
     rings = 8 if disc else 200
@@ -251,6 +253,25 @@ def test_the_disc_in_real_space(inclination, u, v):
     # The cusp of a face-on disc is in the stamp, so galaxies are not drawn from the table there.
     rel = 9e-3 if inclination < 5.0 and np.hypot(u, v) < 0.2 else 5e-3
     assert found == pytest.approx(whole / (4 * np.pi * DISK_SCALE_HEIGHT), rel=rel, abs=1e-9)
+
+
+@pytest.mark.parametrize("camera", ["vis", "lsstcam"])
+def test_a_part_of_the_outskirts_has_the_values_of_the_whole(camera):
+    """Light on a small frame far from a galaxy is that of a frame that contains the galaxy."""
+    shape = shape_of(0.5, 30.0, 2.0, 0.5, 60.0, 20.0)
+    detector = small(camera, {"vis": "3-4", "lsstcam": "R22_S11"}[camera], SIDE)
+    source = one_source(detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), 1e10, **shape)
+    form, psf = galaxy_shapes.forms(source.shapes, source.jacobian), psf_of(camera)
+    weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
+    for x, y in ((-1500.0, 300.4), (90.5, -2000.0)):
+        frames = np.zeros((2, SIDE, SIDE), np.int64)
+        for frame, region in zip(
+            frames, ((-2100.0, 2100.0, -2100.0, 2100.0), (-x, SIDE - x, -y, SIDE - y)), strict=True
+        ):
+            light = outskirts.from_galaxy(source.shapes, form, 1e10, psf, weights, region)
+            outskirts.add(light, frame, x, y, (-1, -1, 0), (0, 0), 1e6)
+        assert frames[0].min() > 0
+        assert np.abs(frames[0] - frames[1]).max() <= 1
 
 
 def test_all_light_is_somewhere():
