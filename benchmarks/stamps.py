@@ -32,8 +32,10 @@ _NOTES = {
     "vis_noise_s": "64 arcsec, VIS, survey, with noise",
     "lsst_r_s": "64 arcsec, LSST r, survey (target 0.25)",
     "small_s": "10 arcsec, VIS, survey (target 1/30)",
+    "stamps_per_core_s": "10 arcsec, VIS, survey: images per s and core with two processes (target 30)",
     "largest_difference": "from the noise-free image of the detector, in units of the noise of a pixel (target 1/320)",
-    "frame_s": "one source added to a raw VIS image (target 3)",
+    "raw_s": "raw VIS image without sources",
+    "frame_s": "one source added to it (target 3)",
     "frame_differences": "pixels that differ from the image in the lake if no source is added (target 0)",
 }
 
@@ -67,7 +69,7 @@ def measure(root: Path, quick: bool) -> dict[str, float]:
             arguments: dict[str, Any] = {"size": _SIZE, "noise": False, **options}
             lake.render(*places[0], **arguments)
             figures[f"{name}_s"] = _cpu_of(lambda place, a=arguments: lake.render(*place, **a), places)  # type: ignore[misc]
-        figures |= _differences(lake, places) | _frames(lake)
+        figures |= _differences(lake, places) | _frames(lake) | _series(lake, 32 if quick else 400)
     return figures
 
 
@@ -90,9 +92,23 @@ def _frames(lake: Any) -> dict[str, float]:
     files = lake.images()
     path = files[files["band"] == "euclid_vis"].iloc[0]
     frame = lake.frame(int(path["exposure_id"]), path["detector"])
+    raw_s = _cpu_of(lambda _: frame.raw, [None])
     differences = int((frame.raw != lake.image(path["path"]).data).sum())
     seconds = _cpu_of(lambda rows: frame.with_sources(rows).raw, [_NEW])
-    return {"frame_s": seconds, "frame_differences": differences}
+    return {"raw_s": raw_s, "frame_s": seconds, "frame_differences": differences}
+
+
+def _series(lake: Any, count: int) -> dict[str, float]:
+    """Draw images at random places; the time counts from the first one, so that the start of processes is left out."""
+    rng = np.random.default_rng(1)
+    ra, dec = (np.sort(middle + rng.uniform(-0.05, 0.05, count)) for middle in _PLACES[0])
+    images = lake.stamps({"ra": ra, "dec": dec}, size=_SMALL, noise=False, processes=2)
+    # Each process draws its first images slowly.
+    for _ in range(count // 4):
+        next(images)
+    started = time.perf_counter()
+    drawn = sum(1 for _ in images)
+    return {"stamps_per_core_s": drawn / (time.perf_counter() - started) / 2.0}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

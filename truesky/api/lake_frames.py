@@ -15,6 +15,7 @@ from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.tables.exposures import SELECTION_BANDS
 from truesky.api import added
 from truesky.render import detector_inputs
+from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.exposure import render
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, truth_table
@@ -47,7 +48,10 @@ class LakeFrame:
             raise BadInput(f"lake {root}: nothing was rendered for detector {detector} of exposure {exposure}")
         self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
         self._extra: Any = None
+        # The same image without and with additional sources shares the drawing of all other sources.
+        self._drawings = DrawingStore(added.is_added)
         self._rendered: RenderedDetector | None = None
+        self._has_maps = False
 
     def with_sources(self, rows: Any) -> LakeFrame:
         """Return the image with additional sources.
@@ -72,18 +76,21 @@ class LakeFrame:
             raise BadInput("rows: this image has additional sources already, give all of them in one call")
         new = object.__new__(LakeFrame)
         new._root, new._facts, new._extra, new._rendered = self._root, self._facts, rows, None
+        new._drawings, new._has_maps = self._drawings, False
         return new
 
-    def _result(self) -> RenderedDetector:
-        if self._rendered is None:
+    def _result(self, with_maps: bool = False) -> RenderedDetector:
+        if self._rendered is None or (with_maps and not self._has_maps):
             request = self._facts["request"]
             aim, rows, variant = detector_inputs.load_inputs(self._root, self._facts)
             if self._extra is not None:
                 band = SELECTION_BANDS.get(aim.exposure.channel, aim.exposure.band)
                 rows = added.add_sources(rows, self._extra, band)
             self._rendered = render.render(
-                aim, rows, variant, request["seed"], request["truth"], noise_seed=request["noise_seed"]
-            )
+                aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
+                noise_seed=request["noise_seed"], drawings=self._drawings,
+            )  # fmt: skip
+            self._has_maps = with_maps
         return self._rendered
 
     @property
@@ -99,7 +106,7 @@ class LakeFrame:
     @property
     def maps(self) -> Mapping[str, Array]:
         """Truth maps (ny, nx) that the request asks for, by name."""
-        return self._result().maps
+        return self._result(with_maps=True).maps
 
     @property
     def truth(self) -> pd.DataFrame:

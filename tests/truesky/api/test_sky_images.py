@@ -137,6 +137,12 @@ def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
     # All effects see the sources; most changed pixels are at the sources, others on the way to the amplifiers.
     near = np.hypot(changed[:, 1] - x[0], changed[:, 0] - y[0]) < 100.0
     assert near.mean() > 0.3
+    # The drawing of all other sources is shared. A frame that shares nothing is the same.
+    alone = lake.frame(1, "R22_S11").with_sources(NEW)
+    assert np.array_equal(alone.raw, new.raw)
+    assert np.array_equal(alone.noise_free, new.noise_free)
+    assert alone.truth.equals(new.truth)
+    assert set(new.maps) == {"noise_free"}
     file = new.write(tmp_path / "new.fits")
     with fits.open(file) as units, fits.open(lake._explorer._version("products").sidecar_path(path)) as before:
         assert [unit.shape for unit in units] == [unit.shape for unit in before]

@@ -87,9 +87,66 @@ def draw(
         of a larger power of two with extremely bright sources (`kernels.fourier.units_of`). The sum therefore does not
         depend on the order of the sources.
     """
+    drawn = draw_in_units(sources, sizes, psf, (nx, ny), progress, neglected, tally)
+    return np.asarray(to_electrons(drawn.frame, drawn.unit, drawn.layer, wings.BLOCK, wings.MARGIN))
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnUnits:
+    """Light of sources on a frame (image of the detector) in integers, so that sums do not depend on the order.
+
+    Attributes
+    ----------
+    frame : int64 array, shape (ny, nx)
+        Light of the stamps.
+    layer : float array
+        Light beyond the stamps on blocks of pixels, as in `wings.wings`: multiples of 1 / `unit`.
+    unit : float
+        Factor from electrons to the integers of the frame.
+    """
+
+    frame: Int
+    layer: Float
+    unit: float
+
+    def electrons_with(self, other: DrawnUnits) -> Float:
+        """Return the electrons [ny, nx] of these sources and of others, which have the same unit."""
+        frame, layer = self.frame + other.frame, self.layer + other.layer
+        return np.asarray(to_electrons(frame, self.unit, layer, wings.BLOCK, wings.MARGIN))
+
+
+def draw_in_units(
+    sources: Sources,
+    sizes: Int,
+    psf: Psf,
+    shape: tuple[int, int],
+    progress: Callable[[int], None] | None = None,
+    neglected: Float | None = None,
+    tally: Tally | None = None,
+    unit: float | None = None,
+) -> DrawnUnits:
+    """Draw sources as `draw` does, without the conversion to electrons.
+
+    Parameters
+    ----------
+    sources, sizes, psf, progress, neglected, tally
+        As for `draw`.
+    shape : (int, int)
+        Number of columns and of rows of the detector.
+    unit : float, optional
+        Factor from electrons to integers, by default `unit_for` these sources.
+
+    Returns
+    -------
+    DrawnUnits
+        The light in integers.
+    """
+    nx, ny = shape
     pieces, trail, parent = split_into_pieces(sources)
     piece_neglected = None if neglected is None else neglected[parent]
     prepared = _prepare(pieces, trail, parent, sizes[parent], psf, piece_neglected)
+    unit = prepared.unit if unit is None else unit
+    prepared = replace(prepared, unit=unit)
     frame, fallen = np.zeros((ny, nx), np.int64), np.zeros(len(pieces))
     unread_rows = (0, 0) if tally is None else tally.unread_rows
     on_frame = selection.overlaps_frame(pieces.column, pieces.row, prepared.sizes, nx, ny)
@@ -104,7 +161,12 @@ def draw(
         tally.electrons[:] = np.bincount(parent, fallen, len(sources))
     layer = wings.wings(pieces.column, pieces.row, _net_electrons(pieces), prepared.sizes, psf, nx, ny, prepared.unit)
     layer += wings.galaxies(pieces.column, pieces.row, prepared.outside, prepared.sizes, nx, ny, prepared.unit)
-    return np.asarray(to_electrons(frame, prepared.unit, layer, wings.BLOCK, wings.MARGIN))
+    return DrawnUnits(frame, layer, unit)
+
+
+def unit_for(sources: Sources) -> float:
+    """Return the factor from electrons to the integers in which the light of sources is summed."""
+    return fourier.units_of(split_into_pieces(sources)[0].electrons)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from truesky.render.channels.aim import Aim
 from truesky.render.dispersing import draw as dispersing
 from truesky.render.drawing import stamp_sizes, stamps
 from truesky.render.drawing.stamps import Tally
+from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.effects.effect import Effect, apply_all
 from truesky.render.effects.readout import trap_pumping
 from truesky.render.effects.scene import Frame, Scene
@@ -46,6 +47,7 @@ def render(
     truth: Sequence[str] = (),
     progress: Callable[[int], None] | None = None,
     noise_seed: int | None = None,
+    drawings: DrawingStore | None = None,
 ) -> RenderedDetector:
     """Simulate the image of one detector in one exposure.
 
@@ -67,6 +69,9 @@ def render(
         It is not called for spectra.
     noise_seed : int, optional
         Seed of the random numbers that differ between exposures, such as noise. By default `seed`.
+    drawings : DrawingStore, optional
+        Sources that were drawn in an earlier call for the same detector, exposure and accuracy. An empty store is
+        filled. It has no effect on spectra.
 
     Returns
     -------
@@ -84,7 +89,9 @@ def render(
     limits.refuse_too_large(aim, light)
     light = board_neighbours.with_neighbour_charge(light, aim, rows, variant, seed)
     drawn, frame = (
-        _draw_images(aim, light, truth, progress) if light.dispersed is None else _draw_spectra(aim, rows, light, truth)
+        _draw_images(aim, light, truth, progress, drawings)
+        if light.dispersed is None
+        else _draw_spectra(aim, rows, light, truth)
     )
     return _apply_effects(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
 
@@ -119,7 +126,11 @@ class _DrawnLight:
 
 
 def _draw_images(
-    aim: Aim, light: Light, truth: Sequence[str], progress: Callable[[int], None] | None
+    aim: Aim,
+    light: Light,
+    truth: Sequence[str],
+    progress: Callable[[int], None] | None,
+    drawings: DrawingStore | None,
 ) -> tuple[_DrawnLight, list[Frame]]:
     """Draw direct images of all sources, and return the drawn light and a list with one frame of expected electrons.
 
@@ -132,16 +143,11 @@ def _draw_images(
         maps: dict[str, Array] = {"noise_free": empty.astype(np.float32)}
         return _DrawnLight(sources, sizes, np.zeros(0), maps, scene), [empty]
     drawn_electrons, maps = np.zeros(len(sources)), {}
-    frame = stamps.draw(
-        sources,
-        sizes,
-        light.psf,
-        detector.nx,
-        detector.ny,
-        progress,
-        light.neglected,
-        Tally(drawn_electrons, scene.unread_rows),
-    )
+    tally, shape = Tally(drawn_electrons, scene.unread_rows), (detector.nx, detector.ny)
+    if drawings is None:
+        frame = stamps.draw(sources, sizes, light.psf, *shape, progress, light.neglected, tally)
+    else:
+        frame = drawings.draw(sources, sizes, light.psf, shape, progress, light.neglected, tally)
     scene = chromatic_response_map.with_chromatic_light(scene_factory.with_peak_electrons(scene, frame), aim, light)
     if "stars" in truth:
         is_star = kind_from_id(sources.ids) == _STAR
