@@ -70,8 +70,8 @@ def notebooks(into: Path, run: bool) -> list[str]:
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
-            # Most notebooks use the lake of `make demo`. Those about shear and slitless spectra make a lake themselves.
-            makes_own_lake = path.stem.endswith(("shear", "slitless"))
+            # Most notebooks use the lake of `make demo`. Those about shear, slitless spectra and lenses make a lake.
+            makes_own_lake = path.stem.endswith(("shear", "slitless", "without"))
             demo = {} if makes_own_lake else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
             client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
             client.execute(env={**os.environ, **demo})

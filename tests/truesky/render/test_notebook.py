@@ -1,4 +1,4 @@
-"""Notebooks that render images: small detectors, the shear of known galaxies, and spectra; their claims hold.
+"""Notebooks that render images: small detectors, known shear, spectra, and added sources; their claims hold.
 
 tests/house/test_public_interface.py checks daily that they use only the public interface.
 """
@@ -156,3 +156,24 @@ def test_redshifts_and_line_fluxes_agree_with_the_catalogue(tmp_path, monkeypatc
     assert scatter < 4e-4
     assert flux == pytest.approx(1.0, abs=0.06)
     assert snr == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.nightly
+def test_arcs_and_added_galaxies_are_found(tmp_path, monkeypatch):
+    outputs = run(
+        monkeypatch,
+        "06_with_and_without",
+        TRUESKY_LAKE=tmp_path / "lenses",
+        TRUESKY_PICTURE=tmp_path / "completeness.jpg",
+    )
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert 10_000 < (tmp_path / "completeness.jpg").stat().st_size < 300_000
+    text = printed(outputs)
+    arcs = [(int(a), int(b)) for a, b in re.findall(r"(\d+) electrons in the difference, (\d+) expected", text)]
+    assert len(arcs) == 2
+    for found, expected in arcs:
+        assert found == pytest.approx(expected, rel=0.03)
+    found, added, chance = map(int, re.search(r"(\d+) of (\d+) galaxies recovered, (\d+) by chance", text).groups())
+    assert added == 900
+    assert chance < 0.05 * added < 0.7 * added < found
+    assert 25.8 < float(re.search(r"recovered at I_E = ([\d.]+)", text)[1]) < 26.8
