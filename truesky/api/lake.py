@@ -247,7 +247,7 @@ class Lake(LakeTables):
         """
         from truesky.api import sky_images
 
-        return self._painter.draw(sky_images.check_request((ra, dec), size, band, options))
+        return self._painter.draw(sky_images.check_request((ra, dec), size, band, options), refuse_unknown=True)
 
     def stamps(
         self,

@@ -277,7 +277,8 @@ class ImageOptions(TypedDict, total=False):
         that are noticeable. Effects that depend on the rest of the detector, such as charge transfer and ghosts,
         cannot be applied.
     without : sequence of int
-        Identifiers of sources or of arcs of strong lenses that are left out.
+        Identifiers of sources or of arcs of strong lenses that are left out. `Lake.render` refuses an identifier that
+        does not exist around the image.
     extra : table
         Sources to add, with the columns of the section ``[sources]`` of a request: stars with ``ra``, ``dec`` and
         ``mag`` (AB, in the band of the image), galaxies also with ``half_light_radius``, ``axis_ratio`` and so on. A
@@ -512,10 +513,13 @@ class SkyPainter:
         image._find_optics = find_optics
         return image
 
-    def draw(self, request: ImageRequest) -> SkyImage:
-        """Draw an image; see `Lake.render`."""
+    def draw(self, request: ImageRequest, refuse_unknown: bool = False) -> SkyImage:
+        """Draw an image; see `Lake.render`. With `refuse_unknown`, all sources that are left out must exist."""
         aim, variant, psf = self.aim(request)
-        rows = inputs.select_rows(inputs.read_rows(self.tables, aim, variant), request.without)
+        rows = inputs.read_rows(self.tables, aim, variant)
+        if refuse_unknown:
+            inputs.refuse_unknown(rows, request.without)
+        rows = inputs.select_rows(rows, request.without)
         if request.extra is not None:
             rows = added.add_sources(rows, request.extra, aim.exposure.band)
         drawn = window_images.draw_window(

@@ -281,6 +281,8 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ({"exposure": 1, "ra": 53.4, "dec": DEC}, "on none of the 1 planned detectors"),
         ({"ra": "x"}, "ra = 'x' must be a number in degrees, or hours"),
         ({"accuracy": "fast"}, "accuracy = 'fast' is not one of quicklook"),
+        ({"without": [3]}, "without: there is no source or arc 3 in this image or around it"),
+        ({"without": [3.0]}, "without = 3.0 is not a whole number"),
         ({"effects": ["ghosts"]}, "effects: 'ghosts' cannot be applied to a window"),
         ({"date": "2001-02-30"}, "date"),
         ({"extra": {"ra": [RA], "dec": [DEC]}}, "rows: column mag is missing"),

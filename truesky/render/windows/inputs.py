@@ -132,6 +132,15 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
         raise BadInput(f"{place}: cut by the edge of the catalogue, which has {percent:.0f} % of the surroundings")
 
 
+def refuse_unknown(rows: Rows, without: Sequence[int]) -> None:
+    """Raise BadInput if a source or arc that is to be left out is not in the catalogue rows around a window."""
+    tables = [rows.galaxies, rows.stars, *(() if rows.lenses is None else (rows.lenses,))]
+    known = np.concatenate([table["id"].to_numpy() for table in tables])
+    for number in without:
+        if number not in known:
+            raise BadInput(f"without: there is no source or arc {number} in this image or around it")
+
+
 def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
     """Return catalogue rows without the sources and arcs with given identifiers."""
     if not len(without):
