@@ -162,11 +162,13 @@ class OutOfRange(BadInput):
         The number that was refused.
     lo, hi : object
         Smallest and largest value that is allowed.
+    unit : str, optional
+        Unit of the limits.
     """
 
-    def __init__(self, name: str, value: object, lo: object, hi: object) -> None:
-        super().__init__(f"{name} = {value} is outside [{lo}, {hi}]")
-        self._arguments = name, value, lo, hi
+    def __init__(self, name: str, value: object, lo: object, hi: object, unit: str = "") -> None:
+        super().__init__(f"{name} = {value} is outside [{lo}, {hi}] {unit}".rstrip())
+        self._arguments = name, value, lo, hi, unit
 
     def __reduce__(self) -> tuple[type[OutOfRange], tuple[object, ...]]:
         # By default, unpickling an exception calls the constructor with the message as its only argument.

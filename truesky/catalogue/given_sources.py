@@ -326,7 +326,8 @@ def _check_titles(
     for name in required:
         if name not in titles:
             hint = ""
-            if similar := spelling.closest_names(name, unknown, 1):
+            longer = [title for title in unknown if title.lower().startswith(name)]
+            if similar := longer[:1] or spelling.closest_names(name, unknown, 1):
                 unknown.remove(similar[0])
                 mapped = f", or map {_MAPPING.format(name, similar[0])}" if can_map else ""
                 hint = f"; did you mean {similar[0]}? Rename it to {name}{mapped}"

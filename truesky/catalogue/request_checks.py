@@ -16,7 +16,7 @@ from truesky.catalogue.external import ingest, mapping
 from truesky.catalogue.stars import bright_stars, from_catalogue, stars
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
-from truesky.request.files import Catalogue
+from truesky.request.files import SOURCES_KIND, Catalogue
 from truesky.request.schema import Request, Stars
 from truesky.request.toml_values import refuse_name
 
@@ -43,6 +43,10 @@ def _check_dust(request: Request) -> None:
 
 def _check_sources(request: Request) -> None:
     if request.sources is not None:
+        with Mistakes() as mistakes:
+            for name, file in (("galaxies", request.sources.galaxies), ("stars", request.sources.stars)):
+                if file is not None:
+                    mistakes.read(user_files.check_file, file, SOURCES_KIND, f"sources.{name}")
         given_sources.load(request.sources, request.area)
 
 
@@ -51,7 +55,9 @@ def _check_galaxies(request: Request) -> None:
         check_band(request)
     if (catalogue := request.ingest.galaxies) is not None:
         replaces_lensing = request.universe.lensing is not None
-        columns = _with_existing_files(catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing))
+        columns = _with_existing_files(
+            "ingest.galaxies", catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing)
+        )
         files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
         split = ingest.split_by_cell(files, sha256, columns)
         ingest.check_area(split, files, columns, request.area)
@@ -59,22 +65,32 @@ def _check_galaxies(request: Request) -> None:
 
 def _check_halos(request: Request) -> None:
     if (catalogue := request.ingest.halos) is not None:
-        columns = _with_existing_files(catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
+        columns = _with_existing_files("ingest.halos", catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns, request.area)
 
 
 def _check_training(request: Request) -> None:
     if (catalogue := request.ingest.training) is not None:
-        columns = _with_existing_files(catalogue, lambda: mapping.training_columns(dict(catalogue.columns)))
+        columns = _with_existing_files(
+            "ingest.training", catalogue, lambda: mapping.training_columns(dict(catalogue.columns))
+        )
         columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)
 
 
-def _with_existing_files(catalogue: Catalogue, make_columns: Callable[[], mapping.Columns]) -> mapping.Columns:
-    """Return the mapping of a catalogue; raise BadInput for mistakes in it and for files that do not exist."""
+def _with_existing_files(
+    section: str, catalogue: Catalogue, make_columns: Callable[[], mapping.Columns]
+) -> mapping.Columns:
+    """Return the mapping of a catalogue; raise BadInput for mistakes in it and for files that do not exist.
+
+    `section` is the section of the request that names the files.
+    """
     with Mistakes() as mistakes:
         for path in catalogue.files:
-            mistakes.read(external_rows.find_files, path)
+            try:
+                external_rows.find_files(path)
+            except BadInput as error:
+                mistakes.add(error.with_prefix(f"{section}.files"))
         columns = mistakes.read(make_columns)
     return columns
 

@@ -23,6 +23,7 @@ from truesky.request.toml_values import (
     Toml,
     as_table,
     boolean,
+    check_keys,
     checked_number,
     integer,
     number,
@@ -37,7 +38,8 @@ _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 GALACTIC_MIN, ECLIPTIC_MIN = 30.0, 15.0
 _WIDE_SQUARE_DEGREES = 15_000.0
 # Where keys belong that an area does not have.
-_PLACES = {**dict.fromkeys(("ra", "dec", "radius", "circle"), "cone = { ra, dec, radius }"), "vertices": "polygon"}
+_PLACES = {"circle": "cone = { ra, dec, radius }", "vertices": "polygon"}
+_CONE_KEYS = ("ra", "dec", "radius")
 # Largest number of vertices of a polygon, and of circles of an area.
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000
 # Limits of right ascensions of a box in degrees, which may begin before 0 or end after 360.
@@ -261,7 +263,11 @@ def parse(table: Toml, path: str = "area") -> Area:
     OutOfRange
         If a number is out of range.
     """
-    table = as_table(table, path, _FORMS, _PLACES)
+    table = as_table(table, path, None)
+    if loose := [key for key in _CONE_KEYS if key in table]:
+        form = ", ".join(f"{key} = {table.get(key, '..')}" for key in _CONE_KEYS)
+        raise BadInput(f"{path}: {', '.join(loose)} must be in a table, in degrees: cone = {{ {form} }}")
+    check_keys(table, path, _FORMS, _PLACES)
     if len(table) != 1:
         has = f"it has {', '.join(table)}" if table else f"such as {_EXAMPLES}"
         raise BadInput(f"{path} must have exactly one of {', '.join(_FORMS)}; {has}")
@@ -277,7 +283,7 @@ def parse(table: Toml, path: str = "area") -> Area:
 
 
 def _cone(value: object, path: str) -> Area:
-    cone = as_table(value, path, ("ra", "dec", "radius"))
+    cone = as_table(value, path, _CONE_KEYS)
     with Mistakes() as mistakes:
         ra = mistakes.read(sky_notation.ra_of, cone, f"{path}.ra")
         dec = mistakes.read(sky_notation.dec_of, cone, f"{path}.dec")

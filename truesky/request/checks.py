@@ -6,7 +6,7 @@ Checks of single keys are in the modules that read them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from lake_schema.errors import BadInput, Mistakes, bad_input
@@ -16,6 +16,8 @@ from truesky.request.schema import MissionChoice, Request, Stars
 
 # Largest distance in degrees from the area to a pointing that may belong to it.
 _NEAR_AREA = 3.0
+# Starts of messages about mission parameters.
+_OVERRIDE, _PARAMETER = "mission override ", "mission parameter "
 
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
@@ -89,7 +91,7 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
     try:
         mission = resolve(ladder=choice.ladder, overrides=overrides, cameras=choice.cameras)
     except BadInput as error:
-        raise bad_input(_with_mission_key(message) for message in error.messages) from None
+        raise bad_input(_with_mission_key(message, overrides) for message in error.messages) from None
     with Mistakes() as mistakes:
         for i, camera in enumerate(choice.cameras):
             for fault in camera_faults(camera.name, mission):
@@ -99,10 +101,14 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
     return mission
 
 
-def _with_mission_key(message: str) -> str:
-    """Return a message about the mission parameters with the key of the request at its start."""
-    override = "mission override "
-    return f"mission.overrides.{message[len(override) :]}" if message.startswith(override) else f"mission: {message}"
+def _with_mission_key(message: str, overrides: Collection[str]) -> str:
+    """Return a message about the mission parameters with the key of the request at its start.
+
+    `overrides` contains the names of parameters to which the request gives values.
+    """
+    parameter = message.removeprefix(_OVERRIDE).removeprefix(_PARAMETER)
+    is_override = message.startswith(_OVERRIDE) or (message != parameter and parameter.split()[0] in overrides)
+    return f"mission.overrides.{parameter}" if is_override else f"mission: {message}"
 
 
 def check_explored(explore: Sequence[tuple[str, Sequence[str]]], mission: MissionConfiguration) -> None:
@@ -124,7 +130,8 @@ def _check_values(key: str, values: Sequence[str], mission: MissionConfiguration
             try:
                 changed_mission = mission.with_overrides({key: tuple(json.loads(value))})
             except BadInput as error:
-                mistakes.add(error.with_prefix(f"explore.{key}"))
+                texts = (text.removeprefix(f"{_OVERRIDE}{key}: ") for text in error.messages)
+                mistakes.add(bad_input(texts).with_prefix(f"explore.{key}"))
                 continue
             for fault in ramp_faults(changed_mission):
                 mistakes.add(BadInput(f"explore.{key}: {fault}"))

@@ -98,7 +98,7 @@ from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.store import layout
 from truesky.request import area as areas
 from truesky.request import bands as request_bands
-from truesky.request import checks, files, lensing_resolution, request_lines, structure
+from truesky.request import checks, files, instruments, lensing_resolution, request_lines, structure
 from truesky.request.accuracy import ALLOWED, SURVEY, Accuracy, fastest_row, preset
 from truesky.request.area import Area
 from truesky.request.exposures import observations, pointings
@@ -472,12 +472,12 @@ def _mission(table: Toml, folder: Path) -> MissionChoice:
 def _override(value: object, key: str) -> Override:
     path = f"mission.overrides.{key}"
     if not isinstance(value, dict):
-        example = f'"{key}" = {{ value = .., unit = ".." }}'
-        raise BadInput(f"{path} must be a table such as {example}, got {_quote_value(value)}")
-    if any(isinstance(item, dict) for item in value.values()):
-        raise BadInput(
-            f'{path}: write the name of the parameter in quotes, such as "{key}.{next(iter(value))}" = {{ .. }}'
-        )
+        raise BadInput(f"{path} = {_quote_value(value)} has no unit: write {instruments.example_override(key, value)}")
+    if value and not value.keys() & {"value", "unit"}:
+        form = instruments.example_override(key, value)
+        raise BadInput(f"{path}: write the name of the parameter in quotes, such as {form}")
+    if "value" in value and "unit" not in value:
+        raise BadInput(f"{path}.unit is missing: write {instruments.example_override(key, value)}")
     table = _as_table(value, path, ("value", "unit"))
     with Mistakes() as mistakes:
         number = mistakes.read(_number, table, f"{path}.value", -math.inf, math.inf)

@@ -192,3 +192,32 @@ def check_detectors(camera: str, names: Collection[str], mission: MissionConfigu
             f"{spelling.choices(name, existing, _SUGGESTED_DETECTORS)}"
             for name in unknown
         )
+
+
+def example_override(name: str, value: object) -> str:
+    """Return a line of the section `mission.overrides` with the unit of a parameter, for an error message.
+
+    Parameters
+    ----------
+    name : str
+        Name of a mission parameter, or its beginning if the user wrote it without quotes.
+    value : object
+        Value of this key in the request. It is a table of the rest of the name if the quotes are missing.
+
+    Returns
+    -------
+    str
+        Text such as '"vis.gain" = { value = 3.0, unit = "electron / adu" }', with ".." for unknown parts.
+    """
+    # Import here, because the import is slow and few requests have such a mistake.
+    from lake_schema.mission import detector_overrides
+    from lake_schema.mission.configuration import resolve
+
+    while isinstance(value, dict) and value and not value.keys() & {"value", "unit"}:
+        part, value = next(iter(value.items()))
+        name = f"{name}.{part}"
+    number = value.get("value") if isinstance(value, dict) else value
+    is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
+    units = {parameter.key: parameter.unit for parameter in resolve().parameters}
+    unit = units.get(detector_overrides.split_name(name, units)[0], "..")
+    return f'"{name}" = {{ value = {number if is_number else ".."}, unit = "{unit}" }}'

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 from lake_schema.errors import Mistakes
+from truesky.request import instruments
 from truesky.request.files import UserSources
 from truesky.request.schema import EFFECTS, Stars, Universe
 from truesky.request.structure import Structure
@@ -84,7 +85,8 @@ class RequestReader:
         """Return a section, {} if it is missing or not a table. Its unknown keys are mistakes."""
         values = self.read(key, section, self.table, key, None)
         if values is not None and _SECTIONS[key]:
-            self.read(key, check_keys, values, key, _SECTIONS[key], _PLACES)
+            places = {**_PLACES, **(_places_of_parameters(values) if key == "mission" else {})}
+            self.read(key, check_keys, values, key, _SECTIONS[key], places)
         return values or {}
 
     def check_top_keys(self) -> None:
@@ -94,6 +96,18 @@ class RequestReader:
     def messages(self) -> tuple[str, ...]:
         """Return the lines of all mistakes in the order of the file."""
         return tuple(sorted(self._mistakes.messages, key=lambda message: _position(message, self.table)))
+
+
+def _places_of_parameters(values: Toml) -> dict[str, str]:
+    """Return where the parameters of instruments belong that are in the section `mission` itself, by key."""
+    parameters = {
+        key: value
+        for key, value in values.items()
+        if key not in _SECTIONS["mission"] and ("." in key or isinstance(value, dict))
+    }
+    return {
+        key: f"[mission.overrides] as {instruments.example_override(key, value)}" for key, value in parameters.items()
+    }
 
 
 def _position(message: str, value: Any) -> list[int]:

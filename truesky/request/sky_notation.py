@@ -32,6 +32,8 @@ _FORMS = {
 _SEXAGESIMAL = re.compile(
     r"[+-]?\s*\d+\s*(?:[:hHdD°]|\s)\s*\d+(?:\s*(?:[:mM'′]|\s)\s*\d+(?:\.\d*)?)?\s*(?:[sS\"″]|[mM'′])?"
 )
+# Radius in degrees from which an area may have been meant in arcmin: larger than the fields of all cameras.
+_LARGE_RADIUS = 5.0
 # Midnight (UTC) at the start of MJD 0.
 _MJD_0 = datetime(1858, 11, 17, tzinfo=UTC)
 
@@ -179,8 +181,9 @@ def optional_mjd(table: Toml, path: str) -> float | None:
 
 
 def understood_values(table: Toml) -> Iterator[str]:
-    """Yield one line for each position or date of a valid request that is not a number: the number that it means.
+    """Yield one line for each value of a valid request that a user may have meant differently: how it is understood.
 
+    These are positions and dates that are not numbers, and radii of areas that may have been meant in arcmin.
     `table` is the parsed request. Lines are, for example, "pointing[0].mjd = '2027-01-01' is MJD 61406 (UTC)".
     """
     for key in ("area", "pointing", "observation"):
@@ -202,3 +205,5 @@ def _understood(value: Any, path: str, axis: str) -> Iterator[str]:
     elif axis in _SEXAGESIMAL_UNITS and isinstance(value, str):
         degrees = angle(value, path, axis, (-math.inf, math.inf))
         yield f"{path} = {value} is {degrees:.10g} deg"
+    elif axis == "radius" and value >= _LARGE_RADIUS:
+        yield f"{path} = {value} is in degrees; for {value} arcmin write {value / 60.0:.4g}"

@@ -20,6 +20,11 @@ TOP_KEYS = ("name", "seed", "noise_seed", "accuracy")
 LIST_KEYS = ("pointing", "observation")
 # Largest number of allowed keys that are listed after a suggestion.
 _MAX_LISTED = 8
+# Other names of keys, which users know from other programs.
+_SYNONYMS = {
+    "pa": "position_angle", "filter": "band", "filters": "bands", "exptime": "exposure_time_s", "depth": "galaxy_limit",
+    "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
+}  # fmt: skip
 _NO_PLACES: Mapping[str, str] = {}
 
 
@@ -56,8 +61,11 @@ def _hint(key: str, path: str, missing: Sequence[str], allowed: Sequence[str], p
         return "it belongs at the top of the file, before the first [section]; "
     if key in places:
         return f"it belongs in {places[key]}; "
+    if _SYNONYMS.get(key) in missing:
+        return f"did you mean {_SYNONYMS[key]}?{' ' if len(allowed) <= _MAX_LISTED else ''}"
     for names in (missing, allowed):
-        if similar := spelling.closest_names(key, names, 1):
+        longer = [name for name in missing if name.startswith(key)]
+        if similar := longer or spelling.closest_names(key, names, 1):
             listed = len(allowed) <= _MAX_LISTED
             return f"did you mean {similar[0] if path else _as_written(similar[0])}?{' ' if listed else ''}"
     return ""
@@ -75,7 +83,7 @@ def _describe_unknown(key: str, path: str, hint: str, allowed: Sequence[str]) ->
     key_path = f"{path}.{printable_key}" if path else printable_key
     names = allowed if path else map(_as_written, allowed)
     listed = "" if hint.endswith("?") else f"allowed here: {', '.join(names)}"
-    return f"{key_path} is not a key of a request: {hint}{listed}"
+    return f"{key_path} is not a key of a request; {hint}{listed}"
 
 
 def section(table: Toml, key: str, keys: Iterable[str] | None, places: Mapping[str, str] = _NO_PLACES) -> Toml:
@@ -373,7 +381,7 @@ def checked_number(value: object, path: str, lo: float, hi: float, unit: str = "
         raise BadInput(f"{path} must be {_describe_range(lo, hi, unit)}, got {quote_value(value)}{hint}")
     # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
     if not lo <= value <= hi or not math.isfinite(value):
-        raise OutOfRange(path, quote_value(value), lo, hi)
+        raise OutOfRange(path, quote_value(value), lo, hi, unit)
     return float(value)
 
 

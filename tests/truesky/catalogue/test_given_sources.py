@@ -245,6 +245,14 @@ def test_a_column_of_another_name_is_one_line(tmp_path):
     assert 'columns = { mag = "MAG_AUTO", .. }' in line
 
 
+def test_a_longer_name_of_a_column_is_one_line(tmp_path):
+    request = asked(tmp_path, galaxies=TWO.replace("mag,", "magnitude,"), stars=None)
+    with pytest.raises(BadInput) as caught:
+        given_sources.load(request.sources, request.area)
+    (line,) = caught.value.messages
+    assert "galaxies.csv: column mag is missing; did you mean magnitude? Rename it to mag" in line
+
+
 def test_positions_in_radians_are_named(tmp_path):
     request = asked(tmp_path, galaxies="ra,dec,mag\n0.927,-0.485,24\n0.9271,-0.4851,24\n", stars=None)
     with pytest.raises(BadInput, match=r"of row 1 are 0.927 and -0.485 deg, .*in radians, convert .*\(1 more row\)"):

@@ -88,10 +88,21 @@ MISTAKES = {
         GOOD + '[ingest.halos]\nfiles = ["none.parquet"]\n'
         'columns = { ra = "a", dec = "d", z_true = "z", log_mass = "m" }\n', "none.parquet: no such file",
     ),
+    "no file of halos names its key": (
+        GOOD + '[ingest.halos]\nfiles = ["none.parquet"]\n'
+        'columns = { ra = "a", dec = "d", z_true = "z", log_mass = "m" }\n', "ingest.halos.files: ",
+    ),
+    "no table of sources": (
+        HEAD + AREA + '[sources]\nonly = "table"\ngalaxies = "none.csv"\n' + POINT, "sources.galaxies: ",
+    ),
     "no map of dust": (GOOD + '[ingest.dust]\nfile = "none.fits"\ncolumn = "EBV"\n', "none.fits"),
     "a limit in no band": (GOOD + '[universe]\ngalaxy_band = "I"\n', "universe.galaxy_band = 'I'"),
     "a limit too faint": (GOOD + "[universe]\ngalaxy_limit = 40\n", "universe.galaxy_limit = 40"),
     "a parameter misspelt": (GOOD + '[mission.overrides]\n"vis.gian" = { value = 3.0, unit = "" }\n', "vis.gian"),
+    "an explored parameter misspelt": (
+        GOOD + '[explore]\n"vis.gian" = { values = [3.0], unit = "" }\n',
+        "explore.vis.gian: the mission database has no such parameter: did you mean vis.gain?",
+    ),
     "a value out of range": (
         GOOD + '[explore]\n"vis.read_noise" = { values = [-1.0], unit = "electron" }\n',
         "explore.vis.read_noise",

@@ -1,4 +1,4 @@
-"""Messages about pointings and observations give the line of the request file."""
+"""Messages about keys give the line of the request file."""
 
 import pytest
 
@@ -17,6 +17,15 @@ ra = 2
 band = "r"
 [area]
 band = 1
+polygon = [
+  [53.0, -28.0],
+  [54.0, -28.0],
+]
+[observation.area]
+tile = 1
+[mission.overrides] # by name
+"vis.gain" = { value = 3.0 }
+effects.off = []
 """
 
 
@@ -29,7 +38,17 @@ band = 1
         ("pointing[1]: no", 8),
         ("observation[0].ra", 7),
         ("observation[1].ra", 0),
-        ("area.band is", 0),
+        ("area.band is", 12),
+        ("area.box is missing", 11),
+        ("area: no cell", 11),
+        ("area.polygon[1].ra = 400", 13),
+        ("observation[0].area.tile = 1", 18),
+        ("mission.overrides.vis.gain.unit is missing", 20),
+        ("mission.cameras: no", 19),
+        ("mission.overrides.effects.off = 1", 21),
+        ("name = 'x' is", 1),
+        ("names are", 0),
+        ("pointing must be a list", 0),
     ],
 )
 def test_the_line_of_a_key(tmp_path, message, line):

@@ -104,6 +104,13 @@ def test_dates_agree_with_astropy():
         assert sky_notation.mjd(text, "x") == pytest.approx(Time(text, scale="utc").mjd, abs=1e-9)
 
 
+def test_large_radii_may_have_been_meant_in_arcmin():
+    assert list(sky_notation.understood_values({"area": {"cone": {"ra": 1.0, "dec": 2.0, "radius": 1.0}}})) == []
+    assert list(sky_notation.understood_values({"area": {"cone": {"ra": 1.0, "dec": 2.0, "radius": 12}}})) == [
+        "area.cone.radius = 12 is in degrees; for 12 arcmin write 0.2"
+    ]
+
+
 def test_all_values_that_are_not_numbers_are_listed():
     table = {
         "area": {"polygon": [["01:00:00", "-10:00:00"], [20.0, 0.0], ["02:00:00", 10.0]]},

@@ -58,7 +58,14 @@ MISTAKES = {
     "two areas": (changed("0.2 }", "0.2 }\ntile = 3"), "area must have exactly one", "it has cone, tile"),
     "a radius in arcmin": (changed("0.2 }", '"12 arcmin" }'), "area.cone.radius", "a number from 0 to 180 deg"),
     "a radius in quotes": (changed("0.2 }", '"0.2" }'), "area.cone.radius", "write it without quotes, radius = 0.2"),
-    "a radius above 180": (changed("0.2 }", "500 }"), "area.cone.radius = 500", "[0.0, 180.0]"),
+    "a radius above 180": (changed("0.2 }", "500 }"), "area.cone.radius = 500", "[0.0, 180.0] deg"),
+    "a circle without braces": (
+        area("ra = 53.1\ndec = -27.8\nradius = 12"),
+        "area: ra, dec, radius must be in a table",
+        "in degrees: cone = { ra = 53.1, dec = -27.8, radius = 12 }",
+    ),
+    "a radius without a cone": (area("radius = 1"), "area: radius must be", "cone = { ra = .., dec = .., radius = 1 }"),
+    "r": (changed("radius", "r"), "area.cone.r is not a key", "did you mean radius?"),
     "no radius": (changed(", radius = 0.2", ""), "area.cone.radius is missing", "a number from 0 to 180 deg"),
     "rad": (changed("radius", "rad"), "area.cone.rad is not a key", "did you mean radius?"),
     "a declination beyond the pole": (changed("-27.808, r", "-97.808, r"), "area.cone.dec = -97.808", "[-90.0, 90.0]"),
@@ -151,6 +158,17 @@ MISTAKES = {
         "did you mean lsst_r? allowed: lsst_u",
     ),
     "one band": (GROUND + 'bands = "lsst_r"\n', "observation[0].bands", "such as ['lsst_r']"),
+    "a position angle": (GOOD + "pa = 30\n", "pointing[0].pa is not a key", "did you mean position_angle?"),
+    "a shear of another name": (
+        section("universe", "lensing = { gamma1 = 0.1, g2 = 0 }"),
+        "universe.lensing.gamma1 is not a key of a request; ",
+        "allowed here: g1, g2",
+    ),
+    "a dither in small letters": (
+        EUCLID + 'dither = "s"\n',
+        "observation[0].dither = 's' is not allowed: did you mean S?",
+        "S? use S, J, none or a list of offsets",
+    ),
     "a number of dithers": (EUCLID + "dither = 4\n", "observation[0].dither = 4", "S, J, none or a list of offsets"),
     "exposures of a Euclid field": (
         EUCLID + "exposures = 3\n",
@@ -176,12 +194,37 @@ MISTAKES = {
     "a parameter without a unit": (
         section("mission.overrides", '"vis.gain" = 3.0'),
         "mission.overrides.vis.gain",
-        '{ value = .., unit = ".." }',
+        'has no unit: write "vis.gain" = { value = 3.0, unit = "electron / adu" }',
     ),
     "a parameter without quotes": (
         section("mission.overrides", 'vis.gain = { value = 3.0, unit = "" }'),
         "mission.overrides.vis",
-        '"vis.gain" = { .. }',
+        'in quotes, such as "vis.gain" = { value = 3.0, unit = "electron / adu" }',
+    ),
+    "a parameter without quotes and unit": (
+        section("mission.overrides", "vis.gain = 3.0"),
+        "mission.overrides.vis",
+        'in quotes, such as "vis.gain" = { value = 3.0, unit = "electron / adu" }',
+    ),
+    "a parameter whose unit is missing": (
+        section("mission.overrides", '"vis.gain@3-4" = { value = 3.0 }'),
+        "mission.overrides.vis.gain@3-4.unit is missing",
+        'write "vis.gain@3-4" = { value = 3.0, unit = "electron / adu" }',
+    ),
+    "a parameter in another section": (
+        section("mission", '"vis.gain" = 3.0'),
+        "mission.vis.gain is not a key",
+        'it belongs in [mission.overrides] as "vis.gain" = { value = 3.0, unit = "electron / adu" }',
+    ),
+    "an unknown parameter without a unit": (
+        section("mission.overrides", '"vis.gian" = "x"'),
+        "mission.overrides.vis.gian = 'x' has no unit",
+        'write "vis.gian" = { value = .., unit = ".." }',
+    ),
+    "a negative parameter": (
+        section("mission.overrides", '"vis.read_noise" = { value = -3, unit = "electron" }'),
+        "mission.overrides.vis.read_noise [electron] = -3",
+        "[0.0, ",
     ),
     "a wrong unit": (
         section("mission.overrides", '"vis.gain" = { value = 3.0, unit = "mm" }'),
@@ -217,7 +260,7 @@ def test_one_line_names_the_key_and_the_remedy(tmp_path, text, key, remedy):
             section("effects", 'off = ["cosmic rays"]'),
             "effects.off: 'cosmic rays' is not allowed: did you mean cosmic_rays?",
         ),
-        (section("univers", "z_max = 2.0"), "univers is not a key of a request: did you mean [universe]?"),
+        (section("univers", "z_max = 2.0"), "univers is not a key of a request; did you mean [universe]?"),
         (
             changed('["3-4"]', '["3-7"]'),
             "pointing[0].detectors: camera vis has no detector '3-7': did you mean 3-6 or 3-5",

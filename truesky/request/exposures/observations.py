@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lake_schema import ramps, user_files
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store import layout
+from lake_schema.texts import spelling
 from truesky.request import area as areas
 from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
@@ -25,7 +26,6 @@ from truesky.request.toml_values import (
     integer,
     optional_number,
     quote_value,
-    refuse_name,
     section,
     string,
     strings,
@@ -522,10 +522,9 @@ def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, fl
     dither = table.get("dither", "none" if ground else "S")
     if not isinstance(dither, list):
         if not isinstance(dither, str) or dither not in DITHERS:
-            name = refuse_name(str(dither), DITHERS) if isinstance(dither, str) else quote_value(dither)
-            raise BadInput(
-                f"{path} = {name}: it must be {', '.join(DITHERS)} or a list of offsets, [[x, y], ..] arcsec"
-            )
+            hint = spelling.did_you_mean(dither, DITHERS) if isinstance(dither, str) else ""
+            allowed = f"use {', '.join(DITHERS)} or a list of offsets, [[x, y], ..] arcsec"
+            raise BadInput(f"{path} = {quote_value(dither)} is not allowed: {f'{hint} ' if hint else ''}{allowed}")
         if ground and dither != "none":
             raise BadInput(
                 f"{path} = {quote_value(dither)} is a Euclid pattern: use a list of offsets in arcsec, [[x, y], ..]"
