@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING
 
-from lake_schema import command, user_files
+from lake_schema import arguments, command, user_files
 from lake_schema.errors import BadInput
 from lake_schema.pandas_import import hide_pandas
 from lake_schema.texts import text_tables
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from truesky.explore.explorer import Explorer
 
 _GIGABYTE = 1e9
+# Limits of the option --memory, GB.
+_GIGABYTES = (0.01, 1e6)
 _MAX_ROWS_SHOWN = 40
 
 
@@ -45,13 +47,12 @@ def run_command(options: argparse.Namespace) -> int:
     from truesky.explore import results
     from truesky.explore.explorer import Explorer
 
+    memory = arguments.check_number("--memory", options.memory, *_GIGABYTES) * _GIGABYTE
     if options.out is not None:
         user_files.check_target(options.out, results.ENDINGS)
         if options.json:
             raise BadInput("--json must not be used with --out, whose ending selects the format")
-    with Explorer(
-        layout.open_lake(options.lake, options.endpoint_url), options.memory * _GIGABYTE, options.timeout, options.name
-    ) as lake:
+    with Explorer(layout.open_lake(options.lake, options.endpoint_url), memory, options.timeout, options.name) as lake:
         if options.sql is None:
             _print_tables(lake, options.json)
             return int(bool(lake.damaged))

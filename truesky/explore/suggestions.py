@@ -33,6 +33,8 @@ _MAX_SUGGESTIONS = 3
 _MIN_SIMILARITY = 0.6
 # The same for names of fluxes and magnitudes in a band: mag_r1 is mag_r01, but mag_g is not mag_h.
 _MIN_BAND_SIMILARITY = 0.85
+# The same for misspelt synonyms: redshfit is redshift, but high is not ha.
+_MIN_SYNONYM_SIMILARITY = 0.8
 # Parts of the name of a flux or magnitude that do not belong to the name of its passband.
 _FLUX_NAME = re.compile(r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$")
 _BAND_PREFIX = "f_nu_"
@@ -41,6 +43,7 @@ _IN_BAND = re.compile(r"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$")
 # End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
 _EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")
 _ERROR_CLASS = re.compile(r"\A(?:[A-Z][\w-]* ?){1,4}Error: ")
+_AMBIGUOUS = re.compile(r'Ambiguous reference to column name "(?P<name>.+?)" \(use: (?P<names>.*?)\)', re.DOTALL)
 _UNKNOWN_FUNCTION = re.compile(
     r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
 )
@@ -56,8 +59,9 @@ _SENTENCES = (
     ),
     (
         r"WHERE clause cannot contain aggregates",
-        "WHERE cannot contain aggregate functions such as avg: write this condition in HAVING, after GROUP BY",
+        "WHERE cannot contain aggregate functions such as count: write this condition in HAVING, after GROUP BY",
     ),
+    (r'Ambiguous reference to table "(.+?)"', r"FROM has \1 twice: give each table another alias, such as AS a"),
     (
         r"WHERE clause cannot contain window functions",
         "WHERE cannot contain window functions: write this condition in QUALIFY, after WHERE and GROUP BY",
@@ -67,6 +71,18 @@ _SENTENCES = (
         r"'\1' is text where a number is required",
     ),
     (r'Referenced table "(.+?)" not found!\s*Candidate tables: ([^\n]*)', r"FROM has no table or alias \1; it has \2"),
+    (r"Values were not provided for the following parameters: ([^\n]*)", r"these parameters have no value: \1"),
+    (r"Cannot compare values of type (\S+) and type (\S+)", r"values of type \1 and \2 cannot be compared"),
+    (
+        r"No function matches the given name and argument types '(max|min)\([^)]*,.*",
+        r"\1 accepts one column: the larger of two is greatest(a, b), the smaller is least(a, b)",
+    ),
+    (
+        # The function has only one form.
+        r"No function matches the given name and argument types '(.+?)\((.*?)\)'.*"
+        r"Candidate functions:\s*(\S[^\n]*?\)) -> \S+\s*\Z",
+        r"\1 does not accept arguments of type \2; write \3",
+    ),
     (
         r"No function matches the given name and argument types '(.+?)\((.*?)\)'",
         r"\1 does not accept arguments of type \2",
@@ -141,7 +157,10 @@ def explain_missing_column(
         return f"{problem}: the lake has fluxes only in {listed}; fluxes.bands in the request adds other bands"
     if similar:
         return f"{problem}; did you mean {' or '.join(similar)}?"
-    return f"{problem}; use one of {', '.join(names)}"
+    for synonym in difflib.get_close_matches(name, _synonyms(), _MAX_SUGGESTIONS, _MIN_SYNONYM_SIMILARITY):
+        if targets := _targets(synonym, columns):
+            return f"{problem}; use {_as_text(targets, with_tables=len(columns) > 1)}"
+    return f"{problem}; use one of {', '.join(names)}; a text must be in single quotes"
 
 
 def _join_hint(
@@ -251,6 +270,9 @@ def plain_message(message: str) -> str:
             else spelling.did_you_mean(unknown["name"], filter(None, [unknown["other"]]))
         )
         return f"function {unknown['name']} does not exist{question and f'; {question}'}"
+    if ambiguous := _AMBIGUOUS.match(body):
+        names = ambiguous["names"].replace('"', "").replace("'", "")
+        return f"several tables have a column {ambiguous['name']}: write {names} in place of {ambiguous['name']}"
     if syntax := re.match(r'syntax error at or near "(.+?)"', body):
         return f"syntax error near {syntax[1]}: {_syntax_hint(syntax[1], extract)}"
     for pattern, sentence in _SENTENCES:
@@ -268,6 +290,15 @@ def _syntax_hint(word: str, extract: re.Match[str] | None) -> str:
         similar = spelling.closest_names(other, _KEYWORDS, 1)
         if similar and other.upper() not in _KEYWORDS:
             return f"did you mean {similar[0]} for {other}?"
+    keywords = {other.upper() for other in words}
+    if "BETWEEN" in keywords and word.upper() in ("TO", ","):
+        return "write BETWEEN 1 AND 2"
+    if word == ":":
+        return "write positions in degrees, such as -27.8"
+    if "JOIN" in keywords and not keywords & {"ON", "USING"}:
+        return "JOIN must have ON or USING, such as JOIN galaxy_fluxes USING (id)"
+    if extract and extract["line"].endswith(word, len(extract["blanks"])):
+        return f"something is missing after {word}"
     return "columns are separated by commas, text is in single quotes, and every bracket must be closed"
 
 

@@ -63,6 +63,7 @@ def test_a_query_into_a_file(explored, tmp_path, capsys):
         (["SELECT 1", "--out", "x.xlsx"], "x.xlsx: the name of the file must end in .csv, .parquet, .fits or .vot\n"),
         (["SELECT 1", "--memory", "nan"], "memory = nan"),
         (["SELECT 1", "--memory", "inf"], "memory = inf"),
+        (["SELECT 1", "--memory", "-1"], "--memory = -1.0 is outside [0.01, 1000000.0]"),
         (["SELECT 1", "--timeout", "nan"], "timeout = nan"),
         (["SELECT 1", "--timeout", "1e12"], "timeout = 1000000000000.0"),
         (["SELECT 1", "--timeout", "-1"], "timeout = -1"),

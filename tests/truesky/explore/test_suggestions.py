@@ -79,6 +79,8 @@ def test_similar_names_and_names_of_subqueries():
     assert explained("z_ob") == "column z_ob does not exist; did you mean z_obs?"
     assert explained("zz") == "column zz does not exist; did you mean zzz?"
     assert explained("qqqq", "halos").startswith("column qqqq does not exist; use one of ")
+    assert explained("qqqq", "halos").endswith("; a text must be in single quotes")
+    assert explained("redshfit", "halos") == explained("redshift", "halos").replace("redshift does", "redshfit does")
     both = {"galaxies": TABLES["galaxies"], "halos": TABLES["halos"]}
     assert "use galaxies.z_obs (" in suggestions.explain_missing_column("redshift", both, {})
 
@@ -159,8 +161,18 @@ def test_queries(explorer, query, words):
         ("SELECT kind FROM t HAVING n > 1", "column n must be in GROUP BY, or in an aggregate function such as"),
         (
             "SELECT n FROM t WHERE avg(n) > 1",
-            "WHERE cannot contain aggregate functions such as avg: write .* in HAVING",
+            "WHERE cannot contain aggregate functions such as count: write .* in HAVING",
         ),
+        ("SELECT n FROM t JOIN u USING (kind) WHERE u.n = n", "several tables have a column n: write t.n or u.n in"),
+        ("SELECT 1 FROM t AS a, t AS a WHERE a.n = 1", "FROM has a twice: give each table another alias"),
+        ("SELECT n FROM t WHERE n > 1 AND", "syntax error near AND: something is missing after AND$"),
+        ("SELECT n FROM t WHERE n BETWEEN 1 TO 2", "syntax error near TO: write BETWEEN 1 AND 2$"),
+        ("SELECT n FROM t WHERE n > -27:48", "syntax error near :: write positions in degrees"),
+        ("SELECT n FROM t JOIN u WHERE n > 1", "syntax error near WHERE: JOIN must have ON or USING"),
+        ("SELECT pow(n) FROM t", r"pow does not accept arguments of type INTEGER; write pow\(x DOUBLE, y DOUBLE\)$"),
+        ("SELECT max(n, n / 2) FROM t", r"max accepts one column: the larger of two is greatest\(a, b\)"),
+        ("SELECT n FROM t WHERE n > $lo", "these parameters have no value: lo$"),
+        ("SELECT n FROM t WHERE n > [1]", r"values of type INTEGER and INTEGER\[\] cannot be compared$"),
         ("SELECT n FROM t WHERE row_number() OVER () > 1", "WHERE cannot contain window functions: .* in QUALIFY"),
         ("SELECT stdev(n) FROM t", r"function stdev does not exist; did you mean stddev\?$"),
         ("SELECT qqqqqqqq(n) FROM t", "function qqqqqqqq does not exist$"),
@@ -178,6 +190,7 @@ def test_queries(explorer, query, words):
 def test_messages_are_sentences(query, message):
     with duckdb.connect() as database:
         database.execute("CREATE TABLE t (n INTEGER, kind VARCHAR)")
+        database.execute("CREATE TABLE u (n INTEGER, kind VARCHAR)")
         database.execute("CREATE MACRO twice(x) AS 2 * x")
         with pytest.raises(duckdb.Error) as error:
             database.execute(query).fetchall()
