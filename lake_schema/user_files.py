@@ -6,6 +6,7 @@ as "request" (settings) or "catalogue", has a largest size. All errors are BadIn
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -208,14 +209,28 @@ def check_reachable(path: Path) -> Iterator[None]:
 def suggest_similar(path: Path, ending: str) -> str:
     """Return "; did you mean X?" for a missing file, or "" if the file exists or no name in its folder is similar.
 
-    X is the file with the most similar name among those with an ending such as ".toml".
+    X is the file with the most similar name among those with an ending such as ".toml", or with a similar ending.
     """
     try:
-        stems = {} if path.exists() else {other.stem: other for other in sorted(path.parent.glob(f"*{ending}"))}
+        entries = [] if path.exists() else sorted(path.parent.iterdir())
     except (OSError, ValueError):
         return ""
-    names = spelling.closest_names(path.stem, stems, 1)
+    stems = {entry.stem: entry for entry in entries if entry.name.endswith(ending)}
+    if not (names := spelling.closest_names(path.stem, stems, 1)):
+        endings = [entry.suffix for entry in entries if entry.suffix != ending]
+        similar = spelling.closest_names(ending, endings, 1)
+        stems = {entry.name: entry for entry in entries if entry.suffix in similar}
+        names = spelling.closest_names(path.name, stems, 1)
     return f"; did you mean {format_path(stems[names[0]])}?" if names else ""
+
+
+def similar_folder(path: Path) -> Path | None:
+    """Return the folder whose name is most similar to that of a missing folder in the same place, else None."""
+    with contextlib.suppress(OSError):
+        names = [entry.name for entry in path.parent.iterdir() if entry.is_dir()]
+        if similar := spelling.closest_names(path.name, names, 1):
+            return path.with_name(similar[0])
+    return None
 
 
 def check_target(path: Path, endings: Sequence[str] = ()) -> Path:

@@ -312,10 +312,15 @@ def missing_table(root: Folder, table_name: str = "", existing: Sequence[str] = 
         The error, with the most similar name or all names of tables.
     """
     if isinstance(root, Path) and not root.exists():
-        return BadInput(f"lake {root} does not exist; make it with truesky run REQUEST {root}")
+        similar = user_files.similar_folder(root)
+        remedy = f"did you mean {similar}?" if similar else f"make it with truesky run REQUEST {root}"
+        return BadInput(f"lake {root} does not exist; {remedy}")
     if table_name:
         # A table that truesky can make is not misspelt.
         question = "" if tables.find_table(table_name) else spelling.did_you_mean(table_name, existing)
+        owners = [name for name in existing if (table := tables.find_table(name)) and table_name in table.names]
+        if owners and not question:
+            question = f"{table_name} is a column of {spelling.join_words(owners, 'and')}"
         remedy = question or f"it has {', '.join(existing) or 'no tables'}"
         return BadInput(f"lake {root} has no table {table_name}{owner}; {remedy}")
     return BadInput(f"{root} is not a lake, because it has no tables; give a folder that truesky run has made")

@@ -398,7 +398,9 @@ class Version:
         """Raise BadInput if the table does not have one of the columns; the message names the first missing one."""
         for name in columns:
             if name not in self.schema.names:
-                raise BadInput(f"table {self.table} has no column {name}")
+                question = spelling.did_you_mean(name, self.schema.names)
+                remedy = question or f"it has {', '.join(self.schema.names)}"
+                raise BadInput(f"table {self.table} has no column {name}; {remedy}")
 
     def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the rows of a catalogue in some HEALPix cells; only files and row groups that may match are read.

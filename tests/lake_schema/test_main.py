@@ -172,6 +172,11 @@ def test_a_missing_table_is_a_wrong_call(lake, capsys, command):
     assert capsys.readouterr().err == f"truesky {command}: {problem}\n"
 
 
+def test_a_similar_folder_is_suggested(lake, capsys):
+    assert main(["list", f"{lake}e"]) == 2
+    assert capsys.readouterr().err == f"truesky list: lake {lake}e does not exist; did you mean {lake}?\n"
+
+
 @pytest.mark.parametrize("command", ["list", "verify", "gc", "describe"])
 def test_a_folder_without_tables_is_not_a_lake(tmp_path, capsys, command):
     (tmp_path / "notes").mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 # Name of the extension with the table of the added sources.
 TABLE_NAME = "INJECTED"
+_NUMBER = re.compile(r"\s*\d*\.?\d+\s*")
 # Largest seed.
 _MAX_SEED = 2**63 - 1
 # Columns of the table of added sources: unit and meaning.
@@ -304,6 +306,8 @@ def frame(
         weights = mistakes.read(_read_plane, file, weight, "weight", image.shape)
         bits = mistakes.read(_read_plane, file, flags, "flags", image.shape)
     pixel_scale = frame_wcs.pixel_scale(system, nx, ny)
+    if isinstance(psf, str) and _NUMBER.fullmatch(psf):
+        raise BadInput(f"psf = {psf!r} is a number in quotes: write psf={psf} for the FWHM in arcsec")
     model = frame_psf.load_psf(user_files.expand_path(psf) if isinstance(psf, str | Path) else psf, nx, ny, pixel_scale)
     if weights is not None:
         planes["weight"] = weights[1]

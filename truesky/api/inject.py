@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 
+from lake_schema.errors import BadInput
 from truesky.api import given_frames
 
 
@@ -12,6 +14,8 @@ def run_command(options: argparse.Namespace) -> int:
 
     Raises BadInput if a file or a value cannot be used.
     """
+    if os.path.realpath(options.out) == os.path.realpath(options.image):
+        raise BadInput(f"OUT {options.out} is the file IMAGE: write the new image to another file")
     given = given_frames.frame(
         options.image,
         psf=_psf(options.psf),

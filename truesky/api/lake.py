@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -116,7 +117,7 @@ class Lake(LakeTables):
         """
         from truesky.render.products import read_back
 
-        file = self._explorer._version("products").sidecar_path(path)
+        file = self._image_file(path)
         return read_back.electrons(file) if electrons else read_back.frame(file)
 
     def extensions(self, path: str) -> list[Image]:
@@ -140,7 +141,7 @@ class Lake(LakeTables):
         Damaged
             If the checksum of the file is wrong.
         """
-        return images.read_images(self._explorer._version("products").sidecar_path(path))
+        return images.read_images(self._image_file(path))
 
     def wcs(self, path: str) -> WCS:
         """Return the world coordinate system of the pixels of an image.
@@ -167,7 +168,7 @@ class Lake(LakeTables):
 
         from truesky.render.products import read_back
 
-        cards = read_back.header(self._explorer._version("products").sidecar_path(path))
+        cards = read_back.header(self._image_file(path))
         header = {keyword: value for keyword, value, _ in cards}
         with warnings.catch_warnings():
             # astropy would warn even if it only changes the format of the date.
@@ -322,6 +323,12 @@ class Lake(LakeTables):
         number = arguments.check_integer("exposure", exposure, 0, _MAX_INT64)
         return lake_frames.LakeFrame(self._explorer.root, self._explorer._version("products"), number, str(detector))
 
+    def _image_file(self, path: str) -> Path:
+        try:
+            return self._explorer._version("products").sidecar_path(path)
+        except BadInput as error:
+            raise BadInput(f"{error}; Lake.images() lists the paths of the images") from None
+
     @cached_property
     def _painter(self) -> SkyPainter:
         from truesky.api import sky_images
@@ -349,10 +356,11 @@ class Lake(LakeTables):
         BadInput
             If the lake has no image of this detector and exposure.
         """
+        from truesky.api import lake_frames
+
         files = self.images(content=None)
         if not np.any((files["exposure_id"] == exposure_id) & (files["detector"] == detector)):
-            raise BadInput(
-                f"lake {self._explorer.root}: nothing was rendered for detector {detector} of exposure {exposure_id}"
-            )
+            rendered = zip(files["exposure_id"], files["detector"], strict=True)
+            raise lake_frames.no_image(self._explorer.root, exposure_id, detector, rendered)
         query = "SELECT * FROM rendered_truth WHERE exposure_id = $exposure AND detector = $detector"
         return self.sql(query, exposure=int(exposure_id), detector=str(detector))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,9 @@ from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.exposure import render
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, truth_table
+
+# Largest number of images that an error message lists.
+_MAX_LISTED = 8
 
 
 class LakeFrame:
@@ -45,7 +48,8 @@ class LakeFrame:
         image_facts = {"exposure_id": exposure, "detector": detector}
         parts = [part["facts"] for part in version.manifest["parts"] if image_facts.items() <= part["facts"].items()]
         if not parts:
-            raise BadInput(f"lake {root}: nothing was rendered for detector {detector} of exposure {exposure}")
+            facts = [part["facts"] for part in version.manifest["parts"]]
+            raise no_image(root, exposure, detector, ((part["exposure_id"], part["detector"]) for part in facts))
         self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
         self._extra: Any = None
         # The same image without and with additional sources shares the drawing of all other sources.
@@ -137,3 +141,29 @@ class LakeFrame:
         rows, writers = fits_files.products(self._result(), (), request["compression"] == "rice", request["wcs"])
         writers[rows["path"][0].as_py()](file)
         return file
+
+
+def no_image(root: Folder, exposure: int, detector: str, rendered: Iterable[tuple[int, str]]) -> BadInput:
+    """Return the error for an image that a lake does not have.
+
+    Parameters
+    ----------
+    root : Folder
+        The lake.
+    exposure : int
+        Number of the exposure.
+    detector : str
+        Name of the detector.
+    rendered : iterable of (int, str)
+        Exposure and detector of the images in the lake.
+
+    Returns
+    -------
+    BadInput
+        The error, which lists the first images of the lake.
+    """
+    listed = [f"{name} of exposure {number}" for number, name in sorted(dict.fromkeys(rendered))]
+    rest = ", .." if len(listed) > _MAX_LISTED else ""
+    existing = f"{', '.join(listed[:_MAX_LISTED])}{rest}" if listed else "no images"
+    problem = f"nothing was rendered for detector {detector} of exposure {exposure}"
+    return BadInput(f"lake {root}: {problem}; it has {existing}")

@@ -375,7 +375,9 @@ def check_request(
         if name not in names:
             raise BadInput(f"render: {refuse_name(name, names)}")
     exposure, date, seed = (options.get(name) for name in ("exposure", "date", "seed"))
-    effects, without = options.get("effects"), options.get("without", ())
+    effects, without, noise = options.get("effects"), options.get("without", ()), options.get("noise", True)
+    if noise not in (True, False):
+        raise BadInput(f"noise = {noise!r} must be True or False")
     return ImageRequest(
         *check_place(*place),
         check_size(size),
@@ -384,7 +386,7 @@ def check_request(
         None if exposure is None else check_count("exposure", exposure),
         None if date is None else sky_notation.mjd(date, "date"),
         parse_accuracy(options.get("accuracy", "survey")),
-        bool(options.get("noise", True)),
+        bool(noise),
         None if seed is None else check_count("seed", seed),
         None if effects is None else tuple(effects),
         tuple(arguments.check_integers("without", without, 0, _MAX_INT64)) if len(without) else (),

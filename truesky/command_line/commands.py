@@ -62,6 +62,12 @@ class Command:
     extra: str = ""
 
 
+# Options before the name of a command, and names of commands in other programs.
+_OPTIONS = ("--help", "--local", "--version")
+_SYNONYMS = {
+    "export": "sql", "forecast": "check", "ls": "list", "make": "run", "query": "sql", "select": "sql",
+    "show": "describe", "simulate": "run", "view": "page",
+}  # fmt: skip
 _INSPECTION = ("lake_schema.inspection",)
 COMMANDS = {
     "run": Command(
@@ -251,7 +257,12 @@ def help_text() -> str:
 
 def unknown_command(name: str) -> str:
     """Return the message for a name that is not a command, with a suggestion or the list of the commands."""
-    similar = suggestion(name, COMMANDS) or f"; use one of {', '.join(sorted(COMMANDS))}, or see truesky --help"
+    if name.startswith("-"):
+        return f"there is no option {name}{suggestion(name, _OPTIONS) or '; see truesky --help'}"
+    similar = (
+        suggestion(_SYNONYMS.get(name, name), COMMANDS)
+        or f"; use one of {', '.join(sorted(COMMANDS))}, or see truesky --help"
+    )
     return f"{name} is not a command{similar}"
 
 

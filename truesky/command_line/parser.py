@@ -14,7 +14,7 @@ from lake_schema.texts import spelling
 
 # Options with the same meaning in different commands or in other programs.
 _SYNONYMS = (
-    ("--delete", "--prune", "--remove", "--clean"),
+    ("--delete", "--prune", "--remove", "--clean", "--clear"),
     ("--out", "--output"),
     ("--dry-run", "--forecast", "--simulate"),
     ("--bands", "--filters"),
@@ -36,6 +36,7 @@ _SENTENCES = (
 _MISSING = "the following arguments are required: "
 _CHOICE = re.compile(r"argument (?P<name>\S+): invalid choice: '(?P<value>.*)' \(choose from (?P<choices>.*)\)")
 _REQUEST_ENDING = ".toml"
+_QUERY = re.compile(r"\s*(?:SELECT|WITH|FROM)\s", re.IGNORECASE)
 
 
 def suggestion(word: str, names: Iterable[str]) -> str:
@@ -92,6 +93,9 @@ class Parser(argparse.ArgumentParser):
         self._fill_positions(parsed, rest)
         self._refuse_commas(parsed)
         self._refuse_swapped(parsed)
+        self._refuse_swapped_query(parsed)
+        self._refuse_open_query(parsed, rest)
+        self._refuse_needless_lake(parsed, rest)
         return parsed, rest
 
     def _fill_positions(self, parsed: argparse.Namespace, rest: list[str]) -> None:
@@ -128,6 +132,28 @@ class Parser(argparse.ArgumentParser):
             self._stop(f"the request comes before the lake: write {self.prog} {lake} {request}")
         if is_request_file:
             self._stop(f"LAKE must be the folder of a lake, but {lake} is a request: truesky run {lake} LAKE makes one")
+
+    def _refuse_swapped_query(self, parsed: argparse.Namespace) -> None:
+        """End the process if the lake is a query."""
+        lake, query = (str(getattr(parsed, name, None) or "") for name in ("lake", "sql"))
+        if _QUERY.match(lake) and not os.path.isdir(lake):
+            self._stop(f'the lake comes before the query: write {self.prog} {query or "LAKE"} "{lake}"')
+
+    def _refuse_open_query(self, parsed: argparse.Namespace, rest: Sequence[str]) -> None:
+        """End the process if a query has no quotes, so that its words are several arguments."""
+        if hasattr(parsed, "sql") and rest and _QUERY.match(f"{parsed.sql} "):
+            query = " ".join([parsed.sql, *rest])
+            self._stop(f'the query must be in quotes: write {self.prog} {parsed.lake} "{query}"')
+
+    def _refuse_needless_lake(self, parsed: argparse.Namespace, rest: Sequence[str]) -> None:
+        """End the process if a command with only a request gets a folder before or after it."""
+        words = [str(parsed.request), *rest] if self._names_of_positions == ["--request"] else []
+        folders = [word for word in words if os.path.isdir(word)]
+        requests = [word for word in words if word not in folders]
+        if folders and requests:
+            self._stop(
+                f"{folders[0]} is a folder, but the command needs only a request: write {self.prog} {requests[0]}"
+            )
 
     def _move_to_positions(self, words: list[str]) -> list[str]:
         """Replace the options --request FILE and --lake LAKE by positional arguments; the last of equal options counts.

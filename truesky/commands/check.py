@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lake_schema import command
+from lake_schema import command, user_files
 from lake_schema.errors import BadInput, Mistakes
 from truesky.command_line import commands
 from truesky.request import checks, request_lines, sky_notation
@@ -42,6 +42,9 @@ def run_command(options: argparse.Namespace) -> int:
     BadInput is raised for a wrong request.
     """
     path = Path(options.request)
+    if path.is_dir():
+        text = user_files.format_path(path)
+        raise BadInput(f"request {text}: is a folder, but must be a TOML file; truesky verify {text} checks a lake")
     table = read_file(path)
     try:
         request, cost = checked_request(read_valid_parts(table, path.resolve().parent), options.plan)

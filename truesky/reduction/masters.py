@@ -131,7 +131,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_command(options: argparse.Namespace) -> int:
     """Run `truesky masters` with its parsed arguments, and return the exit status 0; errors are raised as LakeError."""
     out = user_files.check_folder(options.out)
-    by_detector = lake_frames.from_lake(layout.resolve_lake(options.lake), options.detectors, request=options.name)
+    root = layout.resolve_lake(options.lake)
+    by_detector = lake_frames.from_lake(root, options.detectors, request=options.name)
     selected = {
         key: frames
         for key, frames in by_detector.items()
@@ -139,7 +140,7 @@ def run_command(options: argparse.Namespace) -> int:
     }
     if not selected:
         remedy = 'add an [[observation]] with image_type = "bias" to the request, for NISP "dark" or "flat"'
-        raise BadInput(f"lake {options.lake} has no calibration frames for masters: {remedy}")
+        raise BadInput(f"lake {root} has no calibration frames for masters: {remedy}")
     out.mkdir(parents=True, exist_ok=True)
     for frames in selected.values():
         with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:

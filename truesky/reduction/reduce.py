@@ -117,7 +117,7 @@ def run_command(options: argparse.Namespace) -> int:
         sky_frames for frames in by_detector.values() if (sky_frames := [frame for frame in frames if _sees_sky(frame)])
     ]
     if not science:
-        raise BadInput(f"lake {options.lake} has no frame of the sky for these detectors and exposures")
+        raise BadInput(f"lake {root} has no frame of the sky for these detectors and exposures")
     if settings is not None:
         level2.check_psfs([frame for frames in science for frame in frames])
     all_frames = lake_frames.from_lake(root, options.detectors, (), options.name) if options.exposures else by_detector

@@ -72,3 +72,8 @@ def test_paths_that_cannot_be_lakes_are_refused(tmp_path, monkeypatch, text, wor
 def test_files_of_cells_have_paths_of_hats():
     assert layout.cell_file(5, 1607) == "Norder=5/Dir=0/Npix=1607.parquet"
     assert layout.cell_file(8, 574968) == "Norder=8/Dir=570000/Npix=574968.parquet"
+
+
+def test_a_column_is_not_a_table(tmp_path):
+    error = layout.missing_table(tmp_path, "z_obs", ["galaxies", "halos", "stars"])
+    assert str(error) == f"lake {tmp_path} has no table z_obs; z_obs is a column of galaxies and halos"

@@ -37,8 +37,10 @@ def test_filters_and_columns(toy):
     rows = toy.rows(["id"], where=pc.field("flux") > 0.5)
     assert rows.column_names == ["id"]
     assert rows.num_rows == sum(f > 0.5 for f in toy.rows()["flux"].to_pylist())
-    with pytest.raises(BadInput, match="table toy has no column speed"):
+    with pytest.raises(BadInput, match=r"table toy has no column speed; it has .*flux"):
         toy.rows(["id", "speed"])
+    with pytest.raises(BadInput, match=r"table toy has no column fluxx; did you mean flux\?"):
+        toy.rows(["fluxx"])
 
 
 def test_units_come_back_with_the_rows(toy):

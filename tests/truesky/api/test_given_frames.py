@@ -275,6 +275,7 @@ def test_wrong_rows_are_refused(given, rows, text):
         ({"A_2_0": 1e-2}, {}, "its WCS cannot be inverted"),
         ({}, {"psf": 0.1}, "psf: the FWHM of the PSF, 0.1 arcsec, is below one pixel"),
         ({}, {"psf": "nowhere.psf"}, "nowhere.psf: no such file"),
+        ({}, {"psf": "0.8"}, "psf = '0.8' is a number in quotes: write psf=0.8 for the FWHM"),
         ({}, {"extension": 4}, "has no extension 4; it has 0 to 0"),
         ({}, {"extension": "SCI"}, "has no extension 'SCI'"),
         ({}, {"weight": "WHT"}, "has no extension 'WHT'"),
@@ -333,6 +334,8 @@ def test_the_command_writes_the_same_file(tmp_path, capsys):
     assert command.main(words) == 2
     assert "truesky inject: " in (text := capsys.readouterr().err)
     assert "give zero_point" in text
+    assert command.main([*words[:3], str(file), "--psf", "0.8", "--zero-point", "29"]) == 2
+    assert "is the file IMAGE: write the new image to another file" in capsys.readouterr().err
     assert command.main([*words, "--zero-point", "29", "--gain", "3", "--seed", "4"]) == 0
     assert capsys.readouterr().out.startswith("added 1 sources; 0 are outside the frame\n")
     expected = truesky.frame(file, psf=psf, zero_point=29.0, gain=3.0).with_sources(STAR, seed=4)

@@ -96,6 +96,7 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         (lambda lake: lake.wcs("a.fits"), "has no table products"),
         (lambda lake: lake.extensions("a.fits"), "has no table products"),
         (lambda lake: lake.models(1, "3-4"), "has no table products"),
+        (lambda lake: lake.table("plan"), r"has no table plan; did you mean plain\?"),
         (lambda lake: lake.table("plain", into="polars"), "polars"),
         (lambda lake: lake.table("plain", [3]), r"columns = \[3\] is not a name or a list of names"),
     ],

@@ -149,7 +149,7 @@ def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
         assert units[0].header["EXPOSURE"] == before[0].header["EXPOSURE"] == 1
     with pytest.raises(BadInput, match="additional sources already"):
         new.with_sources(NEW)
-    with pytest.raises(BadInput, match="nothing was rendered for detector R22_S12 of exposure 1"):
+    with pytest.raises(BadInput, match=r"rendered for detector R22_S12 of exposure 1; it has .* of exposure"):
         lake.frame(1, "R22_S12")
 
 
@@ -270,6 +270,9 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
     ("options", "message"),
     [
         ({"ra": 10.0, "dec": 10.0}, "ra 10.00000, dec 10.00000: outside the area of the catalogue"),
+        ({"ra": 10.0, "dec": 10.0}, "outside the area of the catalogue, which is near ra 5.*, dec -2"),
+        ({"ra": DEC, "dec": RA}, "outside the area of the catalogue: are ra and dec exchanged"),
+        ({"noise": "no"}, "noise = 'no' must be True or False"),
         ({"size": 0.0}, "size = 0: must be 0.2 to 801 arcsec, at most a detector"),
         ({"size": np.nan}, "size"),
         ({"band": "euclid_vs"}, "band: 'euclid_vs' is not allowed: did you mean euclid_vis"),
@@ -293,6 +296,11 @@ def test_bad_options_are_refused(lake, options, message):
     with pytest.raises(BadInput, match=message) as caught:
         lake.render(**{"ra": RA, "dec": DEC, "size": 10.0, "band": "lsst_r", **options})
     assert "\n" not in str(caught.value)
+
+
+def test_an_image_that_does_not_exist_is_refused(lake):
+    with pytest.raises(BadInput, match=r"has no file a.fits; Lake.images\(\) lists the paths of the images"):
+        lake.image("a.fits")
 
 
 def test_a_place_at_the_edge_of_the_catalogue_is_refused(lake):

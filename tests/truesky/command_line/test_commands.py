@@ -93,6 +93,12 @@ def test_request_and_lake_may_be_options_of_a_job():
             "truesky masters: LAKE and --out are missing; for example: truesky masters my_lake --out masters",
         ),
         (["sql", "l", "--lake"], "truesky sql: there is no option --lake"),
+        (["sql", "SELECT 1", "l"], 'truesky sql: the lake comes before the query: write truesky sql l "SELECT 1"'),
+        (["sql", "select 1"], 'truesky sql: the lake comes before the query: write truesky sql LAKE "select 1"'),
+        (["sql", "l", "SELECT", "1"], 'truesky sql: the query must be in quotes: write truesky sql l "SELECT 1"'),
+        (["--lokal", "plan"], 'truesky: there is no option --lokal; did you mean "--local"?'),
+        (["export", "l"], 'truesky: export is not a command; did you mean "sql"?'),
+        (["cache", "--clear"], 'truesky cache: there is no option --clear; did you mean "--prune"?'),
         (["mission", "dif"], "truesky mission: ACTION must be list, diff or camera, got 'dif'; did you mean \"diff\"?"),
         (["mission"], "truesky mission: list, diff or camera is missing; for example: truesky mission list"),
         (
@@ -128,6 +134,14 @@ def test_mistakes_are_one_line_with_status_2(words, said, capsys):
         raise SystemExit(truesky.main(words))
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(said)
+
+
+@pytest.mark.parametrize("words", [["a.toml", "{}"], ["{}", "a.toml"]])
+def test_a_check_needs_no_lake(words, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        commands.parse("check", [word.format(tmp_path) for word in words])
+    remedy = "the command needs only a request: write truesky check a.toml"
+    assert capsys.readouterr().err == f"truesky check: {tmp_path} is a folder, but {remedy}\n"
 
 
 @pytest.mark.parametrize("name", ["run", "build", "fluxes", "plan", "render"])

@@ -96,9 +96,19 @@ def test_a_request_with_a_similar_name_is_suggested(tmp_path, capsys):
     assert capsys.readouterr().err.endswith("demo.toml: no such file\n")
 
 
+def test_the_ending_of_a_file_may_be_misspelt(tmp_path, capsys):
+    (tmp_path / "my_field.toml").write_text("")
+    (tmp_path / "my_fields.fits").write_text("")
+    assert check.main([str(tmp_path / "my_field.tml")]) == 2
+    assert capsys.readouterr().err.endswith(f"no such file; did you mean {tmp_path / 'my_field.toml'}?\n")
+    assert check.main([str(tmp_path / "my_fields.csv")]) == 2
+    assert capsys.readouterr().err.endswith("my_fields.csv: no such file\n")
+
+
 def test_a_folder_is_not_a_request(tmp_path, capsys):
     assert check.main([str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"truesky check: request {tmp_path}: is a folder, but must be a TOML file\n"
+    problem = f"request {tmp_path}: is a folder, but must be a TOML file; truesky verify {tmp_path} checks a lake"
+    assert capsys.readouterr().err == f"truesky check: {problem}\n"
 
 
 def test_python_gets_all_mistakes(tmp_path):

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema import sky
+from lake_schema.arrays import Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
@@ -127,7 +128,7 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
     if not inside.all():
         place = f"ra {task['ra']:.5f}, dec {task['dec']:.5f}"
         if not inside.any():
-            raise BadInput(f"{place}: outside the area of the catalogue")
+            raise BadInput(f"{place}: outside the area of the catalogue{_where(cells, task['ra'], task['dec'])}")
         percent = 100.0 * inside.mean()
         raise BadInput(f"{place}: cut by the edge of the catalogue, which has {percent:.0f} % of the surroundings")
 
@@ -139,6 +140,18 @@ def refuse_unknown(rows: Rows, without: Sequence[int]) -> None:
     for number in without:
         if number not in known:
             raise BadInput(f"without: there is no source or arc {number} in this image or around it")
+
+
+def _where(cells: Int, ra: float, dec: float) -> str:
+    """Return the end of a message about a position outside all cells of a catalogue: where the cells are."""
+    # A declination that was given as right ascension may have been read as an angle from 0 to 360 deg.
+    exchanged_ra, exchanged_dec = dec % 360.0, (ra + 180.0) % 360.0 - 180.0
+    if abs(exchanged_dec) <= 90.0:
+        exchanged_cell = sky.cell_at([exchanged_ra], [exchanged_dec], GENERATION_ORDER)
+        if np.isin(exchanged_cell, cells).all():
+            return ": are ra and dec exchanged?"
+    near_ra, near_dec = sky.cell_centres(GENERATION_ORDER, cells[:1])
+    return f", which is near ra {near_ra[0]:.1f}, dec {near_dec[0]:.1f}"
 
 
 def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:
