@@ -290,16 +290,22 @@ def create_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder next to `path`, which the body of the `with` statement must fill.
 
     At the end, it is renamed to `path`, which must not exist. If the body raises an exception, the folder is removed.
-    Folders above `path` that do not exist are created.
+    Folders above `path` that do not exist are created. BadInput is raised if the folder cannot be renamed; it is then
+    kept, and the message names it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
     temporary.mkdir()
     try:
         yield temporary
-        os.rename(temporary, path)
-    finally:
+    except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    try:
+        os.rename(temporary, path)
+    except OSError as error:
+        where = format_path(temporary)
+        raise BadInput(f"{format_path(path)}: {error.strerror}; the complete folder is {where}") from None
 
 
 # ------------------------------------- parsing of TOML texts

@@ -268,7 +268,8 @@ class Lake(LakeTables):
         ----------
         table : table, str, Path or mapping
             Places: a table with the columns ``ra`` and ``dec`` (deg), or the path of one (Parquet, FITS, CSV or HDF5).
-            The columns ``size``, ``exposure``, ``seed`` and ``date`` (MJD) may replace the arguments of the same name.
+            The columns ``size``, ``exposure``, ``seed`` and ``date`` (MJD) may replace the arguments of the same name;
+            an empty value stands for the argument. Other columns are ignored.
         size : float, optional
             Side of the images in arcsec.
         band : str, optional
@@ -281,21 +282,21 @@ class Lake(LakeTables):
         Returns
         -------
         iterator of SkyImage
-            The images, in the order of the table. Only some of them are in memory at the same time.
+            The images, in the order of the table. Only some of them are in memory at the same time. Call its method
+            ``close`` to end the processes before the last image.
 
         Raises
         ------
         BadInput
-            If the table or an option is not valid; this is raised before the first image. Later, if an image cannot be
-            drawn. The message names the row.
+            If the table or an option is not valid, or a place is outside the catalogue; this is raised before the first
+            image. Later, if an image cannot be drawn. The message names the row.
         """
         from truesky.api import stamp_series
 
-        requests = stamp_series.read_places(table, size, band, options)
-        for request in requests[:1]:
-            self._painter.check(request)
-        count = len(os.sched_getaffinity(0)) if processes is None else processes
+        count = (os.cpu_count() or 1) if processes is None else processes
         number = arguments.check_integer("processes", count, 1, _MAX_PROCESSES)
+        requests = stamp_series.read_places(table, size, band, options)
+        stamp_series.check_places(self._painter, requests)
         return stamp_series.draw_all(self._painter, requests, number)
 
     def frame(self, exposure: int, detector: str) -> LakeFrame:
@@ -333,7 +334,7 @@ class Lake(LakeTables):
     def _painter(self) -> SkyPainter:
         from truesky.api import sky_images
 
-        return sky_images.painter(sky_images.find_source(self._explorer.versions, self._explorer.root))
+        return sky_images.painter(sky_images.find_tables(self._explorer.versions, self._explorer.root))
 
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -12,13 +12,15 @@ import numpy as np
 import pandas as pd
 import pyarrow.compute as pc
 
-from lake_schema import arguments
-from lake_schema.arrays import Float
+from lake_schema import arguments, sky
+from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
+from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.tables.exposures import ExposureRow
+from lake_schema.tables.galaxies import GALAXIES
 from truesky.api import added
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry, detectors
@@ -31,7 +33,7 @@ from truesky.render.exposure import scene_factory, visible_sources
 from truesky.render.exposure.records import Variant
 from truesky.render.planning import exposure_chunks, variants
 from truesky.render.psf.model import Psf
-from truesky.render.sources.galaxy_shapes import Shapes
+from truesky.render.sources import catalogue_rows, galaxy_shapes
 from truesky.render.sources.source_list import Sources
 from truesky.render.windows import image as window_images
 from truesky.render.windows import inputs, nominal
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
 _MAX_PIXELS, _MIN_PIXELS = 4096, 1
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
+# Shapes of no galaxies.
+_NO_SHAPES = galaxy_shapes.shapes(GALAXIES.empty().select(visible_sources.SHAPE_COLUMNS))
 # Electrons of the star that is drawn to show a PSF. They are many, so that rounding to 1e-6 electrons does not matter.
 _PSF_ELECTRONS = 1e9
 # Number of PSFs that are kept for the images that follow. One has up to 150 MB with its Fourier transforms.
@@ -107,32 +111,48 @@ class SkyImage:
         Level of a pixel without electrons, ADU.
     """
 
-    def __init__(self, drawn: WindowImage, find_optics: Callable[[], tuple[Aim, Psf]]) -> None:
-        aim, window = drawn.aim, drawn.aim.drawn
-        self._sources, self._truth_table = drawn.sources, window_images.truth(drawn)
-        # These are not sent from the process that draws an image: astropy changes the numbers of a world coordinate
-        # system that is copied, and a PSF is much larger than the image.
-        self._find_optics: Callable[[], tuple[Aim, Psf]] | None = find_optics
-        self._response = drawn.psf.intra_pixel
+    def __init__(self, drawn: WindowImage, request: ImageRequest, painter: SkyPainter) -> None:
+        aim, window, sources = drawn.aim, drawn.aim.drawn, drawn.sources
+        self._ids, self._column, self._row, self._photons = sources.ids, sources.column, sources.row, sources.photons
+        self._truth_table, self._intra_pixel = window_images.truth(drawn), drawn.psf.intra_pixel
+        # The world coordinate system and the PSF are found again when they are needed, without the added sources.
+        # astropy changes the numbers of a system that is copied, and a PSF is much larger than the image.
+        self._request, self._lake = replace(request, extra=None), painter.source
+        self._painter: SkyPainter | None = painter
         self.electrons, self.raw, self.detector = drawn.electrons, drawn.raw, aim.detector.name
         self.exposure = asdict(aim.exposure)
         self.first_pixel = window.column, window.row
-        self.truth: pd.DataFrame = self._truth_table.to_pandas()
         self.errors = asdict(accuracies.expected_errors(drawn.scene.accuracy))
         self.gain = float(drawn.scene.amplifier_values("gain", "electron / adu"))
         self.bias = float(drawn.scene.amplifier_values("bias", "adu"))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_find_optics", "wcs")}
+        return {**self.__dict__, "_painter": None, "wcs": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: value for name, value in state.items() if name != "wcs"})
+
+    @cached_property
+    def truth(self) -> pd.DataFrame:
+        """Drawn sources: the columns of the table ``rendered_truth``."""
+        frame: pd.DataFrame = self._truth_table.to_pandas()
+        return frame
 
     @cached_property
     def wcs(self) -> WCS:
         """World coordinate system of the pixels."""
-        return astrometry.shift_pixels(self._optics()[0].wcs, *(-first for first in self.first_pixel))
+        aim, _ = self._find_painter().aim(self._request)
+        return astrometry.shift_pixels(aim.wcs, *(-first for first in self.first_pixel))
 
-    def _optics(self) -> tuple[Aim, Psf]:
-        assert self._find_optics is not None
-        return self._find_optics()
+    def attach(self, painter: SkyPainter) -> SkyImage:
+        """Use a painter of the same lake for the coordinates and the PSF, and return the image."""
+        self._painter = painter
+        return self
+
+    def _find_painter(self) -> SkyPainter:
+        if self._painter is None:
+            self._painter = shared_painter(self._lake)
+        return self._painter
 
     def __repr__(self) -> str:
         ny, nx = self.electrons.shape
@@ -170,15 +190,15 @@ class SkyImage:
         BadInput
             If the source was not drawn, or the model of the PSF has no samples.
         """
-        sources, photons = self._sources, None
+        photons = None
         ny, nx = self.electrons.shape
         column, row = (nx - 1) / 2, (ny - 1) / 2
         if source is not None:
-            at = np.flatnonzero(sources.ids == source)
+            at = np.flatnonzero(self._ids == source)
             if not len(at):
                 raise BadInput(f"source {source} was not drawn in this image")
-            photons = None if sources.photons is None else sources.photons[at]
-            column, row = float(sources.column[at[0]]), float(sources.row[at[0]])
+            photons = None if self._photons is None else self._photons[at]
+            column, row = float(self._column[at[0]]), float(self._row[at[0]])
         if ra is not None and dec is not None:
             x, y = astrometry.pixel_of_sky(self.wcs, [ra], [dec])
             column, row = float(x[0]), float(y[0])
@@ -193,7 +213,7 @@ class SkyImage:
         return self._psf_in_pixels(model, photons, place)
 
     def _model(self) -> Psf:
-        psf = replace(self._optics()[1], intra_pixel=self._response)
+        psf = replace(self._find_painter().psf_of(self._request), intra_pixel=self._intra_pixel)
         return psf if psf.planes is None else replace(psf, planes=replace(psf.planes, origin=self.first_pixel))
 
     def _psf_in_pixels(self, model: Any, photons: Float | None, place: tuple[Float, Float]) -> PsfImage:
@@ -204,7 +224,7 @@ class SkyImage:
         middle = np.array([float(side // 2)])
         star = Sources(
             np.zeros(1, np.int64), middle, middle, np.zeros((1, 2, 2)), np.array([_PSF_ELECTRONS]),
-            np.array([-1]), _no_shapes(self._sources.shapes), photons,
+            np.array([-1]), _NO_SHAPES, photons,
         )  # fmt: skip
         image = stamps.draw(star, np.array([model.side]), model, side, side) / _PSF_ELECTRONS
         return PsfImage(image, 1, float(image.sum()))
@@ -248,10 +268,6 @@ class SkyImage:
         return file
 
 
-def _no_shapes(shapes: Shapes) -> Shapes:
-    return shapes.take(np.zeros(0, np.int64))
-
-
 class ImageOptions(TypedDict, total=False):
     """Options of `Lake.render`. All may be left out.
 
@@ -262,7 +278,7 @@ class ImageOptions(TypedDict, total=False):
     exposure : int
         Number of a planned exposure of the lake, whose band, pointing, PSF and sky are used. The band, `camera` and
         `date` are then ignored. By default a nominal exposure of the band, in which the place is in the middle of the
-        central detector.
+        central detector. Its date, sky and PSF belong to the middle of the surrounding square degree.
     date : float or str
         Start of a nominal exposure, as MJD or as an ISO date in UTC. By default the first date at which the place can
         be observed.
@@ -423,7 +439,7 @@ class SkyPainter:
 
     Parameters
     ----------
-    source : PainterSource
+    source : PainterTables
         The lake, for other processes.
     tables : SkyTables
         Catalogues of the lake.
@@ -438,7 +454,7 @@ class SkyPainter:
 
     def __init__(
         self,
-        source: PainterSource,
+        source: PainterTables,
         tables: SkyTables,
         settings: Mapping[str, Any],
         planned: Mapping[str, read.Version],
@@ -451,6 +467,7 @@ class SkyPainter:
         self.nominal = lru_cache(maxsize=64)(self._nominal)
         self.psf = lru_cache(maxsize=_PSFS)(self._psf)
         self.band = lru_cache(maxsize=64)(passbands.load)
+        self._cells = np.array(sorted(catalogue_rows.drawn_cells(tables.versions["galaxies"])), np.int64)
 
     def _nominal(self, band: str, camera: str | None, mjd: float | None, cell: tuple[float, float]) -> ExposureRow:
         instrument = nominal.find_instrument(band, camera, self.mission)
@@ -463,21 +480,33 @@ class SkyPainter:
         psf = visible_sources.exposure_psf(aim, scene_factory.from_aim(aim, variant), settings_for(accuracy))
         return replace(psf, transforms={})
 
-    def aim(self, request: ImageRequest) -> tuple[Aim, Variant, Psf]:
-        """Return the exposure, the detector and the window of an image, its parameters and accuracy, and its PSF."""
-        if request.exposure is not None:
-            aim, variant = self._planned_aim(request)
-            return aim, variant, self.psf(aim.exposure, aim.detector, request.accuracy)
-        # The sky, the date and the PSF belong to the middle of a 1 deg cell, so that neighbouring images share them.
-        place = request.ra, request.dec
-        exposure = self.nominal(request.band, request.camera, request.mjd, (round(place[0]), round(place[1])))
+    def _nominal_of(self, request: ImageRequest) -> tuple[ExposureRow, Detector]:
+        """Return the exposure of the square degree around a place, and its central detector."""
+        cell = round(request.ra), round(request.dec)
+        exposure = self.nominal(request.band, request.camera, request.mjd, cell)
         detector = nominal.central_detector(exposure.camera, self.mission)
         # The rows for charge injection, which are not read, would be in the middle of the image.
-        detector = replace(detector, injection_rows=0)
+        return exposure, replace(detector, injection_rows=0)
+
+    def psf_of(self, request: ImageRequest) -> Psf:
+        """Return the PSF of an image, without the variation of response inside a pixel.
+
+        Images at places that share a nominal exposure have the same PSF.
+        """
+        if request.exposure is None:
+            return self.psf(*self._nominal_of(request), request.accuracy)
+        aim, _ = self._planned_aim(request)
+        return self.psf(aim.exposure, aim.detector, request.accuracy)
+
+    def aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
+        """Return the exposure, the detector and the window of an image, and its parameters and accuracy."""
+        if request.exposure is not None:
+            return self._planned_aim(request)
+        exposure, detector = self._nominal_of(request)
         variant = Variant(self.mission, request.accuracy, self.forced)
-        band, moved = self.band(exposure.band), nominal.move_exposure(exposure, detector, place)
-        aim = Aim.from_exposure(moved, detector, band, self.seed)
-        return _with_window(aim, request), variant, self.psf(exposure, detector, request.accuracy)
+        moved = nominal.move_exposure(exposure, detector, (request.ra, request.dec))
+        aim = Aim.from_exposure(moved, detector, self.band(exposure.band), self.seed)
+        return _with_window(aim, request), variant
 
     def _planned_aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
         number = int(request.exposure or 0)
@@ -499,25 +528,22 @@ class SkyPainter:
                 return _with_window(aim, request), variant
         raise BadInput(f"ra {request.ra:.5f}, dec {request.dec:.5f}: on none of the {len(tasks)} planned detectors")
 
+    def covers(self, ra: Float, dec: Float) -> Bool:
+        """Return the mask [n] of the places (deg) that are in a cell of the catalogue."""
+        return np.isin(sky.cell_at(ra, dec, GENERATION_ORDER), self._cells)
+
     def check(self, request: ImageRequest) -> None:
-        """Raise BadInput if the band or the camera of a nominal exposure is unknown, or the lake has no such fluxes."""
+        """Raise BadInput if an image cannot be drawn because of its options, or its place is outside the catalogue."""
         if request.exposure is None:
+            # Answer a wrong band or camera with the names that exist, before anything is planned.
             nominal.find_instrument(request.band, request.camera, self.mission)
-            inputs.check_band(self.tables.versions["galaxy_fluxes"], request.band)
-
-    def attach_optics(self, image: SkyImage, request: ImageRequest) -> SkyImage:
-        """Let an image that another process has drawn find its coordinates and PSF here; return the image."""
-
-        def find_optics() -> tuple[Aim, Psf]:
-            aim, _, psf = self.aim(request)
-            return aim, psf
-
-        image._find_optics = find_optics
-        return image
+        aim, _ = self.aim(request)
+        inputs.check_band(self.tables.versions["galaxy_fluxes"], aim.exposure.band)
+        window_images.check_effects(aim, request.effects)
 
     def draw(self, request: ImageRequest, refuse_unknown: bool = False) -> SkyImage:
         """Draw an image; see `Lake.render`. With `refuse_unknown`, all sources that are left out must exist."""
-        aim, variant, psf = self.aim(request)
+        aim, variant = self.aim(request)
         rows = inputs.read_rows(self.tables, aim, variant)
         if refuse_unknown:
             inputs.refuse_unknown(rows, request.without)
@@ -525,9 +551,10 @@ class SkyPainter:
         if request.extra is not None:
             rows = added.add_sources(rows, request.extra, aim.exposure.band)
         drawn = window_images.draw_window(
-            aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise, psf
-        )
-        return SkyImage(drawn, lambda: (aim, psf))
+            aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise,
+            self.psf_of(request),
+        )  # fmt: skip
+        return SkyImage(drawn, request, self)
 
 
 def _with_window(aim: Aim, request: ImageRequest) -> Aim:
@@ -551,7 +578,7 @@ def _with_window(aim: Aim, request: ImageRequest) -> Aim:
 
 
 @dataclass(frozen=True, slots=True)
-class PainterSource:
+class PainterTables:
     """Lake and versions of its tables, from which every process makes the same painter.
 
     Attributes
@@ -566,7 +593,7 @@ class PainterSource:
     keys: tuple[tuple[str, str], ...]
 
 
-def find_source(versions: Mapping[str, read.Version], root: Folder) -> PainterSource:
+def find_tables(versions: Mapping[str, read.Version], root: Folder) -> PainterTables:
     """Return what a painter needs of a lake; raises BadInput if it lacks catalogues or fluxes.
 
     `versions` are the versions of the tables of the lake `root`, by name.
@@ -575,10 +602,10 @@ def find_source(versions: Mapping[str, read.Version], root: Folder) -> PainterSo
         if name not in versions:
             raise BadInput(f"lake {root}: has no table {name}, which images need")
     names = [name for name in (*_CATALOGUES, *_OPTIONAL, *_PLANNED, "products") if name in versions]
-    return PainterSource(root, tuple((name, versions[name].key) for name in names))
+    return PainterTables(root, tuple((name, versions[name].key) for name in names))
 
 
-def painter(source: PainterSource) -> SkyPainter:
+def painter(source: PainterTables) -> SkyPainter:
     """Open the tables of a lake, and return its painter."""
     versions = {name: read.version(source.root, name, key) for name, key in source.keys}
     products = versions.get("products")
@@ -587,3 +614,9 @@ def painter(source: PainterSource) -> SkyPainter:
     planned = {name: versions[name] for name in _PLANNED if name in versions}
     seed = settings.get("seed", versions["galaxies"].manifest["facts"].get("seed", 0))
     return SkyPainter(source, tables, settings, planned, seed)
+
+
+@lru_cache(maxsize=1)
+def shared_painter(source: PainterTables) -> SkyPainter:
+    """Return the painter of a lake that all images use which were sent from another process."""
+    return painter(source)

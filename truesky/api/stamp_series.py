@@ -6,25 +6,30 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from lake_schema.errors import BadInput
+from lake_schema.texts import spelling
 from truesky.api import sky_images
-from truesky.api.sky_images import ImageOptions, ImageRequest, PainterSource, SkyImage, SkyPainter
+from truesky.api.sky_images import ImageOptions, ImageRequest, PainterTables, SkyImage, SkyPainter
 from truesky.catalogue import injected_rows
 from truesky.request import sky_notation
-from truesky.request.toml_values import refuse_name
 
 # Columns of a table of places, besides `ra` and `dec`.
 _OPTIONAL = ("size", "exposure", "seed", "date")
-# Number of images that a process draws before it returns them, and number of such batches that may wait per process.
-_BATCH, _WAITING = 8, 3
+# Largest number of images that a process draws before it sends them, and their largest number of pixels together.
+_MAX_BATCH, _BATCH_PIXELS = 8, 4e6
 # Time without work after which a process ends, s.
 _IDLE_S = 60
+# Floating-point numbers from this one on do not contain every whole number.
+_MAX_EXACT = 2.0**53
+# Environment of the processes. loky restarts a process whose memory grows by more than a limit; ours keep rows and PSFs
+# of a limited size.
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LOKY_MAX_MEMORY_LEAK_SIZE": "1e12"}
 _Batch = list[tuple[int, ImageRequest]]
+_Drawn = tuple[list[SkyImage], BadInput | None]
 
 
 def read_places(table: Any, size: float, band: str, options: ImageOptions) -> list[ImageRequest]:
@@ -49,23 +54,30 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
     Raises
     ------
     BadInput
-        If a column is missing or unknown, or a value is not valid. The message names the row, from 1.
+        If `ra` or `dec` is missing, the name of a column is misspelt, or a value is not valid. The message names the
+        row, from 1.
     """
-    place, columns = injected_rows.table_columns(table, "table")
-    for name in columns:
-        if name not in ("ra", "dec", *_OPTIONAL):
-            raise BadInput(f"{place}: column {refuse_name(name, ('ra', 'dec', *_OPTIONAL))}")
+    place, columns = injected_rows.table_columns(table, "table", _is_used)
     if missing := [name for name in ("ra", "dec") if name not in columns]:
         raise BadInput(f"{place}: has no column {missing[0]}")
     base = sky_images.check_request((0.0, 0.0), size, band, options)
     requests = []
     for row in range(len(columns["ra"])):
-        values = {name: float(column[row]) for name, column in columns.items() if np.isfinite(column[row])}
+        values = {name: float(column[row]) for name, column in columns.items() if not np.isnan(column[row])}
         try:
             requests.append(_with_place(base, values))
         except BadInput as error:
             raise BadInput(f"{place}, row {row + 1}: {error}") from None
     return requests
+
+
+def _is_used(name: str) -> bool:
+    """Return True for a column that is used, and raise BadInput for a name that is nearly the same."""
+    if name in ("ra", "dec", *_OPTIONAL):
+        return True
+    if similar := spelling.closest_names(name, _OPTIONAL, 1):
+        raise BadInput(f"table: column {name!r}: did you mean {similar[0]}? Other names are ignored")
+    return False
 
 
 def _with_place(base: ImageRequest, values: Mapping[str, float]) -> ImageRequest:
@@ -84,9 +96,23 @@ def _with_place(base: ImageRequest, values: Mapping[str, float]) -> ImageRequest
 
 
 def _whole(name: str, value: float) -> int:
-    if value != int(value):
+    if value != round(value, 0):
         raise BadInput(f"{name} = {value:g}: must be a whole number")
+    if abs(value) >= _MAX_EXACT:
+        raise BadInput(f"{name} = {value:g}: must be below 2^53 = 9.0e15 in a table")
     return int(value)
+
+
+def check_places(painter: SkyPainter, requests: Sequence[ImageRequest]) -> None:
+    """Raise BadInput if a place is outside the catalogue, or if the options of the first image are not valid.
+
+    The message names the row of the table, from 1. A place near the edge of the catalogue is refused later.
+    """
+    ra, dec = (np.array([getattr(request, name) for request in requests]) for name in ("ra", "dec"))
+    for row in np.flatnonzero(~painter.covers(ra, dec))[:1].tolist():
+        raise BadInput(f"table, row {row + 1}: ra {ra[row]:.5f}, dec {dec[row]:.5f}: outside the area of the catalogue")
+    for request in requests[:1]:
+        painter.check(request)
 
 
 def draw_all(painter: SkyPainter, requests: Sequence[ImageRequest], processes: int) -> Iterator[SkyImage]:
@@ -111,45 +137,63 @@ def draw_all(painter: SkyPainter, requests: Sequence[ImageRequest], processes: i
     BadInput
         If an image cannot be drawn; the message names the row of the table, from 1. Also if a process is killed.
     """
-    numbered = list(enumerate(requests, 1))
+    batch_size = _batch_size(painter, requests, processes)
     if processes == 1:
-        for number, request in numbered:
+        for number, request in enumerate(requests, 1):
             yield _draw(painter, number, request)
         return
     # The processes of this library do not import the user's script, so that scripts and notebooks need no guard.
     import loky
     from loky.process_executor import TerminatedWorkerError
 
-    batches = [numbered[first : first + _BATCH] for first in range(0, len(numbered), _BATCH)]
-    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    executor = loky.ProcessPoolExecutor(min(processes, len(batches)), timeout=_IDLE_S, env=limits)
+    numbered = list(enumerate(requests, 1))
+    batches = [numbered[first : first + batch_size] for first in range(0, len(numbered), batch_size)]
+    executor = loky.ProcessPoolExecutor(min(processes, max(len(batches), 1)), timeout=_IDLE_S, env=_ENVIRONMENT)
     try:
-        waiting: deque[tuple[_Batch, Future[list[SkyImage]]]] = deque()
+        waiting: deque[Future[_Drawn]] = deque()
         for batch in batches:
-            waiting.append((batch, executor.submit(_draw_batch, painter.source, batch)))
-            if len(waiting) >= _WAITING * processes:
-                yield from _results(painter, *waiting.popleft())
+            waiting.append(executor.submit(_draw_batch, painter.source, batch))
+            if len(waiting) > processes:
+                yield from _results(painter, waiting.popleft())
         while waiting:
-            yield from _results(painter, *waiting.popleft())
+            yield from _results(painter, waiting.popleft())
     except TerminatedWorkerError:
         raise BadInput("stamps: a process was killed, perhaps for lack of memory; use fewer processes") from None
     finally:
         executor.shutdown(wait=True, kill_workers=True)
 
 
-def _results(painter: SkyPainter, batch: _Batch, task: Future[list[SkyImage]]) -> Iterator[SkyImage]:
-    for image, (_, request) in zip(task.result(), batch, strict=True):
-        yield painter.attach_optics(image, request)
+def _batch_size(painter: SkyPainter, requests: Sequence[ImageRequest], processes: int) -> int:
+    """Return the number of images that a process draws before it sends them.
+
+    There are at least four batches per process, and a batch has at most about _BATCH_PIXELS pixels.
+    """
+    if not requests:
+        return 1
+    largest = max(requests, key=lambda request: request.size)
+    aim, _ = painter.aim(largest)
+    pixels = max((largest.size / aim.detector.pixel_scale) ** 2, 1.0)
+    return int(np.clip(min(len(requests) / (4 * processes), _BATCH_PIXELS / pixels), 1, _MAX_BATCH))
 
 
-def _draw_batch(source: PainterSource, batch: _Batch) -> list[SkyImage]:
-    painter = _painter(source)
-    return [_draw(painter, number, request) for number, request in batch]
+def _results(painter: SkyPainter, task: Future[_Drawn]) -> Iterator[SkyImage]:
+    """Yield the images that a process has drawn, and then raise its error if there is one."""
+    images, error = task.result()
+    for image in images:
+        yield image.attach(painter)
+    if error is not None:
+        raise error
 
 
-@lru_cache(maxsize=1)
-def _painter(source: PainterSource) -> SkyPainter:
-    return sky_images.painter(source)
+def _draw_batch(tables: PainterTables, batch: _Batch) -> _Drawn:
+    """Return the images of a batch before the first error, and the error."""
+    painter, images = sky_images.shared_painter(tables), []
+    for number, request in batch:
+        try:
+            images.append(_draw(painter, number, request))
+        except BadInput as error:
+            return images, error
+    return images, None
 
 
 def _draw(painter: SkyPainter, number: int, request: ImageRequest) -> SkyImage:

@@ -14,14 +14,17 @@ from lake_schema.errors import BadInput
 from truesky.api.lake import Lake
 from truesky.api.sky_images import ImageOptions, SkyImage
 
-# Columns of the list of written files.
-_COLUMNS = ("file", "ra", "dec", "exposure", "detector", "first_column", "first_row", "sources")
+# Columns of the list of written files. `ra` and `dec` are the middle of the image.
+_COLUMNS = ("row", "file", "ra", "dec", "exposure", "detector", "first_column", "first_row", "sources")
+# Exit status of a command that was stopped by Ctrl-C.
+_INTERRUPTED = 130
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Write the images of the places in a table to a new folder as the parsed arguments say, print it, and return 0.
 
-    Raises BadInput if an argument is not valid or an image cannot be drawn; no folder is then left.
+    Return 130 if the user stops it. Raises BadInput if an argument is not valid or an image cannot be drawn. No folder
+    is left in both cases.
     """
     out = Path(options.out)
     if out.exists():
@@ -31,11 +34,15 @@ def run_command(options: argparse.Namespace) -> int:
     for name in ("camera", "exposure", "date", "seed", "effects"):
         if (value := getattr(options, name)) is not None:
             chosen[name] = value
-    with Lake(options.lake) as lake:
-        images = lake.stamps(options.places, options.size, options.band, options.processes, **chosen)
-        with user_files.create_folder(out) as folder:
-            rows = list(_write(images, folder))
-            _write_list(rows, folder / "stamps.csv")
+    try:
+        with Lake(options.lake) as lake:
+            images = lake.stamps(options.places, options.size, options.band, options.processes, **chosen)
+            with user_files.create_folder(out) as folder:
+                rows = list(_write(images, folder))
+                _write_list(rows, folder / "stamps.csv")
+    except KeyboardInterrupt:
+        print(f"stopped; {user_files.format_path(out)} was not written")
+        return _INTERRUPTED
     print(f"{out}: {len(rows)} images, listed in stamps.csv")
     return 0
 
@@ -47,7 +54,7 @@ def _write(images: Iterator[SkyImage], folder: Path) -> Iterator[Sequence[str | 
         ny, nx = image.electrons.shape
         ra, dec = (float(value) for value in image.wcs.all_pix2world((nx - 1) / 2, (ny - 1) / 2, 0))
         identity = image.exposure["exposure_id"], image.detector
-        yield file.name, round(ra, 9), round(dec, 9), *identity, *image.first_pixel, len(image.truth)
+        yield number, file.name, round(ra, 9), round(dec, 9), *identity, *image.first_pixel, len(image.truth)
 
 
 def _write_list(rows: Sequence[Sequence[str | int | float]], file: Path) -> None:

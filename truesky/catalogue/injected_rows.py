@@ -6,7 +6,7 @@ no effect. The extinction `a_v` must be 0, and galaxies cannot have images (`sta
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,9 @@ def _check(columns: Mapping[str, Array], name: str, place: Path, settings: Mappi
     return InjectedRows(name, ids.astype(np.int64), {key: np.asarray(v, float) for key, v in values.items()})
 
 
-def table_columns(table: Any, name: str) -> tuple[Path, dict[str, Float]]:
+def table_columns(
+    table: Any, name: str, is_wanted: Callable[[str], bool] = lambda _: True
+) -> tuple[Path, dict[str, Float]]:
     """Return the columns of a table as numbers.
 
     Parameters
@@ -149,6 +151,8 @@ def table_columns(table: Any, name: str) -> tuple[Path, dict[str, Float]]:
         A table (pandas, astropy, Arrow, or a mapping of columns), or the path of a Parquet, FITS, CSV or HDF5 file.
     name : str
         Name of the argument, for messages.
+    is_wanted : callable, optional
+        Function that returns True for the names of the columns to read. By default all are read.
 
     Returns
     -------
@@ -161,9 +165,9 @@ def table_columns(table: Any, name: str) -> tuple[Path, dict[str, Float]]:
         If the table cannot be read, a column has no numbers, or columns have different numbers of rows.
     """
     if isinstance(table, str | Path):
-        return _columns_of_file(Path(table))
+        return _columns_of_file(Path(table), is_wanted)
     place = Path(name)
-    titles = _titles(table, name)
+    titles = [title for title in _titles(table, name) if is_wanted(title)]
     with Mistakes() as mistakes:
         columns = {title: mistakes.read(_numbers, table[title], f"{place}: column {title}", title) for title in titles}
     lengths = {title: len(values) for title, values in columns.items()}
@@ -182,10 +186,11 @@ def _titles(table: Any, name: str) -> list[str]:
     raise BadInput(f"{name} must be a table, a mapping of columns or a file, got {type(table).__name__}")
 
 
-def _columns_of_file(file: Path) -> tuple[Path, dict[str, Float]]:
+def _columns_of_file(file: Path, is_wanted: Callable[[str], bool]) -> tuple[Path, dict[str, Float]]:
     titles = external_rows.column_names(file, SOURCES_KIND)
     if not titles:
         raise BadInput(f"{file}: has no columns")
+    titles = [title for title in titles if is_wanted(title)]
     batches = list(external_rows.read_batches(file, titles, kind=SOURCES_KIND))
     empty = np.zeros(0)
     return file, {t: np.concatenate([empty, *(np.asarray(b.columns[t], float) for b in batches)]) for t in titles}

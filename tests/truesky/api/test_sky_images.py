@@ -1,5 +1,6 @@
 """Images of single places, and sources added to the images of a lake."""
 
+import copy
 import pickle
 
 import numpy as np
@@ -203,8 +204,27 @@ def test_stamps_are_the_images_of_their_places(lake, tmp_path):
             for one, two in zip(as_drawn(stamp), as_drawn(other), strict=True):
                 assert np.array_equal(one, two)
             copied = pickle.loads(pickle.dumps(stamp))
-            assert np.array_equal(copied.raw, stamp.raw)
-            assert copied.truth.equals(stamp.truth)
+            for one, two in zip(as_drawn(stamp), as_drawn(copied), strict=True):
+                assert np.array_equal(one, two)
+            files = [image.write(tmp_path / f"{name}.fits") for name, image in (("one", stamp), ("two", copied))]
+            assert files[0].read_bytes() == files[1].read_bytes()
+            assert np.array_equal(copy.deepcopy(stamp).psf().image, stamp.psf().image)
+
+
+def test_a_table_without_rows_has_no_stamps(lake):
+    for processes in (1, 2):
+        assert list(lake.stamps({"ra": [], "dec": []}, band="lsst_r", processes=processes)) == []
+
+
+def test_other_columns_of_a_table_of_places_are_ignored(lake):
+    table = pd.DataFrame({"ra": [RA], "dec": [DEC], "name": ["NGC 1"], "seed": [np.nan], "z": [0.1]})
+    (stamp,) = lake.stamps(table, size=5.0, band="lsst_r", processes=1)
+    assert np.array_equal(stamp.raw, lake.render(RA, DEC, size=5.0, band="lsst_r").raw)
+
+
+def test_nominal_images_of_a_square_degree_share_the_psf(lake):
+    one, two = (lake.render(RA, DEC + shift, size=5.0, band="lsst_r", noise=False) for shift in (0.0, 0.02))
+    assert np.array_equal(one.psf().image, two.psf().image)
 
 
 @pytest.mark.nightly
@@ -216,8 +236,13 @@ def test_processes_draw_the_same_stamps(lake, tmp_path):
             assert np.array_equal(value, same)
         files = [image.write(tmp_path / f"{number}_{k}.fits") for k, image in enumerate((stamp, other))]
         assert files[0].read_bytes() == files[1].read_bytes()
-    with pytest.raises(BadInput, match=r"table, row 2: ra 10.00000, dec 10.00000: outside the area"):
-        list(lake.stamps({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, size=5.0, band="lsst_r", processes=2))
+    # Images before one that cannot be drawn are returned.
+    edge = {"ra": np.full(12, RA), "dec": np.append(np.full(11, DEC), northern_edge(lake))}
+    images = lake.stamps(edge, size=5.0, band="lsst_r", processes=2)
+    for _ in range(11):
+        next(images)
+    with pytest.raises(BadInput, match=r"table, row 12: ra .*: cut by the edge of the catalogue"):
+        next(images)
 
 
 def test_the_command_writes_stamps(lake, tmp_path, capsys):
@@ -245,7 +270,7 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
     ("table", "options", "message"),
     [
         ({"ra": [RA]}, {}, "table: has no column dec"),
-        ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes' is not allowed: did you mean size"),
+        ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes': did you mean size"),
         ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),
         ({"ra": [RA], "dec": [95.0]}, {}, "table, row 1: dec = 95.0 is outside"),
         ({"ra": [RA], "dec": [DEC], "seed": [1.5]}, {}, "table, row 1: seed = 1.5: must be a whole number"),
@@ -256,6 +281,11 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
             "^band: 'euclid_vs' is not allowed: did you mean euclid_vis",
         ),
         ({"ra": [RA], "dec": [DEC]}, {"processes": 0}, "processes"),
+        ({"ra": [RA], "dec": [DEC], "seed": [2.0**53]}, {}, r"table, row 1: seed = .* must be below 2\^53"),
+        ({"ra": [RA], "dec": [DEC], "size": [np.inf]}, {}, "table, row 1: size"),
+        ({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, {}, r"table, row 2: ra 10.00000, dec 10.00000: outside the area"),
+        ({"ra": [RA], "dec": [DEC]}, {"exposure": 9}, "^exposure 9: the lake has no exposure with this number"),
+        ({"ra": [RA], "dec": [DEC]}, {"effects": ["ghosts"]}, "^effects: 'ghosts' cannot be applied to a window"),
         ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows"),
         (3, {}, "table must be a table"),
     ],
@@ -303,11 +333,16 @@ def test_an_image_that_does_not_exist_is_refused(lake):
         lake.image("a.fits")
 
 
+def northern_edge(lake):
+    """Return a declination at which an image is cut by the edge of the catalogue."""
+    for dec in np.arange(DEC + 0.1, DEC + 1.0, 0.02):
+        try:
+            lake.render(RA, dec, size=5.0, band="lsst_r", noise=False)
+        except BadInput:
+            return dec
+    raise AssertionError("no edge")
+
+
 def test_a_place_at_the_edge_of_the_catalogue_is_refused(lake):
-
-    def draw_northwards():
-        for shift in np.arange(0.1, 1.0, 0.02):
-            lake.render(RA, DEC + shift, size=10.0, band="lsst_r", noise=False)
-
     with pytest.raises(BadInput, match=r"cut by the edge of the catalogue, which has \d+ % of the surroundings"):
-        draw_northwards()
+        lake.render(RA, northern_edge(lake), size=5.0, band="lsst_r", noise=False)

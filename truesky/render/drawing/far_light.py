@@ -133,15 +133,16 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
 
 
 def _misses_frame(frame: Int, points: tuple[Float, Float], radius: float, bar_directions: Float) -> bool:
-    """Return True if neither the circles of a radius around points (columns, rows) nor their spikes reach the frame.
+    """Return True if no light of a star is drawn on the frame.
 
-    `bar_directions` [b, 2] are unit vectors along the bars of the pupil. The spike of a bar is perpendicular to it, and
-    its table ends at WIDE pixels from its axis.
+    `points` are the columns and rows of the star, or of points along its trail. Up to `radius` pixels from them, rings
+    and aureole are drawn. `bar_directions` [b, 2] are unit vectors along the bars of the pupil. The spike of a bar is
+    perpendicular to it, and its table ends at WIDE pixels from its axis.
     """
     ny, nx = frame.shape
     x, y = points
-    across, down = (np.maximum(np.maximum(-at, at - (count - 1)), 0.0) for at, count in ((x, nx), (y, ny)))
-    if (np.hypot(across, down) <= radius).any():
+    outside_x, outside_y = (np.maximum(np.maximum(-at, at - (count - 1)), 0.0) for at, count in ((x, nx), (y, ny)))
+    if (np.hypot(outside_x, outside_y) <= radius).any():
         return False
     # Distances [b, point, corner] of the corners of the frame from the axis of a spike. If the axis crosses the frame,
     # they have both signs.

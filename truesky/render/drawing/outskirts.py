@@ -111,8 +111,8 @@ class Outskirts:
     across : float
         Factor w of the coordinate v, about the apparent axis ratio of the disc.
     blurred : float array, shape (rows, columns)
-        Electrons by which the PSF changes a pixel (also negative), at nodes `block` pixels apart. One node is the
-        middle of the galaxy, or would be if the nodes continued.
+        Electrons by which the PSF changes a pixel (also negative), at nodes `block` pixels apart. Node (0, 0) is the
+        middle of the galaxy, and may lie outside the array.
     block : int
         Spacing of the nodes of `blurred`, pixels.
     first : (int, int)
@@ -169,18 +169,15 @@ def from_galaxy(
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), max(map(abs, region)))
     cells = _cells(psf, weights, block)
-    first, end = (
-        tuple(int(edge(region[axis + k] / block)) + outward for axis in (0, 2))
-        for k, (edge, outward) in enumerate(((np.floor, -1), (np.ceil, 2)))
-    )
+    first_x, first_y = (int(np.floor(start / block)) - 1 for start in (region[0], region[2]))
+    end_x, end_y = (int(np.ceil(end / block)) + 2 for end in (region[1], region[3]))
     # Nodes around the region from which the PSF moves light into it.
     margin = len(cells) // 2
-    columns, rows = (last - low + 2 * margin for low, last in zip(first, end, strict=True))
-    unblurred = np.zeros((rows, columns))
-    x, y = (float((margin - low) * block) for low in first)
+    unblurred = np.zeros((end_y - first_y + 2 * margin, end_x - first_x + 2 * margin))
+    x, y = float((margin - first_x) * block), float((margin - first_y) * block)
     _sample(light, disk, wide, x, y, float(block), unblurred)
     blurred = scipy.signal.fftconvolve(unblurred, cells, mode="valid")
-    return Outskirts(light, disk, wide, blurred, block, (first[0], first[1]))
+    return Outskirts(light, disk, wide, blurred, block, (first_x, first_y))
 
 
 @lru_cache(maxsize=16)

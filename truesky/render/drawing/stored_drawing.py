@@ -16,7 +16,7 @@ from truesky.render.sources.source_list import Sources
 
 @dataclass(frozen=True, slots=True)
 class _Drawn:
-    """Sources that were drawn, in order, with everything on which their light depends."""
+    """Sources that were drawn, in order, with properties on which their light depends."""
 
     ids: Int
     properties: tuple[Float, ...]
@@ -27,10 +27,11 @@ class _Drawn:
 
 @dataclass(slots=True)
 class DrawingStore:
-    """Light of the sources that were drawn on one detector of one exposure, with one accuracy.
+    """Light of the sources that were drawn on one detector of one exposure of one lake, with one accuracy.
 
     The light of a source does not depend on other sources, and the sum is exact. An image with additional sources is
-    therefore the same, bit by bit, whether all sources are drawn or only the additional ones.
+    therefore the same, bit by bit, whether all sources are drawn or only the additional ones. A store has 8 bytes per
+    pixel of the detector.
 
     Attributes
     ----------
@@ -39,7 +40,15 @@ class DrawingStore:
     """
 
     is_additional: Callable[[Int], Bool]
+    _key: object = field(default=None, repr=False)
     _drawn: _Drawn | None = field(default=None, repr=False)
+
+    def check(self, key: object) -> None:
+        """Raise ValueError unless `key` (exposure, detector and accuracy) equals the key of the first call."""
+        if self._key is None:
+            self._key = key
+        if key != self._key:
+            raise ValueError("a drawing store is for one detector of one exposure, with one accuracy")
 
     def draw(
         self,
@@ -51,7 +60,7 @@ class DrawingStore:
         neglected: Float,
         tally: Tally,
     ) -> Float:
-        """Draw sources as `stamps.draw` does; those of the first call are drawn once, except additional ones.
+        """Draw sources as `stamps.draw` does. Sources of the first call that are not additional are drawn only once.
 
         Parameters
         ----------
@@ -65,7 +74,11 @@ class DrawingStore:
         float array, shape (ny, nx)
             Expected electrons.
         """
-        properties = sources.column, sources.row, sources.electrons, sizes.astype(float), neglected
+        none = np.zeros((len(sources), 0))
+        properties = (
+            sources.column, sources.row, sources.electrons, sources.jacobian, sizes.astype(float), neglected,
+            none if sources.trail is None else sources.trail, none if sources.photons is None else sources.photons,
+        )  # fmt: skip
         new, unit = self.is_additional(sources.ids), stamps.unit_for(sources)
         if self._drawn is None:
             drawn_electrons = np.zeros(int(np.sum(~new)))

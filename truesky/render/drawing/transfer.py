@@ -47,7 +47,8 @@ _FOLDING = 0.1
 # Side, in pixels, of the stamp on which the Fourier transform of the PSF is computed to find the |k| beyond which it is
 # negligible (`max_transfer`).
 _PROBE = 64
-# Largest size of transforms that are kept for other images with the same PSF, bytes. It suffices for all stamps of VIS.
+# Largest size of the transforms for one size of stamps that are kept for other images with the same PSF, bytes. It
+# suffices for all stamps of VIS.
 _KEPT_BYTES = 1e8
 _T = TypeVar("_T")
 
@@ -191,7 +192,10 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
     float array, shape (i,)
         Element i is the largest modulus of all planes for |k| from i STEP to (i + 1) STEP radian / pixel.
     """
-    return _keep(psf, ("max", min_value), lambda: _max_transfer(psf, min_value))
+    if min_value != NEGLIGIBLE:
+        # This value differs between images.
+        return _max_transfer(psf, min_value)
+    return _keep(psf, ("max",), lambda: _max_transfer(psf, min_value))
 
 
 def _max_transfer(psf: Psf, min_value: float) -> Float:
@@ -252,11 +256,13 @@ def _keep(psf: Psf, key: tuple[Any, ...], compute: Callable[[], _T]) -> _T:
     """Return the result of a function of a PSF, from `psf.transforms` if it has been computed before."""
     if psf.transforms is None:
         return compute()
-    # The copies of a PSF with another response inside the pixel share the dictionary.
+    # The copies of a PSF with another response inside the pixel share the dictionary. A copy with another image must
+    # not find the transforms of this one.
     full_key = (*key, psf.intra_pixel)
-    if full_key not in psf.transforms:
-        psf.transforms[full_key] = compute()
-    result: _T = psf.transforms[full_key]
+    image = psf.profile if psf.planes is None else psf.planes.images
+    if full_key not in psf.transforms or psf.transforms[full_key][0] is not image:
+        psf.transforms[full_key] = image, compute()
+    result: _T = psf.transforms[full_key][1]
     return result
 
 

@@ -79,6 +79,8 @@ def render(
         Raw image, truth maps and drawn sources. BadInput is raised by called functions, for example if the image would
         need too much memory or time.
     """
+    if drawings is not None:
+        drawings.check((aim.exposure, aim.detector, variant.accuracy, seed))
     scene = replace(
         scene_factory.from_aim(aim, variant),
         persistence_charge=persistence.total_charge(aim, rows.previous_exposures, variant, seed),

@@ -48,8 +48,8 @@ STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Largest allowed number of expected electrons of a source. Light is summed in 64-bit integers, whose unit is coarser
 # for brighter sources; for this number it is 1/16 electron.
 _MAX_ELECTRONS = 1e17
-# Galaxies larger than the largest stamp are drawn in a window where they have more than this multiple of the light that
-# is noticeable on a detector (1e-2 of the noise of a pixel).
+# Galaxies larger than the largest stamp are drawn in a window where they have more than 1e-3 of the noise of a pixel,
+# which is this multiple of the light that is noticeable on a detector.
 _FAINT = 0.1
 # Smallest total light with which a spectrum counts as noticeable: its electrons divided by the noise of a pixel
 # (electrons rms). If all of this light is in one emission line, its signal-to-noise ratio is 0.7.

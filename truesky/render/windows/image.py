@@ -109,7 +109,8 @@ def draw_window(
     Returns
     -------
     WindowImage
-        The image and its truth. The same pixels in the image of the whole detector have the same expected electrons.
+        The image and its truth. Its expected electrons differ by less than 1/320 of the noise of a pixel from the image
+        of the whole detector.
 
     Raises
     ------
@@ -174,7 +175,8 @@ def _add_noise(
 ) -> tuple[Array, tuple[Decision, ...]]:
     """Return the raw pixels [ny, nx] of a window in ADU, and the decision about each of its effects."""
     window = aim.drawn
-    local = tuple(effect for effect in aim.effects if effect.name in LOCAL_EFFECTS)
+    check_effects(aim, effects)
+    local = _local_effects(aim)
     scene = replace(scene, forced=_switches(local, effects, scene), lights=Lights())
     scene = scene_factory.with_peak_electrons(scene, electrons)
     scene = scene_factory.with_non_source_light(scene, aim.channel, local)
@@ -192,10 +194,21 @@ def _switches(local: tuple[Effect, ...], effects: Collection[str] | None, scene:
     """Return which effects are switched on (True) or off (False), by name; others are applied if noticeable."""
     if effects is None:
         return dict(scene.forced)
-    names = [effect.name for effect in local if effect.optional]
-    if unknown := sorted(set(effects) - set(names)):
+    return {effect.name: effect.name in effects for effect in local if effect.optional}
+
+
+def check_effects(aim: Aim, effects: Collection[str] | None) -> None:
+    """Raise BadInput if an effect cannot be applied to a window. The message lists the effects that can.
+
+    `effects` are the names that the user gave, or None.
+    """
+    names = [effect.name for effect in _local_effects(aim) if effect.optional]
+    if unknown := sorted(set(effects or ()) - set(names)):
         raise BadInput(f"effects: {unknown[0]!r} cannot be applied to a window; allowed here: {', '.join(names)}")
-    return {name: name in effects for name in names}
+
+
+def _local_effects(aim: Aim) -> tuple[Effect, ...]:
+    return tuple(effect for effect in aim.effects if effect.name in LOCAL_EFFECTS)
 
 
 def amplifier_at(aim: Aim, scene: Scene, window: Window) -> int:

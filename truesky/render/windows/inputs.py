@@ -136,9 +136,9 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
 def refuse_unknown(rows: Rows, without: Sequence[int]) -> None:
     """Raise BadInput if a source or arc that is to be left out is not in the catalogue rows around a window."""
     tables = [rows.galaxies, rows.stars, *(() if rows.lenses is None else (rows.lenses,))]
-    known = np.concatenate([table["id"].to_numpy() for table in tables])
+    ids = np.concatenate([table["id"].to_numpy() for table in tables])
     for number in without:
-        if number not in known:
+        if number not in ids:
             raise BadInput(f"without: there is no source or arc {number} in this image or around it")
 
 

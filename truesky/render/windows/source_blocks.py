@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema import sky
+from lake_schema.errors import BadInput
 from lake_schema.store import read
 from truesky.render.sources import catalogue_rows
 from truesky.render.sources.catalogue_rows import BrightQuery
@@ -44,7 +45,7 @@ class SourceBlocks:
         self._far = lru_cache(maxsize=_FAR_BLOCKS)(self._read_far)
 
     def read(self, task: Mapping[str, Any], band: str, rings: Sequence[tuple[float, float]]) -> Pair:
-        """Read all sources in a circle, and brighter sources around it, with their fluxes.
+        """Read at least all sources in a circle, and brighter sources around it, with their fluxes.
 
         Parameters
         ----------
@@ -82,6 +83,10 @@ class SourceBlocks:
         """Return the rows of a cell of _BLOCK_ORDER, their fluxes, and their cells of READ_ORDER."""
         rows = self._catalogue.rows_in_cells([block], _BLOCK_ORDER, [*self._columns, "_healpix_29"])
         light = self._fluxes.rows_in_cells([block], _BLOCK_ORDER, ["id", f"f_nu_{band}"])
+        if not rows["id"].equals(light["id"]):
+            raise BadInput(
+                f"tables {self._catalogue.table} and {self._fluxes.table}: the rows differ, compute the fluxes"
+            )
         cell = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, READ_ORDER)
         return rows.select(self._columns), light, cell
 

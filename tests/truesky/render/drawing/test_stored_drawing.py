@@ -72,6 +72,9 @@ def test_sources_are_drawn_once():
     [
         replace(BASE, column=BASE.column + 1e-9),
         replace(BASE, electrons=np.nextafter(BASE.electrons, np.inf)),
+        replace(BASE, jacobian=1.01 * BASE.jacobian),
+        replace(BASE, trail=np.full((40, 2), 6.0)),
+        replace(BASE, photons=np.full((40, 8), 0.125)),
         BASE.take(np.arange(39)),
         joined(BASE, points(50, 1)),
         # This source needs coarser integers than the others.
@@ -81,6 +84,14 @@ def test_sources_are_drawn_once():
 def test_other_sources_are_not_taken_from_the_store(changed):
     for expected, given in zip(drawn(changed), drawn(changed, store_of(BASE)), strict=True):
         np.testing.assert_array_equal(given, expected)
+
+
+def test_a_store_is_for_one_detector():
+    store = store_of()
+    for key in (("exposure", 1), ("exposure", 1)):
+        store.check(key)
+    with pytest.raises(ValueError, match="for one detector of one exposure"):
+        store.check(("exposure", 2))
 
 
 def test_another_response_is_not_taken_from_the_store():
