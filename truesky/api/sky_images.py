@@ -486,7 +486,8 @@ class SkyPainter:
         exposure = self.nominal(request.band, request.camera, request.mjd, cell)
         detector = nominal.central_detector(exposure.camera, self.mission)
         # The rows for charge injection, which are not read, would be in the middle of the image.
-        return exposure, replace(detector, injection_rows=0)
+        detector = replace(detector, injection_rows=0)
+        return nominal.move_exposure(exposure, detector, cell), detector
 
     def psf_of(self, request: ImageRequest) -> Psf:
         """Return the PSF of an image, without the variation of response inside a pixel.

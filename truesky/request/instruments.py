@@ -160,13 +160,13 @@ def check_band(band: str, bands: Sequence[str], owner: str, path: str) -> None:
         raise BadInput(f"{path}{': ' if path else ''}{owner} has no band {band!r}: {spelling.choices(band, bands)}")
 
 
-def check_detectors(camera: str, names: Collection[str], mission: MissionConfiguration, path: str) -> None:
-    """Check that a camera has detectors with the given names.
+def check_detectors(cameras: Sequence[str], names: Collection[str], mission: MissionConfiguration, path: str) -> None:
+    """Check that each of the given detectors belongs to one of some cameras.
 
     Parameters
     ----------
-    camera : str
-        Name of the camera.
+    cameras : sequence of str
+        Names of the cameras, at least one.
     names : collection of str
         Names of the detectors.
     mission : MissionConfiguration
@@ -177,21 +177,33 @@ def check_detectors(camera: str, names: Collection[str], mission: MissionConfigu
     Raises
     ------
     BadInput
-        If the camera has no detector of one of these names. There is one line for each.
+        If none of the cameras has a detector of one of these names. There is one line for each.
     """
     if not names:
         return
-    # Import here, because most requests name no detectors.
-    from lake_schema.mission import detector_overrides
-
-    existing = detector_overrides.detectors(camera if camera in EUCLID_CAMERAS.values() else f"ext.{camera}", mission)
+    existing = [name for camera in cameras for name in _detector_names(camera, mission)]
+    owner = f"camera {cameras[0]} has" if len(cameras) == 1 else f"cameras {spelling.join_words(cameras, 'and')} have"
     unknown = [name for name in names if name not in existing]
     if unknown:
         raise bad_input(
-            f"{path}: camera {camera} has no detector {name!r}: "
-            f"{spelling.choices(name, existing, _SUGGESTED_DETECTORS)}"
+            f"{path}: {owner} no detector {name!r}: {spelling.choices(name, existing, _SUGGESTED_DETECTORS)}"
             for name in unknown
         )
+
+
+def detectors_of_camera(camera: str, names: Collection[str], mission: MissionConfiguration) -> tuple[str, ...]:
+    """Return those of the given detectors that belong to a camera; () if there is none."""
+    if not names:
+        return ()
+    existing = set(_detector_names(camera, mission))
+    return tuple(name for name in names if name in existing)
+
+
+def _detector_names(camera: str, mission: MissionConfiguration) -> Sequence[str]:
+    # Import here, because most requests name no detectors.
+    from lake_schema.mission import detector_overrides
+
+    return detector_overrides.detectors(camera if camera in EUCLID_CAMERAS.values() else f"ext.{camera}", mission)
 
 
 def example_override(name: str, value: object) -> str:

@@ -19,9 +19,9 @@ AREA = {"cone": {"ra": 53.1, "dec": -27.8, "radius": 1.0}}
 def test_names_are_those_of_the_renderer(channel, camera):
     assert instruments.band_names(channel, camera, MISSION) == bands_of(channel, camera, MISSION)
     names = [detector.name for detector in detectors.detectors(camera, MISSION)]
-    instruments.check_detectors(camera, names, MISSION, "x")
+    instruments.check_detectors((camera,), names, MISSION, "x")
     with pytest.raises(BadInput, match=r"x: camera .* has no detector 'CCD_77'"):
-        instruments.check_detectors(camera, ["CCD_77"], MISSION, "x")
+        instruments.check_detectors((camera,), ["CCD_77"], MISSION, "x")
 
 
 @pytest.mark.parametrize(("channel", "camera"), CAMERAS)
@@ -47,3 +47,11 @@ def test_a_ground_pointing_requires_a_camera():
     pointing = {"channel": "EXT", "ra": 53.1, "dec": -27.8}
     with pytest.raises(BadInput, match=r"pointing\[0\]\.camera is missing: channel EXT requires one of decam, "):
         from_table({"name": "x", "seed": 1, "area": AREA, "pointing": [pointing]})
+
+
+def test_a_detector_may_belong_to_any_of_several_cameras():
+    instruments.check_detectors(("vis", "nisp"), ["3-4", "DET11"], MISSION, "x")
+    with pytest.raises(BadInput, match=r"x: cameras vis and nisp have no detector 'DET15': did you mean DET1"):
+        instruments.check_detectors(("vis", "nisp"), ["3-4", "DET15"], MISSION, "x")
+    assert instruments.detectors_of_camera("nisp", ["3-4", "DET11"], MISSION) == ("DET11",)
+    assert instruments.detectors_of_camera("vis", ["DET11"], MISSION) == ()

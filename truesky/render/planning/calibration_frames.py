@@ -23,6 +23,7 @@ from truesky.render.planning.observing_sequence import FILTERS, N_GRISM_ANGLES, 
 from truesky.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
 from truesky.request.exposures.observations import Observation
+from truesky.request.instruments import detectors_of_camera
 
 _DAY_S = 86400.0
 # Names of the calibrators on the sky that each image type observes (two standard stars: Serrano et al. 2024).
@@ -87,8 +88,9 @@ def exposures(
         if angle is None:
             angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
         template = Exposure(
-            channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
-        )
+            channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration",
+            detectors=detectors_of_camera(name, block.detectors, mission),
+        )  # fmt: skip
         if block.image_type == "persistence":
             for frame in persistence_darks.exposures(template, block, mission, now):
                 yield frame

@@ -9,7 +9,7 @@ Serrano et al. 2024, section 3.2 and the figure of the observing sequence
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from truesky.render.effects.charge import ramp
 from truesky.render.planning.planned_exposures import Exposure, exposure_time, through_grism
 from truesky.render.planning.reference_survey import Field
 from truesky.request.exposures.observations import Observation
+from truesky.request.instruments import detectors_of_camera
 
 _DAY_S = 86400.0
 # Passbands of the NISP filters, in the order in which a dither uses them after the spectrum through the grism.
@@ -204,9 +205,5 @@ class _Dither:
             field=self.field.number,
             visit=self.field.visit,
             dither=self.dither,
-            detectors=self.block.detectors if channel == "VIS" or not _is_vis(self.block.detectors) else (),
+            detectors=detectors_of_camera(camera, self.block.detectors, self.mission),
         )
-
-
-def _is_vis(detectors: Sequence[str]) -> bool:
-    return any("-" in name for name in detectors)

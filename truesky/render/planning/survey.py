@@ -308,10 +308,10 @@ def _exposure_of_pointing(pointing: Pointing, where: str, request: Request, miss
         raise error.with_prefix(f"{where}.camera") from None
     if pointing.band not in {name for name, _ in request.curves.passbands}:
         check_band(pointing.band, bands, f"camera {pointing.camera}", f"{where}.band")
-    check_detectors(pointing.camera, pointing.detectors, mission, f"{where}.detectors")
+    check_detectors((pointing.camera,), pointing.detectors, mission, f"{where}.detectors")
     ra, dec, angle = pointing.ra % 360.0, pointing.dec, pointing.position_angle
     if pointing.centre_on is not None:
-        check_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
+        check_detectors((pointing.camera,), (pointing.centre_on,), mission, f"{where}.centre_on")
         target = detectors.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = boresight_for(target, ra, dec, angle)
     mjd = pointing.mjd
@@ -381,7 +381,7 @@ def _schedule_block(
             else (scheduled.make_exposures(field) for field in _first_visits(scheduled.fields))
         )
         for exposure in (*scheduled.base_exposures, *chain.from_iterable(first_visits)):
-            check_detectors(exposure.camera, exposure.detectors, mission, "detectors")
+            check_detectors((exposure.camera,), exposure.detectors, mission, "detectors")
             check_ramp(exposure.channel, exposure.camera, exposure.exposure_time_s, mission)
             channel = registry.CHANNELS[exposure.channel]
             if not channel.on_ground and block.pointings and exposure.image_type in SKY_TYPES:

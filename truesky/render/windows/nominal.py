@@ -134,7 +134,8 @@ def move_exposure(exposure: ExposureRow, detector: Detector, place: tuple[float,
     Returns
     -------
     ExposureRow
-        The new exposure, in which the y axis of the focal plane points north at this place.
+        The new exposure, in which the columns of the detector point north at this place. The y axis of the focal plane
+        points south if the detector is mounted upside down.
     """
-    ra, dec, angle = boresight_for(detector, *place, 0.0)
+    ra, dec, angle = boresight_for(detector, *place, -detector.rotation)
     return replace(exposure, ra=ra, dec=dec, position_angle=angle)

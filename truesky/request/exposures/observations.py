@@ -388,8 +388,8 @@ def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: Missi
     with Mistakes() as mistakes:
         for band in values["bands"]:
             mistakes.read(instruments.check_band, band, bands, owner, f"{path}.bands")
-        for camera in cameras:
-            mistakes.read(instruments.check_detectors, camera, values["detectors"], mission, f"{path}.detectors")
+        # A name of a detector restricts the images of its own camera. Another camera then takes all of its detectors.
+        mistakes.read(instruments.check_detectors, tuple(cameras), values["detectors"], mission, f"{path}.detectors")
 
 
 def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
