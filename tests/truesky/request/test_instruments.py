@@ -51,7 +51,7 @@ def test_a_ground_pointing_requires_a_camera():
 
 def test_a_detector_may_belong_to_any_of_several_cameras():
     instruments.check_detectors(("vis", "nisp"), ["3-4", "DET11"], MISSION, "x")
-    with pytest.raises(BadInput, match=r"x: cameras vis and nisp have no detector 'DET15': did you mean DET1"):
+    with pytest.raises(BadInput, match=r"x: cameras vis and nisp have no detector 'DET15': did you mean DET"):
         instruments.check_detectors(("vis", "nisp"), ["3-4", "DET15"], MISSION, "x")
     assert instruments.detectors_of_camera("nisp", ["3-4", "DET11"], MISSION) == ("DET11",)
     assert instruments.detectors_of_camera("vis", ["DET11"], MISSION) == ()

@@ -147,9 +147,8 @@ def _instrument(
                 bands = instruments.band_names(channel, camera, mission)
                 read(instruments.check_band, band, bands, f"camera {camera}", f"{path}.band")
             read(instruments.check_detectors, (camera,), detectors or (), mission, f"{path}.detectors")
-            read(
-                instruments.check_detectors, (camera,), (centre_on,) if centre_on else (), mission, f"{path}.centre_on"
-            )
+            centred = (centre_on,) if centre_on else ()
+            read(instruments.check_detectors, (camera,), centred, mission, f"{path}.centre_on")
     named = {"band": band or "", "detectors": detectors, "centre_on": centre_on}
     return {"channel": channel, "camera": camera, **named}
 
