@@ -91,6 +91,9 @@ def test_a_nominal_exposure_has_the_place_in_the_middle(lake, band):
     x, y = drawn.wcs.all_world2pix([RA], [DEC], 0)
     assert abs(x[0] - (nx - 1) / 2) < 0.51
     assert abs(y[0] - (ny - 1) / 2) < 0.51
+    # North is up and east is left, also on detectors that are mounted upside down.
+    x, y = drawn.wcs.all_world2pix([RA, RA + 1e-3], [DEC + 1e-3, DEC], 0) - np.array([[x[0]], [y[0]]])
+    assert (y[0] > 10, abs(x[0]) < 0.05, x[1] < -10, abs(y[1]) < 0.05) == (True,) * 4
     assert drawn.exposure["band"] == band
     assert set(drawn.errors) == {"flux", "shape", "position", "background"}
     # The median is the sky, since few pixels have sources.
