@@ -2,11 +2,133 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 import operator
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import ParamSpec, TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+# Degrees per unit of an angle, by the names of the unit in texts such as "1 arcmin".
+_DEGREES = {
+    **dict.fromkeys(("", "deg", "degree", "degrees", "d", "°"), 1.0),
+    **dict.fromkeys(("arcmin", "arcminute", "arcminutes", "'", "′"), 1.0 / 60.0),
+    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", '"', "″"), 1.0 / 3600.0),
+    **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1.0)),
+}
+_ANGLE = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*")
+
+
+def refuse_missing(call: str) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
+    """Return a decorator of a function that raises BadInput instead of TypeError if a required argument is missing.
+
+    The signature of the function does not change. `call` is an example of a call, for the message, such as
+    "lake.render(ra, dec)". If one of the arguments is a SkyCoord, the message says how to give it as numbers.
+    """
+
+    def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+        signature = inspect.signature(function)
+        required = [name for name, parameter in signature.parameters.items() if _is_required(parameter)]
+
+        @functools.wraps(function)
+        def call_function(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+            given: list[str] = [*list(signature.parameters)[: len(args)], *map(str, kwargs)]
+            if missing := [name for name in required if name not in given]:
+                values: list[object] = [*args, *kwargs.values()]
+                for name, value in zip(given, values, strict=False):
+                    refuse_coordinates(name, value)
+                raise BadInput(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing: write {call}")
+            return function(*args, **kwargs)
+
+        return call_function
+
+    return decorate
+
+
+def _is_required(parameter: inspect.Parameter) -> bool:
+    is_single = parameter.kind not in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return is_single and parameter.default is inspect.Parameter.empty
+
+
+def refuse_coordinates(name: str, value: object) -> None:
+    """Raise BadInput if an argument, which must be a number in degrees, is a SkyCoord of astropy.
+
+    `name` is the name of the argument, for the message.
+    """
+    # Only coordinates of astropy have this attribute. astropy is not imported here, because the import is slow.
+    if not isinstance(value, type) and hasattr(value, "icrs"):
+        frame = getattr(getattr(value, "frame", value), "name", "")
+        c = "c" if frame == "icrs" else "c.icrs"
+        kind = type(value).__name__
+        raise BadInput(f"{name} must be a number in degrees, got a {kind}: write {c}.ra.deg, {c}.dec.deg")
+
+
+def check_degrees(name: str, value: object, lo: float = -math.inf, hi: float = math.inf) -> float:
+    """Return an angle in degrees as a float if it is a number within its bounds, which are included.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    value : object
+        Value that the user gave.
+    lo, hi : float, optional
+        Smallest and largest angle that is allowed. By default all numbers are allowed.
+
+    Returns
+    -------
+    float
+        The angle.
+
+    Raises
+    ------
+    BadInput
+        If the value is not a number. For a text such as "1 arcmin", a Quantity and a SkyCoord, the message contains the
+        number to write.
+    OutOfRange
+        If the value is NaN or lies outside its bounds.
+    """
+    refuse_coordinates(name, value)
+    refuse_angle(name, value, f"of degrees from {lo:g} to {hi:g}" if lo > -math.inf else "in degrees")
+    return check_number(name, value, lo, hi)
+
+
+def refuse_angle(name: str, value: object, form: str) -> None:
+    """Refuse an argument that is a text such as "1 arcmin" or a Quantity of astropy that is an angle.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    value : object
+        Value that the user gave. Other values are accepted.
+    form : str
+        Unit and range of the numbers that are allowed, such as "in degrees".
+
+    Raises
+    ------
+    BadInput
+        If the value is such an angle. The message contains the number to write.
+    """
+    if isinstance(value, str):
+        match = _ANGLE.fullmatch(value)
+        unit = _DEGREES.get(match[2].lower()) if match else None
+        degrees = float(match[1]) * unit if match and unit else None
+        text = repr(value)
+    else:
+        try:
+            degrees = float(value.to_value("deg"))  # type: ignore[attr-defined]
+        except (AttributeError, TypeError, ValueError):
+            degrees = None
+        text = str(value)
+    if degrees is not None:
+        number = f"{round(degrees, 6)}" if abs(degrees) >= 1e-3 else f"{degrees:.6g}"
+        raise BadInput(f"{name} must be a number {form}, got {text}: write {number}")
 
 
 def check_number(name: str, value: object, lo: float = -math.inf, hi: float = math.inf) -> float:

@@ -209,10 +209,12 @@ def check_reachable(path: Path) -> Iterator[None]:
 def suggest_similar(path: Path, ending: str) -> str:
     """Return "; did you mean X?" for a missing file, or "" if the file exists or no name in its folder is similar.
 
-    X is the file with the most similar name among those with an ending such as ".toml", or with a similar ending.
+    X is the file with the most similar name among those with an ending such as ".toml", or with a similar ending. If
+    the folder does not exist, the folder with the most similar name is searched.
     """
     try:
-        entries = [] if path.exists() else sorted(path.parent.iterdir())
+        folder = _nearest_folder(path.parent)
+        entries = [] if folder is None or path.exists() else sorted(folder.iterdir())
     except (OSError, ValueError):
         return ""
     stems = {entry.stem: entry for entry in entries if entry.name.endswith(ending)}
@@ -222,6 +224,16 @@ def suggest_similar(path: Path, ending: str) -> str:
         stems = {entry.name: entry for entry in entries if entry.suffix in similar}
         names = spelling.closest_names(path.name, stems, 1)
     return f"; did you mean {format_path(stems[names[0]])}?" if names else ""
+
+
+def _nearest_folder(folder: Path) -> Path | None:
+    """Return a folder, or the one with the most similar path if it does not exist, else None."""
+    if folder.is_dir() or folder == folder.parent:
+        return folder
+    if (above := _nearest_folder(folder.parent)) is None:
+        return None
+    renamed = above / folder.name
+    return renamed if renamed.is_dir() else similar_folder(renamed)
 
 
 def similar_folder(path: Path) -> Path | None:

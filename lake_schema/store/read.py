@@ -395,12 +395,19 @@ class Version:
             return parquet.read(self.folder, entry)
 
     def _check_columns(self, columns: Sequence[str]) -> None:
-        """Raise BadInput if the table does not have one of the columns; the message names the first missing one."""
-        for name in columns:
-            if name not in self.schema.names:
-                question = spelling.did_you_mean(name, self.schema.names)
-                remedy = question or f"it has {', '.join(self.schema.names)}"
-                raise BadInput(f"table {self.table} has no column {name}; {remedy}")
+        """Raise BadInput if the table does not have all of the columns; the message names all missing ones."""
+        existing = self.schema.names
+        missing = [name for name in dict.fromkeys(columns) if name not in existing]
+        questions = [spelling.did_you_mean(name, existing) for name in missing]
+        if len(missing) == 1:
+            remedy = questions[0] or f"it has {', '.join(existing)}"
+            raise BadInput(f"table {self.table} has no column {missing[0]}; {remedy}")
+        if missing:
+            named = [
+                f"{name} ({question})" if question else name for name, question in zip(missing, questions, strict=True)
+            ]
+            listed = "" if all(questions) else f"; it has {', '.join(existing)}"
+            raise BadInput(f"table {self.table} has no column {spelling.join_words(named, 'and')}{listed}")
 
     def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the rows of a catalogue in some HEALPix cells; only files and row groups that may match are read.
@@ -463,8 +470,8 @@ class Version:
         Damaged
             If a file differs from the manifest.
         """
-        radius = arguments.check_number("radius", radius, 0.0, 180.0)
-        sky.check_positions(arguments.check_number("ra", ra), arguments.check_number("dec", dec))
+        radius = arguments.check_degrees("radius", radius, 0.0, 180.0)
+        sky.check_positions(arguments.check_degrees("ra", ra), arguments.check_degrees("dec", dec))
         position_names = self.position_columns(on)
         self._check_columns([*position_names, "_healpix_29"])
         # Files are sorted by observed positions. Enlarge the circle by the largest deflection, so that it contains the

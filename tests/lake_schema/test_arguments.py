@@ -1,7 +1,11 @@
 """Wrong arguments are refused by name, and NumPy numbers are accepted."""
 
+import inspect
+
 import numpy as np
 import pytest
+from astropy.coordinates import Longitude, SkyCoord
+from astropy.units import Quantity
 
 from lake_schema import arguments
 from lake_schema.errors import BadInput
@@ -19,6 +23,43 @@ def test_good_arguments_are_returned_as_pythons():
 def test_another_number_is_refused(value):
     with pytest.raises(BadInput, match=r"^radius = .*(outside \[0\.0, 1\.0\]|not a number)$"):
         arguments.check_number("radius", value, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "remedy"),
+    [
+        ("1 arcmin", "got '1 arcmin': write 0.016667"),
+        ("30''", "is not a number"),
+        ('18"', "write 0.005"),
+        ("0.1", "got '0.1': write 0.1"),
+        ("0.1deg", "write 0.1"),
+        ("3 Jy", "is not a number"),
+        (Quantity(2.0, "arcmin"), "got 2.0 arcmin: write 0.033333"),
+        (Quantity(2.0, "Jy"), "is not a number"),
+        (Quantity([1.0, 2.0], "deg"), "is not a number"),
+        (Longitude("03:32:48", "hourangle"), "write 53.2"),
+        (SkyCoord(53.2, -28.1, unit="deg"), "got a SkyCoord: write c.ra.deg, c.dec.deg"),
+        (SkyCoord(53.2, -28.1, unit="deg").galactic, "got a SkyCoord: write c.icrs.ra.deg, c.icrs.dec.deg"),
+    ],
+)
+def test_angles_with_units_are_refused_with_their_number_of_degrees(value, remedy):
+    with pytest.raises(BadInput) as caught:
+        arguments.check_degrees("radius", value, 0.0, 180.0)
+    assert str(caught.value).endswith(remedy)
+    assert arguments.check_degrees("radius", 1, 0.0, 180.0) == 1.0
+
+
+def test_a_missing_argument_is_named():
+    @arguments.refuse_missing("area(ra, dec)")
+    def area(ra, dec, /, *, band, size=1.0, **options):
+        return ra, dec, band, size, options
+
+    assert area(1, 2, band="r", b=3) == (1, 2, "r", 1.0, {"b": 3})
+    with pytest.raises(BadInput, match=r"^dec and band are missing: write area\(ra, dec\)$"):
+        area(1, size=3.0)
+    with pytest.raises(BadInput, match=r"^ra must be a number in degrees, got a SkyCoord: write c\.ra\.deg"):
+        area(SkyCoord(53.2, -28.1, unit="deg"), band="r")
+    assert list(inspect.signature(area).parameters) == ["ra", "dec", "band", "size", "options"]
 
 
 @pytest.mark.parametrize("value", [2.0, np.float64(2.0), "2", None, 0, 4, np.arange(2)])

@@ -252,6 +252,7 @@ class InjectedFrame:
         return tables.described_table(TABLE_NAME, columns, cards)
 
 
+@arguments.refuse_missing("truesky.frame(path, psf=0.9) with the FWHM in arcsec, or psf with the path of a file")
 def frame(
     path: str | Path,
     psf: str | Path | float,

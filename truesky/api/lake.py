@@ -211,6 +211,7 @@ class Lake(LakeTables):
         source_models = models.models(self._explorer.root, version, number, str(detector), ids)
         return ((source_model.id, source_model.frame) for source_model in source_models)
 
+    @arguments.refuse_missing("lake.render(ra, dec), in degrees")
     def render(
         self,
         ra: float | str,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -9,8 +10,9 @@ from typing import Any, Self
 
 import pandas as pd
 
-from lake_schema import arguments
+from lake_schema import arguments, user_files
 from lake_schema.arrays import Float, Int
+from lake_schema.errors import BadInput
 from truesky.explore.explorer import ORDER, Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
 
@@ -33,6 +35,9 @@ class LakeTables:
     def __init__(
         self, path: str | Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
     ) -> None:
+        if str(path).endswith(".toml") and not os.path.isdir(path):
+            name = user_files.format_path(path)
+            raise BadInput(f'{name} is a request, not a lake: truesky.run("{name}", "my_lake") makes a lake from it')
         self._explorer = Explorer(str(path) if isinstance(path, Path) else path, memory, timeout, request)
 
     def __repr__(self) -> str:
@@ -136,6 +141,7 @@ class LakeTables:
         """
         return self._explorer.sql(query, into, **parameters)
 
+    @arguments.refuse_missing("lake.cone(table, ra, dec, radius), all angles in degrees")
     def cone(
         self,
         table: str,

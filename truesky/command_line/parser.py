@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
@@ -55,6 +56,8 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
         self._names_of_positions: list[str] = []
+        # Words of the command, in which the values of positional arguments have no options.
+        self._words: list[str] = []
 
     def add_request(self, help_text: str = "simulation request, a TOML file") -> None:
         """Add the positional argument REQUEST, whose value is a text."""
@@ -86,6 +89,7 @@ class Parser(argparse.ArgumentParser):
             Further words, which are not options.
         """
         words = self._move_to_positions(list(sys.argv[1:] if args is None else args))
+        self._words = words
         parsed, rest = super().parse_known_args(words, namespace)
         if unknown := next((word for word in rest if word.startswith("-")), None):
             name = unknown.partition("=")[0]
@@ -129,7 +133,7 @@ class Parser(argparse.ArgumentParser):
         )
         is_request_file = lake.endswith(_REQUEST_ENDING) and not os.path.isdir(lake)
         if is_request_file and request and not request.endswith(_REQUEST_ENDING):
-            self._stop(f"the request comes before the lake: write {self.prog} {lake} {request}")
+            self._stop(f"the request comes before the lake: write {self._call([lake, request])}")
         if is_request_file:
             self._stop(f"LAKE must be the folder of a lake, but {lake} is a request: truesky run {lake} LAKE makes one")
 
@@ -137,13 +141,15 @@ class Parser(argparse.ArgumentParser):
         """End the process if the lake is a query."""
         lake, query = (str(getattr(parsed, name, None) or "") for name in ("lake", "sql"))
         if _QUERY.match(lake) and not os.path.isdir(lake):
-            self._stop(f'the lake comes before the query: write {self.prog} {query or "LAKE"} "{lake}"')
+            call = self._call([query or "LAKE", f'"{lake}"'], [query, lake])
+            self._stop(f"the lake comes before the query: write {call}")
 
     def _refuse_open_query(self, parsed: argparse.Namespace, rest: Sequence[str]) -> None:
         """End the process if a query has no quotes, so that its words are several arguments."""
         if hasattr(parsed, "sql") and rest and _QUERY.match(f"{parsed.sql} "):
             query = " ".join([parsed.sql, *rest])
-            self._stop(f'the query must be in quotes: write {self.prog} {parsed.lake} "{query}"')
+            call = self._call([parsed.lake, f'"{query}"'], [parsed.lake, parsed.sql, *rest])
+            self._stop(f"the query must be in quotes: write {call}")
 
     def _refuse_needless_lake(self, parsed: argparse.Namespace, rest: Sequence[str]) -> None:
         """End the process if a command with only a request gets a folder before or after it."""
@@ -151,9 +157,19 @@ class Parser(argparse.ArgumentParser):
         folders = [word for word in words if os.path.isdir(word)]
         requests = [word for word in words if word not in folders]
         if folders and requests:
-            self._stop(
-                f"{folders[0]} is a folder, but the command needs only a request: write {self.prog} {requests[0]}"
-            )
+            call = self._call(requests[:1], words)
+            self._stop(f"{folders[0]} is a folder, but the command needs only a request: write {call}")
+
+    def _call(self, positions: Sequence[str], given: Sequence[str] = ()) -> str:
+        """Return the command with other positional arguments and with the options that the user gave.
+
+        `given` are the positional arguments that the user gave, by default those of `positions`.
+        """
+        options = [word for word in self._words if word != "--"]
+        for word in given or positions:
+            if word in options:
+                options.remove(word)
+        return " ".join([self.prog, *positions, *map(shlex.quote, options)])
 
     def _move_to_positions(self, words: list[str]) -> list[str]:
         """Replace the options --request FILE and --lake LAKE by positional arguments; the last of equal options counts.

@@ -17,7 +17,7 @@ from typing import Any
 import duckdb
 
 from lake_schema.errors import BadInput
-from truesky.explore.suggestions import plain_message, suggest_tables
+from truesky.explore.suggestions import circle_condition, plain_message, replace_function, suggest_tables
 
 # Largest number of characters of a query.
 _MAX_CHARACTERS = 100_000
@@ -35,6 +35,8 @@ _FUNCTIONS = {
 _FUNCTION_PREFIXES = ("pg_", "duckdb_", "read_", "json_execute")
 # Functions of ADQL for geometry, which the TAP service translates. DuckDB has none with these names.
 _GEOMETRY = {"area", "box", "centroid", "circle", "coord1", "coord2", "distance", "intersects", "point", "polygon"}
+# Functions of ADQL and other databases that make a point or a circle from numbers.
+_POINTS = {"circle", "point", "st_makepoint", "st_point"}
 # TOP of ADQL, which DuckDB cannot parse.
 _TOP = re.compile(r"\bSELECT\s+(?:(?:DISTINCT|ALL)\s+)?TOP\s+(\d+)\b", re.IGNORECASE)
 
@@ -126,9 +128,11 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
         if "cte_map" in node and node.get("type") not in _QUERIES:
             raise BadInput(f"SQL: only SELECT is possible, not {_words(node)}")
         if {"type", "alias", "sample"} <= node.keys():
+            if node["type"] == "TABLE_FUNCTION":
+                _refuse_foreign(node["function"], text.encode())
             used |= _source(node, table_names, visible)
         if node.get("class") == "FUNCTION":
-            _refuse_function(str(node["function_name"]).lower())
+            _refuse_function(node, text.encode())
     return Query(text, tuple(sorted(used)), _origins(tree, used, {}), tree)
 
 
@@ -259,13 +263,52 @@ def _source(node: Tree, table_names: Collection[str], with_names: Collection[str
     raise BadInput(f"{problem} ({', '.join(sorted(table_names))})")
 
 
-def _refuse_function(name: str) -> None:
+def _refuse_function(node: Tree, data: bytes) -> None:
+    """Raise BadInput if a query must not call a function; `data` is the query in UTF-8."""
+    name = str(node["function_name"]).lower()
+    _refuse_foreign(node, data)
     if name in _FUNCTIONS or name.startswith(_FUNCTION_PREFIXES):
         raise BadInput(f"SQL: the function {one_line(name)} is not possible here")
-    if name in _GEOMETRY:
-        circle, area = "separation(ra, dec, 53.1, -27.8) < 0.05", "in_area(ra, dec)"
-        remedy = f"write {circle} for a circle (deg), or {area} for the area of the request"
+    # DuckDB's function `contains` is about texts and lists.
+    has_region = name == "contains" and any(_name(argument) in _GEOMETRY for argument in _arguments(node))
+    if name in _GEOMETRY or has_region:
+        is_distance = name == "distance"
+        numbers = [*_flat_arguments(node, data)]
+        circle = replace_function("st_distance", numbers) if is_distance else circle_condition(numbers)
+        remedy = (
+            f"write {circle}"
+            if is_distance
+            else f"write {circle} for a circle, or in_area(ra, dec) for the area of the request"
+        )
         raise BadInput(f"SQL: the function {name.upper()} is possible only in TAP queries: {remedy}")
+
+
+def _refuse_foreign(node: Tree, data: bytes) -> None:
+    """Raise BadInput with the SQL to write if a function is one that other databases have; `data` is the query."""
+    name = _name(node)
+    if remedy := replace_function(name, [*_flat_arguments(node, data)]):
+        raise BadInput(f"SQL: function {one_line(name)} does not exist: write {one_line(remedy)}")
+
+
+def _name(node: Tree) -> str:
+    return str(node.get("function_name", "")).lower()
+
+
+def _arguments(node: Tree) -> list[Tree]:
+    return [argument["expression"] for argument in node.get("arguments", ())]
+
+
+def _flat_arguments(node: Tree, data: bytes) -> Iterator[str]:
+    """Yield the SQL of the arguments of a function, in which points and circles are replaced by their numbers.
+
+    The numbers of a circle come last. Texts, such as the name of a system of coordinates, are left out.
+    """
+    for argument in sorted(_arguments(node), key=lambda argument: _name(argument) == "circle"):
+        if _name(argument) in _POINTS:
+            yield from _flat_arguments(argument, data)
+        elif argument.get("literal", {}).get("kind") != "STRING":
+            start = argument["query_location"]
+            yield data[start : start + argument["query_location_length"]].decode(errors="replace")
 
 
 def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) -> Origins:

@@ -132,7 +132,7 @@ class Session:
         columns = {table: self._rows[table].schema.names for table in query.tables if table in self._rows}
         first = suggestions.missing_column(str(error)) if isinstance(error, duckdb.BinderException) else None
         if first is None or not columns:
-            return one_line(suggestions.plain_message(str(error)))
+            return one_line(self._explain_code(error, query) or suggestions.plain_message(str(error)))
         texts = {text.lower(): text for text in shared_columns.quoted_texts(query.text, query.tree)}
         unrelated = shared_columns.unrelated_fluxes(columns)
         requests = {table.rpartition(".")[0] for table in columns}
@@ -153,6 +153,18 @@ class Session:
             else suggestions.explain_missing_column(name, columns, other_tables, str(error))
             for name in names[:_MAX_MISSING]
         )
+
+    def _explain_code(self, error: Exception, query: Query) -> str:
+        """Return a message if an error is about a text that is compared with a column of numeric codes, else ""."""
+        if (text := suggestions.refused_text(str(error))) is None:
+            return ""
+        for name, sign in shared_columns.compared_columns(query.tree, text):
+            for table in query.tables:
+                if table in self.open_tables and name in self.open_tables[table].schema.names:
+                    codes = (self.open_tables[table].schema.field(name).metadata or {}).get(b"codes", b"").decode()
+                    if codes:
+                        return suggestions.explain_code(name, sign, text, codes)
+        return ""
 
     def _missing_names(self, query: Query, columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
         """Yield the names of columns that do not exist in the tables of a query, in lower case; none with subqueries.

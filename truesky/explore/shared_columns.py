@@ -15,6 +15,7 @@ Tree = dict[str, Any]
 # Catalogue of each table of fluxes.
 _CATALOGUES = {"galaxy_fluxes": "galaxies", "star_fluxes": "stars"}
 _KEY = "id"
+_SIGNS = {"COMPARE_EQUAL": "=", "COMPARE_NOTEQUAL": "<>"}
 # Clauses of a SELECT in which the name of a result column takes precedence over the name of a table's column.
 _ALIASES_FIRST = ("modifiers", "having")
 
@@ -132,6 +133,24 @@ def quoted_texts(text: str, tree: Tree) -> list[str]:
         and len(operand["column_names"]) == 1
         and data[operand["query_location"] :].startswith(b'"')
     ]
+
+
+def compared_columns(tree: Tree, text: str) -> Iterator[tuple[str, str]]:
+    """Yield the columns that a query compares with a text, and the sign of the comparison, "=", "<>" or "" for others.
+
+    The names of the columns are in lower case and without the name of a table.
+    """
+    for node in _nodes(tree):
+        kind = str(node.get("type"))
+        if kind in ("COMPARE_IN", "COMPARE_NOT_IN"):
+            operands = node.get("children", [])
+        else:
+            operands = [node.get("left"), node.get("right")] if kind.startswith("COMPARE_") else []
+        literals = [operand.get("literal", {}) for operand in operands if operand]
+        if {"kind": "STRING", "text": text} in literals:
+            for operand in operands:
+                if operand and operand.get("class") == "COLUMN_REF":
+                    yield str(operand["column_names"][-1]).lower(), _SIGNS.get(kind, "")
 
 
 def _text_operands(node: Tree) -> list[Tree]:

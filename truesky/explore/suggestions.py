@@ -47,10 +47,22 @@ _AMBIGUOUS = re.compile(r'Ambiguous reference to column name "(?P<name>.+?)" \(u
 _UNKNOWN_FUNCTION = re.compile(
     r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
 )
+_REFUSED_TEXT = r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)"
 # Words that begin the parts of a query.
 _KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
+# Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
+# table functions with a position and a radius (arcmin), and percentiles.
+_DISTANCES = {
+    "angdist", "angsep", "angular_distance", "angular_separation", "angulardistance", "greatcircleangle", "q3c_dist",
+    "sphdist", "sphere_distance", "st_distance", "st_distancesphere", "st_distance_sphere",
+}  # fmt: skip
+_IN_CIRCLE = {"q3c_join", "q3c_radial_query", "st_dwithin"}
+_AROUND = {"fgetnearbyobjalleq", "fgetnearbyobjeq", "fgetnearestobjalleq", "fgetnearestobjeq"}
+_PERCENTILES = {"approx_percentile", "percentile", "percentile_approx"}
+# Example of a condition for a circle.
+_CIRCLE = "separation(ra, dec, RA, DEC) < RADIUS (deg)"
 # Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
 _SENTENCES = (
     (
@@ -67,11 +79,10 @@ _SENTENCES = (
         "WHERE cannot contain window functions: write this condition in QUALIFY, after WHERE and GROUP BY",
     ),
     (
-        r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)",
+        _REFUSED_TEXT,
         r"'\1' is text where a number is required",
     ),
     (r'Referenced table "(.+?)" not found!\s*Candidate tables: ([^\n]*)', r"FROM has no table or alias \1; it has \2"),
-    (r"Values were not provided for the following parameters: ([^\n]*)", r"these parameters have no value: \1"),
     (r"Cannot compare values of type (\S+) and type (\S+)", r"values of type \1 and \2 cannot be compared"),
     (
         r"No function matches the given name and argument types '(max|min)\([^)]*,.*",
@@ -117,6 +128,12 @@ def missing_column(message: str) -> str | None:
     """Return the name of the column that does not exist according to a message of DuckDB, in lower case, else None."""
     matches = (pattern.search(message) for pattern in _MISSING_COLUMN)
     return next((match["name"].lower() for match in matches if match), None)
+
+
+def refused_text(message: str) -> str | None:
+    """Return the text in a query that a message of DuckDB refuses because a number is required, else None."""
+    match = re.search(_REFUSED_TEXT, message)
+    return match[1] if match else None
 
 
 def explain_missing_column(
@@ -275,12 +292,97 @@ def plain_message(message: str) -> str:
         return f"several tables have a column {ambiguous['name']}: write {names} in place of {ambiguous['name']}"
     if syntax := re.match(r'syntax error at or near "(.+?)"', body):
         return f"syntax error near {syntax[1]}: {_syntax_hint(syntax[1], extract)}"
+    if valueless := re.match(r"Values were not provided for the following parameters: ([^\n]*)", body):
+        values = ", ".join(f"{name.strip()}=..." for name in valueless[1].split(","))
+        return f"these parameters have no value: {valueless[1]}; in Python write lake.sql(query, {values})"
     for pattern, sentence in _SENTENCES:
         if match := re.match(pattern, body, re.DOTALL):
             return match.expand(sentence).replace("_LITERAL", "").replace('"', "").strip()
     word = _wrong_word(extract) if extract else ""
     place = f" (near {word})" if word and word not in body else ""
     return body.strip().rstrip("!") + place
+
+
+def replace_function(name: str, arguments: Sequence[str]) -> str:
+    """Return the SQL for a function of another database, or "" if the function is not known.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function in lower case.
+    arguments : sequence of str
+        SQL of its arguments, in which numbers replace points and circles. If their number is wrong, the result is an
+        example.
+
+    Returns
+    -------
+    str
+        Text such as "separation(ra, dec, 53.1, -27.8) < 0.1 (deg)".
+    """
+    if name in _DISTANCES:
+        return f"separation({', '.join(arguments if len(arguments) == 4 else ('ra', 'dec', 'RA', 'DEC'))}) (deg)"
+    if name in _IN_CIRCLE:
+        return circle_condition(arguments)
+    if name in _AROUND:
+        position = ("ra", "dec", *arguments[:2])
+        is_complete = len(arguments) == 3
+        condition = circle_condition((*position, _divide(arguments[2], 60)) if is_complete else ())
+        return f"FROM galaxies WHERE {condition}"
+    if name in _PERCENTILES and len(arguments) >= 2:
+        column, percent = arguments[:2]
+        # Some databases have fractions in place of percent.
+        is_fraction = (number := _number(percent)) is not None and number <= 1.0
+        return f"quantile_cont({column}, {percent if is_fraction else _divide(percent, 100)})"
+    return "quantile_cont(z_obs, 0.5)" if name in _PERCENTILES else ""
+
+
+def circle_condition(arguments: Sequence[str]) -> str:
+    """Return the condition that a position is in a circle; `arguments` are ra, dec, the centre and the radius, in SQL.
+
+    With another number of arguments, an example is returned.
+    """
+    if len(arguments) != 5:
+        return _CIRCLE
+    *positions, radius = arguments
+    return f"separation({', '.join(positions)}) < {radius} (deg)"
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _divide(text: str, divisor: int) -> str:
+    number = _number(text)
+    return f"{text} / {divisor}" if number is None else f"{number / divisor:.6g}"
+
+
+def explain_code(column: str, sign: str, text: str, codes: str) -> str:
+    """Return a message about a text that is compared with a column of numeric codes.
+
+    Parameters
+    ----------
+    column : str
+        Name of the column.
+    sign : str
+        Sign of the comparison, "=" or "<>"; "" for another comparison.
+    text : str
+        The text in the query.
+    codes : str
+        Codes and their meanings, such as "0 central galaxy; 1 satellite galaxy".
+
+    Returns
+    -------
+    str
+        The message, with the code whose meaning is most similar to the text.
+    """
+    numbers = {meaning: code for code, _, meaning in (entry.partition(" ") for entry in codes.split("; "))}
+    meant = spelling.closest_names(text, numbers, 1)
+    number = numbers[meant[0]] if meant else "one of these numbers"
+    remedy = f"{column} {sign} {number}" if meant and sign else f"{number} in place of '{text}'"
+    return f"column {column} contains numbers ({codes}): write {remedy}"
 
 
 def _syntax_hint(word: str, extract: re.Match[str] | None) -> str:

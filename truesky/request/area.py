@@ -37,8 +37,8 @@ _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 # light.
 GALACTIC_MIN, ECLIPTIC_MIN = 30.0, 15.0
 _WIDE_SQUARE_DEGREES = 15_000.0
-# Where keys belong that an area does not have.
-_PLACES = {"circle": "cone = { ra, dec, radius }", "vertices": "polygon"}
+# Questions about keys that an area does not have.
+_PLACES = {"circle": "did you mean cone = { ra, dec, radius }?", "vertices": "did you mean polygon?"}
 _CONE_KEYS = ("ra", "dec", "radius")
 # Largest number of vertices of a polygon, and of circles of an area.
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000

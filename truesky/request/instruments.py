@@ -192,7 +192,7 @@ def check_detectors(cameras: Sequence[str], names: Collection[str], mission: Mis
 
 
 def detectors_of_camera(camera: str, names: Collection[str], mission: MissionConfiguration) -> tuple[str, ...]:
-    """Return those of the given detectors that belong to a camera; () if there is none."""
+    """Return the given detectors that belong to a camera, or () if all belong to other cameras."""
     if not names:
         return ()
     existing = set(_detector_names(camera, mission))

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from datetime import UTC, date, datetime
 from typing import Any
 
+from lake_schema import arguments
 from lake_schema.errors import BadInput
 from truesky.request.toml_values import Toml, checked_number, has_key, quote_value, required_value
 
@@ -67,6 +68,8 @@ def angle(value: object, path: str, axis: str, limits: tuple[float, float]) -> f
     if isinstance(value, str):
         return checked_number(_degrees(value, path, axis), f"{path} (deg)", *limits)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
+        arguments.refuse_coordinates(path, value)
+        arguments.refuse_angle(path, value, "in degrees")
         raise BadInput(f"{path} must be {_FORMS[axis]}, got {quote_value(value)}")
     return checked_number(value, path, *limits)
 

@@ -24,6 +24,7 @@ _MAX_LISTED = 8
 _SYNONYMS = {
     "pa": "position_angle", "filter": "band", "filters": "bands", "exptime": "exposure_time_s", "depth": "galaxy_limit",
     "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
+    "gamma1": "g1", "gamma2": "g2", "gamma_1": "g1", "gamma_2": "g2", "shear1": "g1", "shear2": "g2",
 }  # fmt: skip
 _NO_PLACES: Mapping[str, str] = {}
 
@@ -40,7 +41,8 @@ def check_keys(table: Toml, path: str, keys: Iterable[str], places: Mapping[str,
     keys : iterable of str
         Keys that are allowed. They need not be present.
     places : mapping of str to str, optional
-        Where keys belong that are not allowed here, for the error message: a section such as "[universe]" by key.
+        Where keys belong that are not allowed here, for the error message: a section such as "[universe]" by key, or a
+        question such as "did you mean cone?".
 
     Raises
     ------
@@ -60,7 +62,8 @@ def _hint(key: str, path: str, missing: Sequence[str], allowed: Sequence[str], p
     if path and key in TOP_KEYS:
         return "it belongs at the top of the file, before the first [section]; "
     if key in places:
-        return f"it belongs in {places[key]}; "
+        place = places[key]
+        return place if place.endswith("?") else f"it belongs in {place}; "
     if _SYNONYMS.get(key) in missing:
         return f"did you mean {_SYNONYMS[key]}?{' ' if len(allowed) <= _MAX_LISTED else ''}"
     for names in (missing, allowed):
@@ -170,8 +173,9 @@ def table_list(table: Toml, key: str, max_tables: int) -> list[object]:
     """
     entries = table.get(key, [])
     if not isinstance(entries, list) or len(entries) > max_tables:
-        hint = f": write [[{key}]] instead of [{key}]" if isinstance(entries, dict) else ""
-        raise BadInput(f"{key} must be a list of at most {max_tables} tables{hint}")
+        if isinstance(entries, dict):
+            raise BadInput(f"{key} must be a list of tables: write [[{key}]] instead of [{key}]")
+        raise BadInput(f"{key} must be a list of at most {max_tables} tables")
     return entries
 
 

@@ -41,6 +41,12 @@ def test_filters_and_columns(toy):
         toy.rows(["id", "speed"])
     with pytest.raises(BadInput, match=r"table toy has no column fluxx; did you mean flux\?"):
         toy.rows(["fluxx"])
+    with pytest.raises(
+        BadInput, match=r"table toy has no column FLUX \(did you mean flux\?\) and ID \(did you mean id\?\)$"
+    ):
+        toy.rows(["FLUX", "ra", "ID", "FLUX"])
+    with pytest.raises(BadInput, match=r"no column FLUX \(did you mean flux\?\) and speed; it has .*flux"):
+        toy.rows(["FLUX", "speed"])
 
 
 def test_units_come_back_with_the_rows(toy):

@@ -121,6 +121,7 @@ def test_wrong_arguments_of_a_cone_are_refused(lake, catalogues):
         ((float("inf"), 0.0, 1.0), "ra"),
         (("a", 0.0, 1.0), "ra = 'a' is not a number"),
         ((0.0, None, 1.0), "dec = None is not a number"),
+        ((0.0, 0.0, "1 arcmin"), "radius must be a number of degrees from 0 to 180, got '1 arcmin': write 0.016667"),
         *(((0.0, 0.0, radius), "radius") for radius in (float("nan"), float("inf"), 1e9, "x", 180.1)),
         ((0.0, 0.0, -1e-5, ["id"], "true"), "radius"),
         ((0.0, 0.0, 1.0, ["id"], "seen"), "on = 'seen'"),

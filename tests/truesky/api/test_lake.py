@@ -131,6 +131,13 @@ def test_a_folder_that_is_no_lake_is_refused(tmp_path):
         truesky.open(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize("name", ["requests/demo.toml", "none.toml"])
+def test_a_request_is_not_a_lake(name):
+    remedy = rf'^{name} is a request, not a lake: truesky.run\("{name}", "my_lake"\) makes a lake from it$'
+    with pytest.raises(truesky.BadInput, match=remedy):
+        truesky.open(name)
+
+
 def test_all_names_of_the_interface_are_there():
     for name in truesky.__all__:
         assert getattr(truesky, name) is not None

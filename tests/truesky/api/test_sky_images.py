@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pandas as pd
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
@@ -21,6 +22,7 @@ from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import parse
 
 RA, DEC = 53.117, -27.808
+PLACE = SkyCoord(RA, DEC, unit="deg")
 REQUEST = f"""
 [sources]
 only = "table"
@@ -305,6 +307,8 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ({"ra": 10.0, "dec": 10.0}, "ra 10.00000, dec 10.00000: outside the area of the catalogue"),
         ({"ra": 10.0, "dec": 10.0}, "outside the area of the catalogue, which is near ra 5.*, dec -2"),
         ({"ra": DEC, "dec": RA}, "outside the area of the catalogue: are ra and dec exchanged"),
+        ({"ra": PLACE}, "ra must be a number in degrees, got a SkyCoord: write c.ra.deg, c.dec.deg"),
+        ({"dec": PLACE.dec}, f"dec must be a number in degrees, got .*: write {DEC}"),
         ({"noise": "no"}, "noise = 'no' must be True or False"),
         ({"size": 0.0}, "size = 0: must be 0.2 to 801 arcsec, at most a detector"),
         ({"size": np.nan}, "size"),
@@ -349,3 +353,15 @@ def northern_edge(lake):
 def test_a_place_at_the_edge_of_the_catalogue_is_refused(lake):
     with pytest.raises(BadInput, match=r"cut by the edge of the catalogue, which has \d+ % of the surroundings"):
         lake.render(RA, northern_edge(lake), size=5.0, band="lsst_r", noise=False)
+
+
+def test_missing_arguments_are_named(lake):
+    for call, message in (
+        (lambda: lake.render(PLACE, size=10.0), "ra must be a number in degrees, got a SkyCoord: write c.ra.deg"),
+        (lambda: lake.render(ra=RA), "dec is missing: write lake.render"),
+        (lambda: lake.cone("galaxies", PLACE, 0.1), "ra must be a number in degrees, got a SkyCoord: write c.ra.deg"),
+        (lambda: lake.cone("galaxies", RA, DEC), "radius is missing: write lake.cone"),
+        (lambda: truesky.frame("image.fits"), "psf is missing: write truesky.frame"),
+    ):
+        with pytest.raises(BadInput, match=message):
+            call()

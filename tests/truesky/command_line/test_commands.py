@@ -95,6 +95,22 @@ def test_request_and_lake_may_be_options_of_a_job():
         (["sql", "l", "--lake"], "truesky sql: there is no option --lake"),
         (["sql", "SELECT 1", "l"], 'truesky sql: the lake comes before the query: write truesky sql l "SELECT 1"'),
         (["sql", "select 1"], 'truesky sql: the lake comes before the query: write truesky sql LAKE "select 1"'),
+        (
+            ["sql", "--out", "a b.fits", "SELECT 1", "l"],
+            "truesky sql: the lake comes before the query: write truesky sql l ",
+        ),
+        (
+            ["sql", "l", "SELECT", "1", "--out", "a b.fits"],
+            "truesky sql: the query must be in quotes: write truesky sql l \"SELECT 1\" --out 'a b.fits'",
+        ),
+        (
+            ["run", "new_lake", "good.toml", "--dry-run"],
+            "truesky run: the request comes before the lake: write truesky run good.toml new_lake --dry-run",
+        ),
+        (
+            ["run", "--limit", "3", "--lake", "good.toml", "--request", "new_lake"],
+            "truesky run: the request comes before the lake: write truesky run good.toml new_lake --limit 3",
+        ),
         (["sql", "l", "SELECT", "1"], 'truesky sql: the query must be in quotes: write truesky sql l "SELECT 1"'),
         (["--lokal", "plan"], 'truesky: there is no option --lokal; did you mean "--local"?'),
         (["export", "l"], 'truesky: export is not a command; did you mean "sql"?'),

@@ -84,6 +84,17 @@ def test_all_mistakes_are_reported_in_the_order_of_the_file(tmp_path, capsys):
     ]  # fmt: skip
 
 
+def test_a_request_in_a_similar_folder_is_suggested(tmp_path, capsys):
+    (tmp_path / "requests").mkdir()
+    (tmp_path / "requests" / "my_field.toml").touch()
+    for name in ("request/my_field.toml", "requesst/my_feeld.toml"):
+        assert check.main([str(tmp_path / name)]) == 2
+        assert capsys.readouterr().err.endswith(f"no such file; did you mean {tmp_path}/requests/my_field.toml?\n")
+    for name in ("request/demo.toml", "tables/my_field.toml", "a/b/my_field.toml"):
+        assert check.main([str(tmp_path / name)]) == 2
+        assert capsys.readouterr().err.endswith(f"{tmp_path / name}: no such file\n")
+
+
 def test_a_request_with_a_similar_name_is_suggested(tmp_path, capsys):
     for name in ("my_field.toml", "other.toml", "my_field.csv"):
         (tmp_path / name).touch()

@@ -171,7 +171,10 @@ def test_queries(explorer, query, words):
         ("SELECT n FROM t JOIN u WHERE n > 1", "syntax error near WHERE: JOIN must have ON or USING"),
         ("SELECT pow(n) FROM t", r"pow does not accept arguments of type INTEGER; write pow\(x DOUBLE, y DOUBLE\)$"),
         ("SELECT max(n, n / 2) FROM t", r"max accepts one column: the larger of two is greatest\(a, b\)"),
-        ("SELECT n FROM t WHERE n > $lo", "these parameters have no value: lo$"),
+        (
+            "SELECT n FROM t WHERE n > $lo",
+            r"these parameters have no value: lo; in Python write lake.sql\(query, lo=...\)$",
+        ),
         ("SELECT n FROM t WHERE n > [1]", r"values of type INTEGER and INTEGER\[\] cannot be compared$"),
         ("SELECT n FROM t WHERE row_number() OVER () > 1", "WHERE cannot contain window functions: .* in QUALIFY"),
         ("SELECT stdev(n) FROM t", r"function stdev does not exist; did you mean stddev\?$"),
@@ -212,6 +215,42 @@ def test_other_messages_are_unchanged():
             "^SQL: TOP is possible only in TAP queries: write LIMIT 10 at the end",
         ),
         ("SELECT POINT('ICRS', ra, dec) FROM galaxies", "^SQL: the function POINT is .* TAP .*separation.*in_area"),
+        (
+            "SELECT id FROM galaxies WHERE 1 = CONTAINS(POINT('ICRS', ra, dec), CIRCLE('ICRS', 53.2, -28.1, 0.1))",
+            r"function CONTAINS is .* TAP .*write separation\(ra, dec, 53.2, -28.1\) < 0.1 \(deg\) for a circle, or",
+        ),
+        ("SELECT DISTANCE(POINT(ra, dec), POINT(1, 2)) FROM galaxies", r"write separation\(ra, dec, 1, 2\) \(deg\)$"),
+        (
+            "SELECT id FROM galaxies AS g WHERE q3c_radial_query(g.ra, g.dec, 53.2, -28.1, 6/60.)",
+            r"^SQL: function q3c_radial_query does not exist: write "
+            r"separation\(g.ra, g.dec, 53.2, -28.1\) < 6/60. \(deg\)$",
+        ),
+        ("SELECT q3c_join(ra, dec) FROM galaxies", r": write separation\(ra, dec, RA, DEC\) < RADIUS \(deg\)$"),
+        (
+            "SELECT angDist(ra, dec, 53.2, $d) FROM galaxies",
+            r"angdist .* write separation\(ra, dec, 53.2, \$d\) \(deg\)$",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE ST_DWithin(ST_MakePoint(ra, dec), ST_Point(53.2, -28.1), 0.1)",
+            r"write separation\(ra, dec, 53.2, -28.1\) < 0.1 \(deg\)$",
+        ),
+        (
+            "SELECT id FROM galaxies g JOIN dbo.fGetNearbyObjEq(53.2, -28.1, 3) n ON g.id = n.objID",
+            r"write FROM galaxies WHERE separation\(ra, dec, 53.2, -28.1\) < 0.05 \(deg\)$",
+        ),
+        ("SELECT percentile(z_obs, 50) FROM galaxies", r"write quantile_cont\(z_obs, 0.5\)$"),
+        ("SELECT percentile(z_obs, 0.9) FROM galaxies", r"write quantile_cont\(z_obs, 0.9\)$"),
+        (
+            "SELECT id FROM galaxies WHERE kind = 'QSO'",
+            r"^SQL: column kind contains numbers \(0 central galaxy; .*; 2 QSO; .*\): write kind = 2$",
+        ),
+        ("SELECT id FROM galaxies AS g WHERE g.kind NOT IN ('satelite')", "write 1 in place of 'satelite'$"),
+        ("SELECT id FROM galaxies AS g WHERE g.kind <> 'satelite'", "write kind <> 1$"),
+        ("SELECT id FROM galaxies WHERE 'comet' = kind", "write one of these numbers in place of 'comet'$"),
+        (
+            "SELECT id FROM galaxies WHERE z_obs > $z AND z_obs < $b",
+            r"^SQL: these parameters have no value: b, z; in Python write lake.sql\(query, b=..., z=...\)$",
+        ),
         ("SELECT id FROM galaxies WHERE ra > 'high'", "^SQL: 'high' is text where a number is required$"),
         ("DELETE FROM galaxies", "^SQL: DELETE is not possible: write a SELECT, because the tables can only be read$"),
         ("SELECT 1; SELECT 2", r"^SQL: the text contains 2 statements \(SELECT, SELECT\): write a single SELECT$"),

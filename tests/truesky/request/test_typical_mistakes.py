@@ -84,7 +84,12 @@ MISTAKES = {
         "area.box.ra",
         "the second must be east of the first",
     ),
-    "a circle": (area("circle = { ra = 1, dec = 2, radius = 1 }"), "area.circle", "cone = { ra, dec, radius }"),
+    "a circle": (
+        area("circle = { ra = 1, dec = 2, radius = 1 }"),
+        "area.circle",
+        "did you mean cone = { ra, dec, radius }?",
+    ),
+    "vertices": (area("vertices = [[1, 2], [2, 2], [2, 3]]"), "area.vertices", "did you mean polygon?"),
     "a key misspelt": (section("universe", "galaxy_limt = 25"), "universe.galaxy_limt", "did you mean galaxy_limit?"),
     "a number in quotes": (
         section("universe", 'galaxy_limit = "25"'),
@@ -98,7 +103,7 @@ MISTAKES = {
     "lensing on": (section("universe", "lensing = true"), "universe.lensing", '"box", "none" or a table such as'),
     "one bracket": (
         changed("[[pointing]]", "[pointing]"),
-        "pointing must be a list",
+        "pointing must be a list of tables: ",
         "write [[pointing]] instead of [pointing]",
     ),
     "a band in capitals": (
@@ -162,7 +167,7 @@ MISTAKES = {
     "a shear of another name": (
         section("universe", "lensing = { gamma1 = 0.1, g2 = 0 }"),
         "universe.lensing.gamma1 is not a key of a request; ",
-        "allowed here: g1, g2",
+        "did you mean g1? allowed here: g1, g2",
     ),
     "a dither in small letters": (
         EUCLID + 'dither = "s"\n',

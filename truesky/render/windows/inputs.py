@@ -150,8 +150,19 @@ def _where(cells: Int, ra: float, dec: float) -> str:
         exchanged_cell = sky.cell_at([exchanged_ra], [exchanged_dec], GENERATION_ORDER)
         if np.isin(exchanged_cell, cells).all():
             return ": are ra and dec exchanged?"
-    near_ra, near_dec = sky.cell_centres(GENERATION_ORDER, cells[:1])
-    return f", which is near ra {near_ra[0]:.1f}, dec {near_dec[0]:.1f}"
+    near_ra, near_dec = _middle(cells)
+    return f", which is near ra {near_ra:.1f}, dec {near_dec:.1f}"
+
+
+def _middle(cells: Int) -> tuple[float, float]:
+    """Return ra, dec (deg) of the middle of cells, or of the cell that is closest to it if no cell contains it."""
+    centre_ra, centre_dec = sky.cell_centres(GENERATION_ORDER, cells)
+    x, y, z = sky.unit_vectors(centre_ra, centre_dec).mean(axis=0)
+    ra, dec = float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+    if np.isin(sky.cell_at([ra], [dec], GENERATION_ORDER), cells).all():
+        return ra, dec
+    closest = int(np.argmin(sky.separation(centre_ra, centre_dec, ra, dec)))
+    return float(centre_ra[closest]), float(centre_dec[closest])
 
 
 def select_rows(rows: Rows, without: Sequence[int] = ()) -> Rows:

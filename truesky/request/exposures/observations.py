@@ -388,7 +388,7 @@ def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: Missi
     with Mistakes() as mistakes:
         for band in values["bands"]:
             mistakes.read(instruments.check_band, band, bands, owner, f"{path}.bands")
-        # A name of a detector restricts the images of its own camera. Another camera then takes all of its detectors.
+        # A detector restricts the images of the camera to which it belongs. Another camera takes all of its detectors.
         mistakes.read(instruments.check_detectors, tuple(cameras), values["detectors"], mission, f"{path}.detectors")
 
 
