@@ -22,8 +22,9 @@ from truesky.api.tables import LakeTables
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
+    from truesky.api.image_options import ImageOptions
     from truesky.api.lake_frames import LakeFrame
-    from truesky.api.sky_images import ImageOptions, SkyImage, SkyPainter
+    from truesky.api.sky_images import SkyImage, SkyPainter
 
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
@@ -247,9 +248,9 @@ class Lake(LakeTables):
             If an option is not valid, the place is outside the catalogues or on none of the detectors of the exposure,
             or the lake has no fluxes in the band.
         """
-        from truesky.api import sky_images
+        from truesky.api import image_options
 
-        return self._painter.draw(sky_images.check_request((ra, dec), size, band, options), refuse_unknown=True)
+        return self._painter.draw(image_options.check_request((ra, dec), size, band, options), refuse_unknown=True)
 
     def stamps(
         self,

@@ -12,8 +12,9 @@ import numpy as np
 
 from lake_schema.errors import BadInput
 from lake_schema.texts import spelling
-from truesky.api import sky_images
-from truesky.api.sky_images import ImageOptions, ImageRequest, PainterTables, SkyImage, SkyPainter
+from truesky.api import image_options, sky_images
+from truesky.api.image_options import ImageOptions, ImageRequest
+from truesky.api.sky_images import PainterTables, SkyImage, SkyPainter
 from truesky.catalogue import injected_rows
 from truesky.request import sky_notation
 
@@ -60,7 +61,7 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
     place, columns = injected_rows.table_columns(table, "table", _is_used)
     if missing := [name for name in ("ra", "dec") if name not in columns]:
         raise BadInput(f"{place}: has no column {missing[0]}")
-    base = sky_images.check_request((0.0, 0.0), size, band, options)
+    base = image_options.check_request((0.0, 0.0), size, band, options)
     requests = []
     for row in range(len(columns["ra"])):
         values = {name: float(column[row]) for name, column in columns.items() if not np.isnan(column[row])}
@@ -73,9 +74,10 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
 
 def _is_used(name: str) -> bool:
     """Return True for a column that is used, and raise BadInput for a name that is nearly the same."""
-    if name in ("ra", "dec", *_OPTIONAL):
+    used = ("ra", "dec", *_OPTIONAL)
+    if name in used:
         return True
-    if similar := spelling.closest_names(name, _OPTIONAL, 1):
+    if similar := [word for word in used if word == name.lower()] or spelling.closest_names(name, _OPTIONAL, 1):
         raise BadInput(f"table: column {name!r}: did you mean {similar[0]}? Other names are ignored")
     return False
 
@@ -85,10 +87,10 @@ def _with_place(base: ImageRequest, values: Mapping[str, float]) -> ImageRequest
     for name in ("ra", "dec"):
         if name not in values:
             raise BadInput(f"{name} is missing")
-    ra, dec = sky_images.check_place(values["ra"], values["dec"])
-    size = sky_images.check_size(values.get("size", base.size))
+    ra, dec = image_options.check_place(values["ra"], values["dec"])
+    size = image_options.check_size(values.get("size", base.size))
     exposure, seed = (
-        sky_images.check_count(name, _whole(name, values[name])) if name in values else given
+        image_options.check_count(name, _whole(name, values[name])) if name in values else given
         for name, given in (("exposure", base.exposure), ("seed", base.noise_seed))
     )
     mjd = sky_notation.mjd(values["date"], "date") if "date" in values else base.mjd

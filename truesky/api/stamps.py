@@ -11,8 +11,9 @@ from tqdm import tqdm
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
+from truesky.api.image_options import ImageOptions
 from truesky.api.lake import Lake
-from truesky.api.sky_images import ImageOptions, SkyImage
+from truesky.api.sky_images import SkyImage
 
 # Columns of the list of written files. `ra` and `dec` are the middle of the image.
 _COLUMNS = ("row", "file", "ra", "dec", "exposure", "detector", "first_column", "first_row", "sources")

@@ -71,7 +71,7 @@ _SYNONYMS = {
 _INSPECTION = ("lake_schema.inspection",)
 COMMANDS = {
     "run": Command(
-        "simulate", "REQUEST LAKE", "make everything that a request needs, and draw pictures",
+        "simulate", "REQUEST LAKE", "make everything a request needs, and draw pictures",
         "requests/demo.toml my_lake --dry-run", simulation.add_run_arguments, ("truesky.commands.run",),
     ),
     "examples": Command(
@@ -109,7 +109,7 @@ COMMANDS = {
         ("truesky.api.inject",),
     ),
     "stamps": Command(
-        "simulate", "LAKE PLACES OUT", "draw images of many places from the catalogues of a lake",
+        "simulate", "LAKE PLACES OUT", "draw images of many places on the sky",
         "my_lake places.csv stamps --size 10 --band euclid_vis", injection.add_stamps_arguments,
         ("truesky.api.stamps",),
     ),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +43,8 @@ def run_command(options: argparse.Namespace) -> int:
     BadInput is raised for a wrong request.
     """
     path = Path(options.request)
-    if path.is_dir():
+    # `Path.is_dir` raises an error if the name is too long.
+    if os.path.isdir(path):
         text = user_files.format_path(path)
         raise BadInput(f"request {text}: is a folder, but must be a TOML file; truesky verify {text} checks a lake")
     table = read_file(path)

@@ -192,7 +192,22 @@ def check_detectors(cameras: Sequence[str], names: Collection[str], mission: Mis
 
 
 def detectors_of_camera(camera: str, names: Collection[str], mission: MissionConfiguration) -> tuple[str, ...]:
-    """Return the given detectors that belong to a camera, or () if all belong to other cameras."""
+    """Return the given detectors that belong to a camera, or () if all belong to other cameras.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the camera.
+    names : collection of str
+        Names of detectors of several cameras.
+    mission : MissionConfiguration
+        Mission parameters, which list the detectors of cameras.
+
+    Returns
+    -------
+    tuple of str
+        Names in the given order.
+    """
     if not names:
         return ()
     existing = set(_detector_names(camera, mission))

@@ -276,6 +276,7 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
     [
         ({"ra": [RA]}, {}, "table: has no column dec"),
         ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes': did you mean size"),
+        ({"RA": [RA], "DEC": [DEC]}, {}, "table: column 'RA': did you mean ra"),
         ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),
         ({"ra": [RA], "dec": [95.0]}, {}, "table, row 1: dec = 95.0 is outside"),
         ({"ra": [RA], "dec": [DEC], "seed": [1.5]}, {}, "table, row 1: seed = 1.5: must be a whole number"),

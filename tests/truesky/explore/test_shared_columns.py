@@ -101,6 +101,7 @@ def test_documented_queries():
         with duckdb.connect(":memory:") as opened:
             opened.execute("CREATE MACRO mag_ab(f_nu) AS f_nu")
             opened.execute("CREATE MACRO in_area(ra, dec) AS ra < dec")
+            opened.execute("CREATE MACRO separation(ra1, dec1, ra2, dec2) AS ra1 + dec1 + ra2 + dec2")
             for table in all_tables(bands_of(query)):
                 opened.register(table.name, table.arrow_schema().empty_table())
             try:

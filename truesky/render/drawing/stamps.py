@@ -129,10 +129,16 @@ def draw_in_units(
 
     Parameters
     ----------
-    sources, sizes, psf, progress, neglected, tally
-        As for `draw`.
+    sources : Sources
+        Sources to be drawn.
+    sizes : int array, shape (n,)
+        Sides of the sources' stamps, pixels.
+    psf : Psf
+        PSF of the detector.
     shape : (int, int)
         Number of columns and of rows of the detector.
+    progress, neglected, tally
+        As for `draw`.
     unit : float, optional
         Factor from electrons to integers, by default `unit_for` these sources.
 

@@ -64,10 +64,16 @@ class DrawingStore:
 
         Parameters
         ----------
-        sources, sizes, psf, progress, neglected, tally
-            As for `stamps.draw`.
+        sources : Sources
+            Sources to be drawn.
+        sizes : int array, shape (n,)
+            Sides of the sources' stamps, pixels.
+        psf : Psf
+            PSF of the detector.
         shape : (int, int)
             Number of columns and of rows of the detector.
+        progress, neglected, tally
+            As for `stamps.draw`.
 
         Returns
         -------
