@@ -17,6 +17,7 @@ HARMLESS = {
     "duckdb",
     "fsspec",
     "h5py",
+    "loky",
     "matplotlib",
     "pandas",
     "pyspark",

@@ -28,7 +28,7 @@ def block(language):
 @pytest.fixture
 def request_file(tmp_path, monkeypatch):
     monkeypatch.setattr(ingest, "cache_dir", lambda: tmp_path / "cache")
-    (tmp_path / "catalogue.csv").write_text(block("csv"))
+    (tmp_path / "catalogue.csv").write_text(block("none"))
     path = tmp_path / "own_catalogue.toml"
     path.write_text(block("toml"))
     return path
@@ -43,7 +43,7 @@ def test_the_example_is_checked_and_becomes_a_catalogue(request_file, capsys):
         publish.make_version(lake, step.plan, step.run_task)
     rows = read.version(lake, "galaxies").rows().sort_by("origin_id")
     assert validate.find_violations(rows, GALAXIES) == []
-    columns = np.array([[float(text) for text in line.split(",")] for line in block("csv").split()[1:]]).T
+    columns = np.array([[float(text) for text in line.split(",")] for line in block("none").split()[1:]]).T
     assert rows["origin_id"].to_pylist() == columns[0].astype(int).tolist()
     shears = [galsim.Shear(e1=e1, e2=e2) for e1, e2 in columns[6:].T]
     for name in ("bulge_axis_ratio", "disk_axis_ratio"):

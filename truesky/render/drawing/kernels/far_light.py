@@ -114,7 +114,8 @@ def add_outside(
                     x - dy * bar_directions[b, 1] / bar_directions[b, 0],
                     spike_half_width / abs(bar_directions[b, 0]),
                 )
-                first, stop = int(max(middle - half, 0.0)), int(min(max(middle + half, -1.0), nx - 1.0)) + 1
+                first = int(max(middle - half, 0.0))
+                stop = int(np.floor(min(max(middle + half, -1.0), nx - 1.0))) + 1
             for c in range(first, stop):
                 if (
                     not (row_crosses_square and abs(c - x) < inner)
