@@ -25,6 +25,9 @@ stars = "stars.csv"
 [fluxes]
 bands = ["euclid_vis", "euclid_j", "lsst_r"]
 """
+# Noticeable effects of NISP, except the nonlinearity, which makes stars of 19 mag 0.008 mag too faint in raw pixels. An
+# observer corrects pixels for it before photometry.
+RAMP = ("background", "pixel_response", "dark_map", "ramp_cosmic_rays", "ipc", "reset_level", "group_noise")
 # Stars per row and column. Their positions within a pixel form a lattice as well, because the centroid of a star in
 # large pixels is wrong by up to 70 mas (NISP), with opposite signs on both sides of the middle of a pixel.
 N = 8
@@ -34,13 +37,18 @@ MAGNITUDE, POSITION = 0.01, 5.0
 
 @dataclass(frozen=True)
 class Setting:
-    """How stars are added and measured: sizes in arcsec, magnitudes of the brightest and the faintest star."""
+    """How stars are added and measured.
+
+    Sizes are in arcsec, and magnitudes those of the brightest and the faintest star. All noticeable effects of the
+    detector are applied without `effects`. The exposure begins at `date` (MJD), or at the first possible date.
+    """
 
     pixel: float
     aperture: float
     spacing: float
     brightest: float
     faintest: float
+    effects: tuple[str, ...] | None = None
     date: float | None = None
 
 
@@ -48,8 +56,8 @@ class Setting:
 # of 5800 K by 12 mas.
 SETTINGS = {
     "euclid_vis": Setting(0.1, 1.0, 10.0, 19.5, 21.8),
-    "euclid_j": Setting(0.3, 2.0, 12.0, 18.0, 20.0),
-    "lsst_r": Setting(0.2, 2.4, 14.0, 17.5, 18.7, 61010.15),
+    "euclid_j": Setting(0.3, 2.0, 12.0, 18.0, 20.0, RAMP),
+    "lsst_r": Setting(0.2, 2.4, 14.0, 17.5, 18.7, None, 61010.15),
 }
 
 
@@ -109,7 +117,8 @@ def recover(lake, band, rng, cosmic_rays):
     """
     how = SETTINGS[band]
     ra, dec = RA + rng.uniform(-0.05, 0.05), DEC + rng.uniform(-0.05, 0.05)
-    same = {"size": N * how.spacing, "band": band, "date": how.date, "seed": int(rng.integers(1, 2**31))}
+    same = {"size": N * how.spacing, "band": band, "date": how.date, "effects": how.effects}
+    same["seed"] = int(rng.integers(1, 2**31))
     plain_image = lake.render(ra, dec, **same)
     column, row = lattice(how.spacing / how.pixel, rng)
     star_ra, star_dec = plain_image.wcs.all_pix2world(column, row, 0)
