@@ -20,7 +20,7 @@ class Cost:
     galaxy_s, star_s : float
         Seconds per galaxy and per star drawn with the accuracy "survey".
     base_gb : float
-        Memory of a worker process in GB before it draws.
+        Memory of a new process in GB before it draws.
     bytes_per_pixel, sky_bytes_per_pixel : float
         Bytes of memory per pixel while an image is made, without and with the sky.
     file_bytes_per_pixel : float
