@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 
 from lake_schema import arguments, user_files
@@ -26,6 +25,8 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
 if TYPE_CHECKING:
+    # Imported where they are used, because their imports are slow.
+    import pandas as pd
     from astropy.wcs import WCS
 
 # Name of the extension with the table of the added sources.
@@ -383,6 +384,8 @@ def _place_sources(
     inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     ids = np.concatenate([np.zeros(0, np.int64), *(table.ids for table in row_tables)])
     kinds = np.concatenate([np.zeros(0, "U8"), *(np.full(len(t.ids), t.name, "U8") for t in row_tables)])
+    import pandas as pd
+
     truth = pd.DataFrame(
         {
             "id": ids, "kind": kinds.astype(object), **{name: joined[name] for name in ("ra", "dec")}, "x": x, "y": y,

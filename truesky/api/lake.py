@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-import pandas as pd
 
 from lake_schema import arguments
 from lake_schema.arrays import Float
@@ -20,6 +19,7 @@ from lake_schema.fits.images import Image
 from truesky.api.tables import LakeTables
 
 if TYPE_CHECKING:
+    import pandas as pd
     from astropy.wcs import WCS
 
     from truesky.api.image_options import ImageOptions

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from lake_schema.arrays import Array, Float32
 from lake_schema.errors import BadInput
@@ -19,6 +17,10 @@ from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.exposure import render
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, truth_table
+
+if TYPE_CHECKING:
+    # Imported where it is used, because the import takes 0.4 s.
+    import pandas as pd
 
 # Largest number of images that an error message lists.
 _MAX_LISTED = 8

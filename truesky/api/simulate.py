@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from lake_schema import arguments, instruction_set, user_files
 from lake_schema.arrays import as_python
@@ -22,6 +20,10 @@ from truesky.request import accuracy, universe
 from truesky.request.from_toml import ValidParts, from_table, parse, parse_valid_parts, read_valid_parts
 from truesky.request.schema import Request
 from truesky.running import submitted_job
+
+if TYPE_CHECKING:
+    # Imported where it is used, because the import takes 0.4 s.
+    import pandas as pd
 
 _MAX_DETECTORS = 2**63 - 1
 
@@ -133,6 +135,8 @@ def accuracies() -> pd.DataFrame:
         Four columns with the suffix ``_reached`` are the measured errors. ``seconds`` is the CPU time to draw all
         sources of a VIS detector. The other columns are parameters of the drawing code.
     """
+    import pandas as pd
+
     rows = {}
     for name, allowed in accuracy.PRESETS.items():
         row, errors = accuracy.fastest_row(allowed), asdict(allowed)

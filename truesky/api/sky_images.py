@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import pyarrow.compute as pc
 
 from lake_schema import sky
@@ -44,6 +43,8 @@ from truesky.request import accuracy as accuracies
 from truesky.request.accuracy import Accuracy
 
 if TYPE_CHECKING:
+    # Imported where they are used, because their imports are slow.
+    import pandas as pd
     from astropy.wcs import WCS
 
 # Largest and smallest size of an image in pixels.
@@ -308,7 +309,7 @@ class SkyPainter:
         variant = variants.variant(exposure.settings, self.mission, accuracy, self.forced)
         aim = Aim.from_exposure(exposure, detector, self.band(exposure.band), self.seed)
         psf = visible_sources.exposure_psf(aim, scene_factory.from_aim(aim, variant), settings_for(accuracy))
-        return replace(psf, transforms={})
+        return replace(psf, derived={})
 
     def _nominal_of(self, request: ImageRequest) -> tuple[ExposureRow, Detector]:
         """Return the exposure of the square degree around a place, and its central detector."""

@@ -6,15 +6,17 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, Self
 
 from lake_schema import arguments, user_files
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from truesky.explore.explorer import ORDER, Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
+
+if TYPE_CHECKING:
+    # Imported where it is used, because the import takes 0.4 s.
+    import pandas as pd
 
 
 class LakeTables:

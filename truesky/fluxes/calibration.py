@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from lake_schema import units
@@ -56,8 +58,14 @@ def star_scale(stars: Stars, library: Library) -> Float:
     H in the catalogue is a Vega magnitude, which is 1.375 mag below the AB magnitude. Serrano et al. 2024, appendix B,
     insert it in the formula for AB magnitudes.
     """
+    template, vega_magnitude = _templates_in_h(library)
+    mag_ab = stars.mag_h + vega_magnitude
+    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / (stars.frac * template[stars.sed]).sum(0))
+
+
+@lru_cache(maxsize=4)
+def _templates_in_h(library: Library) -> tuple[Float, float]:
+    """Return f_nu in the H band of each template as it is stored, and the AB magnitude of Vega in H."""
     band = passbands.load(STAR_BAND)
     spectra = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
-    template = matrices.matmul(spectra, passbands.weights(band))
-    mag_ab = stars.mag_h + vega.vega_magnitude(band)
-    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / (stars.frac * template[stars.sed]).sum(0))
+    return matrices.matmul(spectra, passbands.weights(band)), vega.vega_magnitude(band)

@@ -176,7 +176,7 @@ def spectra(galaxies: pa.Table) -> Float:
         if code == QUASAR:
             out[indices] *= intergalactic.transmission(grid, z[indices])
     out *= table_magnification(galaxies)[:, None]
-    out *= extinction.transmission(extinction.milky_way(grid), a_v[:, None])
+    out *= extinction.transmission(extinction.milky_way_table(passbands.GRID_FIRST, len(grid)), a_v[:, None])
     return out
 
 

@@ -191,7 +191,7 @@ def _full_weights(bands: Sequence[Passband]) -> Float:
     for k, band in enumerate(bands):
         table[band.first : band.first + len(band.wavelength), k] = passbands.weights(band)
     table[[0, -1]] = 0.0
-    table[:, -1] = extinction.milky_way(grid)
+    table[:, -1] = extinction.milky_way_table(passbands.GRID_FIRST, len(grid))
     return table
 
 
@@ -218,7 +218,7 @@ def _window(first: int, last: int, bands: Sequence[Passband], reference: Passban
     for k, band in enumerate(bands):
         if (samples := _band_samples(band, first, last)) is not None:
             weights[slice(*samples), k] = passbands.weights(band)
-    milky_way = extinction.milky_way(np.arange(first, last + 1.0)).astype(np.float32)
+    milky_way = extinction.milky_way_table(first, last + 1 - first).astype(np.float32)
     return WavelengthWindow(
         first, weights, milky_way, _band_samples(reference, first, last) if reference is not None else None
     )

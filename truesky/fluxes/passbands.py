@@ -76,7 +76,12 @@ def load(name: str) -> Passband:
     rows = _rows()
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
-    row = rows[name]
+    return _load(name, tuple(rows[name].items()))
+
+
+@lru_cache(maxsize=64)
+def _load(name: str, items: tuple[tuple[str, str], ...]) -> Passband:
+    row = dict(items)
     key = cache.content_key(code_key(__name__), repr(row), _speclite_version())
     arrays = cache.cached_arrays(f"passband_{name}", key, lambda: _curve(row["source"], float(row["shift"])))
     return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])

@@ -48,7 +48,7 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     weights, grid = passbands.weights(reference), first + np.arange(float(count))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
-    milky_way = extinction.milky_way(grid).astype(np.float32)
+    milky_way = extinction.milky_way_table(first, count).astype(np.float32)
     out = np.empty((len(rows), count), np.float32)
     # Sort by redshift, because all galaxies of a block get as many template samples as the galaxy that needs the most.
     order = np.argsort(rows.mix.z_obs, kind="stable")
@@ -93,7 +93,7 @@ def star_spectra(rows: Stars, first: int, count: int, library: Library) -> Float
         f_lambda in erg s-1 cm-2 A-1.
     """
     low = first - int(library.wavelength[0])
-    milky_way = extinction.milky_way(first + np.arange(float(count)))
+    milky_way = extinction.milky_way_table(first, count)
     scale = star_scale(rows, library)
     out = np.empty((len(rows), count), np.float32)
     for start in range(0, len(rows), _ROWS):

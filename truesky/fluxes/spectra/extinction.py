@@ -13,6 +13,8 @@ Serrano et al. 2024, appendix B, eq. f_ext; Ilbert et al. 2009.
 from __future__ import annotations
 
 import csv
+import importlib.metadata
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Float
-from truesky.numerics import matrices
+from truesky.numerics import cache, matrices
+from truesky.numerics.code_fingerprints import code_key
 
 # Number of laws, including code 0 (no dust).
 LAW_COUNT = 5
@@ -30,6 +33,8 @@ PREVOT, CALZETTI = 1, 2
 MILKY_WAY_R_V = 3.1
 # First and last wavelength (A) at which the law of O'Donnell 1994 is defined, 10 and 0.3 per micrometre.
 _MILKY_WAY_RANGE = (1000.0, 33333.0)
+# First and last wavelength (A) of the table of the law, which include those of all passbands.
+_TABLE_FIRST, _TABLE_LAST = 600, 24000
 
 # E(lambda - V) / E(B-V) of the Small Magellanic Cloud: Prevot et al. 1984, table 2. The row at 3704 A is that in the
 # photometric-redshift code LePhare.
@@ -88,6 +93,22 @@ def milky_way(wavelength: npt.ArrayLike) -> Float:
     lam = np.clip(np.asarray(wavelength, float), *_MILKY_WAY_RANGE)
     curve: Any = O94(Rv=MILKY_WAY_R_V)
     return np.asarray(curve(1e4 / lam / u.um), float)
+
+
+def milky_way_table(first: int, count: int) -> Float:
+    """Return A(lambda) / A(V) of the Milky Way at `count` wavelengths in steps of 1 A, from `first` in A.
+
+    They are those of `milky_way`, but are read from the cache. The range is 600 to 24000 A, which is not checked.
+    """
+    start = first - _TABLE_FIRST
+    return _milky_way_table()[start : start + count]
+
+
+@lru_cache(maxsize=1)
+def _milky_way_table() -> Float:
+    key = cache.content_key(code_key(__name__), importlib.metadata.version("dust_extinction"))
+    wavelengths = np.arange(_TABLE_FIRST, _TABLE_LAST + 1.0)
+    return cache.cached_arrays("milky_way_law", key, lambda: {"curve": milky_way(wavelengths)})["curve"]
 
 
 def transmission(k: npt.ArrayLike, ebv: npt.ArrayLike) -> Any:

@@ -136,7 +136,7 @@ def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: L
         tuple(build_tables.galaxy_table(b, library, s, key) for b, s in zip(bands, settings, strict=True)),
         build_tables.galaxy_table(passbands.load(REFERENCE_BAND), library, REFERENCE_SETTING, key),
         _line_grid(bands),
-        extinction.milky_way(passbands.grid()),
+        extinction.milky_way_table(passbands.GRID_FIRST, len(passbands.grid())),
     )
 
 

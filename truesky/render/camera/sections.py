@@ -36,6 +36,10 @@ class Section:
         """Slices (rows, columns) that select the rectangle from an array [rows, columns]."""
         return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
 
+    def contains(self, column: int, row: int) -> bool:
+        """Return True if the rectangle contains a pixel, counted from 0."""
+        return self.x <= column < self.x + self.nx and self.y <= row < self.y + self.ny
+
     @classmethod
     def from_text(cls, text: str) -> Section:
         """Create a rectangle from the text of a FITS header, "[x1:x2,y1:y2]", counted from 1.

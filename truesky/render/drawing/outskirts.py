@@ -168,7 +168,7 @@ def from_galaxy(
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), max(map(abs, region)))
-    cells = _cells(psf, weights, block)
+    cells = psf.keep(("outskirts", weights.tobytes(), block), lambda: _cells(psf, weights, block))
     first_x, first_y = (int(np.floor(start / block)) - 1 for start in (region[0], region[2]))
     end_x, end_y = (int(np.ceil(end / block)) + 2 for end in (region[1], region[3]))
     # Nodes around the region from which the PSF moves light into it.
@@ -176,8 +176,19 @@ def from_galaxy(
     unblurred = np.zeros((end_y - first_y + 2 * margin, end_x - first_x + 2 * margin))
     x, y = float((margin - first_x) * block), float((margin - first_y) * block)
     _sample(light, disk, wide, x, y, float(block), unblurred)
-    blurred = scipy.signal.fftconvolve(unblurred, cells, mode="valid")
+    blurred = _convolve(unblurred, cells)
     return Outskirts(light, disk, wide, blurred, block, (first_x, first_y))
+
+
+def _convolve(image: Float, kernel: Float) -> Float:
+    """Return the part of the convolution of an image with a square kernel that needs no values outside the image.
+
+    It is `scipy.signal.fftconvolve` with the mode "valid". The import of scipy.signal takes longer than most images.
+    """
+    shape = [scipy.fft.next_fast_len(n + len(kernel) - 1, True) for n in image.shape]
+    product = scipy.fft.rfft2(image, shape) * scipy.fft.rfft2(kernel, shape)
+    first, (rows, columns) = len(kernel) - 1, image.shape
+    return np.ascontiguousarray(scipy.fft.irfft2(product, shape)[first:rows, first:columns])
 
 
 @lru_cache(maxsize=16)
@@ -247,37 +258,70 @@ def _cells(psf: Psf, weights: Float, block: int) -> Float:
         image = drawn.array / drawn.array.sum(dtype=float)
     else:
         image = np.asarray(transfer.image_of(psf.planes, weights), float)
-    samples = SAMPLES if psf.planes is None else psf.planes.samples
-    sides = [_shares(length, block, samples) for length in image.shape]
-    out: Float = matrices.matmul(sides[0].T, matrices.matmul(image, sides[1]))
+    out = _to_nodes(image, block, SAMPLES if psf.planes is None else psf.planes.samples)
     out[len(out) // 2, len(out) // 2] -= 1.0
-    return np.asarray(out)
+    return out
 
 
-def _shares(length: int, block: int, samples: int) -> Float:
-    """Return the fraction [length, nodes] of the light of each sample of a line that is added to each node of a grid.
+def _to_nodes(image: Float, block: int, samples: int) -> Float:
+    """Distribute the samples of an image, `samples` per pixel in each direction, to nodes `block` pixels apart."""
+    out = image
+    # First along columns, then along rows.
+    for _ in range(2):
+        nodes, shares = _shares(len(out), block, samples)
+        sums = np.zeros((int(nodes[-1]) + shares.shape[1], out.shape[1]))
+        _add_to_nodes(np.ascontiguousarray(out), nodes, shares, sums)
+        out = sums.T
+    return np.ascontiguousarray(out)
 
-    The line has `length` samples, `samples` per pixel; the nodes are `block` pixels apart. Sample and node in the
-    middle coincide. The light of a sample is added to the five nearest nodes only. The fractions, some of which are
-    negative, have the sum 1.
+
+def _shares(length: int, block: int, samples: int) -> tuple[Int, Float]:
+    """Return the fractions of the light of each sample of a line that are added to five nodes of a grid.
+
+    Parameters
+    ----------
+    length : int
+        Number of samples of the line.
+    block : int
+        Distance between nodes, pixels.
+    samples : int
+        Number of samples per pixel.
+
+    Returns
+    -------
+    first_node : int array, shape (length,)
+        First of the five nodes next to each sample; the first node of the grid is 0. The middle sample coincides with
+        the middle node.
+    shares : float array, shape (length, 5)
+        Fractions, some of which are negative. Their sum is 1 for each sample.
     """
     place = (np.arange(length) - length // 2) / (samples * block)
     node = np.rint(place).astype(int)
     off, pixel = place - node, 1.0 / (12.0 * block**2)
-    half = int(np.abs(node).max()) + 2
-    out = np.zeros((length, 2 * half + 1))
     # Moments, about the nearest node, of a uniform pixel centred on the sample.
     first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
     fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
-    for step, share in (
-        (-2, (2.0 * first - second - 2.0 * third + fourth) / 24.0),
-        (-1, (-4.0 * first + 4.0 * second + third - fourth) / 6.0),
-        (0, 1.0 - (5.0 * second - fourth) / 4.0),
-        (1, (4.0 * first + 4.0 * second - third - fourth) / 6.0),
-        (2, (-2.0 * first - second + 2.0 * third + fourth) / 24.0),
-    ):
-        out[np.arange(length), node + half + step] = share
-    return out
+    shares = (
+        (2.0 * first - second - 2.0 * third + fourth) / 24.0,
+        (-4.0 * first + 4.0 * second + third - fourth) / 6.0,
+        1.0 - (5.0 * second - fourth) / 4.0,
+        (4.0 * first + 4.0 * second - third - fourth) / 6.0,
+        (-2.0 * first - second + 2.0 * third + fourth) / 24.0,
+    )
+    return node + int(np.abs(node).max()), np.column_stack(shares)
+
+
+@jit
+def _add_to_nodes(image: Float, nodes: Int, shares: Float, out: Float) -> None:
+    """Add the rows of an image to rows of nodes, `out` [nodes, columns], as `_shares` distributes them.
+
+    Each row of the image [rows, columns] has few nodes, so that this is much faster than a product of matrices.
+    """
+    for i in range(len(image)):
+        for k in range(shares.shape[1]):
+            share, line, node = shares[i, k], image[i], out[nodes[i] + k]
+            for j in range(len(line)):
+                node[j] += share * line[j]
 
 
 def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:

@@ -6,10 +6,9 @@ PSF of a source is a weighted sum of the planes, with weights that depend on its
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import scipy
@@ -50,7 +49,6 @@ _PROBE = 64
 # Largest size of the transforms for one size of stamps that are kept for other images with the same PSF, bytes. It
 # suffices for all stamps of VIS.
 _KEPT_BYTES = 1e8
-_T = TypeVar("_T")
 
 
 def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
@@ -195,7 +193,7 @@ def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
     if min_value != NEGLIGIBLE:
         # This value differs between images.
         return _max_transfer(psf, min_value)
-    return _keep(psf, ("max",), lambda: _max_transfer(psf, min_value))
+    return psf.keep(("max transfer",), lambda: _max_transfer(psf, min_value))
 
 
 def _max_transfer(psf: Psf, min_value: float) -> Float:
@@ -249,21 +247,7 @@ def transfer(psf: Psf, size: int, reach: float) -> Transfer:
         return Transfer(stamp_grid, _planes(psf, stamp_grid, np.float32))
 
     is_small = plane_count(psf) * 8.0 * len(stamp_grid.kx) <= _KEPT_BYTES
-    return _keep(psf, (size, reach), compute) if is_small else compute()
-
-
-def _keep(psf: Psf, key: tuple[Any, ...], compute: Callable[[], _T]) -> _T:
-    """Return the result of a function of a PSF, from `psf.transforms` if it has been computed before."""
-    if psf.transforms is None:
-        return compute()
-    # The copies of a PSF with another response inside the pixel share the dictionary. A copy with another image must
-    # not find the transforms of this one.
-    full_key = (*key, psf.intra_pixel)
-    image = psf.profile if psf.planes is None else psf.planes.images
-    if full_key not in psf.transforms or psf.transforms[full_key][0] is not image:
-        psf.transforms[full_key] = image, compute()
-    result: _T = psf.transforms[full_key][1]
-    return result
+    return psf.keep(("transfer", size, reach), compute) if is_small else compute()
 
 
 def source_transfer(psf: Psf, weights: Float, stamp_grid: Grid, dtype: type[Any], fading: bool = False) -> Transfer:

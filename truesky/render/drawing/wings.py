@@ -63,7 +63,8 @@ def wings(
     out = _layer(nx, ny)
     if psf.planes is None:
         return out / unit
-    cells = _half_block_sums(psf.planes.images.mean(axis=0), psf.planes.samples)
+    planes = psf.planes
+    cells = psf.keep(("wings",), lambda: _half_block_sums(planes.images.mean(axis=0), planes.samples))
     x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     for size in np.unique(sizes[sizes < psf.side]):
         selected = sizes == size

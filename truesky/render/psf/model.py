@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import scipy
@@ -15,6 +16,8 @@ from truesky.render.psf.spikes import Edges
 if TYPE_CHECKING:
     # Imported in the functions that use it, because its import takes half a second.
     import galsim
+
+_T = TypeVar("_T")
 
 # Number of samples of a PSF image per detector pixel: for VIS, for PSFs from files, and for analytic profiles. The
 # finest optical detail of VIS (lambda / D at 540 nm) is 2.8 samples wide.
@@ -115,9 +118,9 @@ class Psf:
         response. None if the PSF already includes the pixel.
     edges : Edges or None
         Edges of the pupil and aureole, which cause light beyond the border of `planes`; None if there is no such light.
-    transforms : dict or None
-        Fourier transforms of this PSF that `drawing.transfer` has computed before, so that many small images with the
-        same PSF share them; None to keep none.
+    derived : dict or None
+        Quantities that have been computed from this PSF, such as Fourier transforms, so that many small images with the
+        same PSF share them; None to keep none. See `keep`.
     """
 
     profile: galsim.GSObject
@@ -129,12 +132,28 @@ class Psf:
     planes: Planes | None = None
     intra_pixel: float | None = 0.0
     edges: Edges | None = None
-    transforms: dict[Any, Any] | None = None
+    derived: dict[Any, Any] | None = None
 
     @property
     def side(self) -> int:
         """Side of the PSF images, pixels; for an analytic PSF, twice the largest radius in the table `surface`."""
         return 2 * len(self.surface)
+
+    def keep(self, key: tuple[Hashable, ...], compute: Callable[[], _T]) -> _T:
+        """Return the result of `compute`, a function of this PSF without arguments, from `derived` if it is there.
+
+        The key identifies the quantity and everything on which it depends besides the PSF.
+        """
+        if self.derived is None:
+            return compute()
+        # The copies of a PSF with another response inside the pixel share the dictionary. A copy with another image
+        # must not find the results for this one.
+        full_key = (*key, self.intra_pixel)
+        image = self.profile if self.planes is None else self.planes.images
+        if full_key not in self.derived or self.derived[full_key][0] is not image:
+            self.derived[full_key] = image, compute()
+        result: _T = self.derived[full_key][1]
+        return result
 
 
 def reduce_colours(psf: Psf, colours: int) -> Psf:

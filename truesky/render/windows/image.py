@@ -12,12 +12,11 @@ from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from truesky.randomness import rng
 from truesky.render.camera.windows import Window
-from truesky.render.channels import readout
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamps, wings
 from truesky.render.drawing.stamps import Tally
 from truesky.render.effects.effect import Decision, Effect, apply_all
-from truesky.render.effects.readout import adc
+from truesky.render.effects.readout import adc, quadrants
 from truesky.render.effects.scene import Lights, Scene
 from truesky.render.exposure import limits, rendered_detector, scene_factory
 from truesky.render.exposure.records import Rows, Variant
@@ -226,12 +225,13 @@ def amplifier_at(aim: Aim, scene: Scene, window: Window) -> int:
     Returns
     -------
     int
-        Number of the amplifier, from 0; 0 if the detector has only one.
+        Number of the amplifier, from 0; 0 if the detector has only one, or if no amplifier reads the middle.
     """
     if not _SPLITTING & {effect.name for effect in aim.effects}:
         return 0
-    whole = replace(scene, window=None)
-    shape = readout.split_frame(np.zeros((whole.ny, whole.nx), np.uint8), whole).shape
-    numbers = np.broadcast_to(np.arange(shape[0], dtype=np.uint8)[:, None, None], shape)
     column, row = (int(place) for place in window.middle)
-    return int(readout.assemble_frame(numbers, whole)[row, column])
+    whole = replace(scene, window=None)
+    if whole.layout is None:
+        return quadrants.quadrant_of_pixel(column, row, whole.nx, whole.ny)
+    areas = [amplifier.pixels for amplifier in whole.layout.amplifiers]
+    return next((n for n, area in enumerate(areas) if area.contains(column, row)), 0)

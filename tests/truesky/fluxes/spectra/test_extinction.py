@@ -110,6 +110,13 @@ def test_scaling_a_bands_extinction_linearly_would_be_wrong():
     assert abs(dimming("euclid_h", 0.5) - 2.5 * dimming("euclid_h", 0.2)) < 0.002
 
 
+@pytest.mark.parametrize(("first", "count"), [(600, 23401), (3000, 8742), (23999, 2)])
+def test_the_table_of_the_milky_way_contains_the_law(first, count):
+    np.testing.assert_array_equal(
+        extinction.milky_way_table(first, count), extinction.milky_way(first + np.arange(float(count)))
+    )
+
+
 def test_transmission_keeps_single_precision():
     curve = np.ones((2, 3), np.float32)
     out = extinction.transmission(curve, np.array([[1.0], [2.0]], np.float32))

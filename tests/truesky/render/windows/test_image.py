@@ -8,6 +8,7 @@ import pytest
 from lake_schema.errors import BadInput
 from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, stars
+from truesky.reduction import amplifiers
 from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.camera.windows import Window
@@ -35,15 +36,9 @@ LARGEST = 1.0 / 320.0
 def field(request):
     """An exposure of a part of a detector with stars and galaxies, and the image of all its pixels."""
     camera = request.param
-    channel, name, band = CAMERAS[camera]
+    _, name, band = CAMERAS[camera]
     detector = replace(detectors.detector(camera, name, MISSION), nx=720, ny=680, injection_rows=0)
-    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
-    exposed = fields.exposure(
-        channel=channel, camera=camera, band=band, ra=ra, dec=dec, position_angle=angle, mjd=MJD, sky=0.5, seeing=0.7,
-        exposure_time_s=planned_exposures.exposure_time(channel, camera, band, MISSION),
-        zero_point=planned_exposures.zero_point_of(camera, band, MISSION),
-    )  # fmt: skip
-    aim, variant, rng = Aim.from_exposure(exposed, detector, None, SEED), Variant(MISSION, SURVEY, {}), rand()
+    aim, variant, rng = aim_at(camera, detector), Variant(MISSION, SURVEY, {}), rand()
     x, y = rng.uniform(-100.0, 820.0, (2, 900))
     bodies = galaxies(
         *astrometry.sky_of_pixel(aim.wcs, x[:700], y[:700]), inclination=80.0 * rng.random(700),
@@ -61,6 +56,31 @@ def field(request):
         scene = replace(scene, forced={aim.channel.transfer_effect.name: True})
     light = visible_sources.visible_light(aim, rows, scene, SEED)
     return aim, rows, variant, light, draw(light, np.arange(len(light.sources)), detector)
+
+
+def aim_at(camera, detector):
+    channel, _, band = CAMERAS[camera]
+    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
+    exposed = fields.exposure(
+        channel=channel, camera=camera, band=band, ra=ra, dec=dec, position_angle=angle, mjd=MJD, sky=0.5, seeing=0.7,
+        exposure_time_s=planned_exposures.exposure_time(channel, camera, band, MISSION),
+        zero_point=planned_exposures.zero_point_of(camera, band, MISSION),
+    )  # fmt: skip
+    return Aim.from_exposure(exposed, detector, None, SEED)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_amplifier_of_a_window_reads_its_middle(camera):
+    """It is the same as in an image of the numbers of all amplifiers."""
+    detector = detectors.detector(camera, CAMERAS[camera][1], MISSION)
+    aim = aim_at(camera, detector)
+    scene = scene_factory.from_aim(aim, Variant(MISSION, SURVEY, {}))
+    count = {"vis": 4, "nisp": 1, "lsstcam": 16}[camera]
+    numbers = np.broadcast_to(amplifiers.to_pixels(np.arange(count) if count > 1 else 0.0, scene), (scene.ny, scene.nx))
+    first, end = scene.unread_rows
+    for column, row in rand().integers(0, (scene.nx, scene.ny), (200, 2)).tolist():
+        if not (camera == "vis" and first <= row < end):
+            assert image.amplifier_at(aim, scene, Window(column, row, 1, 1)) == numbers[row, column]
 
 
 def rand():

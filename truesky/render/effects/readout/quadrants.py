@@ -96,6 +96,15 @@ def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
+def quadrant_of_pixel(column: int, row: int, nx: int, ny: int) -> int:
+    """Return the index of the quadrant (0 to 3 for E, F, G, H) that reads a pixel of a detector of ny x nx pixels.
+
+    Rows between the halves, which are not read, count to the nearer half.
+    """
+    place = row >= ny / 2, column >= nx / 2
+    return next(n for n, half in enumerate(zip(_UPPER, _RIGHT, strict=True)) if half == place)
+
+
 def pixel_offset(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> tuple[int, int]:
