@@ -29,8 +29,8 @@ class ImageOptions(TypedDict, total=False):
         `date` are then ignored. By default a nominal exposure of the band, in which the place is in the middle of the
         central detector. Its date, sky and PSF belong to the middle of the surrounding square degree.
     date : float or str
-        Start of a nominal exposure, as MJD or as an ISO date in UTC. By default the first date at which the place can
-        be observed.
+        Start of a nominal exposure, as MJD or as an ISO date in UTC. By default the first date at which the Sun
+        allows the place (Euclid), or at which the place crosses the meridian at night (ground cameras).
     accuracy : str or mapping
         Name of an accuracy, such as ``survey`` (see `truesky.accuracies`), or its four errors. By default ``survey``.
     noise : bool

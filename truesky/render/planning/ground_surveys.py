@@ -24,7 +24,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.planning import calibration_frames
 from truesky.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
-from truesky.render.sky.observatory import Site, next_dark_time, sun_altitude
+from truesky.render.sky.observatory import Site, next_dark_time, next_dark_transit, sun_altitude
 from truesky.render.sky.solar_aspect import next_allowed, position_angle
 from truesky.request.area import Area
 from truesky.request.exposures import pointing_tables
@@ -301,8 +301,8 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
 
     Notes
     -----
-    Without a date, a Euclid exposure begins when the Sun constraints allow it, and a ground exposure when its field is
-    next visible at night.
+    Without a date, a Euclid exposure begins when the Sun constraints allow it, and a ground exposure when its field
+    next crosses the meridian at night.
     """
     rows = pointing_tables.read(path, block.channels, block.image_type)
     with Mistakes() as mistakes:
@@ -315,7 +315,7 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
 
 
 def first_date(channel: str, camera: str, ra: float, dec: float, mission: MissionConfiguration) -> float:
-    """Return the first date after the launch of the mission at which a camera can observe a position.
+    """Return the first date after the launch of the mission at which a camera can observe a position well.
 
     Parameters
     ----------
@@ -329,7 +329,8 @@ def first_date(channel: str, camera: str, ra: float, dec: float, mission: Missio
     Returns
     -------
     float
-        MJD. Euclid observes when the Sun allows the position, a ground camera when the position is up at night.
+        MJD. Euclid observes when the Sun allows the position, a ground camera when the position crosses the meridian
+        at night, where the airmass is smallest.
 
     Raises
     ------
@@ -339,7 +340,7 @@ def first_date(channel: str, camera: str, ra: float, dec: float, mission: Missio
     launch = mission.value("svm.launch", "d")
     if not registry.CHANNELS[channel].on_ground:
         return next_allowed(ra, dec, launch, mission)
-    return next_dark_time(ra, dec, launch, Site.from_mission(image_types.section(camera), mission))
+    return next_dark_transit(ra, dec, launch, Site.from_mission(image_types.section(camera), mission))
 
 
 def _exposure_of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:

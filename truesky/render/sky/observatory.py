@@ -91,7 +91,7 @@ class Site:
             Altitude in degrees, negative below the horizon. The error is 0.2 deg, because precession and nutation
             since 2000 are neglected.
         """
-        hour, dec, latitude = self._hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
+        hour, dec, latitude = self.hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
         sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
         return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
@@ -110,12 +110,13 @@ class Site:
         float
             Angle in degrees from north through east, -180 to 180.
         """
-        hour, latitude, declination = float(self._hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
+        hour, latitude, declination = float(self.hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
         east = np.sin(hour) * np.cos(latitude)
         north = np.sin(latitude) * np.cos(declination) - np.cos(latitude) * np.sin(declination) * np.cos(hour)
         return float(np.degrees(np.arctan2(east, north)))
 
-    def _hour_angle(self, ra: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
+    def hour_angle(self, ra: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
+        """Return the angle in radians by which a right ascension (deg) has passed the meridian, for dates (MJD)."""
         turns = _TURN + _TURNS_A_DAY * (np.asarray(mjd, float) - _MJD_J2000)
         return np.asarray(2.0 * np.pi * (turns % 1.0) + np.radians(self.longitude - np.asarray(ra, float)))
 
@@ -227,6 +228,30 @@ def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
         if len(good):
             return float(times[good[0]])
     return start
+
+
+def next_dark_transit(ra: float, dec: float, start: float, site: Site) -> float:
+    """Return the first date at which a field crosses the meridian in the dark, where it is highest.
+
+    Parameters
+    ----------
+    ra, dec : float
+        ICRS position of the field in degrees.
+    start : float
+        Earliest date (MJD).
+    site : Site
+        The observatory.
+
+    Returns
+    -------
+    float
+        MJD. If there is no such date within 400 days, the first date at which the field can be observed in the dark;
+        see `next_dark_time` for the conditions.
+    """
+    first = (-float(site.hour_angle(ra, start)) / (2.0 * np.pi)) % 1.0
+    transits = start + (first + np.arange(float(_DAYS))) / _TURNS_A_DAY
+    good = np.flatnonzero(_is_dark(ra, dec, transits, site))
+    return float(transits[good[0]]) if len(good) else next_dark_time(ra, dec, start, site)
 
 
 def _sun_longitudes(mjd: Float) -> Float:

@@ -84,7 +84,7 @@ def nominal_exposure(
     mission : MissionConfiguration
         Mission parameters.
     mjd : float, optional
-        Start of the exposure (MJD, UTC). By default the first date at which the place can be observed.
+        Start of the exposure (MJD, UTC). By default the date of `ground_surveys.first_date`.
 
     Returns
     -------

@@ -48,7 +48,7 @@ class Pointing:
         Position angle of the focal plane's y axis in degrees, from north through east.
     mjd : float, optional
         Start of the exposure (MJD, UTC). None for the first date after the launch of the mission at which the Sun
-        allows the pointing (Euclid), or at which the field is up at night (ground cameras).
+        allows the pointing (Euclid), or at which the field crosses the meridian at night (ground cameras).
     detectors : tuple of str
         Names of detectors to render; () for all detectors of the camera.
     centre_on : str, optional
