@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +14,13 @@ from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.tables.exposures import SELECTION_BANDS
 from truesky.api import added
 from truesky.render import detector_inputs
+from truesky.render.channels.aim import Aim
 from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.exposure import render
+from truesky.render.exposure.records import Rows, Variant
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, truth_table
+from truesky.running import memory_reuse
 
 if TYPE_CHECKING:
     # Imported where it is used, because the import takes 0.4 s.
@@ -24,6 +28,14 @@ if TYPE_CHECKING:
 
 # Largest number of images that an error message lists.
 _MAX_LISTED = 8
+
+
+@dataclass(slots=True)
+class _SharedParts:
+    """Parts of an image that are the same with and without additional sources, and are computed once."""
+
+    drawings: DrawingStore
+    inputs: tuple[Aim, Rows, Variant] | None = None
 
 
 class LakeFrame:
@@ -54,8 +66,7 @@ class LakeFrame:
             raise no_image(root, exposure, detector, ((part["exposure_id"], part["detector"]) for part in facts))
         self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
         self._extra: Any = None
-        # The same image without and with additional sources shares the drawing of all other sources.
-        self._drawings = DrawingStore(added.is_added)
+        self._shared = _SharedParts(DrawingStore(added.is_added))
         self._rendered: RenderedDetector | None = None
         self._has_maps = False
 
@@ -82,20 +93,23 @@ class LakeFrame:
             raise BadInput("rows: this image has additional sources already, give all of them in one call")
         new = object.__new__(LakeFrame)
         new._root, new._facts, new._extra, new._rendered = self._root, self._facts, rows, None
-        new._drawings, new._has_maps = self._drawings, False
+        new._shared, new._has_maps = self._shared, False
         return new
 
     def _result(self, with_maps: bool = False) -> RenderedDetector:
         if self._rendered is None or (with_maps and not self._has_maps):
             request = self._facts["request"]
-            aim, rows, variant = detector_inputs.load_inputs(self._root, self._facts)
+            if self._shared.inputs is None:
+                self._shared.inputs = detector_inputs.load_inputs(self._root, self._facts)
+            aim, rows, variant = self._shared.inputs
             if self._extra is not None:
                 band = SELECTION_BANDS.get(aim.exposure.channel, aim.exposure.band)
                 rows = added.add_sources(rows, self._extra, band)
-            self._rendered = render.render(
-                aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
-                noise_seed=request["noise_seed"], drawings=self._drawings,
-            )  # fmt: skip
+            with memory_reuse.retain_freed_memory():
+                self._rendered = render.render(
+                    aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
+                    noise_seed=request["noise_seed"], drawings=self._shared.drawings,
+                )  # fmt: skip
             self._has_maps = with_maps
         return self._rendered
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from truesky.render.drawing import stamps
 from truesky.render.drawing.stamps import DrawnUnits, Tally
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,17 @@ class DrawingStore:
     is_additional: Callable[[Int], Bool]
     _key: object = field(default=None, repr=False)
     _drawn: _Drawn | None = field(default=None, repr=False)
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def keep(self, name: str, compute: Callable[[], _T]) -> _T:
+        """Return what `compute` returned when it was first called for this name.
+
+        The result must be the same with and without additional sources.
+        """
+        if name not in self._kept:
+            self._kept[name] = compute()
+        result: _T = self._kept[name]
+        return result
 
     def check(self, key: object) -> None:
         """Raise ValueError unless `key` (exposure, detector and accuracy) equals the key of the first call."""

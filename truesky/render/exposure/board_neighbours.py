@@ -138,34 +138,6 @@ def _noticeable_electrons(scene: Scene) -> float:
     return NOTICEABLE * scene.pixel_noise / abs(detector_crosstalk.coefficient(scene))
 
 
-def with_neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> Light:
-    """Add the charge on other detectors of the readout board, which causes crosstalk, to the inputs of an image.
-
-    Parameters
-    ----------
-    light : Light
-        Sources, PSF and scene (properties on which effects depend) of the detector that receives the crosstalk.
-    aim : Aim
-        Exposure and detector that receives the crosstalk.
-    rows : Rows
-        Catalogue rows, with the other detectors and their stars in `neighbours`.
-    variant : Variant
-        Mission database, accuracy, and the effects that the request switches on or off.
-    seed : int
-        Seed of the request.
-
-    Returns
-    -------
-    Light
-        `light` with the charge in its scene; unchanged without other detectors or without a PSF.
-    """
-    if not rows.neighbours or light.psf is None:
-        return light
-    return replace(
-        light, scene=replace(light.scene, neighbour_charge=neighbour_charge(light, aim, rows, variant, seed))
-    )
-
-
 def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> NeighbourCharge | None:
     """Return the charge on all other detectors of the board that is read at the same time as pixels of this detector.
 
@@ -180,9 +152,10 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
     -------
     NeighbourCharge or None
         Pixels of this detector, and for each the electrons of the other detectors that are read at the same time. None
-        if there is no noticeable charge.
+        without other detectors, without a PSF, or if there is no noticeable charge.
     """
-    assert light.psf is not None
+    if not rows.neighbours or light.psf is None:
+        return None
     scene, psf = light.scene, replace(light.psf, edges=None)
     min_electrons = _noticeable_electrons(scene)
     split_amplifiers = aim.channel.readout.split
@@ -219,7 +192,9 @@ def _bled_electrons(frame: Frame, scene: Scene) -> Frame:
     `frame` contains the expected electrons per pixel. They are first rounded down to whole electrons, and negative
     numbers are set to 0. `scene` contains the properties of the detector, such as its full well.
     """
-    return bleeding.apply(np.maximum(np.floor(frame), 0.0), bleeding.full_well(scene), scene.column_segments)
+    whole = np.floor(frame)
+    np.maximum(whole, 0.0, out=whole)
+    return bleeding.apply(whole, bleeding.full_well(scene), scene.column_segments)
 
 
 def _select_stars(

@@ -17,7 +17,7 @@ from truesky.render.drawing.stamps import Tally
 from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.effects.effect import Effect, apply_all
 from truesky.render.effects.readout import trap_pumping
-from truesky.render.effects.scene import Frame, Scene
+from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 from truesky.render.exposure import (
     board_neighbours,
     chromatic_response_map,
@@ -89,7 +89,12 @@ def render(
     is_dispersed = aim.channel.dispersion is not None and aim.sees_sky
     light = (visible_spectra if is_dispersed else visible_light)(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
-    light = board_neighbours.with_neighbour_charge(light, aim, rows, variant, seed)
+
+    def charge() -> NeighbourCharge | None:
+        return board_neighbours.neighbour_charge(light, aim, rows, variant, seed)
+
+    neighbour_charge = charge() if drawings is None else drawings.keep("neighbour charge", charge)
+    light = replace(light, scene=replace(light.scene, neighbour_charge=neighbour_charge))
     drawn, frame = (
         _draw_images(aim, light, truth, progress, drawings)
         if light.dispersed is None

@@ -39,7 +39,7 @@ COLUMNS = (
         "mjd",
         "d",
         "start of the exposure, MJD (UTC) or an ISO date (UTC)",
-        "the observation's `mjd`; Euclid: the first date the Sun allows; ground: when the field next crosses the meridian at night",
+        "the observation's `mjd`; Euclid: the first date the Sun allows; ground: its next transit at night",
     ),
     ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the channel of the observation, if it has only one"),
     ("camera", "", "camera in the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
