@@ -3,6 +3,7 @@
 import copy
 import pickle
 
+import galsim.des
 import numpy as np
 import pandas as pd
 import pytest
@@ -157,6 +158,29 @@ def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
         new.with_sources(NEW)
     with pytest.raises(BadInput, match=r"rendered for detector R22_S12 of exposure 1; it has .* of exposure"):
         lake.frame(1, "R22_S12")
+
+
+def test_the_psf_is_what_galsim_draws_from_the_psf_file(lake):
+    """Their light, peaks and sizes agree; the file has coarser samples, which causes most of the difference."""
+    path = lake._explorer._version("products").sidecar_path(lake.images()["path"][0])
+    file = path.with_name(path.name.replace("_science.fits", ".psf"))
+    light = fits.getheader(file, 1)["PSFLIGHT"]
+    drawn = lake.render(RA + 0.02, DEC, size=20.0, exposure=1, noise=False)
+    psf = drawn.psf()
+    ny, nx = drawn.electrons.shape
+    middle = len(psf.image) // 2
+    assert len(psf.image) % 2 == 1
+    # The PSF is centred on a pixel; GalSim counts pixels from 1.
+    place = galsim.PositionD(drawn.first_pixel[0] + (nx + 1) / 2, drawn.first_pixel[1] + (ny + 1) / 2)
+    model = galsim.des.DES_PSFEx(str(file)).getPSF(place).withFlux(light)
+    theirs = model.drawImage(nx=41, ny=41, scale=1.0, method="no_pixel").array
+    ours = psf.image[middle - 20 : middle + 21, middle - 20 : middle + 21]
+    assert ours.sum() == pytest.approx(theirs.sum(), rel=0.003)
+    np.testing.assert_allclose(ours, theirs, atol=0.01 * theirs.max())
+    moments = [galsim.hsm.FindAdaptiveMom(galsim.Image(image.astype(float))) for image in (ours, theirs)]
+    assert moments[0].moments_sigma == pytest.approx(moments[1].moments_sigma, rel=0.003)
+    assert moments[0].observed_shape.e1 == pytest.approx(moments[1].observed_shape.e1, abs=0.002)
+    assert moments[0].observed_shape.e2 == pytest.approx(moments[1].observed_shape.e2, abs=0.002)
 
 
 def test_the_psf_of_an_image(lake):
