@@ -14,18 +14,17 @@ from lake_schema.errors import BadInput
 from truesky.api.image_options import ImageOptions
 from truesky.api.lake import Lake
 from truesky.api.sky_images import SkyImage
+from truesky.commands import submit
 
 # Columns of the list of written files. `ra` and `dec` are the middle of the image.
 _COLUMNS = ("row", "file", "ra", "dec", "exposure", "detector", "first_column", "first_row", "sources")
-# Exit status of a command that was stopped by Ctrl-C.
-_INTERRUPTED = 130
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Write the images of the places in a table to a new folder as the parsed arguments say, print it, and return 0.
 
-    Return 130 if the user stops it. Raises BadInput if an argument is not valid or an image cannot be drawn. No folder
-    is left in both cases.
+    Raises BadInput if an argument is not valid or an image cannot be drawn, and SystemExit with the status 130 or 143
+    after Ctrl-C or SIGTERM. No folder is left in these cases.
     """
     out = Path(options.out)
     if out.exists():
@@ -35,15 +34,14 @@ def run_command(options: argparse.Namespace) -> int:
     for name in ("camera", "exposure", "date", "seed", "effects"):
         if (value := getattr(options, name)) is not None:
             chosen[name] = value
-    try:
-        with Lake(options.lake) as lake:
-            images = lake.stamps(options.places, options.size, options.band, options.processes, **chosen)
-            with user_files.create_folder(out) as folder:
-                rows = list(_write(images, folder))
-                _write_list(rows, folder / "stamps.csv")
-    except KeyboardInterrupt:
-        print(f"stopped; {user_files.format_path(out)} was not written")
-        return _INTERRUPTED
+    with (
+        submit.stop_on_signal("truesky stamps", f"{user_files.format_path(out)} was not written"),
+        Lake(options.lake) as lake,
+    ):
+        images = lake.stamps(options.places, options.size, options.band, options.processes, **chosen)
+        with user_files.create_folder(out) as folder:
+            rows = list(_write(images, folder))
+            _write_list(rows, folder / "stamps.csv")
     print(f"{out}: {len(rows)} images, listed in stamps.csv")
     return 0
 

@@ -115,20 +115,18 @@ def _run_program(command: Sequence[str]) -> int:
 
 
 @contextmanager
-def stop_on_signal(name: str) -> Iterator[None]:
+def stop_on_signal(name: str, outcome: str = "a second run continues where this one ended") -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the `with` block, stop the job that runs in it, and end this process.
 
-    A message that begins with `name`, the name of the command, is printed. The exit status is 130 after Ctrl-C and 143
-    after SIGTERM.
+    A message with `name`, the name of the command, and the outcome is printed. The exit status is 130 after Ctrl-C and
+    143 after SIGTERM.
     """
     previous_handlers = {number: signal.signal(number, _raise_interrupt) for number in _STOP_SIGNALS}
     try:
         yield
     except KeyboardInterrupt as stopped:
         number = 128 + int(stopped.args[0])
-        raise SystemExit(
-            command.print_error(name, "stopped; a second run continues where this one ended", number)
-        ) from None
+        raise SystemExit(command.print_error(name, f"stopped; {outcome}", number)) from None
     finally:
         for number, handler in previous_handlers.items():
             signal.signal(number, handler)

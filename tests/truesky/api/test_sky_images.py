@@ -1,7 +1,9 @@
 """Images of single places, and sources added to the images of a lake."""
 
 import copy
+import os
 import pickle
+import signal
 
 import galsim.des
 import numpy as np
@@ -16,6 +18,7 @@ import truesky
 from lake_schema.errors import BadInput
 from lake_schema.store import publish
 from tests import requests
+from truesky.api.sky_images import SkyImage
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.commands.__main__ import main
 from truesky.fluxes import compute_fluxes
@@ -293,6 +296,18 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
     assert main([*words[:3], str(tmp_path / "other"), *options, "--size", "4"]) == 2
     assert "table, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"places.csv", "new"}
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, number, status):
+    pd.DataFrame(PLACES)[:2].to_csv(tmp_path / "places.csv", index=False)
+    monkeypatch.setattr(SkyImage, "write", lambda image, path: os.kill(os.getpid(), number))
+    words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "stamps")]
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--band", "lsst_r", "--processes", "1"])
+    assert ended.value.code == status
+    assert f"stopped; {tmp_path / 'stamps'} was not written" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"places.csv"}
 
 
 @pytest.mark.parametrize(
