@@ -213,12 +213,15 @@ class MissionConfiguration:
         chosen = dict(self._parameters_by_key)
         with Mistakes() as mistakes:
             for name, (value, unit) in overrides.items():
-                chosen[name] = mistakes.read(_override_record, self._parameters_by_key, name, value, unit)
-        names = tuple(sorted({*self.overridden, *overrides}))
-        configuration = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
-        for name in names:
-            if detector_overrides.split_name(name, chosen)[0] != name:
-                detector_overrides.check_override(name, configuration)
+                record: Parameter | None = mistakes.read(_override_record, self._parameters_by_key, name, value, unit)
+                if record is not None:
+                    chosen[name] = record
+            names = tuple(sorted({*self.overridden, *overrides}))
+            configuration = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
+            for name in names:
+                key, _ = detector_overrides.split_name(name, self._parameters_by_key)
+                if name in chosen and key != name:
+                    mistakes.read(detector_overrides.check_override, name, configuration)
         return configuration
 
     @property
@@ -325,7 +328,7 @@ def _override_record(parameters: Mapping[str, Parameter], name: str, value: floa
     where = f"mission override {name}"
     key, _ = detector_overrides.split_name(name, parameters)
     if key not in parameters:
-        suggestion = spelling.did_you_mean(name, parameters)
+        suggestion = spelling.did_you_mean(key, parameters)
         raise BadInput(f"{where}: the mission database has no such parameter: {suggestion or _LISTING_HINT}")
     if not math.isfinite(value):
         raise BadInput(f"{where} = {value} is not finite")

@@ -89,6 +89,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -464,20 +465,32 @@ def _mission(table: Toml, folder: Path) -> MissionChoice:
         read = mistakes.read
         ladder = read(_strings, table, "mission.ladder", STATUSES) or LADDER
         overrides = read(_as_table, table.get("overrides", {}), "mission.overrides", None) or {}
-        chosen = tuple(sorted((key, read(_override, value, key)) for key, value in overrides.items()))
         cameras = read(files.read_cameras, read(_strings, table, "mission.cameras") or (), folder)
+        # Without the user's cameras, the names of their parameters are not known.
+        units = instruments.parameter_units(cameras) if overrides and cameras is not None else {}
+        values = {
+            name: read(_override, value, name, name == key, units)
+            for key, entry in (overrides.items() if units else ())
+            for name, value in instruments.override_values(key, entry)
+        }
+        chosen = tuple(sorted(_without_none(values).items()))
+        if len(chosen) < len(values):
+            read(checks.check_mission, MissionChoice(ladder, chosen, cameras))
     return MissionChoice(ladder, chosen, cameras)
 
 
-def _override(value: object, key: str) -> Override:
-    path = f"mission.overrides.{key}"
+def _override(value: object, name: str, has_quotes: bool, units: Mapping[str, str]) -> Override:
+    path = f"mission.overrides.{name}"
+    problem, line = instruments.explain_override(name, value, units)
+    assigned = path if isinstance(value, dict) else f"{path} = {_quote_value(value)}"
+    if problem:
+        raise BadInput(f"{assigned}: {problem}{f' write {line}' if problem.endswith('?') else ''}")
+    if not has_quotes:
+        raise BadInput(f"{path}: write the name of the parameter in quotes, such as {line}")
     if not isinstance(value, dict):
-        raise BadInput(f"{path} = {_quote_value(value)} has no unit: write {instruments.example_override(key, value)}")
-    if value and not value.keys() & {"value", "unit"}:
-        form = instruments.example_override(key, value)
-        raise BadInput(f"{path}: write the name of the parameter in quotes, such as {form}")
+        raise BadInput(f"{assigned} has no unit: write {line}")
     if "value" in value and "unit" not in value:
-        raise BadInput(f"{path}.unit is missing: write {instruments.example_override(key, value)}")
+        raise BadInput(f"{path}.unit is missing: write {line}")
     table = _as_table(value, path, ("value", "unit"))
     with Mistakes() as mistakes:
         number = mistakes.read(_number, table, f"{path}.value", -math.inf, math.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from lake_schema.tables.exposures import EUCLID_BANDS
 from lake_schema.texts import spelling
 
 if TYPE_CHECKING:
+    from lake_schema.mission.camera_folder import Camera
     from lake_schema.mission.configuration import MissionConfiguration
 
 # Camera of each channel of Euclid. The channel EXT has all ground cameras of the mission database.
@@ -23,6 +24,8 @@ _DEFAULT_BANDS = {"VIS": "euclid_vis", "NISP-P": "euclid_h", "NISP-S": "nisp_red
 _DEFAULT_GROUND_BAND = "_r"
 # Largest number of detectors that an error message suggests.
 _SUGGESTED_DETECTORS = 3
+# The same of mission parameters.
+_SUGGESTED_PARAMETERS = 3
 
 
 def camera_names(channel: str, mission: MissionConfiguration) -> tuple[str, ...]:
@@ -221,30 +224,59 @@ def _detector_names(camera: str, mission: MissionConfiguration) -> Sequence[str]
     return detector_overrides.detectors(camera if camera in EUCLID_CAMERAS.values() else f"ext.{camera}", mission)
 
 
-def example_override(name: str, value: object) -> str:
-    """Return a line of the section `mission.overrides` with the unit of a parameter, for an error message.
+def parameter_units(cameras: Sequence[Camera] = ()) -> dict[str, str]:
+    """Return the unit of each mission parameter by its name, with the parameters of the user's cameras."""
+    # Import here, because the import is slow and few requests have mission parameters.
+    from lake_schema.mission.configuration import resolve
+
+    return {parameter.key: parameter.unit for parameter in resolve(cameras=cameras).parameters}
+
+
+def override_values(name: str, value: object) -> Iterator[tuple[str, object]]:
+    """Yield the name and the value of each mission parameter under a key of `mission.overrides`.
+
+    If a user writes names without quotes, such as vis.gain, the value of the key `vis` is a table of parameters.
+    """
+    if isinstance(value, dict) and value and not value.keys() & {"value", "unit"}:
+        for part, inner in value.items():
+            yield from override_values(f"{name}.{part}", inner)
+    else:
+        yield name, value
+
+
+def explain_override(name: str, value: object, units: Mapping[str, str]) -> tuple[str, str]:
+    """Return the problem with the name of a parameter in `mission.overrides`, and a correct line of this section.
 
     Parameters
     ----------
     name : str
-        Name of a mission parameter, or its beginning if the user wrote it without quotes.
+        Name of the parameter in the request.
     value : object
-        Value of this key in the request. It is a table of the rest of the name if the quotes are missing.
+        Its value in the request.
+    units : mapping of str to str
+        Units of all parameters, from `parameter_units`.
 
     Returns
     -------
-    str
-        Text such as '"vis.gain" = { value = 3.0, unit = "electron / adu" }', with ".." for unknown parts.
+    problem : str
+        Sentence with the most similar names if no such parameter exists, else "".
+    line : str
+        Text such as '"vis.gain" = { value = 3.0, unit = "electron / adu" }', with ".." for unknown parts. It has the
+        most similar name if no such parameter exists.
     """
-    # Import here, because the import is slow and few requests have such a mistake.
     from lake_schema.mission import detector_overrides
-    from lake_schema.mission.configuration import resolve
 
-    while isinstance(value, dict) and value and not value.keys() & {"value", "unit"}:
-        part, value = next(iter(value.items()))
-        name = f"{name}.{part}"
+    problem, (key, _) = "", detector_overrides.split_name(name, units)
+    if key not in units:
+        # The names of all parameters of a camera begin with the same word, which would make them similar.
+        camera, _, rest = key.partition(".")
+        others = [other.removeprefix(f"{camera}.") for other in units if other.startswith(f"{camera}.")]
+        similar = [f"{camera}.{other}" for other in spelling.closest_names(rest, others, _SUGGESTED_PARAMETERS)]
+        similar = similar if others else spelling.closest_names(key, units, _SUGGESTED_PARAMETERS)
+        hint = f"did you mean {spelling.join_words(similar)}?" if similar else "truesky mission list prints all names"
+        problem = f"no parameter {key} exists; {hint}"
+        if similar:
+            name, key = similar[0] + name.removeprefix(key), similar[0]
     number = value.get("value") if isinstance(value, dict) else value
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-    units = {parameter.key: parameter.unit for parameter in resolve().parameters}
-    unit = units.get(detector_overrides.split_name(name, units)[0], "..")
-    return f'"{name}" = {{ value = {number if is_number else ".."}, unit = "{unit}" }}'
+    return problem, f'"{name}" = {{ value = {number if is_number else ".."}, unit = "{units.get(key, "..")}" }}'

@@ -105,8 +105,14 @@ def _places_of_parameters(values: Toml) -> dict[str, str]:
         for key, value in values.items()
         if key not in _SECTIONS["mission"] and ("." in key or isinstance(value, dict))
     }
+    units = instruments.parameter_units() if parameters else {}
+    lines = {
+        key: instruments.explain_override(*next(instruments.override_values(key, value)), units)
+        for key, value in parameters.items()
+    }
     return {
-        key: f"[mission.overrides] as {instruments.example_override(key, value)}" for key, value in parameters.items()
+        key: f"[mission.overrides] as {line}{f' ({problem})' if problem else ''}"
+        for key, (problem, line) in lines.items()
     }
 
 
@@ -116,14 +122,20 @@ def _position(message: str, value: Any) -> list[int]:
     A message begins with the path of a key. The place has the number of each part of the path in its table or list.
     `value` is the whole request.
     """
-    place = []
-    for name, number in re.findall(r"([\w-]+)|\[(\d+)\]", message.split(" ", 1)[0].rstrip(":")):
-        if number and isinstance(value, list) and int(number) < len(value):
-            place.append(int(number))
-            value = value[int(number)]
-        elif isinstance(value, dict) and name in value:
-            place.append(list(value).index(name))
-            value = value[name]
+    place, path = [], message.split(" ", 1)[0].rstrip(":")
+    while path:
+        index = re.match(r"\[(\d+)\]", path)
+        # The name of a parameter, such as "vis.gain", is one key.
+        keys = (
+            [key for key in value if re.match(re.escape(key) + r"(?![\w-])", path)] if isinstance(value, dict) else []
+        )
+        if index and isinstance(value, list) and int(index[1]) < len(value):
+            place.append(int(index[1]))
+            value, path = value[int(index[1])], path[index.end() :].lstrip(".")
+        elif keys:
+            key = max(keys, key=len)
+            place.append(list(value).index(key))
+            value, path = value[key], path[len(key) :].lstrip(".")
         else:
             # Missing keys come first at the top of the file, and otherwise after the other keys of their table.
             place.append(len(value) if place and isinstance(value, (dict, list)) else -1)

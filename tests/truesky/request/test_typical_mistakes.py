@@ -223,8 +223,28 @@ MISTAKES = {
     ),
     "an unknown parameter without a unit": (
         section("mission.overrides", '"vis.gian" = "x"'),
-        "mission.overrides.vis.gian = 'x' has no unit",
-        'write "vis.gian" = { value = .., unit = ".." }',
+        "mission.overrides.vis.gian = 'x': no parameter vis.gian exists",
+        'did you mean vis.gain? write "vis.gain" = { value = .., unit = "electron / adu" }',
+    ),
+    "a parameter of a detector misspelt": (
+        section("mission.overrides", '"vis.readnoise@3-4" = 3.5'),
+        "mission.overrides.vis.readnoise@3-4 = 3.5: no parameter vis.readnoise exists",
+        'write "vis.read_noise@3-4" = { value = 3.5, unit = "electron" }',
+    ),
+    "a parameter without a camera": (
+        section("mission.overrides", "read_noise = 3.5"),
+        "mission.overrides.read_noise = 3.5: no parameter read_noise exists",
+        "did you mean vis.read_noise, nisp.read_noise or ext.hsc.read_noise?",
+    ),
+    "a parameter of no similar name": (
+        section("mission.overrides", '"vis.qe" = 0.9'),
+        "mission.overrides.vis.qe = 0.9: no parameter vis.qe exists",
+        "truesky mission list prints all names",
+    ),
+    "a parameter misspelt in another section": (
+        section("mission", '"vis.readnoise" = 3.5'),
+        "mission.vis.readnoise is not a key",
+        'as "vis.read_noise" = { value = 3.5, unit = "electron" } (no parameter vis.readnoise exists; did you',
     ),
     "a negative parameter": (
         section("mission.overrides", '"vis.read_noise" = { value = -3, unit = "electron" }'),
@@ -276,6 +296,17 @@ def test_after_a_suggestion_long_lists_are_left_out(tmp_path, text, line):
     (message,) = read_valid_parts(tomllib.loads(text), tmp_path).messages
     assert message.startswith(line)
     assert message.endswith("?")
+
+
+def test_all_wrong_values_of_parameters_are_reported_in_the_order_of_the_file(tmp_path):
+    lines = (
+        '"vis.readnoise" = { value = 3.5, unit = "electron" }\n"vis.gain" = 3.5\nvis.bais = 1\nvis.full_well = 1\n'
+        '"vis.read_noise" = { value = 3.5, unit = "mm" }\n"vis.bias@9-9" = { value = 1, unit = "adu" }'
+    )
+    messages = read_valid_parts(tomllib.loads(section("mission.overrides", lines)), tmp_path).messages
+    names = [message.removeprefix("mission.overrides.").split(" ")[0].rstrip(":") for message in messages]
+    wrong = ["vis.readnoise", "vis.gain", "vis.bais", "vis.full_well", "vis.read_noise"]
+    assert names == [*wrong, "vis.bias@9-9"]
 
 
 def test_there_are_more_than_60_mistakes():
