@@ -6,13 +6,16 @@ Checks of single keys are in the modules that read them.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.tables.exposures import RENDERED_TYPES
+from truesky.request import instruments
 from truesky.request.files import Ingest
-from truesky.request.schema import MissionChoice, Request, Stars
+from truesky.request.schema import MissionChoice, Override, Request, Stars
+from truesky.request.toml_values import as_table, number, quote_value, string
 
 # Largest distance in degrees from the area to a pointing that may belong to it.
 _NEAR_AREA = 3.0
@@ -70,6 +73,49 @@ def check_bands(request: Request) -> None:
                     f"{pointing.band} is a user passband, for which camera {pointing.camera} has no zero point and sky"
                 )
                 mistakes.add(BadInput(f"pointing[{i}].band: {problem}: only VIS can observe in it"))
+
+
+def parse_override(value: object, name: str, has_quotes: bool, units: Mapping[str, str]) -> Override:
+    """Read a value of a mission parameter in the section `mission.overrides`.
+
+    Parameters
+    ----------
+    value : object
+        Value in the request, which must be a table with value and unit.
+    name : str
+        Name of the parameter.
+    has_quotes : bool
+        False if the user wrote the name without quotes, so that it is several keys.
+    units : mapping of str to str
+        Units of all parameters, from `instruments.parameter_units`.
+
+    Returns
+    -------
+    Override
+        The value.
+
+    Raises
+    ------
+    BadInput
+        If no such parameter exists, or the value or its unit is missing or of a wrong type. The message contains a
+        correct line.
+    """
+    path = f"mission.overrides.{name}"
+    problem, line = instruments.explain_override(name, value, units)
+    assigned = path if isinstance(value, dict) else f"{path} = {quote_value(value)}"
+    if problem:
+        raise BadInput(f"{assigned}: {problem}{f' write {line}' if problem.endswith('?') else ''}")
+    if not has_quotes:
+        raise BadInput(f"{path}: write the name of the parameter in quotes, such as {line}")
+    if not isinstance(value, dict):
+        raise BadInput(f"{assigned} has no unit: write {line}")
+    if "value" in value and "unit" not in value:
+        raise BadInput(f"{path}.unit is missing: write {line}")
+    table = as_table(value, path, ("value", "unit"))
+    with Mistakes() as mistakes:
+        amount = mistakes.read(number, table, f"{path}.value", -math.inf, math.inf)
+        unit = mistakes.read(string, table, f"{path}.unit")
+    return Override(amount, unit)
 
 
 def check_mission(choice: MissionChoice) -> MissionConfiguration:

@@ -89,7 +89,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -469,7 +468,7 @@ def _mission(table: Toml, folder: Path) -> MissionChoice:
         # Without the user's cameras, the names of their parameters are not known.
         units = instruments.parameter_units(cameras) if overrides and cameras is not None else {}
         values = {
-            name: read(_override, value, name, name == key, units)
+            name: read(checks.parse_override, value, name, name == key, units)
             for key, entry in (overrides.items() if units else ())
             for name, value in instruments.override_values(key, entry)
         }
@@ -477,25 +476,6 @@ def _mission(table: Toml, folder: Path) -> MissionChoice:
         if len(chosen) < len(values):
             read(checks.check_mission, MissionChoice(ladder, chosen, cameras))
     return MissionChoice(ladder, chosen, cameras)
-
-
-def _override(value: object, name: str, has_quotes: bool, units: Mapping[str, str]) -> Override:
-    path = f"mission.overrides.{name}"
-    problem, line = instruments.explain_override(name, value, units)
-    assigned = path if isinstance(value, dict) else f"{path} = {_quote_value(value)}"
-    if problem:
-        raise BadInput(f"{assigned}: {problem}{f' write {line}' if problem.endswith('?') else ''}")
-    if not has_quotes:
-        raise BadInput(f"{path}: write the name of the parameter in quotes, such as {line}")
-    if not isinstance(value, dict):
-        raise BadInput(f"{assigned} has no unit: write {line}")
-    if "value" in value and "unit" not in value:
-        raise BadInput(f"{path}.unit is missing: write {line}")
-    table = _as_table(value, path, ("value", "unit"))
-    with Mistakes() as mistakes:
-        number = mistakes.read(_number, table, f"{path}.value", -math.inf, math.inf)
-        unit = mistakes.read(_string, table, f"{path}.unit")
-    return Override(number, unit)
 
 
 def _truth(table: Toml) -> tuple[str, ...]:
