@@ -16,6 +16,7 @@ from typing import Any
 
 import duckdb
 
+from lake_schema import tables as declarations
 from lake_schema.errors import BadInput
 from truesky.explore.suggestions import circle_condition, plain_message, replace_function, suggest_tables
 
@@ -39,6 +40,22 @@ _GEOMETRY = {"area", "box", "centroid", "circle", "coord1", "coord2", "distance"
 _POINTS = {"circle", "point", "st_makepoint", "st_point"}
 # TOP of ADQL, which DuckDB cannot parse.
 _TOP = re.compile(r"\bSELECT\s+(?:(?:DISTINCT|ALL)\s+)?TOP\s+(\d+)\b", re.IGNORECASE)
+
+# Quantity and relative size of units that a user may write after a number; " is arcsec.
+_UNITS = {
+    "deg": ("angle", 3600.0), "degree": ("angle", 3600.0), "degrees": ("angle", 3600.0), "arcmin": ("angle", 60.0),
+    "arcsec": ("angle", 1.0), "arcseconds": ("angle", 1.0), "as": ("angle", 1.0), '"': ("angle", 1.0),
+    "mas": ("angle", 1e-3), "pc": ("distance", 1.0), "kpc": ("distance", 1e3), "mpc": ("distance", 1e6),
+    "ujy": ("flux", 1.0), "njy": ("flux", 1e-3), "jy": ("flux", 1e6), "mag": ("magnitude", 1.0),
+    "s": ("time", 1.0), "sec": ("time", 1.0), "min": ("time", 60.0), "h": ("time", 3600.0), "d": ("time", 86400.0),
+    "k": ("temperature", 1.0), "um": ("length", 1e4), "nm": ("length", 10.0), "angstrom": ("length", 1.0),
+    "pix": ("pixels", 1.0), "pixel": ("pixels", 1.0), "pixels": ("pixels", 1.0),
+}  # fmt: skip
+# A comparison of a column or function with a number that has a unit; {} is the unit.
+_WITH_UNIT = (
+    r"(?P<name>[\w.]+)\s*(?:\((?:[^()]|\([^()]*\))*\)\s*)?(?:<>|!=|[<>]=?|=|between\b|between\s+\S+\s+and\b)\s*"
+    r"(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*{}(?!\w)"
+)
 
 Tree = dict[str, Any]
 
@@ -183,6 +200,8 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
             if top := _TOP.search(text):
                 problem = f"TOP is possible only in TAP queries: write LIMIT {top[1]} at the end of the query"
                 raise BadInput(f"SQL: {one_line(problem)}") from None
+            if problem := _explain_unit(text, str(error)):
+                raise BadInput(f"SQL: {one_line(problem)}") from None
             raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
         except (duckdb.Error, UnicodeError) as error:
             raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
@@ -193,6 +212,42 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
     if answer.get("error") or len(answer["statements"]) != 1:
         raise BadInput(f"SQL: {one_line(answer.get('error_message', 'cannot be parsed'))}")
     return answer["statements"][0]["node"]  # type: ignore[no-any-return]
+
+
+def _explain_unit(text: str, message: str) -> str:
+    """Return a message about a number with a unit in a query, such as 0.5 arcsec, or "" for another syntax error.
+
+    Parameters
+    ----------
+    text : str
+        SQL of the query.
+    message : str
+        Message of DuckDB, which contains the word that it does not understand.
+    """
+    word = re.search(r'at or near "(\w+)"', message)
+    unit = word[1] if word else '"' if "unterminated quoted identifier" in message else ""
+    size = _UNITS.get(unit.lower())
+    if size is None or not (match := re.search(_WITH_UNIT.format(re.escape(unit)), text, re.IGNORECASE)):
+        return ""
+    blank = " " if unit.isalpha() else ""
+    problem = f"{match['number']}{blank}{unit} is not possible, because SQL takes plain numbers"
+    name = match["name"].rpartition(".")[2].lower()
+    if name == "separation" or re.search(
+        rf"\bseparation\s*\(.*\)\s*(?:as\s+)?{re.escape(name)}\b", text, re.IGNORECASE
+    ):
+        column_unit, owner = "deg", f"{name} is in deg"
+    else:
+        words = dict.fromkeys(re.findall(r"\w+", text.lower()))
+        used = [table for word in words if (table := declarations.find_table(word, [name]))]
+        units = {table.column(name).unit for table in used if name in table.names}
+        if len(units) != 1:
+            return f"{problem}: truesky describe LAKE TABLE prints the units of the columns"
+        (column_unit,) = units
+        owner = f"the unit of column {name} is {column_unit}" if column_unit else f"column {name} has no unit"
+    if (base := _UNITS.get(column_unit.lower())) and base[0] == size[0]:
+        number = f"{float(match['number']) * size[1] / base[1]:.6g}"
+        return f"{problem}: write {match['number'] if size == base else number}, because {owner}"
+    return f"{problem}: {owner}"
 
 
 def _describe_statements(types: Sequence[duckdb.StatementType]) -> str:

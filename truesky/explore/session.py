@@ -40,7 +40,7 @@ _LOCKS = (
 # Fraction of the memory limit of a query that DuckDB may fill; the rest is for the result.
 _SHARE = 0.5
 # Largest number of missing columns that a message names.
-_MAX_MISSING = 3
+_MAX_MISSING = 6
 OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
@@ -130,8 +130,9 @@ class Session:
     def _explain(self, error: Exception, query: Query) -> str:
         """Return the message of an error, or a message with suggestions if columns of the query do not exist."""
         columns = {table: self._rows[table].schema.names for table in query.tables if table in self._rows}
-        first = suggestions.missing_column(str(error)) if isinstance(error, duckdb.BinderException) else None
-        if first is None or not columns:
+        message = str(error) if isinstance(error, duckdb.BinderException) else ""
+        first, first_entry = suggestions.missing_column(message), suggestions.missing_entry(message)
+        if (first is None and first_entry is None) or not columns:
             return one_line(self._explain_code(error, query) or suggestions.plain_message(str(error)))
         texts = {text.lower(): text for text in shared_columns.quoted_texts(query.text, query.tree)}
         unrelated = shared_columns.unrelated_fluxes(columns)
@@ -145,14 +146,20 @@ class Session:
             and table not in unrelated
             and (names := self._column_names(name))
         }
-        names = list(self._missing_names(query, columns))
-        names = names if first in names else [first]
-        return "; ".join(
-            f"\"{texts[name]}\" means a column, because it is in double quotes: write '{texts[name]}' for the text"
-            if name in texts
-            else suggestions.explain_missing_column(name, columns, other_tables, str(error))
-            for name in names[:_MAX_MISSING]
+        missing = suggestions.MissingColumns(
+            shared_columns.entries_of_from(query.tree, columns), columns, other_tables, message
         )
+        references = list(self._missing_names(query, columns))
+        if first is not None and first not in [name for _, name in references]:
+            references = [("", first)]
+        problems = [*missing.explain_entries(shared_columns.unknown_entries(query.tree, columns))]
+        problems += [
+            f"\"{texts[name]}\" means a column, because it is in double quotes: write '{texts[name]}' for the text"
+            if name in texts and not entry
+            else missing.explain(name, entry)
+            for entry, name in references
+        ]
+        return _join(problems[:_MAX_MISSING]) or one_line(suggestions.plain_message(message))
 
     def _explain_code(self, error: Exception, query: Query) -> str:
         """Return a message if an error is about a text that is compared with a column of numeric codes, else ""."""
@@ -166,19 +173,22 @@ class Session:
                         return suggestions.explain_code(name, sign, text, codes)
         return ""
 
-    def _missing_names(self, query: Query, columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
-        """Yield the names of columns that do not exist in the tables of a query, in lower case; none with subqueries.
+    def _missing_names(self, query: Query, columns: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
+        """Yield the entry of FROM, "" for none, and the name of each column of a query that does not exist.
 
         DuckDB reports only one of them.
         """
-        for name in shared_columns.unknown_names(query.tree, columns):
+        for entry, name in shared_columns.unknown_columns(query.tree, columns):
             # Some names, such as current_date, need no column.
             try:
-                self._connect().sql(f'SELECT {shared_columns.quote([name])} FROM "{query.tables[0]}"')
+                if not entry:
+                    self._connect().sql(f'SELECT {shared_columns.quote([name])} FROM "{query.tables[0]}"')
+                    continue
             except duckdb.BinderException:
-                yield name
+                pass
             except duckdb.Error:
                 return
+            yield entry, name
 
     def _column_names(self, name: str) -> Sequence[str]:
         """Return the names of the columns of a table of the lake, [] for others and if the table cannot be opened."""
@@ -237,6 +247,17 @@ class Session:
             )
             fields.append(field.with_metadata(facts) if facts else field)
         return pa.schema(fields)
+
+
+def _join(problems: Sequence[str]) -> str:
+    """Join messages about missing columns. A list of columns that several of them contain is written once."""
+    texts: list[str] = []
+    lists = {""}
+    for problem in dict.fromkeys(problems):
+        beginning, _, columns = problem.partition(suggestions.LIST)
+        texts.append(problem if columns not in lists or not columns else beginning)
+        lists.add(columns)
+    return "; ".join(texts)
 
 
 def _open_table(root: Folder, name: str, key: str) -> OpenTable:

@@ -89,22 +89,93 @@ def unrelated_fluxes(tables: Collection[str]) -> set[str]:
     return {fluxes for fluxes, catalogue in _CATALOGUES.items() if catalogue not in read}
 
 
-def unknown_names(tree: Tree, columns: Mapping[str, Collection[str]]) -> list[str]:
-    """Return the names in a query that are neither columns of its tables nor aliases, in lower case and in order.
+def entries_of_from(
+    tree: Tree, columns: Mapping[str, Collection[str]]
+) -> dict[str, tuple[str, Collection[str] | None]]:
+    """Return the entries of all FROM clauses of a query by the names that references to their columns begin with.
 
-    The result is [] for a query with subqueries, WITH clauses or functions in FROM, whose columns are not known.
+    Parameters
+    ----------
+    tree : dict
+        Syntax tree of the query, from DuckDB.
+    columns : mapping of str to collection of str
+        Columns of the tables of the lake that the query reads, by the name of the table in lower case.
+
+    Returns
+    -------
+    dict of str to (str, collection of str or None)
+        Name of the table of the lake, "" for a subquery, and the names of the columns of each entry, None if they are
+        not known. A name that stands for several different entries is left out.
     """
+    clauses = {
+        str(clause["key"]).lower(): clause["value"]
+        for node in _nodes(tree)
+        for clause in (node.get("cte_map") or {}).get("map", ())
+    }
+    entries: dict[str, tuple[str, Collection[str] | None]] = {}
+    repeated = set()
+    kinds = ("BASE_TABLE", "SUBQUERY", "TABLE_FUNCTION")
+    nodes = [node for node in _nodes(tree) if node.get("type") in kinds and "sample" in node]
+    for node in sorted(nodes, key=lambda node: int(node["query_location"])):
+        source = _read_source(node, columns)
+        names, table = source.columns, str(node.get("table_name", "")).lower()
+        if not source.table and table in clauses and not node["column_name_alias"] and not clauses[table]["aliases"]:
+            names = _result_names(clauses[table]["query_node"])
+        name = str(node["alias"]).lower() or table
+        if name in entries and entries[name] != (source.table, names):
+            repeated.add(name)
+        entries[name] = (source.table, names)
+    return {name: entry for name, entry in entries.items() if name and name not in repeated}
+
+
+def unknown_columns(tree: Tree, columns: Mapping[str, Collection[str]]) -> list[tuple[str, str]]:
+    """Return the references in a query to columns that do not exist, in lower case and in order, each once.
+
+    Parameters
+    ----------
+    tree : dict
+        Syntax tree of the query, from DuckDB.
+    columns : mapping of str to collection of str
+        Columns of the tables of the lake that the query reads, by the name of the table in lower case.
+
+    Returns
+    -------
+    list of (str, str)
+        Entry of FROM and name of the column: ("f", "galaxy_id") for f.galaxy_id. The entry is "" for a reference
+        without one; a query with subqueries, WITH clauses or functions in FROM has no such items, because the columns
+        are not known.
+    """
+    entries = entries_of_from(tree, columns)
     sources = _read_from(tree["from_table"], columns).sources if tree.get("type") == "SELECT_NODE" else ()
-    if (
-        not all(source.table for source in sources)
-        or [node.get("type") for node in _nodes(tree)].count("SELECT_NODE") > 1
-    ):
-        return []
+    is_single = [node.get("type") for node in _nodes(tree)].count("SELECT_NODE") == 1
+    plain = _references({**tree, "type": ""}) if is_single and all(source.table for source in sources) else ()
     existing = {name.lower() for names in columns.values() for name in names}
     existing |= {str(node["alias"]).lower() for node in _nodes(tree) if node.get("alias")}
-    references = sorted(_references({**tree, "type": ""}), key=lambda reference: reference["query_location"])
-    names = dict.fromkeys(str(reference["column_names"][0]).lower() for reference in references)
-    return [name for name in names if name not in existing]
+    unknown = [(node["query_location"], "", str(node["column_names"][0]).lower()) for node in plain]
+    unknown = [reference for reference in unknown if reference[2] not in existing]
+    for location, name, column in _qualified_references(tree, columns):
+        if name in entries and (names := entries[name][1]) is not None and column not in names:
+            unknown.append((location, name, column))
+    return list(dict.fromkeys((name, column) for _, name, column in sorted(unknown)))
+
+
+def unknown_entries(tree: Tree, columns: Mapping[str, Collection[str]]) -> list[tuple[str, str]]:
+    """Return the references in a query to columns of entries that FROM does not have, as in `unknown_columns`."""
+    existing = {str(node["alias"]).lower() for node in _nodes(tree) if node.get("alias")}
+    existing |= {name.lower() for names in columns.values() for name in names} | {*entries_of_from(tree, columns)}
+    references = sorted(_qualified_references(tree, columns))
+    return list(dict.fromkeys((name, column) for _, name, column in references if name not in existing))
+
+
+def _qualified_references(tree: Tree, columns: Mapping[str, Collection[str]]) -> Iterator[tuple[int, str, str]]:
+    """Yield the place, the entry of FROM and the column of all references such as f.id, in lower case."""
+    requests = {table.rpartition(".")[0] for table in columns}
+    for node in _nodes(tree):
+        if node.get("class") == "COLUMN_REF" and len(node["column_names"]) > 1:
+            names = [str(name).lower() for name in node["column_names"]]
+            if len(names) > 2 and names[0] in requests:
+                del names[0]
+            yield node["query_location"], names[0], names[1]
 
 
 def quoted_texts(text: str, tree: Tree) -> list[str]:

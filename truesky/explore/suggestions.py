@@ -27,6 +27,8 @@ _MISSING_COLUMN = (
     re.compile(r'Column "(?P<name>.+?)" in \w+ list not found'),
 )
 _QUOTED = re.compile(r'"([^"]+)"')
+# Words before the list of all columns in a message.
+LIST = "; use one of "
 # Largest number of suggestions in a message.
 _MAX_SUGGESTIONS = 3
 # Smallest similarity of two names, as `difflib` measures it, from 0 to 1.
@@ -102,6 +104,7 @@ _SENTENCES = (
 )
 # Largest number of characters of the wrong word.
 _MAX_WORD = 60
+_NO_ALIASES: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +133,73 @@ def missing_column(message: str) -> str | None:
     return next((match["name"].lower() for match in matches if match), None)
 
 
+def missing_entry(message: str) -> str | None:
+    """Return the table or alias that FROM does not have according to a message of DuckDB, else None."""
+    match = re.search(r'Referenced table "(.+?)" not found', message)
+    return match[1] if match else None
+
+
 def refused_text(message: str) -> str | None:
     """Return the text in a query that a message of DuckDB refuses because a number is required, else None."""
     match = re.search(_REFUSED_TEXT, message)
     return match[1] if match else None
+
+
+@dataclass(frozen=True, slots=True)
+class MissingColumns:
+    """Messages about the columns of a query that do not exist.
+
+    Attributes
+    ----------
+    entries : mapping of str to (str, collection of str or None)
+        Entries of FROM by name or alias: the table of the lake, "" for a subquery, and the columns, None if unknown.
+    columns : mapping of str to collection of str
+        Columns of each table that the query reads.
+    other_tables : mapping of str to collection of str
+        Columns of the other tables of the lake that may be suggested.
+    message : str
+        Message of DuckDB.
+    """
+
+    entries: Mapping[str, tuple[str, Collection[str] | None]]
+    columns: Mapping[str, Collection[str]]
+    other_tables: Mapping[str, Collection[str]]
+    message: str
+
+    def explain(self, name: str, entry: str) -> str:
+        """Return a message about a column that an entry of FROM does not have; `entry` is "" if none is named."""
+        aliases = self._aliases()
+        if not entry:
+            return explain_missing_column(name, self.columns, self.other_tables, self.message, aliases)
+        table, names = self.entries[entry]
+        if table:
+            columns, others = {table: self.columns[table]}, {**self.columns, **self.other_tables}
+            of_query = {other: columns for other, columns in self.columns.items() if _targets(name, {other: columns})}
+            return explain_missing_column(name, columns, of_query or others, "", aliases, entry)
+        known = names or ()
+        columns = {
+            table: [column for column in all_names if column in known] for table, all_names in self.columns.items()
+        }
+        return explain_missing_column(name, {**columns, "": known}, {}, "", aliases, entry)
+
+    def _aliases(self) -> dict[str, str]:
+        """Return the first name that the query gives to each table."""
+        return {table: alias for alias, (table, _) in reversed([*self.entries.items()]) if table}
+
+    def explain_entries(self, references: Sequence[tuple[str, str]]) -> Iterator[str]:
+        """Yield messages about references such as ("f", "id"), which stands for f.id, if FROM has no entry f."""
+        aliases = self._aliases()
+        listed = [alias if table in (alias, "") else f"{alias} ({table})" for alias, (table, _) in self.entries.items()]
+        for entry, column in references:
+            if entry in aliases:
+                yield f"table {entry} has the alias {aliases[entry]} in this query: write {aliases[entry]}.{column}"
+        if unknown := dict.fromkeys(entry for entry, _ in references if entry not in aliases):
+            targets = [
+                _Synonym(entry, name, "") for entry, name in references if name in self.other_tables.get(entry, ())
+            ]
+            hint = _join_hint(targets, self.columns, self.other_tables) if len(targets) == len(unknown) else ""
+            noun = f"table or alias {spelling.join_words([*unknown])}"
+            yield f"FROM has no {noun}; it has {spelling.join_words(listed, 'and')}{hint}"
 
 
 def explain_missing_column(
@@ -141,6 +207,8 @@ def explain_missing_column(
     columns: Mapping[str, Collection[str]],
     other_tables: Mapping[str, Collection[str]],
     message: str = "",
+    aliases: Mapping[str, str] = _NO_ALIASES,
+    entry: str = "",
 ) -> str:
     """Return a message about a column that does not exist, with the columns that can be used in its place.
 
@@ -149,22 +217,31 @@ def explain_missing_column(
     name : str
         Name of the column in lower case.
     columns : mapping of str to collection of str
-        Columns of each table that the query reads.
+        Columns of each table that the query reads, or of the table of `entry`.
     other_tables : mapping of str to collection of str
-        Columns of the other tables of the lake that may be suggested.
+        Columns of the other tables of the query and of the lake that may be suggested.
     message : str, optional
         Message of DuckDB about the column, which contains the names of columns of subqueries.
+    aliases : mapping of str to str, optional
+        Names that the query gives to tables.
+    entry : str, optional
+        Name of the entry of FROM before the column: "f" for f.galaxy_id.
 
     Returns
     -------
     str
         The message, one line.
     """
-    problem = f"column {name} does not exist"
+    before = f"{entry}." if entry else ""
+    problem = f"column {before}{name} does not exist"
+    prefixes = {table: f"{aliases.get(table, table)}." for table in (*columns, *other_tables)}
+    if entry or len(columns) == 1:
+        prefixes |= dict.fromkeys(columns, before)
     if targets := _targets(name, columns):
-        return f"{problem}; use {_as_text(targets, with_tables=len(columns) > 1)}"
+        return f"{problem}; use {_as_text(targets, prefixes)}"
     if targets := _targets(name, other_tables):
-        return f"{problem}; use {_as_text(targets, with_tables=True)}{_join_hint(targets, columns, other_tables)}"
+        hint = "" if {target.table for target in targets} & {*aliases} else _join_hint(targets, columns, other_tables)
+        return f"{problem}; use {_as_text(targets, prefixes)}{hint}"
     # Names of columns of subqueries are in the message only.
     candidates = _QUOTED.findall(message.partition("Candidate bindings")[2].partition("LINE")[0])
     names = [*dict.fromkeys(column for table in columns.values() for column in table)]
@@ -173,11 +250,12 @@ def explain_missing_column(
         listed = spelling.join_words(bands, "and")
         return f"{problem}: the lake has fluxes only in {listed}; fluxes.bands in the request adds other bands"
     if similar:
-        return f"{problem}; did you mean {' or '.join(similar)}?"
+        return f"{problem}; did you mean {' or '.join(before + other for other in similar)}?"
     for synonym in difflib.get_close_matches(name, _synonyms(), _MAX_SUGGESTIONS, _MIN_SYNONYM_SIMILARITY):
         if targets := _targets(synonym, columns):
-            return f"{problem}; use {_as_text(targets, with_tables=len(columns) > 1)}"
-    return f"{problem}; use one of {', '.join(names)}; a text must be in single quotes"
+            return f"{problem}; use {_as_text(targets, prefixes)}"
+    quotes = "" if entry else "; a text must be in single quotes"
+    return f"{problem}{LIST}{', '.join(names)}{quotes}"
 
 
 def _join_hint(
@@ -257,11 +335,8 @@ def _similar(name: str, names: Sequence[str]) -> list[str]:
     ]
 
 
-def _as_text(targets: Sequence[_Synonym], with_tables: bool) -> str:
-    return " or ".join(
-        f"{target.table}.{target.column} ({target.meaning})" if with_tables else f"{target.column} ({target.meaning})"
-        for target in targets
-    )
+def _as_text(targets: Sequence[_Synonym], prefixes: Mapping[str, str]) -> str:
+    return " or ".join(f"{prefixes[target.table]}{target.column} ({target.meaning})" for target in targets)
 
 
 def plain_message(message: str) -> str:

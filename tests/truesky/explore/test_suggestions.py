@@ -144,6 +144,29 @@ def test_tables(name, found):
         ),
         ('SELECT id FROM galaxies WHERE kind IN ("Red", 1)', "column red does not exist"),
         ('SELECT id FROM galaxies WHERE "redshift" = 1', "column redshift does not exist; use z_obs"),
+        (
+            "SELECT f.galaxy_id, g.redshfit, ra FROM galaxies g JOIN galaxy_fluxes f USING (id) WHERE f.z > 1",
+            r"^SQL: column f.galaxy_id does not exist; use f.id \([^)]*\); column g.redshfit does not exist; "
+            r"use g.z_obs \([^)]*\) or g.z_true \([^)]*\); column f.z does not exist; use g.z_obs \([^)]*\) or g",
+        ),
+        (
+            "SELECT g.id, g.zz, h.zz FROM galaxies g, galaxies h",
+            "column g.zz .* use one of id, .*; column h.zz does not exist$",
+        ),
+        ("SELECT s.mm FROM (SELECT ra, z_obs AS zz FROM galaxies) s", "column s.mm does not exist; use one of ra, zz$"),
+        (
+            "WITH t AS (SELECT z_obs FROM galaxies) SELECT t.z FROM t",
+            r"column t.z does not exist; use t.z_obs \([^)]*\)$",
+        ),
+        (
+            "SELECT x.id, y.id FROM galaxies g JOIN galaxy_fluxes f USING (id)",
+            r"^SQL: FROM has no table or alias x or y; it has g \(galaxies\) and f \(galaxy_fluxes\)$",
+        ),
+        ("SELECT galaxies.id FROM galaxies g", "table galaxies has the alias g in this query: write g.id$"),
+        (
+            "SELECT galaxies.id, galaxy_fluxes.f_nu_euclid_vis FROM galaxies",
+            r"alias galaxy_fluxes; it has galaxies; add JOIN galaxy_fluxes USING \(id\)$",
+        ),
         ("SELECT id FROM galaxy", "'galaxy' is not a table of the lake; did you mean galaxies?"),
         ("SELECT id FROM nothing_like_it", r"is not a table of the lake \(galaxies, galaxy_fluxes"),
     ],
@@ -252,6 +275,36 @@ def test_other_messages_are_unchanged():
             r"^SQL: these parameters have no value: b, z; in Python write lake.sql\(query, b=..., z=...\)$",
         ),
         ("SELECT id FROM galaxies WHERE ra > 'high'", "^SQL: 'high' is text where a number is required$"),
+        (
+            "SELECT id FROM galaxies WHERE separation(ra, dec, 53.1, -27.8) < 1 arcsec AND z_obs > 1",
+            "^SQL: 1 arcsec is not possible, because SQL takes plain numbers: write 0.000277778, because .* in deg$",
+        ),
+        (
+            "SELECT separation(ra, dec, 1, 2) AS sep FROM galaxies WHERE sep > 1 arcmin",
+            "write 0.0166667, because sep is in deg$",
+        ),
+        (
+            "SELECT id FROM galaxies g WHERE g.disk_half_light_radius < 0.5 deg",
+            "write 1800, because the unit of column disk_half_light_radius is arcsec$",
+        ),
+        (
+            'SELECT id FROM galaxies WHERE disk_half_light_radius < 0.5"',
+            '^SQL: 0.5" is not possible, because SQL takes plain numbers: write 0.5, because the unit of',
+        ),
+        (
+            "SELECT id FROM galaxies WHERE ra BETWEEN 53 deg AND 54 deg",
+            "write 53, because the unit of column ra is deg$",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE disk_half_light_radius > 1 kpc",
+            ": the unit of column disk_half_light_radius is",
+        ),
+        ("SELECT id FROM galaxies WHERE z_obs > 1 s", "plain numbers: column z_obs has no unit$"),
+        (
+            "SELECT id FROM galaxy_fluxes WHERE f_nu_euclid_vis > 1 nJy",
+            "write 0.001, because .* f_nu_euclid_vis is uJy$",
+        ),
+        ("SELECT id FROM galaxies WHERE foo > 1 deg", "truesky describe LAKE TABLE prints the units of the columns$"),
         ("DELETE FROM galaxies", "^SQL: DELETE is not possible: write a SELECT, because the tables can only be read$"),
         ("SELECT 1; SELECT 2", r"^SQL: the text contains 2 statements \(SELECT, SELECT\): write a single SELECT$"),
         (" ", "^SQL: the query is empty: write a single SELECT$"),
