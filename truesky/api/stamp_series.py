@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.errors import BadInput
-from lake_schema.texts import spelling
+from lake_schema.errors import BadInput, bad_input
+from lake_schema.texts import spelling, synonyms
 from truesky.api import image_options, sky_images
 from truesky.api.image_options import ImageOptions, ImageRequest
 from truesky.api.sky_images import PainterTables, SkyImage, SkyPainter
@@ -58,9 +58,17 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
         If `ra` or `dec` is missing, the name of a column is misspelt, or a value is not valid. The message names the
         row, from 1.
     """
-    place, columns = injected_rows.table_columns(table, "table", _is_used)
+    titles: list[str] = []
+
+    def is_used(title: str) -> bool:
+        titles.append(title)
+        return _is_used(title)
+
+    place, columns = injected_rows.table_columns(table, "table", is_used)
     if missing := [name for name in ("ra", "dec") if name not in columns]:
-        raise BadInput(f"{place}: has no column {missing[0]}")
+        renamed = {name: title for title in titles for name in synonyms.find_columns(title, ("stars",), missing)}
+        hints = [f"{name}; did you mean {renamed[name]}? Rename it to {name}" for name in missing if name in renamed]
+        raise bad_input(f"{place}: has no column {text}" for text in (hints or missing))
     base = image_options.check_request((0.0, 0.0), size, band, options)
     requests = []
     for row in range(len(columns["ra"])):

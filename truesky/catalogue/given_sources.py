@@ -9,7 +9,7 @@ Way's extinction `a_v`. Galaxies have no emission lines.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from lake_schema.external.rows import RowBatch
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical
-from lake_schema.texts import spelling
+from lake_schema.texts import spelling, synonyms
 from truesky.catalogue.external import ingest, mapping, reading
 from truesky.catalogue.external.ingest import Split
 from truesky.catalogue.external.mapping import GALAXY_BOUNDS, Columns, Field
@@ -119,7 +119,8 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
         try:
             tables[name] = _read(file, name, source_tables, None if messages else area)
         except BadInput as error:
-            messages += error.messages
+            key = f"sources.{name}"
+            messages += [text if text.startswith(key) else f"{key}: {text}" for text in error.messages]
     refuse_mistakes(messages)
     if source_tables.spacing:
         tables = _on_grid(tables, area, source_tables.spacing)
@@ -215,6 +216,10 @@ def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]]) -> Sourc
     with Mistakes() as mistakes:
         for name in ("galaxies", "stars"):
             place, columns = tables.get(name, (Path(name), {}))
+            if "e1" in columns or "e2" in columns:
+                remedy = "give axis_ratio and position_angle (deg, north through east) in place of them"
+                mistakes.add(BadInput(f"{place}: columns e1 and e2 are not possible here: {remedy}"))
+                columns = {title: values for title, values in columns.items() if title not in ("e1", "e2")}
             values = mistakes.read(check_arrays, columns, name, place, {}) if columns else _no_sources(name)
             if values is not None:
                 checked[name] = {**values, "ra": sky.wrap_angle(values["ra"])}
@@ -323,23 +328,39 @@ def _check_titles(
     """
     messages = []
     unknown = [title for title in titles if title not in bounds]
+    meant = {title: " or ".join(names) for title in unknown if (names := find_columns(title, bounds))}
     for name in required:
         if name not in titles:
             hint = ""
-            longer = [title for title in unknown if title.lower().startswith(name)]
-            if similar := longer[:1] or spelling.closest_names(name, unknown, 1):
+            similar = [title for title in unknown if meant.get(title, name) == name]
+            longer = [title for title in similar if title in meant or title.lower().startswith(name)]
+            if similar := longer[:1] or spelling.closest_names(name, similar, 1):
                 unknown.remove(similar[0])
                 mapped = f", or map {_MAPPING.format(name, similar[0])}" if can_map else ""
                 hint = f"; did you mean {similar[0]}? Rename it to {name}{mapped}"
             messages.append(f"{file}: column {name} is missing{hint}")
     if unknown:
-        listed = [f"{title}{spelling.suggestion(title, bounds)}" for title in unknown]
+        listed = [
+            f"{title} (rename it to {meant[title]})"
+            if title in meant
+            else f"{title}{spelling.suggestion(title, bounds)}"
+            for title in unknown
+        ]
         allowed = f"; allowed are {', '.join(bounds)}" if set(listed) & set(unknown) else ""
         noun, them = ("unknown columns", "them") if len(unknown) > 1 else ("unknown column", "it")
-        mapped = f", or map {_MAPPING.format('mag', 'MAG')}" if can_map else ""
+        first = next((title for title in unknown if meant.get(title) in bounds), "MAG")
+        mapped = f", or map {_MAPPING.format(meant.get(first, 'mag'), first)}" if can_map else ""
         messages.append(f"{file}: {noun} {', '.join(listed)}{allowed}; remove or rename {them}{mapped}")
     messages += [f"{file}: has column {title} more than once" for title in titles if titles.count(title) > 1]
     refuse_mistakes(messages)
+
+
+def find_columns(title: str, bounds: Container[str] = _GALAXY_BOUNDS) -> list[str]:
+    """Return the properties that the title of a column can mean, such as half_light_radius for r_e, [] if unknown.
+
+    `bounds` are the properties that are allowed, by default those of galaxies.
+    """
+    return synonyms.find_columns(title, ("given_galaxies", "galaxies", "stars"), bounds)
 
 
 def _read(file: Path | None, name: str, source_tables: UserSources, area: Area | None) -> dict[str, Array]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from lake_schema.errors import BadInput, Mistakes
 from lake_schema.external import rows as external_rows
 from lake_schema.external.mistakes import TableMistakes
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
+from lake_schema.texts import spelling
 from truesky.catalogue import given_sources
+from truesky.catalogue.external.ellipticity import CONVENTIONS
 from truesky.catalogue.galaxies import morphology
 from truesky.request.files import SOURCES_KIND
 
@@ -117,7 +120,8 @@ def read_columns(rows: Any) -> dict[str, tuple[Path, dict[str, Float]]]:
         for given_name, table in tables.items():
             named_columns = mistakes.read(table_columns, table, given_name or "rows")
             if named_columns is not None:
-                is_galaxies = not given_name and _GALAXY_COLUMNS & set(named_columns[1])
+                titles = named_columns[1]
+                is_galaxies = _GALAXY_COLUMNS & {*titles, *chain(*map(given_sources.find_columns, titles))}
                 named[given_name or ("galaxies" if is_galaxies else "stars")] = named_columns
     return named
 
@@ -126,6 +130,9 @@ def _check(columns: Mapping[str, Array], name: str, place: Path, settings: Mappi
     count = len(next(iter(columns.values()), ()))
     properties = {title: values for title, values in columns.items() if title != "id"}
     options = settings if "e1" in properties or "e2" in properties else {}
+    if "e1" in properties and "ellipticity" not in settings:
+        conventions = spelling.join_words(CONVENTIONS)
+        raise BadInput(f"{place}: columns e1 and e2 require the argument ellipticity, their convention: {conventions}")
     values = given_sources.check_arrays(properties, name, place, options, _SPECTRA)
     mistakes = TableMistakes()
     for title, (allowed, text) in _FIXED.items():

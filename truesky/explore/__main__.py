@@ -41,6 +41,8 @@ def run_command(options: argparse.Namespace) -> int:
     It is 0, or 1 if the tables are listed and some of them are damaged. Errors are raised as LakeError.
     """
     if options.sql is not None:
+        if options.sql.strip().endswith(".sql") and " " not in options.sql.strip():
+            raise BadInput(f'{options.sql}: the query must be SQL, not a file: truesky sql LAKE "$(cat {options.sql})"')
         hide_pandas()
     # These imports take long, and must come after `hide_pandas`.
     from lake_schema.store import layout

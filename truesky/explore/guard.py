@@ -300,6 +300,9 @@ def _source(node: Tree, table_names: Collection[str], with_names: Collection[str
     WITH clauses that can be used there. BadInput is raised for entries that are not allowed.
     """
     kind = node["type"]
+    if kind == "SHOW_REF":
+        remedy = "truesky sql LAKE lists the tables, and truesky describe LAKE TABLE the columns"
+        raise BadInput(f"SQL: SHOW and DESCRIBE are not possible: {remedy} (in Python lake.tables, lake.columns)")
     if kind not in _SOURCES:
         raise BadInput(f"SQL: {_words(node)} is not possible here")
     if kind == "TABLE_FUNCTION" and node["function"].get("function_name", "").lower() not in _TABLE_FUNCTIONS:

@@ -7,18 +7,15 @@ Other messages of DuckDB become plain sentences.
 
 from __future__ import annotations
 
-import csv
 import difflib
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 from lake_schema import tables as declarations
 from lake_schema.texts import spelling
+from lake_schema.texts.synonyms import Synonym, load_synonyms
 
-_SYNONYMS = Path(__file__).with_name("synonyms.csv")
 # Messages of DuckDB about a column that does not exist. The named group is the name of the column.
 _MISSING_COLUMN = (
     re.compile(r'Referenced column "(?P<name>.+?)" (?:was )?not found'),
@@ -81,8 +78,16 @@ _SENTENCES = (
         "WHERE cannot contain window functions: write this condition in QUALIFY, after WHERE and GROUP BY",
     ),
     (
+        _REFUSED_TEXT.replace(r"([^\n]*?)", r"([-+]?[\d.]+) ?([^\d\n]+?)"),
+        r"'\1 \2' is text where a number is required: write \1, in the unit of the column",
+    ),
+    (
         _REFUSED_TEXT,
         r"'\1' is text where a number is required",
+    ),
+    (
+        r"\* expression without FROM clause",
+        "FROM is missing before the name of the table: SELECT * FROM galaxies",
     ),
     (r'Referenced table "(.+?)" not found!\s*Candidate tables: ([^\n]*)', r"FROM has no table or alias \1; it has \2"),
     (r"Cannot compare values of type (\S+) and type (\S+)", r"values of type \1 and \2 cannot be compared"),
@@ -105,26 +110,6 @@ _SENTENCES = (
 # Largest number of characters of the wrong word.
 _MAX_WORD = 60
 _NO_ALIASES: Mapping[str, str] = {}
-
-
-@dataclass(frozen=True, slots=True)
-class _Synonym:
-    """Meaning of a name: a table, a column ("" if the name means the table), and a phrase that explains the column."""
-
-    table: str
-    column: str
-    meaning: str
-
-
-@lru_cache(maxsize=1)
-def _synonyms() -> Mapping[str, Sequence[_Synonym]]:
-    synonyms: dict[str, list[_Synonym]] = {}
-    with _SYNONYMS.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            for name in row["names"].split():
-                targets = [_Synonym(table, row["column"], row["meaning"]) for table in row["tables"].split()]
-                synonyms.setdefault(name, []).extend(targets)
-    return synonyms
 
 
 def missing_column(message: str) -> str | None:
@@ -173,14 +158,14 @@ class MissingColumns:
             return explain_missing_column(name, self.columns, self.other_tables, self.message, aliases)
         table, names = self.entries[entry]
         if table:
-            columns, others = {table: self.columns[table]}, {**self.columns, **self.other_tables}
+            columns, other_tables = {table: self.columns[table]}, {**self.columns, **self.other_tables}
             of_query = {other: columns for other, columns in self.columns.items() if _targets(name, {other: columns})}
-            return explain_missing_column(name, columns, of_query or others, "", aliases, entry)
-        known = names or ()
+            return explain_missing_column(name, columns, of_query or other_tables, "", aliases, entry)
+        existing = names or ()
         columns = {
-            table: [column for column in all_names if column in known] for table, all_names in self.columns.items()
+            table: [column for column in all_names if column in existing] for table, all_names in self.columns.items()
         }
-        return explain_missing_column(name, {**columns, "": known}, {}, "", aliases, entry)
+        return explain_missing_column(name, {**columns, "": existing}, {}, "", aliases, entry)
 
     def _aliases(self) -> dict[str, str]:
         """Return the first name that the query gives to each table."""
@@ -195,7 +180,7 @@ class MissingColumns:
                 yield f"table {entry} has the alias {aliases[entry]} in this query: write {aliases[entry]}.{column}"
         if unknown := dict.fromkeys(entry for entry, _ in references if entry not in aliases):
             targets = [
-                _Synonym(entry, name, "") for entry, name in references if name in self.other_tables.get(entry, ())
+                Synonym(entry, name, "") for entry, name in references if name in self.other_tables.get(entry, ())
             ]
             hint = _join_hint(targets, self.columns, self.other_tables) if len(targets) == len(unknown) else ""
             noun = f"table or alias {spelling.join_words([*unknown])}"
@@ -232,11 +217,11 @@ def explain_missing_column(
     str
         The message, one line.
     """
-    before = f"{entry}." if entry else ""
-    problem = f"column {before}{name} does not exist"
+    qualifier = f"{entry}." if entry else ""
+    problem = f"column {qualifier}{name} does not exist"
     prefixes = {table: f"{aliases.get(table, table)}." for table in (*columns, *other_tables)}
     if entry or len(columns) == 1:
-        prefixes |= dict.fromkeys(columns, before)
+        prefixes |= dict.fromkeys(columns, qualifier)
     if targets := _targets(name, columns):
         return f"{problem}; use {_as_text(targets, prefixes)}"
     if targets := _targets(name, other_tables):
@@ -250,8 +235,8 @@ def explain_missing_column(
         listed = spelling.join_words(bands, "and")
         return f"{problem}: the lake has fluxes only in {listed}; fluxes.bands in the request adds other bands"
     if similar:
-        return f"{problem}; did you mean {' or '.join(before + other for other in similar)}?"
-    for synonym in difflib.get_close_matches(name, _synonyms(), _MAX_SUGGESTIONS, _MIN_SYNONYM_SIMILARITY):
+        return f"{problem}; did you mean {' or '.join(qualifier + other for other in similar)}?"
+    for synonym in difflib.get_close_matches(name, load_synonyms(), _MAX_SUGGESTIONS, _MIN_SYNONYM_SIMILARITY):
         if targets := _targets(synonym, columns):
             return f"{problem}; use {_as_text(targets, prefixes)}"
     quotes = "" if entry else "; a text must be in single quotes"
@@ -259,7 +244,7 @@ def explain_missing_column(
 
 
 def _join_hint(
-    targets: Sequence[_Synonym], columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
+    targets: Sequence[Synonym], columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
 ) -> str:
     """Return the JOIN that a query needs for columns of one other table, "" for several tables or without an id."""
     tables = {target.table for target in targets}
@@ -285,37 +270,37 @@ def suggest_tables(name: str, table_names: Collection[str]) -> Sequence[str]:
         Names of tables of the lake.
     """
     request, dot, table = name.rpartition(".")
-    meant = dict.fromkeys(synonym.table for synonym in _synonyms().get(table, ()) if not synonym.column)
+    meant = dict.fromkeys(synonym.table for synonym in load_synonyms().get(table, ()) if not synonym.column)
     existing = [request + dot + target for target in meant if request + dot + target in table_names]
     return existing[:_MAX_SUGGESTIONS] or _similar(name, sorted(table_names))
 
 
-def _targets(name: str, tables: Mapping[str, Collection[str]]) -> Sequence[_Synonym]:
+def _targets(name: str, tables: Mapping[str, Collection[str]]) -> Sequence[Synonym]:
     """Return the columns of tables that a name can mean, by the name itself, a synonym or a passband."""
-    targets: dict[tuple[str, str], _Synonym] = {}
+    targets: dict[tuple[str, str], Synonym] = {}
     for table, columns in tables.items():
         plain_name = table.rpartition(".")[2]
-        meant = [synonym for synonym in _synonyms().get(name, ()) if synonym.table == plain_name]
+        meant = [synonym for synonym in load_synonyms().get(name, ()) if synonym.table == plain_name]
         for synonym in (*meant, *_same_name(name, plain_name, columns), *_band_columns(name, plain_name, columns)):
             if synonym.column in columns:
-                targets.setdefault((synonym.table, synonym.column), _Synonym(table, synonym.column, synonym.meaning))
+                targets.setdefault((synonym.table, synonym.column), Synonym(table, synonym.column, synonym.meaning))
     return list(targets.values())[:_MAX_SUGGESTIONS]
 
 
-def _same_name(name: str, table: str, columns: Collection[str]) -> Iterator[_Synonym]:
+def _same_name(name: str, table: str, columns: Collection[str]) -> Iterator[Synonym]:
     declaration = declarations.find_table(table)
     if name in columns and declaration is not None and name in declaration.names:
-        yield _Synonym(table, name, declaration.column(name).doc)
+        yield Synonym(table, name, declaration.column(name).doc)
 
 
-def _band_columns(name: str, table: str, columns: Collection[str]) -> Iterator[_Synonym]:
+def _band_columns(name: str, table: str, columns: Collection[str]) -> Iterator[Synonym]:
     """Yield the columns f_nu_<band> of the passbands that a name such as "vis", "mag_r" or "lsst_r_flux" can mean."""
     band = _FLUX_NAME.sub("", name)
     for column in columns:
         if column.startswith(_BAND_PREFIX):
             full_name = column.removeprefix(_BAND_PREFIX)
             if band == full_name or full_name.endswith(f"_{band}"):
-                yield _Synonym(table, column, f"flux density, microjansky; mag_ab({column}) is its AB magnitude")
+                yield Synonym(table, column, f"flux density, microjansky; mag_ab({column}) is its AB magnitude")
 
 
 def _bands_for(name: str, tables: Mapping[str, Collection[str]]) -> list[str]:
@@ -335,7 +320,7 @@ def _similar(name: str, names: Sequence[str]) -> list[str]:
     ]
 
 
-def _as_text(targets: Sequence[_Synonym], prefixes: Mapping[str, str]) -> str:
+def _as_text(targets: Sequence[Synonym], prefixes: Mapping[str, str]) -> str:
     return " or ".join(f"{prefixes[target.table]}{target.column} ({target.meaning})" for target in targets)
 
 
@@ -470,6 +455,16 @@ def _syntax_hint(word: str, extract: re.Match[str] | None) -> str:
     keywords = {other.upper() for other in words}
     if "BETWEEN" in keywords and word.upper() in ("TO", ","):
         return "write BETWEEN 1 AND 2"
+    if word[0] in "<>=" and keywords & {"AND", "OR"}:
+        return "write the column in each comparison, such as z_obs > 1 AND z_obs < 2"
+    if word == "," and extract and re.search(r"\d,\d", extract["line"][len(extract["blanks"]) - 1 :][:3]):
+        return "write a decimal point in place of the comma"
+    if (ordering := keywords & {"ORDER", "GROUP"}) and "BY" not in keywords:
+        return f"write {' and '.join(f'{other} BY' for other in sorted(ordering))}"
+    if word.startswith("'") and "IS" in keywords:
+        return f"write = {word} in place of IS {word}"
+    if word.upper() == "WHERE" and keywords & {"GROUP", "ORDER", "LIMIT"}:
+        return "WHERE comes before GROUP BY, ORDER BY and LIMIT"
     if word == ":":
         return "write positions in degrees, such as -27.8"
     if "JOIN" in keywords and not keywords & {"ON", "USING"}:

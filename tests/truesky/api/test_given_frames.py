@@ -250,7 +250,10 @@ def test_magnification_makes_galaxies_brighter(given):
         ({**STAR, "a_v": [0.3]}, "rows: column a_v of row 1 is 0.3, but must be 0: give magnitudes"),
         ({**STAR, "id": [0.5]}, "rows: column id of row 1 is 0.5, but must be a whole number"),
         ({**DISC, "stamp": [3]}, "rows: column stamp of row 1 is 3, but must be -1"),
-        ({"galaxies": {**STAR, "e1": [0.1], "e2": [0.0]}}, "galaxies: e1, e2 require ellipticity"),
+        (
+            {"galaxies": {**STAR, "e1": [0.1], "e2": [0.0]}},
+            "galaxies: columns e1 and e2 require the argument ellipticity, .*: shear, d",
+        ),
         ({"galaxies": {**STAR, "kappa": [1.0], "gamma1": [0.0], "gamma2": [0.0]}}, "galaxies: .* near a caustic"),
         (3, "rows must be a table, a mapping of columns or a file, got int"),
         ("nowhere.csv", "nowhere.csv: no such file"),

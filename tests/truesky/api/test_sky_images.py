@@ -314,6 +314,7 @@ def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, n
     ("table", "options", "message"),
     [
         ({"ra": [RA]}, {}, "table: has no column dec"),
+        ({"RAJ2000": [RA], "DEJ2000": [DEC]}, {}, r"column ra; did you mean RAJ2000\? Rename it to ra; .* DEJ2000\?"),
         ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes': did you mean size"),
         ({"RA": [RA], "DEC": [DEC]}, {}, "table: column 'RA': did you mean ra"),
         ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),

@@ -1,5 +1,7 @@
 """Tables that list all sources of a request: the catalogue contains their values, and errors name their rows."""
 
+from pathlib import Path
+
 import galsim
 import h5py
 import numpy as np
@@ -110,7 +112,8 @@ BAD = [
         {"galaxies": TWO.replace("-0.02", "-0.95")},
         r"columns kappa, gamma1 and gamma2 of row 2 give an image near a caustic, but",
     ),
-    ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: unknown column shear; allowed are ra, dec, mag"),
+    ({"galaxies": TWO.replace("gamma1", "shear")}, r"unknown column shear \(rename it to gamma1 or gamma2\); remove"),
+    ({"galaxies": TWO.replace("gamma1", "foo")}, r"galaxies.csv: unknown column foo; allowed are ra, dec, mag"),
     ({"galaxies": TWO.replace("gamma1", "mag")}, r"galaxies.csv: has column mag more than once"),
     (
         {"galaxies": TWO.replace("gamma1", "ext_law")},
@@ -206,9 +209,9 @@ def test_all_mistakes_of_both_tables_are_reported_at_once(tmp_path):
     assert lines[0].startswith("sources.band = 'lsst_q' is not allowed: did you mean lsst_")
     assert "did you mean lsst_" in lines[0]
     assert lines[1:] == [
-        "galaxies.csv: column z_true of row 2 is -1, but must be from 0 to 15 (2 more rows)",
-        "galaxies.csv: column bulge_fraction of row 2 is 2, but must be from 0 to 1 (2 more rows)",
-        "stars.csv: column teff of row 1 is 4, but must be from 300 to 100000",
+        "sources.galaxies: galaxies.csv: column z_true of row 2 is -1, but must be from 0 to 15 (2 more rows)",
+        "sources.galaxies: galaxies.csv: column bulge_fraction of row 2 is 2, but must be from 0 to 1 (2 more rows)",
+        "sources.stars: stars.csv: column teff of row 1 is 4, but must be from 300 to 100000",
     ]
 
 
@@ -225,7 +228,11 @@ def test_all_mistakes_of_both_tables_are_reported_at_once(tmp_path):
         ),
         ('ra = "ra", dec = "dec", mag = "mag", frame = "north_east"', "frame requires e1 and e2"),
         ('ra = "ra", dec = "dec", mag = "mag", bulge_fracton = "x"', "did you mean bulge_fraction"),
-        ('ra = "ra", dec = "dec", mag = "MAG_I"', r"has no column MAG_I \(did you mean mag"),
+        (
+            'ra = "ra", dec = "dec", mag = "MAG_I"',
+            r"^sources.galaxies.columns.mag: .*galaxies.csv has no column MAG_I \(did you mean mag\?\); it has ra",
+        ),
+        ('ra = "ra", dec = "dec", mag = "mag", r_e = "mag"', r"columns.r_e .* did you mean half_light_radius\?$"),
     ],
 )
 def test_a_wrong_mapping_is_refused(tmp_path, columns, message):
@@ -251,6 +258,30 @@ def test_a_longer_name_of_a_column_is_one_line(tmp_path):
         given_sources.load(request.sources, request.area)
     (line,) = caught.value.messages
     assert "galaxies.csv: column mag is missing; did you mean magnitude? Rename it to mag" in line
+
+
+def test_names_of_other_catalogues_are_answered_with_names_of_columns(tmp_path):
+    text = "RAJ2000,DEJ2000,mag_r,r_e,n,foo\n53.1,-27.8,20,0.3,4,1\n"
+    request = asked(tmp_path, galaxies=text, stars=None)
+    with pytest.raises(BadInput) as caught:
+        given_sources.load(request.sources, request.area)
+    lines = [line.partition("galaxies.csv: ")[2].partition(", or map")[0] for line in caught.value.messages]
+    assert lines[:3] == [
+        "column ra is missing; did you mean RAJ2000? Rename it to ra",
+        "column dec is missing; did you mean DEJ2000? Rename it to dec",
+        "column mag is missing; did you mean mag_r? Rename it to mag",
+    ]
+    renamed = "r_e (rename it to half_light_radius), n (rename it to bulge_sersic_index), foo; allowed are "
+    assert lines[3].startswith(f"unknown columns {renamed}")
+    assert 'columns = { half_light_radius = "r_e", .. }' in caught.value.messages[3]
+
+
+def test_ellipticities_of_tables_in_memory_are_refused_with_the_remedy():
+    columns = {"ra": np.array([1.0]), "dec": np.array([2.0]), "mag": np.array([20.0]), "e1": np.array([0.1])}
+    with pytest.raises(
+        BadInput, match="rows: columns e1 and e2 are not possible here: give axis_ratio and position_an"
+    ):
+        given_sources.from_arrays({"galaxies": (Path("rows"), columns)})
 
 
 def test_positions_in_radians_are_named(tmp_path):

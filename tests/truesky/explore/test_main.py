@@ -25,6 +25,11 @@ def test_a_query_prints_its_rows(explored, capsys):
     assert capsys.readouterr().out.split() == ["n", "500", "1", "rows"]
 
 
+def test_a_file_in_place_of_a_query_is_refused(explored, capsys):
+    assert main(["query.sql", "--lake", str(explored)]) == 2
+    assert 'must be SQL, not a file: truesky sql LAKE "$(cat query.sql)"' in capsys.readouterr().err
+
+
 def test_values_are_printed_with_their_digits(explored, capsys):
     query = "SELECT 53.123456789::DOUBLE AS a, 0.1::FLOAT AS b, NULL AS c, repeat('x', 99) AS d FROM range(99)"
     assert main([query, "--lake", str(explored)]) == 0

@@ -19,7 +19,7 @@ from typing import Any
 from lake_schema import user_files
 from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.tables.galaxies import GALAXIES
-from lake_schema.texts import spelling
+from lake_schema.texts import spelling, synonyms
 from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
 from truesky.fluxes import passbands
 
@@ -157,6 +157,8 @@ class Columns:
         Convention of the properties `e1` and `e2`, one of `CONVENTIONS` in ellipticity.py; "" without them.
     frame : str
         Axes of the ellipticities, one of `FRAMES` in ellipticity.py.
+    path : str
+        Key of the request that contains the mapping, for messages.
     """
 
     fields: Mapping[str, Field]
@@ -168,6 +170,7 @@ class Columns:
     lines_magnified: bool = False
     ellipticity: str = ""
     frame: str = FRAMES[0]
+    path: str = ""
 
     def titles(self, in_companion: bool) -> list[str]:
         """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).
@@ -266,7 +269,9 @@ def parse_columns(
     fields = {}
     for key, entry in entries.items():
         if key not in legal:
-            messages.append(f"{path}.{key} is not a known property: {spelling.choices(key, list(legal))}")
+            meant = synonyms.find_columns(key, ("given_galaxies", "galaxies", "halos"), legal)
+            hint = f"did you mean {' or '.join(meant)}?" if meant else spelling.choices(key, list(legal))
+            messages.append(f"{path}.{key} is not a known property: {hint}")
         elif key not in legal_settings:
             try:
                 fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
@@ -275,11 +280,11 @@ def parse_columns(
     messages += _wrong_settings(settings, path)
     messages += _missing_keys(entries, path, required)
     if "mag" in fields and "band" in legal_settings and "band" not in settings:
-        messages.append(f"{path}: mag requires band, the name of its passband")
+        messages.append(f'{path}: mag requires band, the name of its passband: add a line such as band = "euclid_vis"')
     messages += _excluded_keys(fields, settings, path)
     refuse_mistakes(messages)
     companion_prefixes = tuple(settings.pop("beside", ()))
-    return Columns(fields, bounds, nullable, companion_prefixes=companion_prefixes, **settings)
+    return Columns(fields, bounds, nullable, companion_prefixes=companion_prefixes, path=path, **settings)
 
 
 def with_last_template(columns: Columns, last: int) -> Columns:
@@ -348,7 +353,8 @@ def _field(entry: Any, path: str) -> Field:
 
 def _missing_keys(entries: Collection[str], path: str, required: Sequence[Sequence[str]]) -> list[str]:
     missing = [" or ".join(group) for group in required if not any(key in entries for key in group)]
-    messages = [f"{path} must have {', '.join(missing)}"] if missing else []
+    example = f'add the name of its column, such as {missing[0].partition(" ")[0]} = ".."' if missing else ""
+    messages = [f"{path} must have {', '.join(missing)}: {example}"] if missing else []
     for group in _TOGETHER:
         first = next((key for key in group if key in entries), None)
         messages += [f"{path}: {first} requires {key}" for key in group if first and key not in entries]

@@ -6,6 +6,7 @@ mistakes: the file, the column and the first row of each, see `lake_schema.exter
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,9 @@ import numpy as np
 
 from lake_schema import user_files
 from lake_schema.arrays import Array
-from lake_schema.errors import BadInput, Mistakes
+from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.external import rows as external_rows
+from lake_schema.external.files import check_column_names
 from lake_schema.external.mistakes import TableMistakes, format_range
 from lake_schema.external.rows import RowBatch
 from lake_schema.tables.galaxies import GALAXIES
@@ -37,6 +39,8 @@ from truesky.fluxes import cosmology
 
 # Redshift from which the distances of galaxies with smaller redshifts are computed.
 MIN_REDSHIFT = 1e-4
+# Path of a key of a request, and largest number of keys whose missing columns have a message each.
+_IS_KEY, _MAX_KEYS = re.compile(r"[\w.]+"), 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +107,32 @@ def _read_file(file: Path, columns: Columns, kind: str, mistakes: TableMistakes)
         yield from _read_batches(file, columns, kind)
     except BadInput as error:
         present = _with_present_columns(file, columns, kind)
-        if len(present.fields) in (0, len(columns.fields)):
+        if len(present.fields) == len(columns.fields):
             raise
+        missing = {key: field for key, field in columns.fields.items() if key not in present.fields}
+        error = _with_keys(error, file, replace(columns, fields=missing), kind)
+        if not present.fields:
+            raise error from None
         mistakes.add(error)
         yield from _read_batches(file, present, kind)
+
+
+def _with_keys(error: BadInput, file: Path, missing: Columns, kind: str) -> BadInput:
+    """Return an error about missing columns of a file with the keys of the request that name them.
+
+    `missing` has the properties whose columns are missing.
+    """
+    if not _IS_KEY.fullmatch(missing.path):
+        return error
+    if len(missing.fields) > _MAX_KEYS:
+        return error.with_prefix(missing.path)
+    names, listed = external_rows.column_names(file, kind), Mistakes()
+    for key, field in missing.fields.items():
+        try:
+            check_column_names(file, names, field.titles())
+        except BadInput as absent:
+            listed.add(absent.with_prefix(f"{missing.path}.{key}"))
+    return bad_input(listed.messages)
 
 
 def _read_batches(file: Path, columns: Columns, kind: str) -> Iterator[tuple[RowBatch, Columns]]:

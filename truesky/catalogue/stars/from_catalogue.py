@@ -20,6 +20,7 @@ import numpy.typing as npt
 from lake_schema import sky, user_files
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput, refuse_mistakes
+from lake_schema.external.files import check_column_names
 from lake_schema.external.mistakes import TableMistakes, find_out_of_bounds
 from lake_schema.fits import external
 from lake_schema.ids import GENERATION_ORDER
@@ -137,7 +138,10 @@ def stars_of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
 
 
 def _read(file: Path, columns: Mapping[str, str]) -> dict[str, Array]:
-    table = _read_table(file, list(columns.values()))
+    try:
+        table = _read_table(file, list(columns.values()))
+    except BadInput as error:
+        raise error.with_prefix("stars.catalogue") from None
     labels = {key: title if title == key else f"{title} ({key})" for key, title in columns.items()}
     find_out_of_bounds(
         file,
@@ -180,15 +184,17 @@ def _read_table(file: Path, titles: list[str]) -> Mapping[str, Float]:
 def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
     with user_files.open_file(file, KIND) as binary, TextIOWrapper(binary, "utf-8", "replace") as stream:
         lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
-        head: list[str] = next(
-            (
-                candidate
-                for line in islice(lines, _MAX_HEADER_LINES)
-                if set(titles) <= set(candidate := _split_line(line))
-            ),
-            [],
-        )
+        head: list[str] = []
+        similar: list[str] = []
+        for line in islice(lines, _MAX_HEADER_LINES):
+            candidate = _split_line(line)
+            if set(titles) <= set(candidate):
+                head = candidate
+                break
+            similar = max(similar, candidate, key=lambda names: len(set(titles) & set(names)))
         if not head:
+            if set(titles) & set(similar):
+                check_column_names(file, similar, titles)
             raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines has the columns {', '.join(titles)}")
         if duplicates := [title for title in titles if head.count(title) > 1]:
             raise BadInput(f"{file}: the column name {duplicates[0]} must not occur twice")

@@ -68,7 +68,8 @@ def test_missing_columns_and_wrong_values_are_reported_together(tmp_path):
     columns["Redshift"] = columns.pop("Z")
     lines = mistakes(tmp_path, written(tmp_path, columns), galaxies({**GALAXIES, "z_true": "redshift"}))
     assert lines == [
-        "0.parquet has no column redshift (did you mean Redshift?); it has ID, RA, DEC, MAG, M, Redshift",
+        "ingest.galaxies.columns.z_true: 0.parquet has no column redshift (did you mean Redshift?); "
+        "it has ID, RA, DEC, MAG, M, Redshift",
         "0.parquet: column DEC (dec) of row 3 is 95, but must be from -90 to 90 deg",
         "0.parquet: column MAG (mag) of row 4 is 99, but must be from -5 to 60",
     ]
@@ -148,7 +149,7 @@ def test_all_mistakes_of_a_mapping_are_reported_at_once():
         galaxies({"ra": "RA", "mag": {"column": "M", "times": 2}, "bulge_fracton": "B", "kappa": "K"})
     lines = caught.value.messages
     assert [line.removeprefix("ingest.galaxies.columns") for line in lines[2:]] == [
-        " must have dec, z_true or z_obs",
+        ' must have dec, z_true or z_obs: add the name of its column, such as dec = ".."',
         ": kappa requires gamma1",
         ": kappa requires gamma2",
     ]
