@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import ParamSpec, TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.texts import spelling
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -25,7 +26,7 @@ _ANGLE = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s]*
 
 
 def refuse_missing(call: str) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
-    """Return a decorator of a function that raises BadInput instead of TypeError if a required argument is missing.
+    """Return a decorator of a function that raises BadInput instead of TypeError for missing and unknown arguments.
 
     The signature of the function does not change. `call` is an example of a call, for the message, such as
     "lake.render(ra, dec)". If one of the arguments is a SkyCoord, the message says how to give it as numbers.
@@ -33,11 +34,15 @@ def refuse_missing(call: str) -> Callable[[Callable[_Parameters, _Result]], Call
 
     def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         signature = inspect.signature(function)
+        takes_any = inspect.Parameter.VAR_KEYWORD in [parameter.kind for parameter in signature.parameters.values()]
         required = [name for name, parameter in signature.parameters.items() if _is_required(parameter)]
 
         @functools.wraps(function)
         def call_function(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
             given: list[str] = [*list(signature.parameters)[: len(args)], *map(str, kwargs)]
+            for name in [] if takes_any else [name for name in given if name not in signature.parameters]:
+                hint = spelling.choices(name, [other for other in signature.parameters if other != "self"])
+                raise BadInput(f"{function.__name__} has no argument {name}: {hint}")
             if missing := [name for name in required if name not in given]:
                 values: list[object] = [*args, *kwargs.values()]
                 for name, value in zip(given, values, strict=False):
@@ -95,7 +100,7 @@ def check_degrees(name: str, value: object, lo: float = -math.inf, hi: float = m
     """
     refuse_coordinates(name, value)
     refuse_angle(name, value, f"of degrees from {lo:g} to {hi:g}" if lo > -math.inf else "in degrees")
-    return check_number(name, value, lo, hi)
+    return check_number(name, value, lo, hi, "deg")
 
 
 def refuse_angle(name: str, value: object, form: str) -> None:
@@ -131,7 +136,7 @@ def refuse_angle(name: str, value: object, form: str) -> None:
         raise BadInput(f"{name} must be a number {form}, got {text}: write {number}")
 
 
-def check_number(name: str, value: object, lo: float = -math.inf, hi: float = math.inf) -> float:
+def check_number(name: str, value: object, lo: float = -math.inf, hi: float = math.inf, unit: str = "") -> float:
     """Return a number as a float if it lies within its bounds, which are included.
 
     Parameters
@@ -142,6 +147,8 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
         Value that the user gave.
     lo, hi : float, optional
         Smallest and largest number that is allowed. By default all numbers are allowed, including infinities.
+    unit : str, optional
+        Unit of the number, for the message.
 
     Returns
     -------
@@ -161,7 +168,7 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     except (TypeError, ValueError, OverflowError):
         raise BadInput(f"{name} = {value!r} is not a number") from None
     if not is_within:
-        raise OutOfRange(name, value, lo, hi)
+        raise OutOfRange(name, value, lo, hi, unit)
     return converted
 
 

@@ -18,6 +18,7 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout
 from lake_schema.store.manifest import sync, write_json
 from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.texts import spelling
 
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 # File in the folder of a request with the area of the sky that it covers. No table has this name.
@@ -35,8 +36,13 @@ def check_request(root: Folder, name: str) -> str:
 
     The message lists the names that the lake has.
     """
-    if layout.check_name(name) not in (existing := request_names(root)):
-        raise BadInput(f"lake {root} has no request {name}" + (f"; it has {', '.join(existing)}" if existing else ""))
+    existing = request_names(root)
+    if not isinstance(name, str) or name not in existing:
+        text = str(name)[:100]
+        reason = "" if layout.is_name(text) else ", because names have only small letters, digits, _ and -"
+        question = spelling.did_you_mean(text, existing)
+        listed = f"; {f'{question} ' if question else ''}it has {', '.join(existing)}" if existing else ""
+        raise BadInput(f"lake {root} has no request {text}{reason}{listed}")
     return name
 
 

@@ -62,6 +62,16 @@ def test_a_missing_argument_is_named():
     assert list(inspect.signature(area).parameters) == ["ra", "dec", "band", "size", "options"]
 
 
+def test_an_unknown_argument_is_named():
+    @arguments.refuse_missing("area(ra, dec)")
+    def area(ra, dec, band="r"):
+        return ra, dec, band
+
+    assert area(1, dec=2) == (1, 2, "r")
+    with pytest.raises(BadInput, match=r"^area has no argument bands: did you mean band\? allowed: ra, dec, band$"):
+        area(1, 2, bands="i")
+
+
 @pytest.mark.parametrize("value", [2.0, np.float64(2.0), "2", None, 0, 4, np.arange(2)])
 def test_another_whole_number_is_refused(value):
     with pytest.raises(BadInput, match=r"^bins = .*(outside \[1, 3\]|not a whole number)$"):

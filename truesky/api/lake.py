@@ -16,6 +16,8 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.fits.images import Image
+from lake_schema.tables import products
+from lake_schema.texts import spelling
 from truesky.api.tables import LakeTables
 
 if TYPE_CHECKING:
@@ -84,10 +86,13 @@ class Lake(LakeTables):
         Raises
         ------
         BadInput
-            If the lake has no table ``products``, or if requests have different versions of it and no request was
-            chosen.
+            If there is no such content, the lake has no table ``products``, or requests have different versions of it
+            and no request was chosen.
         """
         version = self._explorer._version("products")
+        contents = [name for name, _ in products.CONTENTS]
+        if content is not None and content not in contents:
+            raise BadInput(f"content = {content!r}: {spelling.choices(str(content), contents)}")
         files = version.rows().to_pandas()
         files["file"] = [f"products/v-{version.key}/{path}" for path in files["path"]]
         return files if content is None else files[files["content"] == content].reset_index(drop=True)

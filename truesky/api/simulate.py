@@ -62,6 +62,7 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
         raise error.with_prefix(_describe_request(request)) from None
 
 
+@arguments.refuse_missing('truesky.run("request.toml", "lake")')
 def run(
     request: str | Path | Mapping[str, Any],
     lake: str | Path,

@@ -206,6 +206,7 @@ class LakeTables:
         """
         return self._explorer.export(query, path, **parameters)
 
+    @arguments.refuse_missing('lake.hist("galaxies", "z_obs"), with a table and an SQL expression')
     def hist(
         self,
         table: str,
@@ -247,6 +248,7 @@ class LakeTables:
         """
         return self._explorer.hist(table, x, bins, span, where, weight)
 
+    @arguments.refuse_missing('lake.heatmap("galaxies", "ra", "dec"), with a table and two SQL expressions')
     def heatmap(
         self,
         table: str,
@@ -291,6 +293,7 @@ class LakeTables:
         """
         return self._explorer.heatmap(table, x, y, bins, span, where, weight)
 
+    @arguments.refuse_missing('lake.skymap("galaxies")')
     def skymap(
         self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
     ) -> tuple[Int, Float]:

@@ -66,15 +66,14 @@ class Explorer:
         self.versions: dict[str, read.Version] = {}
         self.damaged: dict[str, LakeError] = {}
         self._ambiguous: dict[str, LakeError] = {}
+        requests = request_links.request_names(self.root)
+        if request is not None:
+            requests = [request_links.check_request(self.root, request)]
         for table in (
             read.table_names(self.root) if request is None else request_links.tables_of_request(self.root, request)
         ):
             self._open(table, request, table)
-        for request_name in (
-            request_links.request_names(self.root)
-            if request is None
-            else [request_links.check_request(self.root, request)]
-        ):
+        for request_name in requests:
             for table in request_links.tables_of_request(self.root, request_name):
                 self._open(f"{request_name}.{table}", request_name, table)
         if not self.versions and not self.damaged:
@@ -288,6 +287,8 @@ class Explorer:
         -----
         BadInput is raised as by `sql`, if the path has another ending, or if the file type cannot hold the result.
         """
+        if Path(text.strip()).suffix.lower() in results.ENDINGS and " " not in text.strip():
+            raise BadInput(f"the query comes before the file: write lake.export(query, {text.strip()!r})")
         target = user_files.expand_path(path)
         results.write(self._process.ask(text, parameters, self.timeout), target)
         return target
@@ -443,7 +444,8 @@ def _pair(name: str, value: Any) -> tuple[Any, Any]:
     try:
         first, second = value
     except (TypeError, ValueError):
-        raise BadInput(f"{name} = {value!r} is not a pair") from None
+        example = "(100, 100) for x and y" if name == "bins" else "(0.0, 1.0), from the lowest to the highest edge"
+        raise BadInput(f"{name} = {value!r} is not a pair such as {example}") from None
     return first, second
 
 

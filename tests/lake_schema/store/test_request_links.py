@@ -46,6 +46,10 @@ def test_several_requests_require_a_name(two):
 def test_a_missing_name_is_refused(two):
     with pytest.raises(BadInput, match=r"has no request c; it has a, b"):
         read.version(two, "plain", request="c")
+    with pytest.raises(
+        BadInput, match=r"no request A, because names have only small letters.*; did you mean a\? it has"
+    ):
+        read.version(two, "plain", request="A")
     with pytest.raises(BadInput, match=r"no table halos of request a; it has plain, toy$"):
         read.version(two, "halos", request="a")
     with pytest.raises(BadInput, match="name"):

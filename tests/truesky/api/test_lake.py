@@ -92,6 +92,17 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         (lambda lake: lake.table("galaxies"), "has no table galaxies; it has plain"),
         (lambda lake: lake.sql("DELETE FROM plain"), "DELETE"),
         (lambda lake: lake.images(), "has no table products"),
+        (
+            lambda lake: lake.hist("plain", "id", range=(0, 1)),
+            "hist has no argument range: allowed: table, x, bins, span",
+        ),
+        (lambda lake: lake.heatmap("plain", "id"), r'y is missing: write lake.heatmap\("galaxies", "ra", "dec"\)'),
+        (
+            lambda lake: lake.skymap("plain", orders=5),
+            r"skymap has no argument orders: did you mean order\? allowed: table, order",
+        ),
+        (lambda lake: lake.export("few.csv", "SELECT id FROM plain"), r"write lake.export\(query, 'few.csv'\)$"),
+        (lambda lake: truesky.run("a.toml", "lake", detector="3-4"), r"no argument detector: did you mean detectors\?"),
         (lambda lake: lake.truth(1, "3-4"), "has no table products"),
         (lambda lake: lake.wcs("a.fits"), "has no table products"),
         (lambda lake: lake.extensions("a.fits"), "has no table products"),

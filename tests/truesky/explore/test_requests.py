@@ -59,6 +59,10 @@ def test_name_selects_a_request(two, capsys):
             explorer.sql('FROM "my-b".plain')
     with pytest.raises(BadInput, match="has no request c; it has a, my-b"):
         Explorer(two, request="c")
+    with pytest.raises(
+        BadInput, match=r"no request My-B, because names have only small .*; did you mean my-b\? it has a, m"
+    ):
+        Explorer(two, request="My-B")
     assert main(["SELECT max(value) FROM plain", "--lake", str(two), "--name", "my-b"]) == 0
     assert "2.0" in capsys.readouterr().out
     assert main(["FROM plain", "--lake", str(two)]) == 2
