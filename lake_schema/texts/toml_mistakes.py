@@ -86,6 +86,8 @@ def _explain_line(message: str, head: str, rest: str) -> str:
             return "write an equals sign in place of the colon, key = value"
         return f"an equals sign is missing, key = value ({_NAME_RULE})"
     if message.startswith("Unclosed"):
+        if (start := re.search(r"[\w.]+$", head)) and re.match(r"[-_\w]", rest):
+            return f'write text in quotes, "{start[0]}{word}"'
         if word:
             return f"a comma is missing before {word}"
         return "a table { .. } must end with } on the same line"

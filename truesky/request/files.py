@@ -16,7 +16,7 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
-from truesky.request.toml_values import Toml, as_table, boolean, number, quote_value, string, strings
+from truesky.request.toml_values import Toml, as_table, boolean, number, quote_value, required_value, string, strings
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
@@ -361,7 +361,7 @@ def _templates(value: object, folder: Path) -> Curves:
     table = as_table(value, path, ("files", "format"))
     with Mistakes() as mistakes:
         files = mistakes.read(_file_list, table, path, folder, distinct=False)
-        form = mistakes.read(string, table, f"{path}.format")
+        form = mistakes.read(_format, table, f"{path}.format")
     return Curves(files, form)
 
 
@@ -394,8 +394,15 @@ def _curves(value: object, path: str, folder: Path, has_medium: bool = False) ->
     with Mistakes() as mistakes:
         medium = mistakes.read(string, table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
         file = mistakes.read(_file, table, f"{path}.file", folder)
-        form = mistakes.read(string, table, f"{path}.format")
+        form = mistakes.read(_format, table, f"{path}.format")
     return Curves((file,), form, medium)
+
+
+def _format(table: Toml, path: str) -> str:
+    kind = "passband" if ".passbands." in path else "extinction" if ".extinction." in path else "spectrum"
+    examples = {"passband": '"passband_ascii"', "extinction": '"extinction"', "spectrum": '"spectrum_csv"'}
+    required_value(table, path, f"it must be the format of the file, such as {examples[kind]} (docs/own_files.md)")
+    return string(table, path)
 
 
 def parse_ingest(table: Toml, folder: Path) -> Ingest:
@@ -420,6 +427,11 @@ def parse_ingest(table: Toml, folder: Path) -> Ingest:
     return Ingest(galaxies, halos, training, dust)
 
 
+def _map_column(table: Toml, path: str) -> str:
+    required_value(table, path, 'it must be the name of the column with the map, such as "EBV"')
+    return string(table, path)
+
+
 def _dust_map(value: object, folder: Path) -> DustMap:
     path = "ingest.dust"
     table = as_table(value, path, DustMap.__slots__)
@@ -427,7 +439,7 @@ def _dust_map(value: object, folder: Path) -> DustMap:
         read = mistakes.read
         dust = DustMap(
             read(_file, table, f"{path}.file", folder),
-            read(string, table, f"{path}.column"),
+            read(_map_column, table, f"{path}.column"),
             read(string, table, f"{path}.quantity", ("ebv", "a_v"), "ebv"),
             read(string, table, f"{path}.ordering", ("RING", "NESTED")) if "ordering" in table else "",
             read(string, table, f"{path}.coordinates", ("G", "C")) if "coordinates" in table else "",

@@ -522,6 +522,10 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
     parameter as [number, unit].
     """
     path = f"explore.{key}"
+    if isinstance(value, dict) and not value.keys() & {"values", "unit"}:
+        name, _ = next(instruments.override_values(key, value))
+        form = "[true, false]" if key == "effects" else '{ values = [..], unit = ".." }'
+        raise BadInput(f'{path}: write the name in quotes, such as "{name}" = {form}')
     if key != "accuracy" and not key.startswith("effects."):
         table = _as_table(value, path, ("values", "unit"))
         unit, numbers = _string(table, f"{path}.unit"), _required_value(table, f"{path}.values")

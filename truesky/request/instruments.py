@@ -270,9 +270,11 @@ def explain_override(name: str, value: object, units: Mapping[str, str]) -> tupl
     if key not in units:
         # The names of all parameters of a camera begin with the same word, which would make them similar.
         camera, _, rest = key.partition(".")
-        others = [other.removeprefix(f"{camera}.") for other in units if other.startswith(f"{camera}.")]
-        similar = [f"{camera}.{other}" for other in spelling.closest_names(rest, others, _SUGGESTED_PARAMETERS)]
-        similar = similar if others else spelling.closest_names(key, units, _SUGGESTED_PARAMETERS)
+        parameter_names = [other.removeprefix(f"{camera}.") for other in units if other.startswith(f"{camera}.")]
+        similar = [
+            f"{camera}.{other}" for other in spelling.closest_names(rest, parameter_names, _SUGGESTED_PARAMETERS)
+        ]
+        similar = similar if parameter_names else spelling.closest_names(key, units, _SUGGESTED_PARAMETERS)
         hint = f"did you mean {spelling.join_words(similar)}?" if similar else "truesky mission list prints all names"
         problem = f"no parameter {key} exists; {hint}"
         if similar:

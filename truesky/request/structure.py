@@ -8,7 +8,7 @@ from typing import Any
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput, Mistakes
-from truesky.request.toml_values import Toml, as_table, boolean, integer, number, string
+from truesky.request.toml_values import Toml, as_table, boolean, integer, number, quote_value, string
 
 # Smallest and largest number of knots per disc. Fewer knots do not fill a disc. More take too long, since each knot is
 # drawn.
@@ -101,6 +101,9 @@ def _arms(value: object) -> Arms | None:
     path, default = "structure.arms", Arms()
     if isinstance(value, bool):
         return default if value else None
+    if not isinstance(value, dict):
+        form = "true or a table such as { contrast = 0.5 }"
+        raise BadInput(f"{path} must be {form}, got {quote_value(value)}")
     arms_table = as_table(value, path, Arms.__slots__)
     with Mistakes() as mistakes:
         read = mistakes.read

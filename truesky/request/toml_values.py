@@ -26,6 +26,11 @@ _SYNONYMS = {
     "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
     "gamma1": "g1", "gamma2": "g2", "gamma_1": "g1", "gamma_2": "g2", "shear1": "g1", "shear2": "g2",
 }  # fmt: skip
+# Other names of values: ground cameras and surveys belong to one channel.
+_VALUES = {
+    **dict.fromkeys(("lsst", "lsstcam", "rubin", "des", "decam", "hsc", "megacam", "gpc1", "ground"), "EXT"),
+    **dict.fromkeys(("off", "no", "false"), "none"), "noiseless": "noise_free",
+}  # fmt: skip
 _NO_PLACES: Mapping[str, str] = {}
 
 
@@ -251,6 +256,8 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
 
 def refuse_name(name: str, legal: Sequence[str]) -> str:
     """Return the end of an error message about a name: the most similar legal name, if any, and the legal names."""
+    if (meant := _VALUES.get(name.lower())) in legal:
+        return f"{quote_value(name)} is not allowed: {spelling.choices(str(meant), legal)}"
     if spelling.did_you_mean(name, legal):
         return f"{quote_value(name)} is not allowed: {spelling.choices(name, legal)}"
     return f"{quote_value(name)} is not one of {', '.join(legal)}"

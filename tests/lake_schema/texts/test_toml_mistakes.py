@@ -29,6 +29,7 @@ MISTAKES = {
     "a colon": ("name: 'x'", 1, "write an equals sign in place of the colon, key = value"),
     "no equals sign": ("a 1", 1, "an equals sign is missing, key = value"),
     "no comma in a table": ("cone = { ra = 5 radius = 1 }", 1, "a comma is missing before radius"),
+    "a name that begins with a digit": ("a = [3-4]", 1, 'write text in quotes, "3-4"'),
     "no comma in a list": ('a = ["x" "y"]', 1, 'a comma is missing before "y"'),
     "a comma too many": ("c = { a = 1, }", 1, "remove the comma before }"),
     "a table in two lines": ("c = { a = 1,\nb = 2 }", 1, "a table { .. } must end with } on the same line"),

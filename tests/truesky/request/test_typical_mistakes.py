@@ -146,7 +146,7 @@ MISTAKES = {
     "a camera as channel": (
         changed('["VIS"]', '["LSST"]', EUCLID),
         "observation[0].channels",
-        "is not one of VIS, NISP-P",
+        "did you mean EXT? allowed: VIS, NISP-P",
     ),
     "Euclid and the ground": (
         changed('["VIS"]', '["VIS", "EXT"]', EUCLID),
@@ -178,7 +178,7 @@ MISTAKES = {
     "exposures of a Euclid field": (
         EUCLID + "exposures = 3\n",
         "observation[0].exposures",
-        "its keys are visits, dither",
+        "visits repeats the exposures; its keys are visits, dither",
     ),
     "a detector of NISP": (EUCLID + 'detectors = ["DET22"]\n', "observation[0].detectors", "allowed: 1-1, 1-2"),
     "no file": (
@@ -266,6 +266,34 @@ MISTAKES = {
         "stars.catalogue",
         "{ columns = .., file = .. }",
     ),
+    "a parameter of [explore] without quotes": (
+        section("explore", 'vis.gain = { values = [3.0], unit = "electron / adu" }'),
+        "explore.vis: write the name in quotes",
+        'such as "vis.gain" = { values = [..], unit = ".." }',
+    ),
+    "an effect of [explore] without quotes": (
+        section("explore", "effects.cosmic_rays = [true, false]"),
+        "explore.effects: write the name in quotes",
+        'such as "effects.cosmic_rays" = [true, false]',
+    ),
+    "arms of a word": (section("structure", 'arms = "yes"'), "structure.arms", "must be true or a table such as"),
+    "a passband without a format": (
+        section("fluxes.passbands.x", 'file = "x.dat"\nmedium = "air"'),
+        "fluxes.passbands.x.format is missing",
+        'such as "passband_ascii" (docs/own_files.md)',
+    ),
+    "a map without a column": (
+        section("ingest.dust", 'file = "x.fits"'),
+        "ingest.dust.column",
+        "the column with the map",
+    ),
+    "a survey as channel": (changed('"VIS"', '"LSST"'), "pointing[0].channel", "did you mean EXT? allowed: VIS"),
+    "lensing off": (
+        section("universe", 'lensing = "off"'),
+        "universe.lensing",
+        "did you mean none? allowed: box, none",
+    ),
+    "truth without noise": (section("products", 'truth = ["noiseless"]'), "products.truth", "did you mean noise_free?"),
     "one file": (section("ingest.galaxies", 'file = "x.parquet"'), "ingest.galaxies.file", "did you mean files?"),
 }
 
@@ -300,12 +328,12 @@ def test_after_a_suggestion_long_lists_are_left_out(tmp_path, text, line):
 
 def test_all_wrong_values_of_parameters_are_reported_in_the_order_of_the_file(tmp_path):
     lines = (
-        '"vis.readnoise" = { value = 3.5, unit = "electron" }\n"vis.gain" = 3.5\nvis.bais = 1\nvis.full_well = 1\n'
+        '"vis.readnoise" = { value = 3.5, unit = "electron" }\n"vis.gain" = 3.5\nvis.biass = 1\nvis.full_well = 1\n'
         '"vis.read_noise" = { value = 3.5, unit = "mm" }\n"vis.bias@9-9" = { value = 1, unit = "adu" }'
     )
     messages = read_valid_parts(tomllib.loads(section("mission.overrides", lines)), tmp_path).messages
     names = [message.removeprefix("mission.overrides.").split(" ")[0].rstrip(":") for message in messages]
-    wrong = ["vis.readnoise", "vis.gain", "vis.bais", "vis.full_well", "vis.read_noise"]
+    wrong = ["vis.readnoise", "vis.gain", "vis.biass", "vis.full_well", "vis.read_noise"]
     assert names == [*wrong, "vis.bias@9-9"]
 
 

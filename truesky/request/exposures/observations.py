@@ -474,7 +474,9 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
                 useless = {other for other, users in _CHANNELS_OF_KEY.items() if not {*users} & {*channels}}
                 useless |= {other for other, types in _TYPES_OF_KEY.items() if image_type not in types}
                 keys = [other for other, kinds in _BLOCKS_OF_KEY.items() if kind in kinds and other not in useless]
-                mistakes.add(BadInput(f"{path}.{key} is not for {kind}: its keys are {', '.join(keys)}, realisations"))
+                instead = "visits repeats the exposures; " if key == "exposures" and "visits" in keys else ""
+                text = f"{path}.{key} is not for {kind}: {instead}its keys are {', '.join(keys)}, realisations"
+                mistakes.add(BadInput(text))
             elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):
                 mistakes.add(BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(types)}"))
             elif not {*(users := _CHANNELS_OF_KEY.get(key, channels))} & {*channels}:
