@@ -193,7 +193,8 @@ def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
                 break
             similar = max(similar, candidate, key=lambda names: len(set(titles) & set(names)))
         if not head:
-            if set(titles) & set(similar):
+            # The line with the names of the columns has at least half of them.
+            if 2 * len(set(titles) & set(similar)) >= len(set(titles)):
                 check_column_names(file, similar, titles)
             raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines has the columns {', '.join(titles)}")
         if duplicates := [title for title in titles if head.count(title) > 1]:
