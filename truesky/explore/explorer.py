@@ -283,9 +283,10 @@ class Explorer:
         Path
             Path of the file.
 
-        Notes
-        -----
-        BadInput is raised as by `sql`, if the path has another ending, or if the file type cannot hold the result.
+        Raises
+        ------
+        BadInput
+            As by `sql`, if the path has another ending, or if the file type cannot hold the result.
         """
         if Path(text.strip()).suffix.lower() in results.ENDINGS and " " not in text.strip():
             raise BadInput(f"the query comes before the file: write lake.export(query, {text.strip()!r})")
