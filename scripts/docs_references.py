@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import pkgutil
 import re
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -34,15 +35,18 @@ from truesky.render.exposure import sky_through_grism
 from truesky.request import accuracy, from_toml, schema, sky_notation, toml_values
 from truesky.request.exposures import observations, pointings
 
-# Modules that users import, in the order of the page of the Python interface.
+# Modules, classes and functions of the page of the Python interface, in order.
 API = (
     "truesky.api.lake",
     "truesky.api.tables",
     "truesky.api.simulate",
-    "truesky.api.image_options",
-    "truesky.api.sky_images",
-    "truesky.api.lake_frames",
-    "truesky.api.given_frames",
+    "truesky.api.image_options.ImageOptions",
+    "truesky.api.sky_images.SkyImage",
+    "truesky.api.sky_images.PsfImage",
+    "truesky.api.lake_frames.LakeFrame",
+    "truesky.api.given_frames.frame",
+    "truesky.api.given_frames.GivenFrame",
+    "truesky.api.given_frames.InjectedFrame",
     "truesky.explore.plots",
     "lake_schema.store.read",
     "lake_schema.store.layout",
@@ -430,11 +434,19 @@ def accuracy_page(into: Path) -> str:
 
 
 def api_page() -> str:
-    """Return the Markdown page of the Python interface, with a directive of Sphinx for each module that `API` lists.
+    """Return the Markdown page of the Python interface, with a directive of Sphinx for each object that `API` lists.
 
-    Sphinx replaces the directives by the docstrings of the modules.
+    Sphinx replaces the directives by the docstrings of the objects.
     """
     lines = ["# Python interface", ""]
-    for module in API:
-        lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]
+    for name in API:
+        lines += [f"## {name}", "", "```{eval-rst}", f".. {_directive(name)}:: {name}", "```", ""]
     return "\n".join(lines)
+
+
+def _directive(name: str) -> str:
+    """Return the directive of Sphinx for a module, class or function."""
+    documented = pkgutil.resolve_name(name)
+    if inspect.ismodule(documented):
+        return "automodule"
+    return "autoclass" if inspect.isclass(documented) else "autofunction"
