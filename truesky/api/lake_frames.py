@@ -20,10 +20,9 @@ from truesky.render.exposure import render
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, truth_table
-from truesky.running import memory_reuse
 
 if TYPE_CHECKING:
-    # Imported where it is used, because the import takes 0.4 s.
+    # Needed for annotations only.
     import pandas as pd
 
 # Largest number of images that an error message lists.
@@ -31,8 +30,8 @@ _MAX_LISTED = 8
 
 
 @dataclass(slots=True)
-class _SharedParts:
-    """Parts of an image that are the same with and without additional sources, and are computed once."""
+class _Shared:
+    """What an image without and with additional sources has in common, and is read or computed once."""
 
     drawings: DrawingStore
     inputs: tuple[Aim, Rows, Variant] | None = None
@@ -66,7 +65,7 @@ class LakeFrame:
             raise no_image(root, exposure, detector, ((part["exposure_id"], part["detector"]) for part in facts))
         self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
         self._extra: Any = None
-        self._shared = _SharedParts(DrawingStore(added.is_added))
+        self._shared = _Shared(DrawingStore(added.is_added))
         self._rendered: RenderedDetector | None = None
         self._has_maps = False
 
@@ -102,14 +101,15 @@ class LakeFrame:
             if self._shared.inputs is None:
                 self._shared.inputs = detector_inputs.load_inputs(self._root, self._facts)
             aim, rows, variant = self._shared.inputs
+            # The file of a PSF is read again for each image.
+            detector_inputs.check_psf_files(aim.exposure, rows.previous_exposures, self._facts)
             if self._extra is not None:
                 band = SELECTION_BANDS.get(aim.exposure.channel, aim.exposure.band)
                 rows = added.add_sources(rows, self._extra, band)
-            with memory_reuse.retain_freed_memory():
-                self._rendered = render.render(
-                    aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
-                    noise_seed=request["noise_seed"], drawings=self._shared.drawings,
-                )  # fmt: skip
+            self._rendered = render.render(
+                aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
+                noise_seed=request["noise_seed"], drawings=self._shared.drawings,
+            )  # fmt: skip
             self._has_maps = with_maps
         return self._rendered
 

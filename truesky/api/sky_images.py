@@ -297,7 +297,6 @@ class SkyPainter:
         self.forced = {**dict.fromkeys(effects["on"], True), **dict.fromkeys(effects["off"], False)}
         self.nominal = lru_cache(maxsize=64)(self._nominal)
         self.psf = lru_cache(maxsize=_PSFS)(self._psf)
-        self.band = lru_cache(maxsize=64)(passbands.load)
         self._cells = np.array(sorted(catalogue_rows.drawn_cells(tables.versions["galaxies"])), np.int64)
 
     def _nominal(self, band: str, camera: str | None, mjd: float | None, cell: tuple[float, float]) -> ExposureRow:
@@ -307,7 +306,7 @@ class SkyPainter:
     def _psf(self, exposure: ExposureRow, detector: Detector, accuracy: Accuracy) -> Psf:
         """Return the PSF of a detector, which keeps its Fourier transforms for the images that follow."""
         variant = variants.variant(exposure.settings, self.mission, accuracy, self.forced)
-        aim = Aim.from_exposure(exposure, detector, self.band(exposure.band), self.seed)
+        aim = Aim.from_exposure(exposure, detector, passbands.load(exposure.band), self.seed)
         psf = visible_sources.exposure_psf(aim, scene_factory.from_aim(aim, variant), settings_for(accuracy))
         return replace(psf, derived={})
 
@@ -337,7 +336,7 @@ class SkyPainter:
         exposure, detector = self._nominal_of(request)
         variant = Variant(self.mission, request.accuracy, self.forced)
         moved = nominal.move_exposure(exposure, detector, (request.ra, request.dec))
-        aim = Aim.from_exposure(moved, detector, self.band(exposure.band), self.seed)
+        aim = Aim.from_exposure(moved, detector, passbands.load(exposure.band), self.seed)
         return _with_window(aim, request), variant
 
     def _planned_aim(self, request: ImageRequest) -> tuple[Aim, Variant]:
@@ -354,7 +353,7 @@ class SkyPainter:
         tasks = exposure_chunks.rows(self.planned["tasks"], [number], where=is_number).to_pylist()
         for task in tasks:
             detector = detectors.detector(exposure.camera, task["detector"], variant.mission)
-            aim = Aim.from_exposure(exposure, detector, self.band(exposure.band), self.seed)
+            aim = Aim.from_exposure(exposure, detector, passbands.load(exposure.band), self.seed)
             column, row = (float(at[0]) for at in astrometry.pixel_of_sky(aim.wcs, [request.ra], [request.dec]))
             if -0.5 <= column < detector.nx - 0.5 and -0.5 <= row < detector.ny - 0.5:
                 return _with_window(aim, request), variant

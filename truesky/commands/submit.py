@@ -116,7 +116,7 @@ def _run_program(command: Sequence[str]) -> int:
 
 @contextmanager
 def stop_on_signal(name: str, outcome: str = "a second run continues where this one ended") -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the `with` block, stop the job that runs in it, and end this process.
+    """Let Ctrl-C and SIGTERM end the `with` block, with the processes that it waits for, and then this process.
 
     A message with `name`, the name of the command, and the outcome is printed. The exit status is 130 after Ctrl-C and
     143 after SIGTERM.
@@ -125,7 +125,8 @@ def stop_on_signal(name: str, outcome: str = "a second run continues where this 
     try:
         yield
     except KeyboardInterrupt as stopped:
-        number = 128 + int(stopped.args[0])
+        # A process that this one started may have stopped first; its interrupt has no number.
+        number = 128 + int(stopped.args[0] if stopped.args else signal.SIGINT)
         raise SystemExit(command.print_error(name, f"stopped; {outcome}", number)) from None
     finally:
         for number, handler in previous_handlers.items():

@@ -85,14 +85,7 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
     in_detector = (pc.field("exposure_id") == number) & (pc.field("detector") == facts["detector"])
     (task,) = exposure_chunks.rows(inputs["tasks"], [number], where=in_detector).to_pylist()
     previous_exposures = find_previous_exposures(lake, inputs, exposed, task, mission, request["seed"])
-    for exposure_row in (
-        exposed,
-        *(previous.exposure for previous in previous_exposures if isinstance(previous, PreviousExposure)),
-    ):
-        if exposure_row.psf:
-            file = str(from_file.path_for_detector(exposure_row.psf, task["detector"]))
-            if file_sha256(Path(file)) != facts["psf"][file]:
-                raise BadInput(f"{file}: has changed since the rendering began")
+    check_psf_files(exposed, previous_exposures, facts)
     bodies = solar_system.empty_population if request.get("bodies") == "none" else None
     if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
@@ -101,6 +94,19 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
             bodies = ephemerides.read(Path(file), sha256).on_day
     rows = _read_rows(lake, inputs, aim, task, variant, bodies, previous_exposures, request["seed"])
     return aim, _with_structure(rows, request, facts.get("stamps", {})), variant
+
+
+def check_psf_files(exposed: ExposureRow, previous_exposures: Sequence[object], facts: Json) -> None:
+    """Raise BadInput if a PSF file of the user has changed since its checksum was recorded in `facts`.
+
+    The files are those of an exposure and of previous exposures that are drawn for their persistence.
+    """
+    drawn = [previous.exposure for previous in previous_exposures if isinstance(previous, PreviousExposure)]
+    for exposure_row in (exposed, *drawn):
+        if exposure_row.psf:
+            file = str(from_file.path_for_detector(exposure_row.psf, facts["detector"]))
+            if file_sha256(Path(file)) != facts["psf"][file]:
+                raise BadInput(f"{file}: has changed since the rendering began")
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:

@@ -40,7 +40,7 @@ class Setting:
     """How stars are added and measured.
 
     Sizes are in arcsec, and magnitudes those of the brightest and the faintest star. All noticeable effects of the
-    detector are applied without `effects`. The exposure begins at `date` (MJD), or at the first possible date.
+    detector are applied without `effects`.
     """
 
     pixel: float
@@ -49,15 +49,12 @@ class Setting:
     brightest: float
     faintest: float
     effects: tuple[str, ...] | None = None
-    date: float | None = None
 
 
-# LSST observes the field near the zenith. At an airmass of 2, which the first possible date has, refraction moves stars
-# of 5800 K by 12 mas.
 SETTINGS = {
     "euclid_vis": Setting(0.1, 1.0, 10.0, 19.5, 21.8),
     "euclid_j": Setting(0.3, 2.0, 12.0, 18.0, 20.0, RAMP),
-    "lsst_r": Setting(0.2, 2.4, 14.0, 17.5, 18.7, None, 61010.15),
+    "lsst_r": Setting(0.2, 2.4, 14.0, 17.5, 18.7),
 }
 
 
@@ -117,7 +114,7 @@ def recover(lake, band, rng, cosmic_rays):
     """
     how = SETTINGS[band]
     ra, dec = RA + rng.uniform(-0.05, 0.05), DEC + rng.uniform(-0.05, 0.05)
-    same = {"size": N * how.spacing, "band": band, "date": how.date, "effects": how.effects}
+    same = {"size": N * how.spacing, "band": band, "effects": how.effects}
     same["seed"] = int(rng.integers(1, 2**31))
     plain_image = lake.render(ra, dec, **same)
     column, row = lattice(how.spacing / how.pixel, rng)

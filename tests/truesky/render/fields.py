@@ -104,6 +104,7 @@ def rendered(
     passband=None,
     noise_seed=None,
     way="raw",
+    drawings=None,
     **rows,
 ):
     """Render one detector; `tables` contains galaxies, their fluxes, stars, and their fluxes.
@@ -119,6 +120,7 @@ def rendered(
         truth,
         progress,
         noise_seed,
+        drawings,
     )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Float
+from lake_schema.errors import OutOfRange
 from truesky.numerics import cache, matrices
 from truesky.numerics.code_fingerprints import code_key
 
@@ -98,9 +99,12 @@ def milky_way(wavelength: npt.ArrayLike) -> Float:
 def milky_way_table(first: int, count: int) -> Float:
     """Return A(lambda) / A(V) of the Milky Way at `count` wavelengths in steps of 1 A, from `first` in A.
 
-    They are those of `milky_way`, but are read from the cache. The range is 600 to 24000 A, which is not checked.
+    The values are those of `milky_way`, read from the cache. OutOfRange is raised for wavelengths outside 600 to
+    24000 A.
     """
     start = first - _TABLE_FIRST
+    if start < 0 or first + count - 1 > _TABLE_LAST:
+        raise OutOfRange("wavelength (A)", first if start < 0 else first + count - 1, _TABLE_FIRST, _TABLE_LAST)
     return _milky_way_table()[start : start + count]
 
 

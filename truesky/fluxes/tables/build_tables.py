@@ -114,7 +114,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
     return arrays["galaxies"]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=24)
 def star_table(band: Passband, library: Library, key: str) -> Float32:
     """Return a table of ln(f_nu in a band) of each stellar template against the A(V) of dust in front of it.
 

@@ -168,7 +168,7 @@ def from_galaxy(
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), max(map(abs, region)))
-    cells = psf.keep(("outskirts", weights.tobytes(), block), lambda: _cells(psf, weights, block))
+    cells = _cells(psf, weights, block)
     first_x, first_y = (int(np.floor(start / block)) - 1 for start in (region[0], region[2]))
     end_x, end_y = (int(np.ceil(end / block)) + 2 for end in (region[1], region[3]))
     # Nodes around the region from which the PSF moves light into it.

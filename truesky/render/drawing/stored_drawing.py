@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -34,7 +34,7 @@ class DrawingStore:
 
     The light of a source does not depend on other sources, and the sum is exact. An image with additional sources is
     therefore the same, bit by bit, whether all sources are drawn or only the additional ones. A store has 8 bytes per
-    pixel of the detector.
+    pixel of the detector, and what `keep` holds.
 
     Attributes
     ----------
@@ -45,16 +45,16 @@ class DrawingStore:
     is_additional: Callable[[Int], Bool]
     _key: object = field(default=None, repr=False)
     _drawn: _Drawn | None = field(default=None, repr=False)
-    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
 
-    def keep(self, name: str, compute: Callable[[], _T]) -> _T:
-        """Return what `compute` returned when it was first called for this name.
+    def keep(self, key: Hashable, compute: Callable[[], _T]) -> _T:
+        """Return what `compute` returned when it was first called for this key.
 
-        The result must be the same with and without additional sources.
+        The key contains everything that may differ between images with and without additional sources.
         """
-        if name not in self._kept:
-            self._kept[name] = compute()
-        result: _T = self._kept[name]
+        if key not in self._kept:
+            self._kept[key] = compute()
+        result: _T = self._kept[key]
         return result
 
     def check(self, key: object) -> None:

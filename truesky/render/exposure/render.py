@@ -93,7 +93,9 @@ def render(
     def charge() -> NeighbourCharge | None:
         return board_neighbours.neighbour_charge(light, aim, rows, variant, seed)
 
-    neighbour_charge = charge() if drawings is None else drawings.keep("neighbour charge", charge)
+    # The response inside a pixel is only taken into account if a source is bright enough.
+    key = "neighbour charge", None if light.psf is None else light.psf.intra_pixel
+    neighbour_charge = charge() if drawings is None else drawings.keep(key, charge)
     light = replace(light, scene=replace(light.scene, neighbour_charge=neighbour_charge))
     drawn, frame = (
         _draw_images(aim, light, truth, progress, drawings)

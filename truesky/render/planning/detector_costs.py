@@ -37,7 +37,7 @@ _STARS_S = 2e-8
 # Memory in GB that a worker keeps from the tasks that it ran before, most of it from fluxes and from other detectors.
 # Measured in runs of the demo: workers needed 2.13 and 1.67 GB for a VIS and an LSST detector, new processes 1.68 and
 # 1.24 GB.
-_KEPT_GB = 0.4
+_KEPT_GB = 0.5
 # Bytes per pixel that an image with 32 bits takes in addition to one with 16 bits.
 _WIDE_BYTES = 2.0
 

@@ -220,11 +220,11 @@ def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
     if float(airmass(90.0 - abs(dec - site.latitude))) > _MAX_AIRMASS:
         return start
     # Test `start` before the search: most exposures directly follow another one in the same night.
-    if _is_dark(ra, dec, np.array([start]), site)[0]:
+    if _is_observable(ra, dec, np.array([start]), site)[0]:
         return start
     for day in range(_DAYS):
         times: Float = start + day + _STEP * np.arange(float(round(1.0 / _STEP)))
-        good = np.flatnonzero(_is_dark(ra, dec, times, site))
+        good = np.flatnonzero(_is_observable(ra, dec, times, site))
         if len(good):
             return float(times[good[0]])
     return start
@@ -245,13 +245,14 @@ def next_dark_transit(ra: float, dec: float, start: float, site: Site) -> float:
     Returns
     -------
     float
-        MJD. If there is no such date within 400 days, the first date at which the field can be observed in the dark;
-        see `next_dark_time` for the conditions.
+        MJD of the transit. The Sun is more than 15 deg below the horizon for an hour before and after it, and the Moon
+        is below the horizon or more than 30 deg away. `start` if there is no such date within 400 days. The field may
+        be low, or never rise.
     """
     first = (-float(site.hour_angle(ra, start)) / (2.0 * np.pi)) % 1.0
     transits = start + (first + np.arange(float(_DAYS))) / _TURNS_A_DAY
-    good = np.flatnonzero(_is_dark(ra, dec, transits, site))
-    return float(transits[good[0]]) if len(good) else next_dark_time(ra, dec, start, site)
+    is_dark = np.all([_is_dark(ra, dec, transits + hours / 24.0, site) for hours in (-1.0, 0.0, 1.0)], axis=0)
+    return float(transits[np.argmax(is_dark)]) if is_dark.any() else start
 
 
 def _sun_longitudes(mjd: Float) -> Float:
@@ -259,11 +260,15 @@ def _sun_longitudes(mjd: Float) -> Float:
     return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
 
 
+def _is_observable(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
+    is_up = airmass(site.altitude(ra, dec, mjd)) <= _MAX_AIRMASS
+    return np.asarray(is_up & _is_dark(ra, dec, mjd, site)) if is_up.any() else is_up
+
+
 def _is_dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
     night = sun_altitude(mjd, site) < _TWILIGHT
-    up = airmass(site.altitude(ra, dec, mjd)) <= _MAX_AIRMASS
-    if not (night & up).any():
-        return night & up
+    if not night.any():
+        return night
     moon_ra, moon_dec, _ = moon_position(mjd)
     away = separation(np.full(len(mjd), ra), np.full(len(mjd), dec), moon_ra, moon_dec) > _FROM_MOON
-    return np.asarray(night & up & (away | (moon_altitude(mjd, site) < 0.0)))
+    return np.asarray(night & (away | (moon_altitude(mjd, site) < 0.0)))

@@ -225,7 +225,8 @@ def amplifier_at(aim: Aim, scene: Scene, window: Window) -> int:
     Returns
     -------
     int
-        Number of the amplifier, from 0; 0 if the detector has only one, or if no amplifier reads the middle.
+        Number of the amplifier, from 0; 0 if the detector has only one. If none reads the middle, the number is that of
+        the nearer half of a VIS detector, or 0 for a ground camera.
     """
     if not _SPLITTING & {effect.name for effect in aim.effects}:
         return 0

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lake_schema.errors import OutOfRange
 from truesky.fluxes import passbands
 from truesky.fluxes.spectra import extinction
 
@@ -115,6 +116,12 @@ def test_the_table_of_the_milky_way_contains_the_law(first, count):
     np.testing.assert_array_equal(
         extinction.milky_way_table(first, count), extinction.milky_way(first + np.arange(float(count)))
     )
+
+
+@pytest.mark.parametrize(("first", "count"), [(599, 2), (23990, 12), (24001, 1)])
+def test_the_table_of_the_milky_way_ends(first, count):
+    with pytest.raises(OutOfRange, match="wavelength"):
+        extinction.milky_way_table(first, count)
 
 
 def test_transmission_keeps_single_precision():

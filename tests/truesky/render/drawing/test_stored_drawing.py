@@ -53,6 +53,21 @@ def store_of(*lists):
 BASE, NEW, OTHER = points(1, 40), points(ADDITIONAL, 5), points(ADDITIONAL + 7, 1)
 
 
+def test_a_result_is_computed_once_for_each_key():
+    store, calls = store_of(), []
+    results = [store.keep(key, lambda: calls.append(1) or len(calls)) for key in ("a", ("a", 0.1), "a", ("a", 0.1))]
+    assert results == [1, 2, 1, 2]
+
+
+def test_a_copy_of_a_psf_with_another_image_finds_no_results_for_the_first():
+    psf = replace(psf_of("vis"), derived={})
+    assert psf.keep(("x",), lambda: 1) == 1
+    assert psf.keep(("x",), lambda: 2) == 1
+    assert replace(psf, intra_pixel=0.3).keep(("x",), lambda: 3) == 3
+    assert replace(psf, profile=psf.profile.shear(g1=0.1)).keep(("x",), lambda: 4) == 4
+    assert psf_of("vis").keep(("x",), lambda: 5) == 5
+
+
 @pytest.mark.parametrize("before", [(), (BASE,), (joined(BASE, NEW),), (BASE, joined(BASE, OTHER))])
 @pytest.mark.parametrize("sources", [BASE, joined(BASE, NEW), joined(BASE, OTHER)])
 def test_a_stored_drawing_gives_the_same_image(before, sources):

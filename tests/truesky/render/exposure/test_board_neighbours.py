@@ -14,6 +14,7 @@ from tests.truesky.render.sources.test_catalogue_rows import Files
 from truesky.render.camera import amplifiers, detectors
 from truesky.render.camera.astrometry import pixel_of_sky, sky_of_pixel, wcs
 from truesky.render.channels.aim import Aim
+from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.effects.charge import bleeding
 from truesky.render.effects.readout import quadrants
 from truesky.render.exposure import board_neighbours
@@ -45,13 +46,15 @@ def beside(camera, places, electrons, order=slice(None)):
     return NeighbourDetector(d, points.take(rows), light.take(rows))
 
 
-def rendered(camera, others, mission=MISSION, detector=None, own=((), ())):
+def rendered(camera, others, mission=MISSION, detector=None, own=((), ()), drawings=None):
     name, *_, band, _ = PAIRS[camera]
     none, points = galaxies([], []), stars(*own) if len(own[0]) else stars([], [])
     light = fluxes(points, band, 3e6 / (10 ** (0.4 * (27.0 - 23.9)) * SECONDS))
     tables = none, fluxes(none, band, []), points, light
     shown = detector or small(camera, name, SIDE)
-    return fields.rendered(exposed(camera), shown, tables, mission, SURVEY, forced=QUIET, neighbours=others, truth=())
+    return fields.rendered(
+        exposed(camera), shown, tables, mission, SURVEY, forced=QUIET, neighbours=others, drawings=drawings
+    )
 
 
 @cache
@@ -93,6 +96,24 @@ def test_the_coefficient_is_recovered(camera):
     # Nothing else.
     far = in_order(camera, np.asarray(own.noise_free < 1e-4 * full), own.detector) & (held < 1e-4 * full)
     assert np.abs(change[far]).max() < 1.01 * gain.max()
+
+
+@pytest.mark.parametrize("camera", PAIRS)
+def test_an_image_with_an_additional_star_has_the_same_crosstalk_if_it_is_kept(camera):
+    """The star is so bright that VIS takes the response inside a pixel into account, which changes other stars."""
+    mission, others = stronger(camera), (beside(camera, [(60.3, 40.8), (200.0, 180.0)], [3e6, 4e6]),)
+    name, *_ = PAIRS[camera]
+    own = [np.asarray(at) for at in sky_of_pixel(wcs(small(camera, name, SIDE), *POINTING), [101.0], [99.0])]
+    store = DrawingStore(lambda ids: np.ones(len(ids), bool))
+    empty = rendered(camera, others, mission, drawings=store)
+    kept = rendered(camera, others, mission, own=own, drawings=store)
+    alone = rendered(camera, others, mission, own=own)
+    assert empty.scene.neighbour_charge is not None
+    assert len(alone.sources) == 1
+    np.testing.assert_array_equal(kept.raw, alone.raw)
+    np.testing.assert_array_equal(kept.scene.neighbour_charge.electrons, alone.scene.neighbour_charge.electrons)
+    if camera == "vis":
+        assert empty.psf.intra_pixel != alone.psf.intra_pixel
 
 
 def test_the_order_of_the_rows_changes_nothing():
