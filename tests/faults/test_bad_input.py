@@ -194,11 +194,20 @@ def test_an_invalid_request_file_is_refused(tmp_path, capsys, call):
             assert path.name in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new"))
 
 
-@pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
-def test_a_request_with_invalid_content_is_refused(tmp_path, capsys, call):
-    for name, text in TEXTS.items():
-        if name in NO_MISSION and call is OF_REQUEST["mission diff"]:
-            continue
+@pytest.mark.parametrize(
+    ("command", "texts"),
+    [
+        *(pytest.param(name, TEXTS, id=name) for name in OF_REQUEST if name not in ("demo", "mission diff")),
+        # It reads each request in a child process, which starts Java.
+        pytest.param("demo", ["no text", "a star"], id="demo"),
+        pytest.param("demo", TEXTS, id="demo, all", marks=pytest.mark.nightly),
+        pytest.param("mission diff", [name for name in TEXTS if name not in NO_MISSION], id="mission diff"),
+    ],
+)
+def test_a_request_with_invalid_content_is_refused(tmp_path, capsys, command, texts):
+    call = OF_REQUEST[command]
+    for name in texts:
+        text = TEXTS[name]
         path = tmp_path / "r.toml"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         assert "r.toml" in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new")), name
