@@ -99,7 +99,7 @@ def emulator():
     [
         # In the default run, the test of threads compares two processes of the standard kind.
         pytest.param({}, marks=pytest.mark.nightly),
-        {"TRUESKY_CPU": "native"},
+        pytest.param({"TRUESKY_CPU": "native"}, marks=pytest.mark.nightly),
         {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
     ],
 )

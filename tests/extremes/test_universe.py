@@ -47,7 +47,11 @@ def with_either(cases):
 
 
 @pytest.mark.parametrize(
-    ("limit", "z_max", "seed"), with_either([(16.0, 0.01), (29.0, 0.01), (16.0, 6.0), (29.0, 0.1)])
+    ("limit", "z_max", "seed"),
+    [
+        *with_either([(29.0, 0.01), (16.0, 6.0), (29.0, 0.1)]),
+        *(pytest.param(16.0, 0.01, seed, marks=pytest.mark.nightly) for seed in (FIRST, LAST)),
+    ],
 )
 def test_smallest_and_largest_limits_and_redshifts(seed, limit, z_max):
     rows, halos = drawn(seed, limit, z_max)

@@ -45,9 +45,11 @@ def test_help_imports_no_library(arguments):
     assert not command(*arguments) & (SLOW | {"numpy", "pandas", "pyarrow", "scipy"})
 
 
-@pytest.mark.parametrize("module", JOBS)
+@pytest.mark.parametrize(
+    "module", [", ".join(JOBS), *(pytest.param(job, marks=pytest.mark.nightly) for job in JOBS)], ids=["all", *JOBS]
+)
 def test_the_module_of_a_job_imports_no_slow_library(module):
-    """Functions import a slow library when they use it."""
+    """Functions import a slow library when they use it. Nightly runs name the module that imports one."""
     modules = imported_modules(f"import {module}")
     assert modules & SLOW == set()
     assert modules & CHANNEL_MODULES == set()

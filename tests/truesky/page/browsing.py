@@ -16,6 +16,15 @@ def at(view):
 
 
 VIEWS = ("sky", "plots", "sql", "images", "runs")
+# Conditions that hold when a view has drawn its first result.
+DRAWN = {
+    "sky": "document.getElementById('sky-legend').textContent.includes('deg')",
+    "plots": "document.getElementById('plot-state').textContent.includes('rows')",
+    "sql": "document.querySelectorAll('#sql-result td').length > 0"
+    " && document.getElementById('sql-editor').shadowRoot.querySelector('.cm-content')",
+    "images": "document.getElementById('image-legend').textContent.includes('electron')",
+    "runs": "document.querySelectorAll('#runs-content h2').length > 2",
+}
 # State of the page, which is stored in its address.
 HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
 

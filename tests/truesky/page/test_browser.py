@@ -9,7 +9,7 @@ import pytest
 
 import truesky.page as page_package
 from lake_schema.store import publish
-from tests.truesky.page.browsing import VIEWS, at, canvas_colours, tab_of, until
+from tests.truesky.page.browsing import DRAWN, VIEWS, at, canvas_colours, tab_of, until
 from tests.truesky.page.conftest import serving
 from tests.universe import plain_plan, plain_work
 
@@ -175,8 +175,7 @@ def test_every_control_has_a_name_and_text_can_be_read_where_it_stands(any_view,
     tab = in_theme(any_view, theme)
     for number, view in enumerate(VIEWS, start=1):
         tab.keyboard.press(str(number))
-        until(tab, f"!document.getElementById('{view}').hidden")
-        time.sleep(0.5)
+        until(tab, f"!document.getElementById('{view}').hidden && {DRAWN[view]}")
         assert tab.evaluate(NAMELESS) == []
         assert tab.evaluate(SEEN) == []
 

@@ -2,18 +2,9 @@
 
 import pytest
 
-from tests.truesky.page.browsing import VIEWS, at, tab_of, until
+from tests.truesky.page.browsing import DRAWN, VIEWS, at, tab_of, until
 
 SIZES = {"phone": {"width": 390, "height": 844}, "desk": {"width": 1280, "height": 800}}
-# Conditions that hold when a view has drawn its first result.
-DRAWN = {
-    "sky": "document.getElementById('sky-legend').textContent.includes('deg')",
-    "plots": "document.getElementById('plot-state').textContent.includes('rows')",
-    "sql": "document.querySelectorAll('#sql-result td').length > 0"
-    " && document.getElementById('sql-editor').shadowRoot.querySelector('.cm-content')",
-    "images": "document.getElementById('image-legend').textContent.includes('electron')",
-    "runs": "document.querySelectorAll('#runs-content h2').length > 2",
-}
 # For the visible view: how far the page is too wide (pixels), whether the footer overlaps the view, and the fraction of
 # the picture (map or image) that legends cover. The page is scrolled to its end.
 LAYOUT = """() => {
@@ -60,7 +51,16 @@ def test_nothing_covers_a_view(sized, view):
 
 
 @pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("theme", ["dark", "light"])
+@pytest.mark.parametrize(
+    ("sized", "theme"),
+    [
+        ("phone", "dark"),
+        ("desk", "light"),
+        pytest.param("phone", "light", marks=pytest.mark.nightly),
+        pytest.param("desk", "dark", marks=pytest.mark.nightly),
+    ],
+    indirect=["sized"],
+)
 def test_axe_finds_no_violation(sized, view, theme):
     """The rules of axe-core, among them contrast, names and roles of controls, landmarks and the order of headings."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()

@@ -50,7 +50,10 @@ def planner(request_, most):
     return replace(found, layout=exposure_chunks.Layout.from_request(request_, mission, most))
 
 
-@pytest.mark.parametrize("most", [1, 100, 700, 9000])
+@pytest.mark.parametrize(
+    "most",
+    [pytest.param(1, marks=pytest.mark.nightly), 100, pytest.param(700, marks=pytest.mark.nightly), 9000],
+)
 def test_chunks_of_any_size_together_equal_the_plan(request_, whole, most):
     own = planner(request_, most)
     assert (len(own.layout.chunks) > 1) == (most < 9000)

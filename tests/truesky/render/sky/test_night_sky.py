@@ -44,8 +44,8 @@ def dates(site, ra, dec):
     ("camera", "band", "dark"),
     [
         ("megacam", "cfis_u", 22.7),
-        ("megacam", "cfis_r", 21.3),
-        ("jpcam", "jedis_g", 22.0),
+        pytest.param("megacam", "cfis_r", 21.3, marks=pytest.mark.nightly),
+        pytest.param("jpcam", "jedis_g", 22.0, marks=pytest.mark.nightly),
         ("lsstcam", "lsst_r", 21.07),
     ],
 )

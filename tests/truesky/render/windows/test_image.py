@@ -37,18 +37,18 @@ def field(request):
     """An exposure of a part of a detector with stars and galaxies, and the image of all its pixels."""
     camera = request.param
     _, name, band = CAMERAS[camera]
-    detector = replace(detectors.detector(camera, name, MISSION), nx=720, ny=680, injection_rows=0)
+    detector = replace(detectors.detector(camera, name, MISSION), nx=480, ny=440, injection_rows=0)
     aim, variant, rng = aim_at(camera, detector), Variant(MISSION, SURVEY, {}), rand()
-    x, y = rng.uniform(-100.0, 820.0, (2, 900))
+    x, y = rng.uniform(-100.0, 580.0, (2, 450))
     bodies = galaxies(
-        *astrometry.sky_of_pixel(aim.wcs, x[:700], y[:700]), inclination=80.0 * rng.random(700),
-        position_angle=180.0 * rng.random(700), bulge_fraction=rng.random(700),
-        disk_half_light_radius=0.2 + rng.random(700),
+        *astrometry.sky_of_pixel(aim.wcs, x[:350], y[:350]), inclination=80.0 * rng.random(350),
+        position_angle=180.0 * rng.random(350), bulge_fraction=rng.random(350),
+        disk_half_light_radius=0.2 + rng.random(350),
     )  # fmt: skip
-    points = stars(*astrometry.sky_of_pixel(aim.wcs, x[700:], y[700:]))
+    points = stars(*astrometry.sky_of_pixel(aim.wcs, x[350:], y[350:]))
     tables = (
-        bodies, fluxes(bodies, band, 10 ** rng.uniform(-1.0, 2.5, 700)),
-        points, fluxes(points, band, 10 ** rng.uniform(-1.0, 4.5, 200)),
+        bodies, fluxes(bodies, band, 10 ** rng.uniform(-1.0, 2.5, 350)),
+        points, fluxes(points, band, 10 ** rng.uniform(-1.0, 4.5, 100)),
     )  # fmt: skip
     rows = Rows(*tables)
     scene = scene_factory.from_aim(aim, variant)
@@ -114,7 +114,7 @@ def test_how_a_source_is_drawn_does_not_depend_on_the_others(field):
 
 
 @pytest.mark.parametrize(
-    "window", [Window(203, 310, 128, 128), Window(0, 0, 65, 33), Window(600, 571, 120, 109), Window(350, 350, 1, 1)]
+    "window", [Window(203, 250, 128, 128), Window(0, 0, 65, 33), Window(360, 331, 120, 109), Window(350, 350, 1, 1)]
 )
 def test_a_window_is_a_part_of_the_image(field, window):
     *_, light, whole = field
@@ -166,13 +166,13 @@ def test_the_noise_of_a_window(field):
 def test_a_window_has_few_dark_columns(field):
     light = field[3]
     whole, part = (
-        pixel_response.parameters(replace(light.scene, window=window))[2] for window in (None, Window(0, 0, 72, 68))
+        pixel_response.parameters(replace(light.scene, window=window))[2] for window in (None, Window(0, 0, 48, 44))
     )
     assert part == pytest.approx(0.01 * whole, rel=1e-12, abs=0.0)
 
 
 def test_noise_depends_on_the_seed_of_the_noise_alone(field):
-    window = Window(203, 310, 64, 64)
+    window = Window(203, 250, 64, 64)
     one, same, other = (window_of(field, window, noise_seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(one.raw, same.raw)
     assert not np.array_equal(one.raw, other.raw)
@@ -181,7 +181,7 @@ def test_noise_depends_on_the_seed_of_the_noise_alone(field):
 
 def test_accuracy_changes_the_light_by_less_than_the_noise(field):
     aim, rows, variant, light, _ = field
-    window = Window(203, 310, 128, 128)
+    window = Window(203, 250, 128, 128)
     rough = image.draw_window(
         replace(aim, window=window), rows, replace(variant, accuracy=DRAFT), SEED, with_noise=False
     )
@@ -191,7 +191,7 @@ def test_accuracy_changes_the_light_by_less_than_the_noise(field):
 
 def test_unknown_effects_and_slitless_images_are_refused(field):
     aim, rows, variant, *_ = field
-    window = Window(203, 310, 64, 64)
+    window = Window(203, 250, 64, 64)
     with pytest.raises(BadInput, match=r"effects: 'ghosts' cannot be applied to a window; allowed here: background, "):
         window_of(field, window, effects=["ghosts"])
     dark = replace(aim, window=window, exposure=replace(aim.exposure, image_type="dark"))
