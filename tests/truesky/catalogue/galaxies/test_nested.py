@@ -148,8 +148,14 @@ def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one(
     assert not np.any(there[0] & there[1])
 
 
-@pytest.mark.parametrize("seed", [0, 2**63 - 1])
-@pytest.mark.parametrize(("limit", "z_max"), [(16.0, 0.01), (16.0, 0.3), (20.0, 0.05)])
+@pytest.mark.parametrize(
+    ("limit", "z_max", "seed"),
+    [
+        pytest.param(*case, seed, marks=[] if number % 2 == turn else [pytest.mark.nightly])
+        for number, case in enumerate([(16.0, 0.01), (16.0, 0.3), (20.0, 0.05)])
+        for turn, seed in enumerate((0, 2**63 - 1))
+    ],
+)
 def test_extreme_requests(seed, limit, z_max):
     few, some = tables(limit, z_max, CELLS[0], seed)
     many, every = tables(20.0, 0.3, CELLS[0], seed)

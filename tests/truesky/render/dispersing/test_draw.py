@@ -14,7 +14,9 @@ WAVES = np.arange(float(FIRST), LAST + 1.0)
 FINE = draw.Settings(edge=1e-9, faint=0.0, along=3)
 
 
-@pytest.mark.parametrize(("slope", "sag", "along"), [(0.0, 0.0, 1), (0.07, 1.5, 1), (-0.07, -1.5, -1)])
+@pytest.mark.parametrize(
+    ("slope", "sag", "along"), [pytest.param(0.0, 0.0, 1, marks=pytest.mark.nightly), (0.07, 1.5, 1), (-0.07, -1.5, -1)]
+)
 def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
     """A galaxy and a star agree if wavelengths in blocks of 110 A share a PSF.
 
@@ -84,8 +86,14 @@ def continuum_and_line(line=0.0, every=20):
     return spectrum
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.07])
-@pytest.mark.parametrize("i", [0, 1, 4])
+@pytest.mark.parametrize(
+    ("i", "slope"),
+    [
+        (0, 0.07),
+        (4, 0.0),
+        *(pytest.param(i, slope, marks=pytest.mark.nightly) for i, slope in ((0, 0.0), (1, 0.0), (1, 0.07), (4, 0.07))),
+    ],
+)
 def test_spectra_are_the_series_of_every_wavelength(i, slope):
     """The first order is 64 pixels long. The sources are galaxies and a star."""
     source, through, short = placed(8, i, 47.3, 33.6), psf(), trace((-10.0, 64.0), slope)

@@ -282,7 +282,10 @@ def test_focal_plane_jacobian_has_the_sign_used_by_stamps():
     np.testing.assert_allclose(j, np.eye(2) * detector.pixel_scale, atol=1e-5)
 
 
-@pytest.mark.parametrize(("size", "electrons", "side"), [(64, 1e3, 1024), (2048, 1e3, 256), (2048, 1e9, 256)])
+@pytest.mark.parametrize(
+    ("size", "electrons", "side"),
+    [(64, 1e3, 1024), pytest.param(2048, 1e3, 256, marks=pytest.mark.nightly), (2048, 1e9, 256)],
+)
 def test_memory_is_what_was_predicted(size, electrons, side):
     """Buffers of compiled code are not measured, but they are not larger than the stamps."""
     detector = small("vis", "3-4")

@@ -68,15 +68,9 @@ def test_the_mean_sky_is_as_observed(whole):
     assert sum(check.passes for check in remembered) > 0.85 * len(remembered)
 
 
-def rows_of_cells(rows, number):
-    """Return the rows in the first cells of the sky."""
-    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
-    return rows.filter(pa.array(cell < number))
-
-
-def test_a_lake_is_compared(flat_sky, tmp_path, capsys):
+def test_a_lake_is_compared(flat, tmp_path, capsys):
     """The command publishes the same figures as the rows themselves give."""
-    rows = rows_of_cells(flat_sky, 2)
+    rows = mean_sky.rows(flat, 0, 2)
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 0), {}),))
     publish.make_version(tmp_path, plan, lambda root, facts: Output(rows))
     seen, _ = observed.from_version(read.version(tmp_path, "galaxies"))
@@ -96,9 +90,10 @@ def test_a_lake_is_compared(flat_sky, tmp_path, capsys):
 @pytest.fixture(scope="module")
 def patch(flat_sky):
     """Return the sky of a lake with eight cells, and the cell of each galaxy."""
-    part = rows_of_cells(flat_sky, 2 * FEW)
-    cell = part["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
-    return seen(part, 2 * FEW), cell[part["kind"].to_numpy() < 2]
+    rows = flat_sky
+    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
+    part = rows.filter(pa.array(cell < 2 * FEW))
+    return seen(part, 2 * FEW), cell[(cell < 2 * FEW) & (rows["kind"].to_numpy() < 2)]
 
 
 def verdicts(seen, cell):
