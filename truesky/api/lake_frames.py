@@ -31,7 +31,7 @@ _MAX_LISTED = 8
 
 @dataclass(slots=True)
 class _Shared:
-    """What an image without and with additional sources has in common, and is read or computed once."""
+    """Inputs and drawings that an image without and with additional sources shares."""
 
     drawings: DrawingStore
     inputs: tuple[Aim, Rows, Variant] | None = None

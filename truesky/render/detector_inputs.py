@@ -99,7 +99,7 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
 def check_psf_files(exposed: ExposureRow, previous_exposures: Sequence[object], facts: Json) -> None:
     """Raise BadInput if a PSF file of the user has changed since its checksum was recorded in `facts`.
 
-    The files are those of an exposure and of previous exposures that are drawn for their persistence.
+    Files of the exposure and of previous exposures, which are drawn for their persistence, are checked.
     """
     drawn = [previous.exposure for previous in previous_exposures if isinstance(previous, PreviousExposure)]
     for exposure_row in (exposed, *drawn):

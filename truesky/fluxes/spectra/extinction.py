@@ -99,7 +99,7 @@ def milky_way(wavelength: npt.ArrayLike) -> Float:
 def milky_way_table(first: int, count: int) -> Float:
     """Return A(lambda) / A(V) of the Milky Way at `count` wavelengths in steps of 1 A, from `first` in A.
 
-    The values are those of `milky_way`, read from the cache. OutOfRange is raised for wavelengths outside 600 to
+    The values of `milky_way` are read from the cache. OutOfRange is raised for wavelengths outside 600 to
     24000 A.
     """
     start = first - _TABLE_FIRST

@@ -17,6 +17,7 @@ from lake_schema.errors import LakeError
 from lake_schema.store import read
 from lake_schema.texts import text_tables
 from truesky.render.camera import footprints
+from truesky.render.forecasting.image_costs import size_ratio
 from truesky.render.planning import exposure_chunks
 from truesky.render.products import run_log
 
@@ -118,8 +119,10 @@ def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> li
     }
     for task in exposure_chunks.rows_of_exposures(tasks, exposure_ids, _TASK_COLUMNS).to_pylist():
         tasks_of_kind[_kind({**task, **exposure_rows[task["exposure_id"]]})].append(task)
+    files = products.manifest["facts"]["request"]
+    form = files["compression"], files["readout"], files["truth"]
     lines = [
-        _line(kind, number, tasks_of_kind[kind], rendered, factor)
+        _line(kind, number, tasks_of_kind[kind], rendered, (factor, size_ratio(kind[0], kind[2], *form)))
         for kind, number in sorted(_planned_counts(tasks, exposure_columns).items())
     ]
     channels = sorted({line.channel for line in lines})
@@ -146,7 +149,13 @@ def _planned_counts(tasks: read.Version, exposures: pa.Table) -> dict[_Kind, int
     return counts
 
 
-def _line(kind: _Kind, planned: int, tasks: Sequence[dict[str, Any]], rendered: RenderedTasks, factor: float) -> Line:
+def _line(
+    kind: _Kind, planned: int, tasks: Sequence[dict[str, Any]], rendered: RenderedTasks, factors: tuple[float, float]
+) -> Line:
+    """Return the costs of one kind of images.
+
+    `factors` are the CPU time relative to the reference machine, and the size of files relative to uncompressed ones.
+    """
     rendered_tasks = [
         (task, *rendered[place]) for task in tasks if (place := (task["exposure_id"], task["detector"])) in rendered
     ]
@@ -159,10 +168,10 @@ def _line(kind: _Kind, planned: int, tasks: Sequence[dict[str, Any]], rendered: 
         rendered=len(rendered_tasks),
         measured=len(measured_tasks),
         cpu_s=cpu,
-        forecast_s=factor * sum(task["seconds"] for task, _ in measured_tasks),
+        forecast_s=factors[0] * sum(task["seconds"] for task, _ in measured_tasks),
         peak_gb=max((metrics.get("peak_gb", 0.0) for _, metrics in measured_tasks), default=0.0),
         gb=sum(size for _, size, _ in rendered_tasks) / 1e9,
-        forecast_gb=sum(task["bytes"] for task, *_ in rendered_tasks) / 1e9,
+        forecast_gb=factors[1] * sum(task["bytes"] for task, *_ in rendered_tasks) / 1e9,
         deg2=deg2,
         core_hours_deg2=cpu / 3600.0 / deg2 if deg2 else 0.0,
     )

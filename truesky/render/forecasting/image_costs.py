@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache, cached_property
 from importlib.resources import files
 from typing import Any
@@ -104,7 +104,8 @@ class ImageCosts:
             sees_sky = channel.sees_sky(row["image_type"])
             if self.request.compression != "none":
                 self.seconds += row["bytes_sum"] * run_costs()["compression"]["byte_s"]
-            self.bytes += row["bytes_sum"] * self._compression(row["channel"], row["image_type"], sees_sky)
+            kind, readout = (row["channel"], row["image_type"]), self.request.readout
+            self.bytes += row["bytes_sum"] * size_ratio(*kind, self.request.compression, readout, self.request.truth)
             self.bytes += tables["image_bytes"] * row["bytes_count"]
             if sees_sky:
                 self.bytes += tables["source_bytes"] * row["sources_sum"]
@@ -113,18 +114,6 @@ class ImageCosts:
             if sees_sky and channel.dispersion is not None:
                 spectra = min(row["sources_sum"], tables["most_spectra"] * row["bytes_count"])
                 self.bytes += tables["spectrum_bytes"] * spectra
-
-    def _compression(self, name: str, image_type: str, sees_sky: bool) -> float:
-        """Return the size of the files of images and truth maps relative to that without compression."""
-        if self.request.compression == "none":
-            return 1.0
-        channel, ratios = registry.CHANNELS[name], run_costs()["compression"]
-        map_ratios = ratios["maps"]
-        effects = channel.with_readout(self.request.readout).effects.get(image_type) or ()
-        maps = truth_maps.available_maps(self.request.truth, [effect.name for effect in effects], sees_sky)
-        parts = [(channel.cost.file_bytes_per_pixel, ratios[name])]
-        parts += [(truth_maps.BYTES_PER_PIXEL[m], map_ratios.get(m, 1.0)) for m in maps]
-        return float(sum(size * ratio for size, ratio in parts) / sum(size for size, _ in parts))
 
     def psfs(self) -> set[PsfKey]:
         """Return the PSFs that the images need, without PSFs in the user's files."""
@@ -139,3 +128,29 @@ class ImageCosts:
     @cached_property
     def _mission(self) -> MissionConfiguration:
         return mission_of(self.request.mission)
+
+
+def size_ratio(name: str, image_type: str, compression: str, readout: str, truth: Sequence[str]) -> float:
+    """Return the size of the files of images and truth maps relative to that without compression.
+
+    Parameters
+    ----------
+    name, image_type : str
+        Channel and type of the images.
+    compression, readout, truth : str, str, sequence of str
+        Compression, form of the images, and names of the truth maps, as the request has them.
+
+    Returns
+    -------
+    float
+        1 without compression.
+    """
+    if compression == "none":
+        return 1.0
+    channel, ratios = registry.CHANNELS[name], run_costs()["compression"]
+    map_ratios = ratios["maps"]
+    effects = channel.with_readout(readout).effects.get(image_type) or ()
+    maps = truth_maps.available_maps(truth, [effect.name for effect in effects], channel.sees_sky(image_type))
+    parts = [(channel.cost.file_bytes_per_pixel, ratios[name])]
+    parts += [(truth_maps.BYTES_PER_PIXEL[m], map_ratios.get(m, 1.0)) for m in maps]
+    return float(sum(size * ratio for size, ratio in parts) / sum(size for size, _ in parts))

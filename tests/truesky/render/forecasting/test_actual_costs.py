@@ -12,6 +12,7 @@ from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
 from tests.universe import rows_of
 from truesky.render.forecasting import actual_costs
+from truesky.render.forecasting.image_costs import size_ratio
 
 # Exposure, channel and image type. Detectors have 0.2 x 0.2 deg: two adjacent ones, each exposed twice, and a bias.
 FRAMES = ((0, "VIS", "science"), (1, "VIS", "science"), (2, "VIS", "bias"), (3, "EXT", "science"))
@@ -34,6 +35,10 @@ def published(lake, table, rows):
 
 @pytest.fixture
 def rendered(lake):
+    return made(lake, "none")
+
+
+def made(lake, compression):
     """A lake with all but one detector made, all but one of which a log tells of."""
     planned = [(number, name, channel) for number, channel, _ in FRAMES for name in PLACES]
     tasks = published(
@@ -55,9 +60,13 @@ def rendered(lake):
             "image_type": [t for *_, t in FRAMES], "camera": ["vis", "vis", "vis", "hsc"],
         },
     )  # fmt: skip
-    made = planned[:-1]
-    parts = [Task(f"{i}.parquet", {"exposure_id": n, "detector": d}) for i, (n, d, _) in enumerate(made)]
-    plan = Plan(PRODUCTS, {"inputs": {"tasks": tasks, "exposures": exposures}}, tuple(parts))
+    present = planned[:-1]
+    parts = [Task(f"{i}.parquet", {"exposure_id": n, "detector": d}) for i, (n, d, _) in enumerate(present)]
+    facts = {
+        "inputs": {"tasks": tasks, "exposures": exposures},
+        "request": {"compression": compression, "readout": "raw", "truth": ["noise_free"]},
+    }
+    plan = Plan(PRODUCTS, facts, tuple(parts))
     publish.make_version(lake, plan, lambda root, facts: Output(PRODUCTS.empty()))
     lines = [{"job": "render_exposures", "table": "products", "key": plan.key}]
     lines += [{"part": part.name, "cpu_s": 5.0 + i, "peak_gb": 1.0 + i} for i, part in enumerate(parts[:-1])]
@@ -83,6 +92,13 @@ def test_lines_of_a_request(rendered):
     assert (vis.cpu_s, vis.core_hours_deg2) == (26.0 + 9.0 + 10.0, science.core_hours_deg2)
     assert (total.planned, total.rendered, total.measured, total.peak_gb) == (8, 7, 6, 6.0)
     assert total.core_hours_deg2 == science.core_hours_deg2
+
+
+def test_the_forecast_of_sizes_includes_compression(lake):
+    """A VIS image and its noise-free image become smaller, by the measured ratios."""
+    (vis, *_) = (line for line in actual_costs.summarise(made(lake, "rice")) if line.image_type == "science")
+    assert vis.forecast_gb == pytest.approx(4e-3 * size_ratio("VIS", "science", "rice", "raw", ["noise_free"]))
+    assert 1e-3 < vis.forecast_gb < 3.5e-3
 
 
 def test_the_table(rendered):
