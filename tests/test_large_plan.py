@@ -81,7 +81,8 @@ def published(root, number, times):
         row = {**legal, **planned, "path": f"{facts['exposure_id']}", "content": "science"}
         return Output(PRODUCTS.build({name: [value] for name, value in row.items()}))
 
-    make(PRODUCTS, {"inputs": inputs, **about}, [image_part(rows[number]) for number in MADE], image)
+    facts = {"inputs": inputs, "request": REQUEST.facts("compression", "readout", "truth")}
+    make(PRODUCTS, facts, [image_part(rows[number]) for number in MADE], image)
     return exposures, tasks
 
 
