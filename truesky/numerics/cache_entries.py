@@ -37,7 +37,7 @@ KINDS = (
     ("spectra", "libraries of spectra, isochrones", r"(galaxy|stellar|published)_library|published_stars|isochrones"),
     ("fluxes", "flux tables and passbands", r"(galaxy|star|line)_table_.+|(flux_errors|band_ratios|passband)_.+"),
     ("psf", "PSF planes and profiles", r"\w+_psf|sersic"),
-    ("dust", "dust maps", r"dust_map|dust_file"),
+    ("dust", "dust maps and laws", r"dust_map|dust_file|milky_way_law"),
     ("catalogues", "your catalogues, as read", r"ingest|checked_rows|training|star_catalogue|tycho2"),
     ("page", "columns and images of the web page", r"columns|pyramid"),
     ("code", "machine code", r"numba/[0-9a-f]{16}"),

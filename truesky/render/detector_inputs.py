@@ -97,9 +97,21 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
 
 
 def check_psf_files(exposed: ExposureRow, previous_exposures: Sequence[object], facts: Json) -> None:
-    """Raise BadInput if a PSF file of the user has changed since its checksum was recorded in `facts`.
+    """Check that the user's PSF files have not changed since their checksums were recorded.
 
-    Files of the exposure and of previous exposures, which are drawn for their persistence, are checked.
+    Parameters
+    ----------
+    exposed : ExposureRow
+        The exposure.
+    previous_exposures : sequence
+        Previous exposures, whose persistence is drawn, as `find_previous_exposures` returns them.
+    facts : dict
+        Recorded inputs of the image, with the checksums of PSF files by path in `psf`.
+
+    Raises
+    ------
+    BadInput
+        If a file has changed.
     """
     drawn = [previous.exposure for previous in previous_exposures if isinstance(previous, PreviousExposure)]
     for exposure_row in (exposed, *drawn):

@@ -57,7 +57,7 @@ BAD = [
     ("area", {"polygon": [[0, 0], 1, [1, 1]]}, r"area.polygon\[1\]"),
     ("area", "all", "area"),
     ("structure", {"bars": True}, "structure.bars"),
-    ("structure", {"arms": "many"}, "structure.arms must be a table"),
+    ("structure", {"arms": "many"}, "structure.arms must be true or a table"),
     ("structure", {"arms": {"pitch": 20.0}}, "structure.arms.pitch"),
     ("structure", {"arms": {"contrast": -0.1}}, "structure.arms.contrast"),
     ("structure", {"arms": {"knots": 0.6}}, "structure.arms.knots"),

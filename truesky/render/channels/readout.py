@@ -448,6 +448,28 @@ def _electrons(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
 ELECTRONS = replace(AMPLIFIERS, make_readout=_electrons, stop_before=layout.AMPLIFIERS.name, file_bytes_per_pixel=4)
 
 
+def amplifier_of_pixel(column: int, row: int, scene: Scene) -> int:
+    """Find the amplifier that reads a pixel of a detector.
+
+    Parameters
+    ----------
+    column, row : int
+        Place of the pixel, from 0.
+    scene : Scene
+        Properties of the exposure, for the whole detector.
+
+    Returns
+    -------
+    int
+        Number of the amplifier, from 0. If none reads the pixel, the amplifier of the nearer half of a detector with
+        quadrants, or 0.
+    """
+    if scene.layout is None:
+        return layout.quadrant_of_pixel(column, row, scene.nx, scene.ny)
+    areas = [amplifier.pixels for amplifier in scene.layout.amplifiers]
+    return next((n for n, area in enumerate(areas) if area.contains(column, row)), 0)
+
+
 def split_frame(frame: Float, scene: Scene) -> Float:
     """Split the pixels [ny, nx] of a detector into planes [amplifier, row, column].
 

@@ -24,9 +24,9 @@ from lake_schema.arrays import Array, Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from truesky.numerics import matrices
 from truesky.numerics.compiling import jit
-from truesky.render.drawing import transfer
+from truesky.render.drawing import psf_on_nodes
 from truesky.render.drawing.kernels.frame import BULGE, BULGE_FORM, DISK, DISK_FORM, POWER
-from truesky.render.psf.model import SAMPLES, Psf
+from truesky.render.psf.model import Psf
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.selection import FARTHEST
@@ -66,9 +66,6 @@ _COARSEST = 1.0 / 16.0
 # Spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the width (minor
 # axis) that the galaxy's ellipse has at the distance of the ring.
 _SPACING_FRACTION = 0.2
-# Half side of the square in which a PSF that is given as a profile (not as images) is evaluated, pixels. For seeing by
-# the atmosphere, 1e-5 of the light lies outside.
-_MOFFAT = 128
 # Number of nodes along the major axis, and along the minor axis, of the table of an inclined disc's light.
 _NODES = 76
 # Spacing of the nodes in the table of an inclined disc's light. Nodes are equally spaced in t = arsinh(u), where u is
@@ -168,7 +165,7 @@ def from_galaxy(
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), max(map(abs, region)))
-    cells = _cells(psf, weights, block)
+    cells = psf_on_nodes.change_by_psf(psf, weights, block)
     first_x, first_y = (int(np.floor(start / block)) - 1 for start in (region[0], region[2]))
     end_x, end_y = (int(np.ceil(end / block)) + 2 for end in (region[1], region[3]))
     # Nodes around the region from which the PSF moves light into it.
@@ -176,19 +173,8 @@ def from_galaxy(
     unblurred = np.zeros((end_y - first_y + 2 * margin, end_x - first_x + 2 * margin))
     x, y = float((margin - first_x) * block), float((margin - first_y) * block)
     _sample(light, disk, wide, x, y, float(block), unblurred)
-    blurred = _convolve(unblurred, cells)
+    blurred = psf_on_nodes.convolve_inside(unblurred, cells)
     return Outskirts(light, disk, wide, blurred, block, (first_x, first_y))
-
-
-def _convolve(image: Float, kernel: Float) -> Float:
-    """Return the part of the convolution of an image with a square kernel that needs no values outside the image.
-
-    It is `scipy.signal.fftconvolve` with the mode "valid". The import of scipy.signal takes longer than most images.
-    """
-    shape = [scipy.fft.next_fast_len(n + len(kernel) - 1, True) for n in image.shape]
-    product = scipy.fft.rfft2(image, shape) * scipy.fft.rfft2(kernel, shape)
-    first, (rows, columns) = len(kernel) - 1, image.shape
-    return np.ascontiguousarray(scipy.fft.irfft2(product, shape)[first:rows, first:columns])
 
 
 @lru_cache(maxsize=16)
@@ -243,85 +229,6 @@ def _block(slim: float, farthest: float) -> int:
     while block > _FINEST_BLOCK and slim < _SLIM * block / _BLOCK and farthest <= _MOST_NODES * (block // 2):
         block //= 2
     return block
-
-
-def _cells(psf: Psf, weights: Float, block: int) -> Float:
-    """Return the PSF of a source minus a delta function, on nodes `block` pixels apart.
-
-    Convolved with the light of a galaxy at the nodes, it gives the change of the light by the PSF. Each sample of the
-    PSF is averaged over a pixel and distributed to five nodes per direction, which preserves moments up to the fourth.
-    `weights` [planes] are the weights of the PSF's planes (basis images) for the source, from `transfer.basis_weights`.
-    """
-    if psf.planes is None:
-        side = 2 * _MOFFAT * SAMPLES + 1
-        drawn = psf.profile.drawImage(nx=side, ny=side, scale=psf.pixel_scale / SAMPLES, method="no_pixel")
-        image = drawn.array / drawn.array.sum(dtype=float)
-    else:
-        image = np.asarray(transfer.image_of(psf.planes, weights), float)
-    out = _to_nodes(image, block, SAMPLES if psf.planes is None else psf.planes.samples)
-    out[len(out) // 2, len(out) // 2] -= 1.0
-    return out
-
-
-def _to_nodes(image: Float, block: int, samples: int) -> Float:
-    """Distribute the samples of an image, `samples` per pixel in each direction, to nodes `block` pixels apart."""
-    out = image
-    # First along columns, then along rows.
-    for _ in range(2):
-        nodes, shares = _shares(len(out), block, samples)
-        sums = np.zeros((int(nodes[-1]) + shares.shape[1], out.shape[1]))
-        _add_to_nodes(np.ascontiguousarray(out), nodes, shares, sums)
-        out = sums.T
-    return np.ascontiguousarray(out)
-
-
-def _shares(length: int, block: int, samples: int) -> tuple[Int, Float]:
-    """Return the fractions of the light of each sample of a line that are added to five nodes of a grid.
-
-    Parameters
-    ----------
-    length : int
-        Number of samples of the line.
-    block : int
-        Distance between nodes, pixels.
-    samples : int
-        Number of samples per pixel.
-
-    Returns
-    -------
-    first_node : int array, shape (length,)
-        First of the five nodes next to each sample; the first node of the grid is 0. The middle sample coincides with
-        the middle node.
-    shares : float array, shape (length, 5)
-        Fractions, some of which are negative. Their sum is 1 for each sample.
-    """
-    place = (np.arange(length) - length // 2) / (samples * block)
-    node = np.rint(place).astype(int)
-    off, pixel = place - node, 1.0 / (12.0 * block**2)
-    # Moments, about the nearest node, of a uniform pixel centred on the sample.
-    first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
-    fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
-    shares = (
-        (2.0 * first - second - 2.0 * third + fourth) / 24.0,
-        (-4.0 * first + 4.0 * second + third - fourth) / 6.0,
-        1.0 - (5.0 * second - fourth) / 4.0,
-        (4.0 * first + 4.0 * second - third - fourth) / 6.0,
-        (-2.0 * first - second + 2.0 * third + fourth) / 24.0,
-    )
-    return node + int(np.abs(node).max()), np.column_stack(shares)
-
-
-@jit
-def _add_to_nodes(image: Float, nodes: Int, shares: Float, out: Float) -> None:
-    """Add the rows of an image to rows of nodes, `out` [nodes, columns], as `_shares` distributes them.
-
-    Each row of the image [rows, columns] has few nodes, so that this is much faster than a product of matrices.
-    """
-    for i in range(len(image)):
-        for k in range(shares.shape[1]):
-            share, line, node = shares[i, k], image[i], out[nodes[i] + k]
-            for j in range(len(line)):
-                node[j] += share * line[j]
 
 
 def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:

@@ -12,11 +12,12 @@ from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from truesky.randomness import rng
 from truesky.render.camera.windows import Window
+from truesky.render.channels import readout
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamps, wings
 from truesky.render.drawing.stamps import Tally
 from truesky.render.effects.effect import Decision, Effect, apply_all
-from truesky.render.effects.readout import adc, quadrants
+from truesky.render.effects.readout import adc
 from truesky.render.effects.scene import Lights, Scene
 from truesky.render.exposure import limits, rendered_detector, scene_factory
 from truesky.render.exposure.records import Rows, Variant
@@ -231,8 +232,4 @@ def amplifier_at(aim: Aim, scene: Scene, window: Window) -> int:
     if not _SPLITTING & {effect.name for effect in aim.effects}:
         return 0
     column, row = (int(place) for place in window.middle)
-    whole = replace(scene, window=None)
-    if whole.layout is None:
-        return quadrants.quadrant_of_pixel(column, row, whole.nx, whole.ny)
-    areas = [amplifier.pixels for amplifier in whole.layout.amplifiers]
-    return next((n for n, area in enumerate(areas) if area.contains(column, row)), 0)
+    return readout.amplifier_of_pixel(column, row, replace(scene, window=None))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy import signal
 from scipy.integrate import quad
 from scipy.special import gammaincinv, gammaln, k1
 
@@ -219,41 +218,6 @@ def test_aliased_light_of_a_stamp_is_the_sum_of_all_periodic_images(index, ratio
         for a, b in zip(x, y, strict=True)
     ]
     np.testing.assert_allclose(-stamp[y, x], electrons * np.array(expected), rtol=2e-3, atol=0.1)
-
-
-@given(st.integers(1, 60), st.sampled_from([4, 8]), st.floats(-4.0, 4.0), st.floats(-40.0, 40.0))
-def test_samples_on_nodes_keep_what_any_quartic_sees(half, block, curve, slope):
-    """A sample spread over a pixel has the same mean on the nodes as on the sky."""
-    first, shares = outskirts._shares(2 * half + 1, block, SAMPLES)
-    nodes = block * (first[:, None] + np.arange(5) - first[half] - 2)
-    seen = np.linspace(-0.5, 0.5, 2001)
-    at = (np.arange(-half, half + 1) / SAMPLES)[:, None] + 0.5 * (seen[1:] + seen[:-1])
-
-    def quartic(x):
-        x = x / block
-        return x**4 + curve * x**3 + x**2 + slope * x + 1.0
-
-    np.testing.assert_allclose((shares * quartic(nodes)).sum(axis=1), quartic(at).mean(axis=1), rtol=1e-6, atol=1e-5)
-
-
-@pytest.mark.parametrize("block", [2, 8])
-def test_an_image_on_nodes_is_a_product_of_matrices(block):
-    image = np.random.default_rng(4).normal(size=(41, 63))
-    sides = []
-    for length in image.shape:
-        first, shares = outskirts._shares(length, block, SAMPLES)
-        matrix = np.zeros((length, int(first[-1]) + 5))
-        np.put_along_axis(matrix, first[:, None] + np.arange(5), shares, axis=1)
-        sides.append(matrix)
-    np.testing.assert_allclose(
-        outskirts._to_nodes(image, block, SAMPLES), sides[0].T @ image @ sides[1], rtol=0.0, atol=1e-12
-    )
-
-
-def test_convolution_is_that_of_scipy():
-    rng = np.random.default_rng(8)
-    image, kernel = rng.normal(size=(53, 40)), rng.normal(size=(9, 9))
-    np.testing.assert_array_equal(outskirts._convolve(image, kernel), signal.fftconvolve(image, kernel, mode="valid"))
 
 
 @given(st.floats(0.0, 90.0), st.floats(0.0, 8.0), st.floats(0.0, 4.0))

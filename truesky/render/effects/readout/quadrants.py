@@ -97,9 +97,19 @@ def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[
 
 
 def quadrant_of_pixel(column: int, row: int, nx: int, ny: int) -> int:
-    """Return the index of the quadrant (0 to 3 for E, F, G, H) that reads a pixel of a detector of ny x nx pixels.
+    """Find the quadrant that reads a pixel.
 
-    Rows between the halves, which are not read, count to the nearer half.
+    Parameters
+    ----------
+    column, row : int
+        Place of the pixel, from 0.
+    nx, ny : int
+        Number of columns and of rows of the detector.
+
+    Returns
+    -------
+    int
+        0 to 3 for E, F, G, H. Rows between the halves, which are not read, count to the nearer half.
     """
     place = row >= ny / 2, column >= nx / 2
     return next(n for n, half in enumerate(zip(_UPPER, _RIGHT, strict=True)) if half == place)
