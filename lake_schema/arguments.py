@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import numbers
 import operator
 import re
 from collections.abc import Callable, Iterable, Sequence
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.texts import spelling
@@ -73,6 +74,19 @@ def refuse_coordinates(name: str, value: object) -> None:
         raise BadInput(f"{name} must be a number in degrees, got a {kind}: write {c}.ra.deg, {c}.dec.deg")
 
 
+def exchanged_question(ra: object, dec: object) -> str:
+    """Return "are ra and dec exchanged?" if a declination is out of range and its right ascension is not, else "".
+
+    `ra` and `dec` are in degrees; the result is "" if one of them is not a number.
+    """
+    # Values are not converted to float, which fails for huge whole numbers.
+    values: list[Any] = [
+        abs(value) for value in (ra, dec) if isinstance(value, numbers.Real) and not isinstance(value, bool)
+    ]
+    is_exchanged = len(values) == 2 and values[0] <= 90.0 < values[1] <= 360.0
+    return "are ra and dec exchanged?" if is_exchanged else ""
+
+
 def check_degrees(name: str, value: object, lo: float = -math.inf, hi: float = math.inf) -> float:
     """Return an angle in degrees as a float if it is a number within its bounds, which are included.
 
@@ -103,7 +117,7 @@ def check_degrees(name: str, value: object, lo: float = -math.inf, hi: float = m
     return check_number(name, value, lo, hi, "deg")
 
 
-def refuse_angle(name: str, value: object, form: str) -> None:
+def refuse_angle(name: str, value: object, form: str, unit: str = "deg", digits: int = 6) -> None:
     """Refuse an argument that is a text such as "1 arcmin" or a Quantity of astropy that is an angle.
 
     Parameters
@@ -114,6 +128,10 @@ def refuse_angle(name: str, value: object, form: str) -> None:
         Value that the user gave. Other values are accepted.
     form : str
         Unit and range of the numbers that are allowed, such as "in degrees".
+    unit : str, optional
+        Unit of the number that the message contains: "deg" or "arcsec".
+    digits : int, optional
+        Number of decimals of this number.
 
     Raises
     ------
@@ -122,8 +140,8 @@ def refuse_angle(name: str, value: object, form: str) -> None:
     """
     if isinstance(value, str):
         match = _ANGLE.fullmatch(value)
-        unit = _DEGREES.get(match[2].lower()) if match else None
-        degrees = float(match[1]) * unit if match and unit else None
+        scale = _DEGREES.get(match[2].lower()) if match else None
+        degrees = float(match[1]) * scale if match and scale else None
         text = repr(value)
     else:
         try:
@@ -132,7 +150,8 @@ def refuse_angle(name: str, value: object, form: str) -> None:
             degrees = None
         text = str(value)
     if degrees is not None:
-        number = f"{round(degrees, 6)}" if abs(degrees) >= 1e-3 else f"{degrees:.6g}"
+        angle = degrees / _DEGREES["arcsec"] if unit == "arcsec" else degrees
+        number = f"{round(angle, digits):.12g}" if abs(angle) >= 1e-3 else f"{angle:.6g}"
         raise BadInput(f"{name} must be a number {form}, got {text}: write {number}")
 
 

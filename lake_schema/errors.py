@@ -164,13 +164,20 @@ class OutOfRange(BadInput):
         Smallest and largest value that is allowed.
     unit : str, optional
         Unit of the limits.
+    question : str, optional
+        Question about the cause, such as "are ra and dec exchanged?".
     """
 
-    def __init__(self, name: str, value: object, lo: object, hi: object, unit: str = "") -> None:
-        super().__init__(f"{name} = {value} is outside [{lo}, {hi}] {unit}".rstrip())
-        self._arguments = name, value, lo, hi, unit
+    def __init__(self, name: str, value: object, lo: object, hi: object, unit: str = "", question: str = "") -> None:
+        limits = f"{name} = {value} is outside [{lo}, {hi}] {unit}".rstrip()
+        super().__init__(f"{limits}: {question}" if question else limits)
+        self._arguments = name, value, lo, hi, unit, question
 
-    def __reduce__(self) -> tuple[type[OutOfRange], tuple[object, ...]]:
+    def with_question(self, question: str) -> OutOfRange:
+        """Return the error with a question about the cause at its end."""
+        return OutOfRange(*self._arguments[:5], question)
+
+    def __reduce__(self) -> tuple[type[OutOfRange], tuple[object, object, object, object, str, str]]:
         # By default, unpickling an exception calls the constructor with the message as its only argument.
         return OutOfRange, self._arguments
 

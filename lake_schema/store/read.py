@@ -22,7 +22,7 @@ from lake_schema import arguments, sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
-from lake_schema.errors import BadInput, Damaged, VersionMismatch
+from lake_schema.errors import BadInput, Damaged, OutOfRange, VersionMismatch
 from lake_schema.store import layout, manifest, parquet, request_links
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.provenance import digest
@@ -471,7 +471,10 @@ class Version:
             If a file differs from the manifest.
         """
         radius = arguments.check_degrees("radius", radius, 0.0, 180.0)
-        sky.check_positions(arguments.check_degrees("ra", ra), arguments.check_degrees("dec", dec))
+        try:
+            sky.check_positions(arguments.check_degrees("ra", ra), arguments.check_degrees("dec", dec))
+        except OutOfRange as error:
+            raise error.with_question(arguments.exchanged_question(ra, dec)) from None
         position_names = self.position_columns(on)
         self._check_columns([*position_names, "_healpix_29"])
         # Files are sorted by observed positions. Enlarge the circle by the largest deflection, so that it contains the

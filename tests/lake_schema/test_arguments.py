@@ -49,6 +49,21 @@ def test_angles_with_units_are_refused_with_their_number_of_degrees(value, remed
     assert arguments.check_degrees("radius", 1, 0.0, 180.0) == 1.0
 
 
+@pytest.mark.parametrize("value", ["30 arcsec", "0.5'", Quantity(0.5, "arcmin"), " 30 arcsec "])
+def test_angles_with_units_are_refused_with_their_number_of_arcsec(value):
+    with pytest.raises(BadInput, match=r"^size must be a number of arcsec from 0 to 60, got .*: write 30$"):
+        arguments.refuse_angle("size", value, "of arcsec from 0 to 60", "arcsec")
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec", "is_exchanged"),
+    [(-27.8, 153.1, True), (np.int64(2), np.float32(150.0), True), (153.1, -27.8, False), (153.1, 100.0, False),
+     (1.0, 400.0, False), ("1", 150.0, False), (True, 150.0, False), (None, 150.0, False)],
+)  # fmt: skip
+def test_exchanged_positions_are_asked_about(ra, dec, is_exchanged):
+    assert arguments.exchanged_question(ra, dec) == ("are ra and dec exchanged?" if is_exchanged else "")
+
+
 def test_a_missing_argument_is_named():
     @arguments.refuse_missing("area(ra, dec)")
     def area(ra, dec, /, *, band, size=1.0, **options):

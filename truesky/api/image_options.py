@@ -15,6 +15,8 @@ from truesky.request.toml_values import refuse_name
 
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
+# Largest side of an image in arcsec.
+_MAX_SIZE = 3600.0
 
 
 class ImageOptions(TypedDict, total=False):
@@ -163,13 +165,14 @@ def check_place(ra: float | str, dec: float | str) -> tuple[float, float]:
     """Return a position in degrees, with ra from 0 to 360; raises BadInput if the values are not allowed."""
     return (
         sky_notation.angle(ra, "ra", "ra", sky_notation.RA_LIMITS) % 360.0,
-        sky_notation.angle(dec, "dec", "dec", sky_notation.DEC_LIMITS),
+        sky_notation.angle(dec, "dec", "dec", sky_notation.DEC_LIMITS, ra),
     )
 
 
 def check_size(size: float) -> float:
     """Return the side of an image in arcsec; raises BadInput if it is not a number from 0 to 3600."""
-    return arguments.check_number("size", size, 0.0, 3600.0)
+    arguments.refuse_angle("size", size, f"of arcsec from 0 to {_MAX_SIZE:g}", "arcsec")
+    return arguments.check_number("size", size, 0.0, _MAX_SIZE, "arcsec")
 
 
 def check_count(name: str, value: Any) -> int:

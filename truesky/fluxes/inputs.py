@@ -157,7 +157,7 @@ def _read_passband(name: str, curves: Curves) -> tuple[Passband, Origin]:
     location = curves.location or f"{FILTER_PREFIX}{name}"
     if name in passbands.names():
         raise BadInput(f"{location}: truesky has a passband {name}: choose another name for this curve")
-    with _prefix_errors(location):
+    with _prefix_errors(curves.location or f"{location}.file"):
         return from_files.passband(curves.files[0], name, curves.medium, curves.format), _user_origin(curves)
 
 

@@ -38,7 +38,7 @@ _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 GALACTIC_MIN, ECLIPTIC_MIN = 30.0, 15.0
 _WIDE_SQUARE_DEGREES = 15_000.0
 # Questions about keys that an area does not have.
-_PLACES = {"circle": "did you mean cone = { ra, dec, radius }?", "vertices": "did you mean polygon?"}
+_PLACES = {"circle": "did you mean cone = {{ {} }}?", "vertices": "did you mean polygon?"}
 _CONE_KEYS = ("ra", "dec", "radius")
 # Largest number of vertices of a polygon, and of circles of an area.
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000
@@ -241,13 +241,14 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
     return np.asarray(depth.reshape(np.shape(ra)))
 
 
-def parse(table: Toml, path: str = "area") -> Area:
+def parse(table: Toml | None, path: str = "area") -> Area:
     """Read the section `area` of a request.
 
     Parameters
     ----------
-    table : Toml
-        The section, with exactly one of the keys "polygon", "cone", "box", "tile", "patches" and "wide".
+    table : Toml or None
+        The section, with exactly one of the keys "polygon", "cone", "box", "tile", "patches" and "wide"; None if it is
+        missing.
     path : str, optional
         Name of the section, for error messages.
 
@@ -259,15 +260,17 @@ def parse(table: Toml, path: str = "area") -> Area:
     Raises
     ------
     BadInput
-        If the section has another number of keys, an unknown key or a wrong value. The message names the key.
+        If the section is missing, has another number of keys, an unknown key or a wrong value. The message names it.
     OutOfRange
         If a number is out of range.
     """
+    if table is None:
+        raise BadInput(f"{path} is missing: add [{path}] with a line such as {_EXAMPLES}")
     table = as_table(table, path, None)
     if loose := [key for key in _CONE_KEYS if key in table]:
-        form = ", ".join(f"{key} = {table.get(key, '..')}" for key in _CONE_KEYS)
-        raise BadInput(f"{path}: {', '.join(loose)} must be in a table, in degrees: cone = {{ {form} }}")
-    check_keys(table, path, _FORMS, _PLACES)
+        form = f"cone = {{ {_cone_values(table)} }}"
+        raise BadInput(f"{path}: {', '.join(loose)} must be in a table, in degrees: {form}")
+    check_keys(table, path, _FORMS, {key: text.format(_cone_values(table.get(key))) for key, text in _PLACES.items()})
     if len(table) != 1:
         has = f"it has {', '.join(table)}" if table else f"such as {_EXAMPLES}"
         raise BadInput(f"{path} must have exactly one of {', '.join(_FORMS)}; {has}")
@@ -282,7 +285,17 @@ def parse(table: Toml, path: str = "area") -> Area:
     return readers[next(iter(table))]()
 
 
+def _cone_values(value: object) -> str:
+    """Return the keys of a circle with the user's values, from a table or a list of three numbers, for a message."""
+    if isinstance(value, list) and len(value) == len(_CONE_KEYS):
+        value = dict(zip(_CONE_KEYS, value, strict=True))
+    values = value if isinstance(value, dict) else {}
+    return ", ".join(f"{key} = {quote_value(values[key]) if key in values else '..'}" for key in _CONE_KEYS)
+
+
 def _cone(value: object, path: str) -> Area:
+    if isinstance(value, list) and len(value) == len(_CONE_KEYS):
+        raise BadInput(f"{path} must be a table, not a list: write {path} = {{ {_cone_values(value)} }}")
     cone = as_table(value, path, _CONE_KEYS)
     with Mistakes() as mistakes:
         ra = mistakes.read(sky_notation.ra_of, cone, f"{path}.ra")
@@ -363,7 +376,8 @@ def _coordinate_lists(
                 mistakes.add(BadInput(f"{path}[{i}] must be {form} in degrees, got {quote_value(place)}"))
                 continue
             ra = mistakes.read(sky_notation.angle, place[0], f"{path}[{i}].ra", "ra", RA_LIMITS)
-            numbers = [ra, mistakes.read(sky_notation.angle, place[1], f"{path}[{i}].dec", "dec", DEC_LIMITS)]
+            dec_path = f"{path}[{i}].dec"
+            numbers = [ra, mistakes.read(sky_notation.angle, place[1], dec_path, "dec", DEC_LIMITS, place[0])]
             if read_radius is not None:
                 numbers.append(mistakes.read(read_radius, place[2], f"{path}[{i}].radius"))
             places.append(numbers)

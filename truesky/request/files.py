@@ -16,11 +16,24 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
-from truesky.request.toml_values import Toml, as_table, boolean, number, quote_value, required_value, string, strings
+from truesky.request.toml_values import (
+    Toml,
+    as_table,
+    boolean,
+    check_keys,
+    number,
+    quote_value,
+    required_value,
+    string,
+    strings,
+)
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
 
+# Formats of a user's passband. This copies truesky/fluxes/libraries/spectrum_formats.toml, because requests must not
+# import the fluxes; test_from_files.py compares the two.
+PASSBAND_FORMATS = ("passband_ascii", "passband_ecsv", "passband_svo")
 # Words by which error messages of lake_schema.user_files name a file of sources.
 SOURCES_KIND = "table of sources"
 
@@ -390,11 +403,15 @@ def _file_list(table: Toml, path: str, folder: Path, distinct: bool = True) -> t
 
 
 def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
-    table = as_table(value, path, ("file", "format", *(("medium",) if has_medium else ())))
+    table = as_table(value, path, None)
     with Mistakes() as mistakes:
+        mistakes.read(check_keys, table, path, ("file", "format", *(("medium",) if has_medium else ())))
         medium = mistakes.read(string, table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
         file = mistakes.read(_file, table, f"{path}.file", folder)
         form = mistakes.read(_format, table, f"{path}.format")
+        if len(mistakes) and file is not None:
+            # A file that does not exist is reported with the other mistakes. Else the file is checked when it is read.
+            mistakes.read(user_files.check_file, file, "curve", f"{path}.file")
     return Curves((file,), form, medium)
 
 
@@ -402,7 +419,7 @@ def _format(table: Toml, path: str) -> str:
     kind = "passband" if ".passbands." in path else "extinction" if ".extinction." in path else "spectrum"
     examples = {"passband": '"passband_ascii"', "extinction": '"extinction"', "spectrum": '"spectrum_csv"'}
     required_value(table, path, f"it must be the format of the file, such as {examples[kind]} (docs/own_files.md)")
-    return string(table, path)
+    return string(table, path, PASSBAND_FORMATS if kind == "passband" else ())
 
 
 def parse_ingest(table: Toml, folder: Path) -> Ingest:

@@ -269,7 +269,7 @@ def read_valid_parts(table: Toml, folder: Path = Path()) -> ValidParts:
     named = None if curves is None else mission
     pointing_list = read("pointing", pointings.parse_pointings, table, named, user_bands) or ()
     blocks = read("observation", observations.parse_observations, table, folder, named, user_bands) or ()
-    area = read("area", areas.parse, table.get("area", {}))
+    area = read("area", areas.parse, table.get("area"))
     values = _values(reader, folder, area)
     invalid = reader.invalid
     if area is None or explore is None or choice is None or curves is None or bands is None or "mission" in invalid:

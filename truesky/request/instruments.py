@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from lake_schema.errors import BadInput, bad_input
 from lake_schema.tables.exposures import EUCLID_BANDS
 from lake_schema.texts import spelling
+from truesky.request.toml_values import known_name
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
@@ -140,7 +141,9 @@ def check_camera(channel: str, camera: str, mission: MissionConfiguration, path:
         raise BadInput(f"{path}: channel {channel} has no camera {camera!r}: {spelling.choices(camera, names)}")
 
 
-def check_band(band: str, bands: Sequence[str], owner: str, path: str) -> None:
+def check_band(
+    band: str, bands: Sequence[str], owner: str, path: str, mission: MissionConfiguration | None = None
+) -> None:
     """Check that a camera or a survey has a passband.
 
     Parameters
@@ -153,14 +156,46 @@ def check_band(band: str, bands: Sequence[str], owner: str, path: str) -> None:
         Camera or survey with these passbands, such as "camera vis", for the error message.
     path : str
         Path of the key, for the error message; "" if the caller adds it.
+    mission : MissionConfiguration, optional
+        Mission parameters, for the channel, camera or survey that has the passband, if another one has it.
 
     Raises
     ------
     BadInput
         If the passband is not allowed.
     """
-    if band not in bands:
-        raise BadInput(f"{path}{': ' if path else ''}{owner} has no band {band!r}: {spelling.choices(band, bands)}")
+    if band in bands:
+        return
+    meant = known_name(band, bands)
+    remedy = spelling.choices(meant, bands)
+    in_observation = path.endswith("bands")
+    other = "" if mission is None or meant != band else _owner_of_band(band, in_observation, mission)
+    if other:
+        filter_name = band.rpartition("_")[2]
+        same = [name for name in bands if name.rpartition("_")[2] == filter_name] if len(bands) > 1 else bands
+        form = 'bands = ["{}"]' if in_observation else 'band = "{}"'
+        remedy = f"{other}, or {form.format(same[0]) if len(same) == 1 else f'one of {spelling.join_words(bands)}'}"
+    raise BadInput(f"{path}{': ' if path else ''}{owner} has no band {band!r}: {remedy}")
+
+
+def _owner_of_band(band: str, in_observation: bool, mission: MissionConfiguration) -> str:
+    """Return the channel, camera or survey that has a passband, and the keys that select it, "" if none has it.
+
+    The keys are those of an observation if `in_observation` is True, else those of a pointing.
+    """
+    band = known_name(band, [name for bands in EUCLID_BANDS.values() for name in bands])
+    for channel, bands in EUCLID_BANDS.items():
+        if band in bands:
+            keys = f'channels = ["{channel}"]' if in_observation else f'channel = "{channel}"'
+            keys += " and blue = true" if in_observation and band == "nisp_blue" else ""
+            return f"{band} is a band of {channel}, write {keys}"
+    if in_observation:
+        surveys = [row["survey"] for row in mission.rows("survey.external") if band in row["bands"].split()]
+        listed = [(f"survey {name}", f'channels = ["{GROUND_CHANNEL}"] and survey = "{name}"') for name in surveys]
+    else:
+        cameras = [name for name in mission.ground_cameras if band in band_names(GROUND_CHANNEL, name, mission)]
+        listed = [(f"camera {name}", f'channel = "{GROUND_CHANNEL}" and camera = "{name}"') for name in cameras]
+    return f"{band} is a band of {listed[0][0]}, write {listed[0][1]}" if listed else ""
 
 
 def check_detectors(cameras: Sequence[str], names: Collection[str], mission: MissionConfiguration, path: str) -> None:

@@ -11,7 +11,7 @@ from truesky.request import instruments
 from truesky.request.files import UserSources
 from truesky.request.schema import EFFECTS, Stars, Universe
 from truesky.request.structure import Structure
-from truesky.request.toml_values import LIST_KEYS, TOP_KEYS, Toml, check_keys, section
+from truesky.request.toml_values import LIST_KEYS, TOP_KEYS, Toml, check_keys, meant_key, section
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -94,8 +94,14 @@ class RequestReader:
         self.read("", check_keys, self.table, "", (*TOP_KEYS, *LIST_KEYS, *_SECTIONS), _PLACES)
 
     def messages(self) -> tuple[str, ...]:
-        """Return the lines of all mistakes in the order of the file."""
-        return tuple(sorted(self._mistakes.messages, key=lambda message: _position(message, self.table)))
+        """Return the lines of all mistakes in the order of the file.
+
+        A required key is not reported as missing if an unknown key of the same table was meant to be it.
+        """
+        lines = self._mistakes.messages
+        meant = [f"{path} is missing" for path in map(meant_key, lines) if path]
+        lines = tuple(line for line in lines if not line.startswith(tuple(meant)))
+        return tuple(sorted(lines, key=lambda message: _position(message, self.table)))
 
 
 def _places_of_parameters(values: Toml) -> dict[str, str]:

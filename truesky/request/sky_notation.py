@@ -15,7 +15,7 @@ from datetime import UTC, date, datetime
 from typing import Any
 
 from lake_schema import arguments
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, OutOfRange
 from truesky.request.toml_values import Toml, checked_number, has_key, quote_value, required_value
 
 # First and last date (MJD) that a request may contain: 1968 to 2132.
@@ -39,7 +39,7 @@ _LARGE_RADIUS = 5.0
 _MJD_0 = datetime(1858, 11, 17, tzinfo=UTC)
 
 
-def angle(value: object, path: str, axis: str, limits: tuple[float, float]) -> float:
+def angle(value: object, path: str, axis: str, limits: tuple[float, float], ra: object = None) -> float:
     """Read a right ascension or a declination.
 
     Parameters
@@ -52,6 +52,9 @@ def angle(value: object, path: str, axis: str, limits: tuple[float, float]) -> f
         "ra" (texts are in hours) or "dec" (texts are in degrees).
     limits : (float, float)
         Smallest and largest angle in degrees.
+    ra : object, optional
+        Right ascension that belongs to a declination. If the declination is outside its limits, and this number is
+        not, the message asks whether they are exchanged.
 
     Returns
     -------
@@ -71,7 +74,11 @@ def angle(value: object, path: str, axis: str, limits: tuple[float, float]) -> f
         arguments.refuse_coordinates(path, value)
         arguments.refuse_angle(path, value, "in degrees")
         raise BadInput(f"{path} must be {_FORMS[axis]}, got {quote_value(value)}")
-    return checked_number(value, path, *limits)
+    try:
+        return checked_number(value, path, *limits)
+    except OutOfRange as error:
+        question = arguments.exchanged_question(ra, value)
+        raise (error.with_question(question) if question else error) from None
 
 
 def _degrees(text: str, path: str, axis: str) -> float:
@@ -165,7 +172,7 @@ def ra_of(table: Toml, path: str) -> float:
 
 def dec_of(table: Toml, path: str) -> float:
     """Return the declination of a required key in degrees; raises BadInput if it is missing or wrong."""
-    return angle(required_value(table, path, _FORMS["dec"]), path, "dec", DEC_LIMITS)
+    return angle(required_value(table, path, _FORMS["dec"]), path, "dec", DEC_LIMITS, table.get("ra"))
 
 
 def optional_ra(table: Toml, path: str) -> float | None:

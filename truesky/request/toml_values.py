@@ -7,9 +7,11 @@ sections, for example "universe.z_max". The function looks for the last part, he
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, cast
 
+from lake_schema import arguments
 from lake_schema.errors import BadInput, OutOfRange, bad_input
 from lake_schema.texts import spelling
 
@@ -18,6 +20,10 @@ Toml = Mapping[str, Any]
 TOP_KEYS = ("name", "seed", "noise_seed", "accuracy")
 # Keys of a request that are lists of tables.
 LIST_KEYS = ("pointing", "observation")
+# Message about an unknown key with the key that the user may have meant.
+_MEANT = re.compile(
+    r"(?P<section>(?:.*\.)?)[^.]* is not a key of a request; did you mean \[{0,2}(?P<name>\w+)(?:\]{0,2}| = .*)\?"
+)
 # Largest number of allowed keys that are listed after a suggestion.
 _MAX_LISTED = 8
 # Other names of keys, which users know from other programs.
@@ -26,11 +32,18 @@ _SYNONYMS = {
     "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
     "gamma1": "g1", "gamma2": "g2", "gamma_1": "g1", "gamma_2": "g2", "shear1": "g1", "shear2": "g2",
 }  # fmt: skip
-# Other names of values: ground cameras and surveys belong to one channel.
+# Other names of values: ground cameras and surveys belong to one channel, cameras to a survey, and I_E is euclid_vis.
 _VALUES = {
-    **dict.fromkeys(("lsst", "lsstcam", "rubin", "des", "decam", "hsc", "megacam", "gpc1", "ground"), "EXT"),
-    **dict.fromkeys(("off", "no", "false"), "none"), "noiseless": "noise_free",
+    **dict.fromkeys(("lsst", "des", "ground"), ("EXT",)),
+    **dict.fromkeys(("rubin", "lsstcam", "lsst_cam"), ("EXT", "lsst")), "decam": ("EXT", "des"),
+    "hsc": ("EXT", "wishes"), "megacam": ("EXT", "cfis"), "gpc1": ("EXT", "ps1"),
+    **dict.fromkeys(("pan-starrs", "panstarrs"), ("EXT", "ps1")),
+    **dict.fromkeys(("off", "no", "false"), ("none",)), "noiseless": ("noise_free",),
+    **{f"{filter}{mark}e": (band,) for mark in ("", "_") for filter, band in
+       (("i", "euclid_vis"), ("y", "euclid_y"), ("j", "euclid_j"), ("h", "euclid_h"))},
 }  # fmt: skip
+# Number of decimals of an angle in a message, which replaces a text such as "17 arcmin".
+_ANGLE_DIGITS = 4
 _NO_PLACES: Mapping[str, str] = {}
 
 
@@ -94,6 +107,12 @@ def _describe_unknown(key: str, path: str, hint: str, allowed: Sequence[str]) ->
     return f"{key_path} is not a key of a request; {hint}{listed}"
 
 
+def meant_key(message: str) -> str:
+    """Return the path of the key that a message of `check_keys` suggests for an unknown key, else ""."""
+    match = _MEANT.match(message)
+    return f"{match['section'] or ''}{match['name']}" if match else ""
+
+
 def section(table: Toml, key: str, keys: Iterable[str] | None, places: Mapping[str, str] = _NO_PLACES) -> Toml:
     """Return a section of a request as a table, empty if the section is missing.
 
@@ -146,7 +165,7 @@ def as_table(value: object, path: str, keys: Iterable[str] | None, places: Mappi
         If the value is not a table, or the table has another key.
     """
     if not isinstance(value, dict):
-        form = f"{path} = {{ {', '.join(f'{key} = ..' for key in sorted(keys))} }}" if keys else "{ key = value, .. }"
+        form = f"{path} = {{ {', '.join(f'{key} = ..' for key in keys)} }}" if keys else "{ key = value, .. }"
         hint = f"; write [{path}] once" if isinstance(value, list) and "." not in path else f" such as {form}"
         raise BadInput(f"{path} must be a table{hint}, got {quote_value(value)}")
     if keys is not None:
@@ -254,10 +273,15 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
     return text
 
 
+def known_name(name: str, legal: Collection[str]) -> str:
+    """Return the legal value that is known by another name, such as "EXT" for "DECam"; the name itself otherwise."""
+    return next((other for other in _VALUES.get(name.lower(), ()) if other in legal), name)
+
+
 def refuse_name(name: str, legal: Sequence[str]) -> str:
     """Return the end of an error message about a name: the most similar legal name, if any, and the legal names."""
-    if (meant := _VALUES.get(name.lower())) in legal:
-        return f"{quote_value(name)} is not allowed: {spelling.choices(str(meant), legal)}"
+    if (meant := known_name(name, legal)) != name:
+        return f"{quote_value(name)} is not allowed: {spelling.choices(meant, legal)}"
     if spelling.did_you_mean(name, legal):
         return f"{quote_value(name)} is not allowed: {spelling.choices(name, legal)}"
     return f"{quote_value(name)} is not one of {', '.join(legal)}"
@@ -389,6 +413,9 @@ def checked_number(value: object, path: str, lo: float, hi: float, unit: str = "
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         hint = _quotes_hint(value, path, float)
+        if unit in ("deg", "arcsec") and hint.endswith("quotes"):
+            form = _describe_range(lo, hi, unit).removeprefix("a number ")
+            arguments.refuse_angle(path, value, form, unit, _ANGLE_DIGITS)
         raise BadInput(f"{path} must be {_describe_range(lo, hi, unit)}, got {quote_value(value)}{hint}")
     # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
     if not lo <= value <= hi or not math.isfinite(value):

@@ -115,7 +115,8 @@ def test_all_columns_and_the_whole_sky(catalogues):
 def test_wrong_arguments_of_a_cone_are_refused(lake, catalogues):
     _, _, version = catalogues[0]
     for arguments, words in (
-        ((0.0, 91.0, 1.0), "dec"),
+        ((100.0, 91.0, 1.0), r"^dec = 91.0 is outside \[-90.0, 90.0\]$"),
+        ((-27.8, 153.1, 1.0), r"^dec = 153.1 is outside \[-90.0, 90.0\]: are ra and dec exchanged\?$"),
         ((0.0, 0.0, -1.0), "radius"),
         ((float("nan"), 0.0, 1.0), "ra"),
         ((float("inf"), 0.0, 1.0), "ra"),

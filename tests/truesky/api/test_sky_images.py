@@ -353,6 +353,8 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ({"noise": "no"}, "noise = 'no' must be True or False"),
         ({"size": 0.0}, "size = 0: must be 0.2 to 801 arcsec, at most a detector"),
         ({"size": np.nan}, "size"),
+        ({"size": "30 arcsec"}, "^size must be a number of arcsec from 0 to 3600, got '30 arcsec': write 30$"),
+        ({"ra": DEC, "dec": 153.1}, r"^dec = 153.1 is outside \[-90.0, 90.0\]: are ra and dec exchanged\?$"),
         ({"band": "euclid_vs"}, "band: 'euclid_vs' is not allowed: did you mean euclid_vis"),
         ({"band": "nisp_red"}, "band nisp_red: spectra through a grism cannot be drawn"),
         ({"band": "lsst_i"}, "band lsst_i: the lake has fluxes in .*; add the band to fluxes.bands"),

@@ -54,7 +54,7 @@ MISTAKES = {
     ),
     "an effect that every image needs": (GOOD + '[effects]\noff = ["adc"]\n', "effects.off: 'adc' cannot be switched"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
-    "an area too small": (pointed("0.2 }", "0.01 }"), "[area] cone = { ra = 53.117, dec = -27.808,"),
+    "an area too small": (pointed("0.2 }", "0.01 }"), "enough: area.cone = { ra = 53.117, dec = -27.808, radius"),
     "an area elsewhere": (
         pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 detector positions see sky outside",
     ),
@@ -134,7 +134,7 @@ MISTAKES = {
     "no number of frames": (OWN + 'image_type = "bias"\n', "requires exposures"),
     "a calibration of another channel": (OWN + 'image_type = "standard_star"\n', "observation[0].image_type"),
     "fields that see more than the area": (
-        HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "this area is large enough: [area] cone",
+        HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "is large enough: area.cone = { ra =",
     ),
     "dithers of a ground survey": (EXT + "dither = [[0, 0], [9, 9]]\n", "[0].dither is not for a ground survey's"),
     "fields of a ground survey": (EXT + "fields = 2\n", "observation[0].fields is not for a ground survey's pattern"),
@@ -160,7 +160,7 @@ TABLES = {
     "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is not one of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
     "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: the pointing is 126."),
-    "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this area is large enough: [area] cone"),
+    "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "is large enough: area.cone = { ra ="),
     "a line's detector": ("ra,dec,detectors\n53.1,-27.8,9-9\n", "no detector '9-9'"),
 }
 CASES = {name: (text, "", words) for name, (text, words) in MISTAKES.items()}

@@ -4,7 +4,8 @@ import tomllib
 
 import pytest
 
-from truesky.request.from_toml import read_valid_parts
+from lake_schema.errors import BadInput
+from truesky.request.from_toml import parse, read_valid_parts
 
 HEAD = 'name = "x"\nseed = 1\n'
 AREA = "[area]\ncone = { ra = 53.117, dec = -27.808, radius = 0.2 }\n"
@@ -54,9 +55,31 @@ MISTAKES = {
     ),
     "an accuracy of no name": ('accuracy = "high"\n' + GOOD, "accuracy = 'high'", "{ flux = 1e-3, shape = 1e-4"),
     "an accuracy in capitals": ('accuracy = "Survey"\n' + GOOD, "accuracy = 'Survey'", "did you mean survey?"),
-    "no area": (HEAD + POINT, "area must have exactly one of polygon, cone", "such as cone = { ra = 150.1"),
+    "no area": (HEAD + POINT, "area is missing: add [area] with a line such as", "such as cone = { ra = 150.1"),
+    "an empty area": (area(""), "area must have exactly one of polygon, cone", "such as cone = { ra = 150.1"),
+    "sead": (changed("seed = 1", "sead = 1"), "sead is not a key of a request; ", "did you mean seed?"),
+    "an area misspelt": (changed("[area]", "[aera]"), "aera is not a key of a request; ", "did you mean [area]?"),
+    "a required key of a pointing misspelt": (
+        changed("channel", "chanel"),
+        "pointing[0].chanel is not a key",
+        "did you mean channel?",
+    ),
     "two areas": (changed("0.2 }", "0.2 }\ntile = 3"), "area must have exactly one", "it has cone, tile"),
-    "a radius in arcmin": (changed("0.2 }", '"12 arcmin" }'), "area.cone.radius", "a number from 0 to 180 deg"),
+    "a radius in arcmin": (
+        changed("0.2 }", '"17 arcmin" }'),
+        "area.cone.radius must be a number from 0 to 180 deg, got '17 arcmin': ",
+        "write 0.2833",
+    ),
+    "a spacing in degrees": (
+        changed(POINT, '[sources]\nonly = "grid"\nstars = "x.csv"\nspacing = "0.01 deg"\n'),
+        "sources.spacing must be a number from 0.01 to 3600 arcsec, got '0.01 deg': ",
+        "write 36",
+    ),
+    "a circle as a list": (
+        area("cone = [53.1, -27.8, 0.1]"),
+        "area.cone must be a table, not a list: ",
+        "write area.cone = { ra = 53.1, dec = -27.8, radius = 0.1 }",
+    ),
     "a radius in quotes": (changed("0.2 }", '"0.2" }'), "area.cone.radius", "write it without quotes, radius = 0.2"),
     "a radius above 180": (changed("0.2 }", "500 }"), "area.cone.radius = 500", "[0.0, 180.0] deg"),
     "a circle without braces": (
@@ -69,6 +92,26 @@ MISTAKES = {
     "no radius": (changed(", radius = 0.2", ""), "area.cone.radius is missing", "a number from 0 to 180 deg"),
     "rad": (changed("radius", "rad"), "area.cone.rad is not a key", "did you mean radius?"),
     "a declination beyond the pole": (changed("-27.808, r", "-97.808, r"), "area.cone.dec = -97.808", "[-90.0, 90.0]"),
+    "an exchanged circle": (
+        area("cone = { ra = -27.8, dec = 153.1, radius = 0.2 }"),
+        "area.cone.dec = 153.1 is outside [-90.0, 90.0]: ",
+        "are ra and dec exchanged?",
+    ),
+    "an exchanged vertex": (
+        area("polygon = [[53, -28], [-28, 154], [54, -27]]"),
+        "area.polygon[1].dec = 154 is outside",
+        "are ra and dec exchanged?",
+    ),
+    "an exchanged pointing": (
+        changed("ra = 53.117\ndec = -27.808\nd", "ra = -27.808\ndec = 153.117\nd"),
+        "pointing[0].dec = 153.117 is outside",
+        "are ra and dec exchanged?",
+    ),
+    "an exchanged field": (
+        changed("ra = 53.117\ndec = -27.808\n", "ra = -27.808\ndec = 153.117\n", EUCLID),
+        "observation[0].dec = 153.117 is outside",
+        "are ra and dec exchanged?",
+    ),
     "two vertices": (
         area("polygon = [[53, -28], [54, -28]]"),
         "area.polygon must be",
@@ -87,7 +130,7 @@ MISTAKES = {
     "a circle": (
         area("circle = { ra = 1, dec = 2, radius = 1 }"),
         "area.circle",
-        "did you mean cone = { ra, dec, radius }?",
+        "did you mean cone = { ra = 1, dec = 2, radius = 1 }?",
     ),
     "vertices": (area("vertices = [[1, 2], [2, 2], [2, 3]]"), "area.vertices", "did you mean polygon?"),
     "a key misspelt": (section("universe", "galaxy_limt = 25"), "universe.galaxy_limt", "did you mean galaxy_limit?"),
@@ -111,7 +154,51 @@ MISTAKES = {
         "pointing[0].band",
         "did you mean euclid_vis? allowed: euclid_vis",
     ),
-    "a band of another camera": (changed("euclid_vis", "lsst_r"), "pointing[0].band", "allowed: euclid_vis"),
+    "a band of another camera": (
+        changed("euclid_vis", "lsst_r"),
+        "pointing[0].band: camera vis has no band 'lsst_r': lsst_r is a band of camera lsstcam, write",
+        'write channel = "EXT" and camera = "lsstcam", or band = "euclid_vis"',
+    ),
+    "a band of another channel": (
+        changed("euclid_vis", "euclid_h"),
+        "pointing[0].band: camera vis has no band 'euclid_h': euclid_h is a band of NISP-P, ",
+        'write channel = "NISP-P", or band = "euclid_vis"',
+    ),
+    "a band of another ground camera": (
+        changed('channel = "VIS"\nband = "euclid_vis"', 'channel = "EXT"\ncamera = "lsstcam"\nband = "des_r"').replace(
+            'detectors = ["3-4"]\n', ""
+        ),
+        "camera lsstcam has no band 'des_r': des_r is a band of camera decam, ",
+        'write channel = "EXT" and camera = "decam", or band = "lsst_r"',
+    ),
+    "a band of a grism": (
+        changed('channel = "VIS"\nband = "euclid_vis"', 'channel = "NISP-P"\nband = "nisp_red"').replace(
+            'detectors = ["3-4"]\n', ""
+        ),
+        "nisp_red is a band of NISP-S, ",
+        'write channel = "NISP-S", or one of euclid_y, euclid_j or euclid_h',
+    ),
+    "a published name of a band": (changed("euclid_vis", "I_E"), "pointing[0].band", "did you mean euclid_vis?"),
+    "a published name of another channel's band": (
+        changed("euclid_vis", "H_E"),
+        "camera vis has no band 'H_E': euclid_h is a band of NISP-P, ",
+        'write channel = "NISP-P", or band = "euclid_vis"',
+    ),
+    "bands of another channel": (
+        EUCLID + 'bands = ["euclid_h"]\n',
+        "observation[0].bands: VIS has no band 'euclid_h': euclid_h is a band of NISP-P, ",
+        'write channels = ["NISP-P"], or bands = ["euclid_vis"]',
+    ),
+    "a band of another survey": (
+        GROUND + 'bands = ["des_r"]\n',
+        "observation[0].bands: survey lsst has no band 'des_r': des_r is a band of survey des, ",
+        'write channels = ["EXT"] and survey = "des", or bands = ["lsst_r"]',
+    ),
+    "the blue grism": (
+        changed('["VIS"]', '["NISP-S"]', EUCLID) + 'bands = ["nisp_blue"]\n',
+        "observation[0].bands: NISP-S has no band 'nisp_blue'",
+        'write channels = ["NISP-S"] and blue = true',
+    ),
     "a camera in capitals": (
         changed('channel = "VIS"\nband = "euclid_vis"', 'channel = "EXT"\ncamera = "LSSTCam"'),
         "pointing[0].camera",
@@ -156,6 +243,16 @@ MISTAKES = {
     "an image type of NISP": (EUCLID + 'image_type = "standard_star"\n', "[0].image_type", "science, deep, bias, dark"),
     "an image type misspelt": (EUCLID + 'image_type = "sciense"\n', "[0].image_type", "did you mean science?"),
     "a survey in capitals": (changed('"lsst"', '"LSST"', GROUND), "observation[0].survey", "did you mean lsst?"),
+    "an observatory as survey": (
+        changed('"lsst"', '"Rubin"', GROUND),
+        "observation[0].survey = 'Rubin' is not allowed: ",
+        "did you mean lsst? allowed: des, lsst",
+    ),
+    "visits of a ground camera": (
+        GROUND + "visits = 3\n",
+        "observation[0].visits is not for a ground camera's field",
+        "use exposures; its keys are exposures",
+    ),
     "no survey": (changed('survey = "lsst"\n', "", GROUND), "observation[0].survey is missing", "des, lsst, cfis"),
     "a short name of a band": (
         GROUND + 'bands = ["r"]\n',
@@ -259,12 +356,12 @@ MISTAKES = {
     "a list of values": (
         section("explore", '"vis.gain" = [3.0, 3.5]'),
         "explore.vis.gain",
-        "{ unit = .., values = .. }",
+        "{ values = .., unit = .. }",
     ),
     "a file instead of a table": (
         section("stars", 'catalogue = "g.csv"'),
         "stars.catalogue",
-        "{ columns = .., file = .. }",
+        "{ file = .., columns = .. }",
     ),
     "a parameter of [explore] without quotes": (
         section("explore", 'vis.gain = { values = [3.0], unit = "electron / adu" }'),
@@ -300,6 +397,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("text", "key", "remedy"), MISTAKES.values(), ids=MISTAKES)
 def test_one_line_names_the_key_and_the_remedy(tmp_path, text, key, remedy):
+    (tmp_path / "x.dat").touch()
     (line,) = read_valid_parts(tomllib.loads(text), tmp_path).messages
     assert key in line
     assert remedy in line
@@ -344,3 +442,16 @@ def test_there_are_more_than_60_mistakes():
 @pytest.mark.parametrize("text", [GOOD, EUCLID, GROUND])
 def test_requests_without_a_mistake_are_valid(tmp_path, text):
     assert read_valid_parts(tomllib.loads(text), tmp_path).messages == ()
+
+
+def test_all_mistakes_of_a_passband_are_reported_each_with_its_line(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text(GOOD + '[fluxes.passbands.my_g]\nfile = "my_g.dat"\nformat = "ascii"\n')
+    with pytest.raises(BadInput) as caught:
+        parse(file)
+    assert caught.value.messages == (
+        f"request {file} line 13: fluxes.passbands.my_g.file: {tmp_path / 'my_g.dat'}: no such file",
+        f"request {file} line 14: fluxes.passbands.my_g.format = 'ascii' is not allowed: "
+        "did you mean passband_ascii? allowed: passband_ascii, passband_ecsv, passband_svo",
+        f"request {file} line 12: fluxes.passbands.my_g.medium is missing: it must be one of air, vacuum",
+    )

@@ -152,7 +152,7 @@ def refuse_small_area(area: Area, tasks: pa.Table) -> None:
     raise BadInput(
         f"area: {outside.sum()} of {outside.size} detector positions see sky outside it, for example "
         f"{first['channel'][0]} {first['detector'][0]} at ra {ra[outside][0]:.3f}, dec {dec[outside][0]:.3f}; "
-        f"this area is large enough: [area] {_sufficient_area(ra, dec, radius)}"
+        f"this area is large enough: area.{_sufficient_area(ra, dec, radius)}"
     )
 
 

@@ -387,7 +387,7 @@ def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: Missi
     )
     with Mistakes() as mistakes:
         for band in values["bands"]:
-            mistakes.read(instruments.check_band, band, bands, owner, f"{path}.bands")
+            mistakes.read(instruments.check_band, band, bands, owner, f"{path}.bands", mission)
         # A detector restricts the images of the camera to which it belongs. Another camera takes all of its detectors.
         mistakes.read(instruments.check_detectors, tuple(cameras), values["detectors"], mission, f"{path}.detectors")
 
@@ -475,6 +475,7 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
                 useless |= {other for other, types in _TYPES_OF_KEY.items() if image_type not in types}
                 keys = [other for other, kinds in _BLOCKS_OF_KEY.items() if kind in kinds and other not in useless]
                 instead = "visits repeats the exposures; " if key == "exposures" and "visits" in keys else ""
+                instead = "use exposures; " if key == "visits" and "exposures" in keys else instead
                 text = f"{path}.{key} is not for {kind}: {instead}its keys are {', '.join(keys)}, realisations"
                 mistakes.add(BadInput(text))
             elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):

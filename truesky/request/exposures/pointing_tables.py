@@ -329,7 +329,8 @@ def _number(row: Mapping[str, str], name: str, lo: float, hi: float, location: s
 def _angle(row: Mapping[str, str], axis: str, limits: tuple[float, float], location: str) -> float:
     if not row[axis]:
         raise BadInput(f"{location}: {axis} is missing")
-    return sky_notation.angle(_as_number(row[axis]), f"{location}: {axis}", axis, limits)
+    ra = _as_number(row["ra"]) if axis == "dec" else None
+    return sky_notation.angle(_as_number(row[axis]), f"{location}: {axis}", axis, limits, ra)
 
 
 def _mjd(row: Mapping[str, str], location: str) -> float | None:

@@ -145,7 +145,7 @@ def _instrument(
                 band = instruments.default_band(channel, camera, mission)
             elif band is not None and band not in user_bands:
                 bands = instruments.band_names(channel, camera, mission)
-                read(instruments.check_band, band, bands, f"camera {camera}", f"{path}.band")
+                read(instruments.check_band, band, bands, f"camera {camera}", f"{path}.band", mission)
             read(instruments.check_detectors, (camera,), detectors or (), mission, f"{path}.detectors")
             centred = (centre_on,) if centre_on else ()
             read(instruments.check_detectors, (camera,), centred, mission, f"{path}.centre_on")

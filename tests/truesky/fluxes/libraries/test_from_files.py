@@ -11,6 +11,7 @@ from truesky.fluxes import band_fluxes, passbands
 from truesky.fluxes.libraries import from_files
 from truesky.fluxes.tables import build_tables, flux_tables
 from truesky.request.accuracy import SURVEY
+from truesky.request.files import PASSBAND_FORMATS
 
 WAVELENGTH = np.arange(900.0, 26_000.0, 20.0)
 FLUX = 1.0 + 0.5 * np.sin(WAVELENGTH / 800.0)
@@ -48,6 +49,10 @@ def test_every_format_names_its_source_and_reader():
         assert form["source"], name
         assert form["reader"] in ("ascii", "csv", "ecsv", "fits", "votable")
         assert {"wavelength", "value", "unit", "largest_gap", "bounds"} <= set(form)
+
+
+def test_requests_allow_the_formats_of_passbands():
+    assert tuple(name for name in from_files.formats() if name.startswith("passband_")) == PASSBAND_FORMATS
 
 
 @pytest.mark.parametrize("form", ["cosmos", "extinction", "irtf", "spectrum_csv", "spectrum_ecsv", "spectrum_fits"])
