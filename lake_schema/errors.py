@@ -71,6 +71,26 @@ class BadInputs(BadInput):
         return BadInputs, (self._messages,)
 
 
+class PartOfLake(BadInput):
+    """A folder inside a lake was given as the lake.
+
+    Parameters
+    ----------
+    message : object
+        The message, which names the folder and the lake.
+    request : str, optional
+        Name of the request to which the folder belongs, "" for none.
+    """
+
+    def __init__(self, message: object, request: str = "") -> None:
+        super().__init__(message)
+        self.request = request
+
+    def with_option(self, option: str) -> BadInput:
+        """Return an error that also tells the option for the request, such as "--name {}", if the folder has one."""
+        return BadInput(f"{self} and {option.format(self.request)}") if self.request else self
+
+
 def bad_input(messages: Iterable[str]) -> BadInput:
     """Return an error for one mistake or for several. Equal messages are one mistake."""
     distinct = tuple(dict.fromkeys(messages))

@@ -25,7 +25,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from lake_schema import tables, user_files
-from lake_schema.errors import BadInput, Damaged
+from lake_schema.errors import BadInput, Damaged, PartOfLake
 from lake_schema.store.object_storage import s3
 from lake_schema.store.object_storage.s3 import Below, Folder, ObjectPath
 from lake_schema.texts import spelling
@@ -97,6 +97,8 @@ def resolve_lake(text: str | Path) -> Path:
     ------
     BadInput
         If the path is empty, an address of object storage, an existing file, or not allowed by the file system.
+    PartOfLake
+        If the folder is a part of a lake, such as a table.
     """
     if local := _FILE_URL.fullmatch(str(text)):
         text = unquote(local[1])
@@ -114,12 +116,27 @@ def resolve_lake(text: str | Path) -> Path:
         os.lstat(root)
         if not root.is_dir():
             raise BadInput(f"lake {user_files.format_path(text)} is not a folder")
+        _refuse_part_of_lake(text, root)
     except FileNotFoundError:
         pass
     except (OSError, RuntimeError, ValueError) as error:
         # Possible reasons: a loop of symbolic links, a path that is too long, or a NUL character in the path.
         raise BadInput(f"lake {user_files.format_path(text)}: {getattr(error, 'strerror', None) or error}") from None
     return root
+
+
+def _refuse_part_of_lake(text: str | Path, root: Path) -> None:
+    """Raise PartOfLake if a folder is in a lake; `text` is its path as the user typed it, `root` the absolute path."""
+    for lake in root.parents:
+        first, *others = root.relative_to(lake).parts
+        is_part = first in (_NAMES, _RUNS) or tables.find_table(first) is not None
+        # A lake may itself be in a folder with the name of a table.
+        if is_part and any(tables.find_table(name) for name in table_names(lake)) and not table_names(root):
+            typed = user_files.expand_path(text)
+            shown = next((folder for folder in (typed, *typed.parents) if folder.resolve() == lake), lake)
+            name = user_files.format_path(shown)
+            request = others[0] if first == _NAMES and others else ""
+            raise PartOfLake(f"lake {user_files.format_path(text)} is a part of the lake {name}: give {name}", request)
 
 
 def open_lake(text: str | Folder, endpoint: str | None = None) -> Folder:

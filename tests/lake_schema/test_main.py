@@ -2,10 +2,12 @@
 
 import errno
 import shutil
+from pathlib import Path
 
 import pytest
 
-from lake_schema.errors import Damaged, TasksFailed
+import truesky
+from lake_schema.errors import BadInput, Damaged, TasksFailed
 from lake_schema.store import garbage, layout, manifest, provenance, publish, read
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 from truesky.commands.__main__ import main
@@ -183,6 +185,45 @@ def test_a_folder_without_tables_is_not_a_lake(tmp_path, capsys, command):
     assert main([command, str(tmp_path)]) == 2
     problem = f"{tmp_path} is not a lake, because it has no tables; give a folder that truesky run has made"
     assert capsys.readouterr().err == f"truesky {command}: {problem}\n"
+
+
+@pytest.fixture
+def parent(tmp_path, monkeypatch):
+    """A folder with the lake `lake`, which has the table `stars` and the request `demo`; it is the working folder."""
+    (tmp_path / "lake" / "stars" / "v-0123456789abcdef" / "stars").mkdir(parents=True)
+    (tmp_path / "lake" / "stars" / "current").symlink_to("v-0123456789abcdef")
+    (tmp_path / "lake" / "names" / "demo").mkdir(parents=True)
+    (tmp_path / "lake" / "runs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", ["list", "verify", "gc", "describe", "sql", "report"])
+@pytest.mark.parametrize("folder", ["stars", "stars/current", "stars/current/stars", "names", "names/demo", "runs"])
+def test_a_part_of_a_lake_is_not_a_lake(parent, capsys, command, folder):
+    has_option = folder == "names/demo" and command in ("verify", "describe", "sql")
+    for lake in ("lake", f"{parent}/lake"):
+        assert main([command, f"{lake}/{folder}"]) == 2
+        option = " and --name demo" if has_option else ""
+        problem = f"lake {lake}/{folder} is a part of the lake {lake}: give {lake}{option}"
+        assert capsys.readouterr().err == f"truesky {command}: {problem}\n"
+
+
+def test_a_part_of_a_lake_is_not_a_lake_in_python(parent, monkeypatch):
+    with pytest.raises(
+        BadInput, match=r'^lake lake/names/demo is a part of the lake lake: give lake and request="demo"$'
+    ):
+        truesky.open("lake/names/demo")
+    monkeypatch.chdir(parent / "lake" / "stars")
+    with pytest.raises(BadInput, match=rf"^lake current is a part of the lake {parent}/lake: give {parent}/lake$"):
+        truesky.open(Path("current"))
+
+
+@pytest.mark.parametrize("command", ["list", "verify", "gc", "describe"])
+def test_a_folder_without_tables_in_a_folder_with_the_name_of_a_table_is_not_a_lake(tmp_path, capsys, command):
+    (tmp_path / "stars" / "notes").mkdir(parents=True)
+    assert main([command, str(tmp_path / "stars")]) == 2
+    assert "is not a lake, because it has no tables" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["list", "verify", "gc", "describe"])

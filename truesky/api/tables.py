@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from lake_schema import arguments, user_files
 from lake_schema.arrays import Float, Int
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, PartOfLake
 from truesky.explore.explorer import ORDER, Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
 
@@ -40,7 +40,10 @@ class LakeTables:
         if str(path).endswith(".toml") and not os.path.isdir(path):
             name = user_files.format_path(path)
             raise BadInput(f'{name} is a request, not a lake: truesky.run("{name}", "my_lake") makes a lake from it')
-        self._explorer = Explorer(str(path) if isinstance(path, Path) else path, memory, timeout, request)
+        try:
+            self._explorer = Explorer(str(path) if isinstance(path, Path) else path, memory, timeout, request)
+        except PartOfLake as error:
+            raise error.with_option('request="{}"') from None
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._explorer.root}: {', '.join(self.tables().index)}>"
@@ -112,7 +115,9 @@ class LakeTables:
         """
         from truesky.explore import results
 
-        return results.convert(self._explorer._version(name).rows(_names(columns)), into)
+        names = _names(columns)
+        self._explorer.check_columns(name, names or ())
+        return results.convert(self._explorer._version(name).rows(names), into)
 
     def sql(self, query: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Run one SELECT over the tables of the lake.

@@ -56,7 +56,7 @@ def rows(table: Any, band: str, flux_bands: Sequence[str], first_number: int = 0
     BadInput
         If a column is unknown or missing, or a value is out of range.
     """
-    columns = given_sources.from_arrays(injected_rows.read_columns(table))
+    columns = given_sources.from_arrays(injected_rows.read_columns(table, "extra"))
     user_sources = UserSources(None, None, band, 0.0)
     bands = [passbands.load(name) for name in flux_bands]
     return _galaxies(user_sources, columns, bands, first_number), _stars(columns, band, bands, first_number)

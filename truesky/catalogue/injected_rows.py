@@ -96,13 +96,15 @@ def read_rows(rows: Any, ellipticity: str | None = None, axes: str | None = None
     return [checked[name] for name in TABLES if name in checked and len(checked[name].ids)]
 
 
-def read_columns(rows: Any) -> dict[str, tuple[Path, dict[str, Float]]]:
+def read_columns(rows: Any, argument: str = "rows") -> dict[str, tuple[Path, dict[str, Float]]]:
     """Return the columns of tables of galaxies and stars, which are not checked.
 
     Parameters
     ----------
     rows : table, str, Path or mapping
         Tables as in `read_rows`.
+    argument : str, optional
+        Name of the argument with the tables, for messages.
 
     Returns
     -------
@@ -118,7 +120,7 @@ def read_columns(rows: Any) -> dict[str, tuple[Path, dict[str, Float]]]:
     named = {}
     with Mistakes() as mistakes:
         for given_name, table in tables.items():
-            named_columns = mistakes.read(table_columns, table, given_name or "rows")
+            named_columns = mistakes.read(table_columns, table, given_name or argument)
             if named_columns is not None:
                 titles = named_columns[1]
                 is_galaxies = _GALAXY_COLUMNS & {*titles, *chain(*map(given_sources.find_columns, titles))}

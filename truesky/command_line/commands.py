@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from lake_schema import __version__, command
+from lake_schema.errors import PartOfLake
 from truesky.command_line import injection, lakes, mission, reduction, simulation
 from truesky.command_line.parser import Parser, suggestion
 
@@ -228,8 +229,34 @@ def run(name: str, body: Callable[[argparse.Namespace], int], argv: Sequence[str
     int
         Exit status, as `lake_schema.command.run` defines it.
     """
-    options = parse(name, argv)
-    return command.run(f"truesky {name}", lambda: body(options))
+    return run_parsed(name, body, parse(name, argv))
+
+
+def run_parsed(name: str, body: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
+    """Run the body of a command with its parsed arguments, print errors in one line, and return the exit status.
+
+    Parameters
+    ----------
+    name : str
+        Name of the command.
+    body : callable
+        Function that runs the command with the parsed arguments, and returns its exit status.
+    options : Namespace
+        The parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status, as `lake_schema.command.run` defines it.
+    """
+
+    def run_body() -> int:
+        try:
+            return body(options)
+        except PartOfLake as error:
+            raise (error.with_option("--name {}") if hasattr(options, "name") else error) from None
+
+    return command.run(f"truesky {name}", run_body)
 
 
 def complete_parser() -> Parser:

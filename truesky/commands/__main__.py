@@ -45,7 +45,7 @@ def _module_command(name: str, words: Sequence[str]) -> int:
     options = commands.parse(name, words)
     try:
         module = import_module(declared.modules[0])
-        return command.run(f"truesky {name}", lambda: module.run_command(options))
+        return commands.run_parsed(name, module.run_command, options)
     except ModuleNotFoundError as error:
         if not declared.extra or (error.name or "").startswith(("truesky", "lake_schema")):
             raise

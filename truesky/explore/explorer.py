@@ -16,7 +16,7 @@ from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError, VersionMismatch
 from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
-from truesky.explore import results
+from truesky.explore import results, shared_columns, suggestions
 from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process
 
 if TYPE_CHECKING:
@@ -210,6 +210,18 @@ class Explorer:
             raise layout.missing_table(self.root, table, list(self.versions))
         return self.versions[table]
 
+    def check_columns(self, table: str, columns: Sequence[str]) -> None:
+        """Raise BadInput if a table lacks one of the columns; the message has the same suggestions as in SQL."""
+        existing = self._version(table).schema.names
+        if missing := [name for name in dict.fromkeys(columns) if name not in existing]:
+            request, unrelated = table.rpartition(".")[0], shared_columns.unrelated_fluxes([table])
+            other_tables = {
+                name: version.schema.names
+                for name, version in self.versions.items()
+                if name != table and name.rpartition(".")[0] == request and name.rpartition(".")[2] not in unrelated
+            }
+            raise BadInput(suggestions.explain_argument(missing, table, existing, other_tables))
+
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Return the result of one SELECT over the tables of the lake.
 
@@ -264,6 +276,7 @@ class Explorer:
         -----
         BadInput is raised if the table or a column does not exist, or an argument is outside its bounds.
         """
+        self.check_columns(table, columns or ())
         return results.convert(self._version(table).cone(ra, dec, radius, columns, on), into)
 
     def export(self, text: str, path: str | Path, /, **parameters: object) -> Path:

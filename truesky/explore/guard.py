@@ -202,9 +202,9 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
                 raise BadInput(f"SQL: {one_line(problem)}") from None
             if problem := _explain_unit(text, str(error)):
                 raise BadInput(f"SQL: {one_line(problem)}") from None
-            raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
+            raise BadInput(f"SQL: {one_line(plain_message(str(error), text))}") from None
         except (duckdb.Error, UnicodeError) as error:
-            raise BadInput(f"SQL: {one_line(plain_message(str(error)))}") from None
+            raise BadInput(f"SQL: {one_line(plain_message(str(error), text))}") from None
     try:
         answer: Tree = json.loads(row[0]) if row else {"error": True}
     except RecursionError:

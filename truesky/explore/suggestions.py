@@ -34,11 +34,18 @@ _MIN_SIMILARITY = 0.6
 _MIN_BAND_SIMILARITY = 0.85
 # The same for misspelt synonyms: redshfit is redshift, but high is not ha.
 _MIN_SYNONYM_SIMILARITY = 0.8
-# Parts of the name of a flux or magnitude that do not belong to the name of its passband.
-_FLUX_NAME = re.compile(r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$")
+# Parts of the name of a flux or magnitude that do not belong to the name of its passband. Names without an underscore
+# are those of common filters, such as "gmag".
+_FILTER = "[ubvgrizyjhkw]"
+_FLUX_NAME = re.compile(
+    r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$"
+    rf"|(?:(?<=^{_FILTER})|(?<=^vis))(?:mag|flux)$|^(?:mag|flux)(?={_FILTER}$|vis$)"
+)
 _BAND_PREFIX = "f_nu_"
 # Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i" or "lsst_i_flux".
-_IN_BAND = re.compile(r"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$")
+_IN_BAND = re.compile(
+    rf"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
+)
 # End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
 _EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")
 _ERROR_CLASS = re.compile(r"\A(?:[A-Z][\w-]* ?){1,4}Error: ")
@@ -49,6 +56,11 @@ _UNKNOWN_FUNCTION = re.compile(
 _REFUSED_TEXT = r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)"
 # Words that begin the parts of a query.
 _KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
+# Words and signs that follow a condition, and those that a condition or a value must follow.
+_AFTER_CONDITION = ("AND", "OR", "ORDER", "GROUP", "HAVING", "LIMIT", "QUALIFY", "UNION", "WHERE", ")")
+_BEFORE_CONDITION = re.compile(
+    r"(?P<value>\bBETWEEN\s+\S+\s+)?(?P<word>\b(?:WHERE|AND|OR|NOT|HAVING|ON|QUALIFY)|[<>=]+)\s*\Z", re.IGNORECASE
+)
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
 # Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
@@ -243,6 +255,41 @@ def explain_missing_column(
     return f"{problem}{LIST}{', '.join(names)}{quotes}"
 
 
+def explain_argument(
+    names: Sequence[str], table: str, columns: Collection[str], other_tables: Mapping[str, Collection[str]]
+) -> str:
+    """Return a message about names in an argument that are not columns of a table, as in `explain_missing_column`.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The names, as the user wrote them.
+    table : str
+        Name of the table.
+    columns : collection of str
+        Columns of the table.
+    other_tables : mapping of str to collection of str
+        Columns of the other tables of the lake that may be suggested.
+
+    Returns
+    -------
+    str
+        The message, one line.
+    """
+    texts, unknown = [], []
+    for name in names:
+        text = explain_missing_column(name.lower(), {table: columns}, other_tables)
+        _, mark, remedy = text.removeprefix(f"column {name.lower()} does not exist").partition(LIST)
+        if mark:
+            unknown.append(name)
+        else:
+            remedy = text.removeprefix(f"column {name.lower()} does not exist")
+            texts.append(f"{name}{remedy.replace('; add JOIN', '; in lake.sql add JOIN')}")
+    if unknown:
+        texts.append(f"{spelling.join_words(unknown, 'and')}; it has {', '.join(columns)}")
+    return f"table {table} has no column {'; no column '.join(texts)}"
+
+
 def _join_hint(
     targets: Sequence[Synonym], columns: Mapping[str, Collection[str]], other_tables: Mapping[str, Collection[str]]
 ) -> str:
@@ -312,6 +359,10 @@ def _bands_for(name: str, tables: Mapping[str, Collection[str]]) -> list[str]:
 def _similar(name: str, names: Sequence[str]) -> list[str]:
     """Return the most similar names, but no flux or magnitude in another band."""
     min_similarity = _MIN_BAND_SIMILARITY if _IN_BAND.search(name) else _MIN_SIMILARITY
+    if _IN_BAND.search(name):
+        band = _FLUX_NAME.sub("", name)
+        if same := [other for other in names if _IN_BAND.search(other) and _FLUX_NAME.sub("", other) == band]:
+            return list(dict.fromkeys(same))
     similar = difflib.get_close_matches(name, dict.fromkeys(names), _MAX_SUGGESTIONS, min_similarity)
     return [
         other
@@ -324,13 +375,15 @@ def _as_text(targets: Sequence[Synonym], prefixes: Mapping[str, str]) -> str:
     return " or ".join(f"{prefixes[target.table]}{target.column} ({target.meaning})" for target in targets)
 
 
-def plain_message(message: str) -> str:
+def plain_message(message: str, query: str = "") -> str:
     """Return a message of DuckDB as one plain sentence; a message of another origin changes little or not at all.
 
     Parameters
     ----------
     message : str
         The message, perhaps with an extract of the query that has carets below the wrong word.
+    query : str, optional
+        Query to which the message refers. Without it, only the line in the message is known.
 
     Returns
     -------
@@ -351,7 +404,8 @@ def plain_message(message: str) -> str:
         names = ambiguous["names"].replace('"', "").replace("'", "")
         return f"several tables have a column {ambiguous['name']}: write {names} in place of {ambiguous['name']}"
     if syntax := re.match(r'syntax error at or near "(.+?)"', body):
-        return f"syntax error near {syntax[1]}: {_syntax_hint(syntax[1], extract)}"
+        hint = _missing_condition(syntax[1], extract, query) or _syntax_hint(syntax[1], extract)
+        return f"syntax error near {syntax[1]}: {hint}"
     if valueless := re.match(r"Values were not provided for the following parameters: ([^\n]*)", body):
         values = ", ".join(f"{name.strip()}=..." for name in valueless[1].split(","))
         return f"these parameters have no value: {valueless[1]}; in Python write lake.sql(query, {values})"
@@ -443,6 +497,21 @@ def explain_code(column: str, sign: str, text: str, codes: str) -> str:
     number = numbers[meant[0]] if meant else "one of these numbers"
     remedy = f"{column} {sign} {number}" if meant and sign else f"{number} in place of '{text}'"
     return f"column {column} contains numbers ({codes}): write {remedy}"
+
+
+def _missing_condition(word: str, extract: re.Match[str] | None, query: str) -> str:
+    """Return a message that a condition is missing between a word of a query and the word before it, or ""."""
+    if extract is None or word.upper() not in _AFTER_CONDITION:
+        return ""
+    number = int(re.sub(r"\D", "", extract["line"].partition(":")[0]))
+    lines = [*query.splitlines()[: number - 1], extract["line"][: len(extract["blanks"])].partition(": ")[2]]
+    match = _BEFORE_CONDITION.search(" ".join(lines))
+    if match is None:
+        return ""
+    previous = match["word"].upper()
+    missing = "a value" if match["value"] or previous[0] in "<>=" else "a condition"
+    following = f"{word.upper()} BY" if word.upper() in ("ORDER", "GROUP") else word.upper()
+    return f"{missing} is missing between {previous} and {following}"
 
 
 def _syntax_hint(word: str, extract: re.Match[str] | None) -> str:

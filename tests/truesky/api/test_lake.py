@@ -46,6 +46,13 @@ def test_a_table_is_read_in_each_form(opened):
     assert list(opened.table("plain", into="astropy")[name]) == rows[name].to_pylist()
 
 
+def test_columns_that_do_not_exist_are_refused_with_suggestions(opened):
+    with pytest.raises(truesky.BadInput, match=r"^table plain has no column ID; did you mean id\?$"):
+        opened.table("plain", ["ID"])
+    with pytest.raises(truesky.BadInput, match=r"^table plain has no column qqqq; it has "):
+        opened.cone("plain", 0.0, 0.0, 1.0, columns="qqqq")
+
+
 def test_tables_are_pandas_unless_another_kind_is_named(lake):
     publish.make_version(lake, toy_plan(), toy_work)
     with truesky.open(lake) as found:

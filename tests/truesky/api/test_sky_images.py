@@ -277,6 +277,19 @@ def test_processes_draw_the_same_stamps(lake, tmp_path):
         next(images)
 
 
+def test_the_command_names_its_options(lake, tmp_path, capsys):
+    pd.DataFrame({"ra": [RA], "dec": [DEC]}).to_csv(tmp_path / "places.csv", index=False)
+    words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "stamps")]
+    for option, problem in (
+        (["--band", "VIS"], "--band: 'VIS' is not allowed: did you mean euclid_vis?"),
+        (["--band", "lsst_r", "--exposure", "9"], "--exposure 9: the lake has no exposure with this number"),
+        (["--size", "-1"], "--size = -1.0 is outside [0.0, 3600.0] arcsec"),
+    ):
+        assert main([*words, *option]) == 2
+        assert capsys.readouterr().err == f"truesky stamps: {problem}\n"
+        assert not (tmp_path / "stamps").exists()
+
+
 def test_the_command_writes_stamps(lake, tmp_path, capsys):
     pd.DataFrame(PLACES)[:2].to_csv(tmp_path / "places.csv", index=False)
     words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "new" / "stamps")]
@@ -368,8 +381,8 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ({"without": [3.0]}, "without = 3.0 is not a whole number"),
         ({"effects": ["ghosts"]}, "effects: 'ghosts' cannot be applied to a window"),
         ({"date": "2001-02-30"}, "date"),
-        ({"extra": {"ra": [RA], "dec": [DEC]}}, "rows: column mag is missing"),
-        ({"extra": {"ra": [RA], "dec": [DEC], "mag": [99.0]}}, "rows: column mag of row 1 is 99, but must be"),
+        ({"extra": {"ra": [RA], "dec": [DEC]}}, "^extra: column mag is missing"),
+        ({"extra": {"ra": [RA], "dec": [DEC], "mag": [99.0]}}, "^extra: column mag of row 1 is 99, but must be"),
     ],
 )
 def test_bad_options_are_refused(lake, options, message):

@@ -73,12 +73,32 @@ def test_similar_names_and_names_of_subqueries():
     assert "use galaxies.z_obs (" in suggestions.explain_missing_column("redshift", both, {})
 
 
+def test_names_in_arguments_have_the_same_suggestions():
+    others = {name: columns for name, columns in TABLES.items() if name != "stars"}
+    text = suggestions.explain_argument(["RA", "temp", "kmag", "qqqq", "rrrr"], "stars", TABLES["stars"], others)
+    assert re.fullmatch(
+        r"table stars has no column RA; use ra \(right asc[^;]*\); no column temp; use teff \(effective [^;]*\); "
+        r"no column kmag: the lake has fluxes only in [^;]*; fluxes.bands in the request adds other bands; "
+        r"no column qqqq and rrrr; it has id, .*",
+        text,
+    )
+    del others["gaia"]
+    assert "; no column" not in suggestions.explain_argument(["gmag"], "stars", TABLES["stars"], others)
+    assert "mag_h" not in suggestions.explain_argument(["gmag"], "stars", TABLES["stars"], others)
+    only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
+    text = suggestions.explain_argument(["flux_vis"], "galaxies", TABLES["galaxies"], only)
+    assert text.startswith("table galaxies has no column flux_vis; use galaxy_fluxes.f_nu_euclid_vis (")
+    assert "; in lake.sql add JOIN galaxy_fluxes USING (id)" in text
+
+
 @pytest.mark.parametrize(("message", "name"), [(MESSAGE.format("X"), "x"), ('Table "x" does not exist', None)])
 def test_the_missing_column_of_a_message(message, name):
     assert suggestions.missing_column(message) == name
 
 
-@pytest.mark.parametrize("name", ["f_nu_lsst_i", "f_nu_euclid_vs", "mag_lsst_i", "lsst_i_flux", "flux_g"])
+@pytest.mark.parametrize(
+    "name", ["f_nu_lsst_i", "f_nu_euclid_vs", "mag_lsst_i", "lsst_i_flux", "flux_g", "kmag", "g_mag", "magk", "hflux"]
+)
 def test_no_other_band_is_suggested(name):
     remedy = "the lake has fluxes only in euclid_vis, lsst_r and des_r; fluxes.bands in the request adds other bands"
     assert explained(name, "galaxy_fluxes") == f"column {name} does not exist: {remedy}"
@@ -88,7 +108,13 @@ def test_no_other_band_is_suggested(name):
 
 @pytest.mark.parametrize(
     ("name", "table", "column"),
-    [("fnu_lsst_r", "galaxy_fluxes", "f_nu_lsst_r"), ("mag_r1", "galaxies", "mag_r01")],
+    [
+        ("fnu_lsst_r", "galaxy_fluxes", "f_nu_lsst_r"),
+        ("mag_r1", "galaxies", "mag_r01"),
+        ("hmag", "stars", "mag_h"),
+        ("h_mag", "stars", "mag_h"),
+        ("magh", "stars", "mag_h"),
+    ],
 )
 def test_the_same_band_is_suggested(name, table, column):
     assert explained(name, table) == f"column {name} does not exist; did you mean {column}?"
@@ -177,6 +203,18 @@ def test_queries(explorer, query, words):
         ("SELECT n FROM t JOIN u USING (kind) WHERE u.n = n", "several tables have a column n: write t.n or u.n in"),
         ("SELECT 1 FROM t AS a, t AS a WHERE a.n = 1", "FROM has a twice: give each table another alias"),
         ("SELECT n FROM t WHERE n > 1 AND", "syntax error near AND: something is missing after AND$"),
+        (
+            "SELECT n FROM t WHERE n > 1 AND ORDER BY n",
+            "syntax error near ORDER: a condition is missing between AND and",
+        ),
+        ("SELECT n FROM t WHERE n > 1 AND GROUP BY n", "syntax error near GROUP: .* between AND and GROUP BY$"),
+        ("SELECT n FROM t WHERE OR n > 1", "syntax error near OR: a condition is missing between WHERE and OR$"),
+        ("SELECT n FROM t WHERE ORDER BY n", "syntax error near ORDER: a condition is missing between WHERE and ORDER"),
+        ("SELECT n FROM t\nWHERE n > 1 AND\nLIMIT 1", "syntax error near LIMIT: .* is missing between AND and LIMIT$"),
+        ("SELECT n FROM t WHERE (n > 1 OR) LIMIT 1", r"syntax error near \): .* is missing between OR and \)$"),
+        ("SELECT n FROM t WHERE n > ORDER BY n", "syntax error near ORDER: a value is missing between > and ORDER BY$"),
+        ("SELECT n FROM t WHERE n BETWEEN 1 AND LIMIT 1", "syntax error .* a value is missing between AND and LIMIT$"),
+        ("SELECT n FROM t LIMIT 1 ORDER BY n", "syntax error near ORDER: columns are separated by commas"),
         ("SELECT n FROM t WHERE n BETWEEN 1 TO 2", "syntax error near TO: write BETWEEN 1 AND 2$"),
         ("SELECT n FROM t WHERE n > -27:48", "syntax error near :: write positions in degrees"),
         ("SELECT n FROM t JOIN u WHERE n > 1", "syntax error near WHERE: JOIN must have ON or USING"),
@@ -208,7 +246,7 @@ def test_messages_are_sentences(query, message):
         database.execute("CREATE MACRO twice(x) AS 2 * x")
         with pytest.raises(duckdb.Error) as error:
             database.execute(query).fetchall()
-    text = suggestions.plain_message(str(error.value))
+    text = suggestions.plain_message(str(error.value), query)
     assert re.match(message, text), text
     assert "Error" not in text
     assert "\n" not in text
