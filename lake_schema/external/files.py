@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 
 from lake_schema import command, user_files
 from lake_schema.errors import BadInput
-from lake_schema.texts import spelling
+from lake_schema.texts import synonyms
 
 # First and last four bytes of a Parquet file.
 _MAGIC = b"PAR1"
@@ -277,7 +277,7 @@ def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str])
     count = Counter(names)
     if missing := [column for column in dict.fromkeys(columns) if not count[column]]:
         has = " ".join(", ".join(names).split())[:300]
-        absent = ", ".join(f"{column}{spelling.suggestion(column, names)}" for column in missing)
+        absent = ", ".join(f"{column}{synonyms.suggest_title(column, names)}" for column in missing)
         raise BadInput(f"{path} has no column {absent}; it has {has}")
     for column in columns:
         if count[column] > 1:

@@ -128,14 +128,14 @@ def resolve_lake(text: str | Path) -> Path:
 def _refuse_part_of_lake(text: str | Path, root: Path) -> None:
     """Raise PartOfLake if a folder is in a lake; `text` is its path as the user typed it, `root` the absolute path."""
     for lake in root.parents:
-        first, *others = root.relative_to(lake).parts
+        first, *rest = root.relative_to(lake).parts
         is_part = first in (_NAMES, _RUNS) or tables.find_table(first) is not None
         # A lake may itself be in a folder with the name of a table.
         if is_part and any(tables.find_table(name) for name in table_names(lake)) and not table_names(root):
             typed = user_files.expand_path(text)
-            shown = next((folder for folder in (typed, *typed.parents) if folder.resolve() == lake), lake)
-            name = user_files.format_path(shown)
-            request = others[0] if first == _NAMES and others else ""
+            typed_lake = next((folder for folder in (typed, *typed.parents) if folder.resolve() == lake), lake)
+            name = user_files.format_path(typed_lake)
+            request = rest[0] if first == _NAMES and rest else ""
             raise PartOfLake(f"lake {user_files.format_path(text)} is a part of the lake {name}: give {name}", request)
 
 

@@ -11,6 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from lake_schema.texts import spelling
+
+# Tables whose synonyms are compared with the titles of a user's catalogue.
+_CATALOGUES = ("given_galaxies", "given_stars", "galaxies", "stars", "halos")
 _FILE = Path(__file__).with_name("synonyms.csv")
 
 
@@ -57,3 +61,14 @@ def find_columns(name: str, tables: Sequence[str], columns: Container[str]) -> l
         if names := [meant.column for meant in synonyms if meant.table == table and meant.column in columns]:
             return names
     return []
+
+
+def suggest_title(column: str, titles: Sequence[str]) -> str:
+    """Return " (did you mean X?)" with the title in a file that a missing column may have, "" if none is known.
+
+    It is the most similar title, or one that means the column, such as RAJ2000 for ra.
+    """
+    if similar := spelling.suggestion(column, titles):
+        return similar
+    meant = [title for title in titles if find_columns(title, _CATALOGUES, [column])]
+    return f" (did you mean {meant[0]}?)" if meant else ""

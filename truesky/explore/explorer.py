@@ -5,7 +5,7 @@ The versions of the tables are fixed when the lake is opened. New versions that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError, VersionMismatch
 from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.texts import spelling
 from truesky.explore import results, shared_columns, suggestions
 from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process
 
@@ -220,7 +221,7 @@ class Explorer:
                 for name, version in self.versions.items()
                 if name != table and name.rpartition(".")[0] == request and name.rpartition(".")[2] not in unrelated
             }
-            raise BadInput(suggestions.explain_argument(missing, table, existing, other_tables))
+            raise BadInput(explain_columns(missing, table, existing, other_tables))
 
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Return the result of one SELECT over the tables of the lake.
@@ -452,6 +453,41 @@ class Explorer:
         # Near large numbers, a float cannot represent half a unit.
         half = max(0.5, 2.0 * float(np.spacing(abs(lo))))
         return (lo, hi) if hi > lo else (lo - half, hi + half)
+
+
+def explain_columns(
+    names: Sequence[str], table: str, columns: Collection[str], other_tables: Mapping[str, Collection[str]]
+) -> str:
+    """Return a message about names in an argument that are not columns of a table, as for a query.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The names, as the user wrote them.
+    table : str
+        Name of the table.
+    columns : collection of str
+        Columns of the table.
+    other_tables : mapping of str to collection of str
+        Columns of the other tables of the lake that may be suggested.
+
+    Returns
+    -------
+    str
+        The message, one line.
+    """
+    texts, unknown = [], []
+    for name in names:
+        text = suggestions.explain_missing_column(name.lower(), {table: columns}, other_tables)
+        _, mark, remedy = text.removeprefix(f"column {name.lower()} does not exist").partition(suggestions.LIST)
+        if mark:
+            unknown.append(name)
+        else:
+            remedy = text.removeprefix(f"column {name.lower()} does not exist")
+            texts.append(f"{name}{remedy.replace('; add JOIN', '; in lake.sql add JOIN')}")
+    if unknown:
+        texts.append(f"{spelling.join_words(unknown, 'and')}; it has {', '.join(columns)}")
+    return f"table {table} has no column {'; no column '.join(texts)}"
 
 
 def _pair(name: str, value: Any) -> tuple[Any, Any]:

@@ -34,8 +34,8 @@ _MIN_SIMILARITY = 0.6
 _MIN_BAND_SIMILARITY = 0.85
 # The same for misspelt synonyms: redshfit is redshift, but high is not ha.
 _MIN_SYNONYM_SIMILARITY = 0.8
-# Parts of the name of a flux or magnitude that do not belong to the name of its passband. Names without an underscore
-# are those of common filters, such as "gmag".
+# Parts of the name of a flux or magnitude that do not belong to the name of its passband. Names without an
+# underscore belong to common filters, such as "gmag".
 _FILTER = "[ubvgrizyjhkw]"
 _FLUX_NAME = re.compile(
     r"^(?:f_nu|flux|magnitude|mag|f|m|ab_mag)_|_(?:mag|flux|magnitude|ab)$"
@@ -56,7 +56,7 @@ _UNKNOWN_FUNCTION = re.compile(
 _REFUSED_TEXT = r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)"
 # Words that begin the parts of a query.
 _KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
-# Words and signs that follow a condition, and those that a condition or a value must follow.
+# Words and signs that follow a condition, and words and signs that must come before a condition or a value.
 _AFTER_CONDITION = ("AND", "OR", "ORDER", "GROUP", "HAVING", "LIMIT", "QUALIFY", "UNION", "WHERE", ")")
 _BEFORE_CONDITION = re.compile(
     r"(?P<value>\bBETWEEN\s+\S+\s+)?(?P<word>\b(?:WHERE|AND|OR|NOT|HAVING|ON|QUALIFY)|[<>=]+)\s*\Z", re.IGNORECASE
@@ -253,41 +253,6 @@ def explain_missing_column(
             return f"{problem}; use {_as_text(targets, prefixes)}"
     quotes = "" if entry else "; a text must be in single quotes"
     return f"{problem}{LIST}{', '.join(names)}{quotes}"
-
-
-def explain_argument(
-    names: Sequence[str], table: str, columns: Collection[str], other_tables: Mapping[str, Collection[str]]
-) -> str:
-    """Return a message about names in an argument that are not columns of a table, as in `explain_missing_column`.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The names, as the user wrote them.
-    table : str
-        Name of the table.
-    columns : collection of str
-        Columns of the table.
-    other_tables : mapping of str to collection of str
-        Columns of the other tables of the lake that may be suggested.
-
-    Returns
-    -------
-    str
-        The message, one line.
-    """
-    texts, unknown = [], []
-    for name in names:
-        text = explain_missing_column(name.lower(), {table: columns}, other_tables)
-        _, mark, remedy = text.removeprefix(f"column {name.lower()} does not exist").partition(LIST)
-        if mark:
-            unknown.append(name)
-        else:
-            remedy = text.removeprefix(f"column {name.lower()} does not exist")
-            texts.append(f"{name}{remedy.replace('; add JOIN', '; in lake.sql add JOIN')}")
-    if unknown:
-        texts.append(f"{spelling.join_words(unknown, 'and')}; it has {', '.join(columns)}")
-    return f"table {table} has no column {'; no column '.join(texts)}"
 
 
 def _join_hint(

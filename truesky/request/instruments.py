@@ -181,7 +181,7 @@ def check_band(
 def _owner_of_band(band: str, in_observation: bool, mission: MissionConfiguration) -> str:
     """Return the channel, camera or survey that has a passband, and the keys that select it, "" if none has it.
 
-    The keys are those of an observation if `in_observation` is True, else those of a pointing.
+    The keys belong to an observation if `in_observation` is True, else to a pointing.
     """
     band = known_name(band, [name for bands in EUCLID_BANDS.values() for name in bands])
     for channel, bands in EUCLID_BANDS.items():

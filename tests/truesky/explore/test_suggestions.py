@@ -7,7 +7,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.tables import all_tables
-from truesky.explore import suggestions
+from truesky.explore import explorer, suggestions
 
 BANDS = ["euclid_vis", "lsst_r", "des_r"]
 TABLES = {table.name: list(table.names) for table in all_tables(BANDS)}
@@ -75,7 +75,7 @@ def test_similar_names_and_names_of_subqueries():
 
 def test_names_in_arguments_have_the_same_suggestions():
     others = {name: columns for name, columns in TABLES.items() if name != "stars"}
-    text = suggestions.explain_argument(["RA", "temp", "kmag", "qqqq", "rrrr"], "stars", TABLES["stars"], others)
+    text = explorer.explain_columns(["RA", "temp", "kmag", "qqqq", "rrrr"], "stars", TABLES["stars"], others)
     assert re.fullmatch(
         r"table stars has no column RA; use ra \(right asc[^;]*\); no column temp; use teff \(effective [^;]*\); "
         r"no column kmag: the lake has fluxes only in [^;]*; fluxes.bands in the request adds other bands; "
@@ -83,10 +83,10 @@ def test_names_in_arguments_have_the_same_suggestions():
         text,
     )
     del others["gaia"]
-    assert "; no column" not in suggestions.explain_argument(["gmag"], "stars", TABLES["stars"], others)
-    assert "mag_h" not in suggestions.explain_argument(["gmag"], "stars", TABLES["stars"], others)
+    assert "; no column" not in explorer.explain_columns(["gmag"], "stars", TABLES["stars"], others)
+    assert "mag_h" not in explorer.explain_columns(["gmag"], "stars", TABLES["stars"], others)
     only = {"galaxy_fluxes": TABLES["galaxy_fluxes"]}
-    text = suggestions.explain_argument(["flux_vis"], "galaxies", TABLES["galaxies"], only)
+    text = explorer.explain_columns(["flux_vis"], "galaxies", TABLES["galaxies"], only)
     assert text.startswith("table galaxies has no column flux_vis; use galaxy_fluxes.f_nu_euclid_vis (")
     assert "; in lake.sql add JOIN galaxy_fluxes USING (id)" in text
 

@@ -266,10 +266,11 @@ def parse_columns(
     entries = {key: entry for key, entry in entries.items() if entry not in ("", {})}
     settings = {key: entry for key, entry in entries.items() if key in legal_settings}
     legal = dict.fromkeys([*(key for key in bounds if key not in _NOT_MAPPED), *nullable, *legal_settings])
-    fields = {}
+    fields, suggested = {}, set()
     for key, entry in entries.items():
         if key not in legal:
             meant = synonyms.find_columns(key, ("given_galaxies", "galaxies", "halos"), legal)
+            suggested |= {*(meant or spelling.closest_names(key, legal, 1))}
             hint = f"did you mean {' or '.join(meant)}?" if meant else spelling.choices(key, list(legal))
             messages.append(f"{path}.{key} is not a known property: {hint}")
         elif key not in legal_settings:
@@ -278,7 +279,8 @@ def parse_columns(
             except BadInput as error:
                 messages.append(str(error))
     messages += _wrong_settings(settings, path)
-    messages += _missing_keys(entries, path, required)
+    # A required property is not missing if an unknown key was meant to be it.
+    messages += _missing_keys({*entries, *suggested}, path, required)
     if "mag" in fields and "band" in legal_settings and "band" not in settings:
         messages.append(f'{path}: mag requires band, the name of its passband: add a line such as band = "euclid_vis"')
     messages += _excluded_keys(fields, settings, path)

@@ -25,7 +25,7 @@ from lake_schema.external.mistakes import TableMistakes, find_out_of_bounds
 from lake_schema.fits import external
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.provenance import canonical
-from lake_schema.texts import spelling
+from lake_schema.texts import spelling, synonyms
 from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
@@ -175,7 +175,7 @@ def _read_table(file: Path, titles: list[str]) -> Mapping[str, Float]:
     if file.suffix.lower() in (".fits", ".fit"):
         columns = external.read_numbers(file, KIND)
         if absent := [title for title in titles if title not in columns]:
-            listed = ", ".join(f"{title}{spelling.suggestion(title, columns)}" for title in absent)
+            listed = ", ".join(f"{title}{synonyms.suggest_title(title, list(columns))}" for title in absent)
             raise BadInput(f"{file}: has no column {listed}; it has {', '.join(columns)}")
         return columns
     return _read_text(file, titles)

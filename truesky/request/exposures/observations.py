@@ -35,10 +35,8 @@ from truesky.request.toml_values import (
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
 
-# Largest number of observation blocks in a request.
-_MAX_OBSERVATIONS = 1000
-# Largest number of values in a list that gives one value per calibration frame, such as delays_s.
-_MAX_VALUES = 1000
+# Largest numbers of observation blocks in a request, and of values in a list with one value per calibration frame.
+_MAX_OBSERVATIONS, _MAX_VALUES = 1000, 1000
 # Largest number of dither offsets that a user may give, and largest offset along each axis (arcsec).
 _MAX_DITHERS, _MAX_OFFSET = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
@@ -474,8 +472,8 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
                 useless = {other for other, users in _CHANNELS_OF_KEY.items() if not {*users} & {*channels}}
                 useless |= {other for other, types in _TYPES_OF_KEY.items() if image_type not in types}
                 keys = [other for other, kinds in _BLOCKS_OF_KEY.items() if kind in kinds and other not in useless]
-                instead = "visits repeats the exposures; " if key == "exposures" and "visits" in keys else ""
-                instead = "use exposures; " if key == "visits" and "exposures" in keys else instead
+                hints = {"exposures": "visits repeats the exposures; ", "visits": "use exposures; "}
+                instead = "" if kind == _TABLE else hints.get(key, "")
                 text = f"{path}.{key} is not for {kind}: {instead}its keys are {', '.join(keys)}, realisations"
                 mistakes.add(BadInput(text))
             elif image_type not in (types := _TYPES_OF_KEY.get(key, (image_type,))):

@@ -75,6 +75,26 @@ def test_missing_columns_and_wrong_values_are_reported_together(tmp_path):
     ]
 
 
+def test_known_names_of_missing_columns_are_suggested(tmp_path):
+    columns = table()
+    columns["RAJ2000"], columns["DEJ2000"] = columns.pop("RA"), columns.pop("DEC")
+    lines = mistakes(tmp_path, written(tmp_path, columns), galaxies({**GALAXIES, "ra": "ra", "dec": "dec"}))
+    assert [line.partition("; it has")[0] for line in lines] == [
+        "ingest.galaxies.columns.ra: 0.parquet has no column ra (did you mean RAJ2000?)",
+        "ingest.galaxies.columns.dec: 0.parquet has no column dec (did you mean DEJ2000?)",
+    ]
+
+
+def test_a_property_that_is_suggested_is_not_missing():
+    with pytest.raises(BadInput) as caught:
+        mapping.halo_columns(dict.fromkeys(("RAJ2000", "dec", "z_tru", "log_mass"), json.dumps("a")))
+    assert caught.value.messages == (
+        "ingest.halos.columns.RAJ2000 is not a known property: did you mean ra?",
+        "ingest.halos.columns.z_tru is not a known property: did you mean z_true? allowed: ra, dec, z_true, z_obs, "
+        "velocity, log_mass, origin_id",
+    )
+
+
 def test_texts_in_columns_of_numbers_are_named(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("RA,DEC,Z,MAG,ID\n53,-27,0.5,21,1\n53,-27,half,-,2\n53,-27,+.5e0,1e1,3\n53,-27,,n/a,4\n")
