@@ -47,7 +47,7 @@ truth = ["noisefree"]
 [unversee]
 """
 KEYS = [
-    "name", "seed", "nam", "accuracy", "universe.galaxy_limt", "universe.star_limit", "universe.box_cells",
+    "seed", "nam", "accuracy", "universe.galaxy_limt", "universe.star_limit", "universe.box_cells",
     "area.cone.dec", "area.cone.radius", "pointing[0].band", "pointing[0].ra", "pointing[0].detectors",
     "pointing[0].detectors", "pointing[1].camera", "pointing[1].mjd", "observation[0].bands", "observation[0].visits",
     "products.truth", "unversee",
