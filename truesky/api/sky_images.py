@@ -142,7 +142,18 @@ class SkyImage:
         return astrometry.shift_pixels(aim.wcs, *(-first for first in self.first_pixel))
 
     def attach(self, painter: SkyPainter) -> SkyImage:
-        """Use a painter of the same lake for the coordinates and the PSF, and return the image."""
+        """Use a painter of the same lake for the coordinates and the PSF.
+
+        Parameters
+        ----------
+        painter : SkyPainter
+            The painter.
+
+        Returns
+        -------
+        SkyImage
+            This image.
+        """
         self._painter = painter
         return self
 

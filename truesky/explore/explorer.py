@@ -212,7 +212,20 @@ class Explorer:
         return self.versions[table]
 
     def check_columns(self, table: str, columns: Sequence[str]) -> None:
-        """Raise BadInput if a table lacks one of the columns; the message has the same suggestions as in SQL."""
+        """Check that a table has columns.
+
+        Parameters
+        ----------
+        table : str
+            Name of the table.
+        columns : sequence of str
+            Names of the columns.
+
+        Raises
+        ------
+        BadInput
+            If it lacks one of them. The message has the same suggestions as in SQL.
+        """
         existing = self._version(table).schema.names
         if missing := [name for name in dict.fromkeys(columns) if name not in existing]:
             request, unrelated = table.rpartition(".")[0], shared_columns.unrelated_fluxes([table])
