@@ -60,8 +60,8 @@ MISTAKES = {
     "sead": (changed("seed = 1", "sead = 1"), "sead is not a key of a request; ", "did you mean seed?"),
     "an area misspelt": (changed("[area]", "[aera]"), "aera is not a key of a request; ", "did you mean [area]?"),
     "a required key of a pointing misspelt": (
-        changed("channel", "channl"),
-        "pointing[0].channl is not a key",
+        changed("channel", "chhannel"),
+        "pointing[0].chhannel is not a key",
         "did you mean channel?",
     ),
     "two areas": (changed("0.2 }", "0.2 }\ntile = 3"), "area must have exactly one", "it has cone, tile"),
