@@ -72,7 +72,7 @@ def test_area_in_the_error_message_is_large_enough(ra, dec):
     block = {"channels": ["VIS"], "ra": ra, "dec": dec}
     with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(made(block, ((ra + 180.0) % 360.0, -dec / 2, 0.1)))
-    area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
+    area = tomllib.loads(re.search(r"large enough: (.*)", str(refused.value))[1])["area"]
     plan.check(from_table({**BASE, "area": area, "observation": [block]}))
     # The area is not much larger than the field of view.
     assert area["cone"]["radius"] < 0.8
@@ -83,7 +83,7 @@ def test_distant_fields_give_several_circles():
     elsewhere = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}
     with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
-    area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
+    area = tomllib.loads(re.search(r"large enough: (.*)", str(refused.value))[1])["area"]
     assert np.array(area["patches"]) == pytest.approx(np.array([[10, -45, 0.65], [60, -45, 0.65]]), abs=0.15)
 
 
