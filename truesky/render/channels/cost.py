@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -18,7 +19,8 @@ class Cost:
     sky_s : float
         Additional seconds per image if the sky with its sources is drawn.
     galaxy_s, star_s : float
-        Seconds per galaxy and per star drawn with the accuracy "survey".
+        Seconds per galaxy and per star on the detector, at the accuracy "survey". They include the sources around the
+        detector whose light is drawn on it.
     base_gb : float
         Memory of a new process in GB before it draws.
     bytes_per_pixel, sky_bytes_per_pixel : float
@@ -30,6 +32,9 @@ class Cost:
     lamp_s : float
         Additional seconds per million pixels if a calibration lamp illuminates the detector. The charge of each frame
         of a ramp is then drawn separately.
+    most_sources : float
+        Largest number of sources on a detector to which `galaxy_s` and `star_s` apply. In deeper catalogues, further
+        sources are too faint to be drawn.
     """
 
     frame_s: float
@@ -42,3 +47,4 @@ class Cost:
     file_bytes_per_pixel: float
     redraw_s: float = 0.0
     lamp_s: float = 0.0
+    most_sources: float = math.inf

@@ -91,21 +91,21 @@ def _psf(
     return euclid.nisp_psf(detector, band, mission, positions)
 
 
-# Costs of an image (CPU seconds, memory) on the reference machine, measured for 1.2e4 predicted sources: 1.5 s and 1.2
-# GB on an AMD EPYC, which needs half the time of the reference machine (forecasting/speed.py). The cost redraw_s (to
-# draw an earlier image again, for its persistence) is from the last image of a visit with four dithers. This image
-# takes 10.5 s on the EPYC, of which 0.28 s are for each of eleven earlier NISP-P images, and 0.6 s for each of four
-# NISP-S images.
+# Costs of an image (CPU seconds, memory) on the reference machine. The times were measured in runs of the requests
+# nisp_spectra and slitless with two workers (see nisp_s.py): 3.4 s at draft accuracy without earlier images, and at
+# survey accuracy 5.4 to 5.9 s after one NISP-S image, 10.4 to 11.8 s after four of them and nine to eleven NISP-P
+# images. redraw_s is the cost to draw an earlier image again, for its persistence. A single process that has drawn
+# before needs 1.5 s for 1.2e4 sources and 1.2 GB.
 COST = Cost(
     frame_s=0.05,
-    sky_s=0.3,
-    galaxy_s=1.3e-4,
-    star_s=1.3e-4,
+    sky_s=2.6,
+    galaxy_s=1.6e-4,
+    star_s=1.6e-4,
     base_gb=0.5,
     bytes_per_pixel=120.0,
     sky_bytes_per_pixel=160.0,
     file_bytes_per_pixel=3.0,
-    redraw_s=0.3,
+    redraw_s=0.36,
     lamp_s=1.2,
 )
 

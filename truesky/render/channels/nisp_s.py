@@ -147,23 +147,25 @@ def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, pos
     return double_gaussian.psf_at(detector, waves, mission)
 
 
-# Costs of an image (CPU seconds, memory) on the reference machine, measured for 1.1e4 predicted sources, all of which
-# were drawn. An image takes 17.2 s of CPU time, of which 1.3 s are for spectra, and 1.5 GB on a busy AMD EPYC. That
-# machine needs half the time of the reference machine (forecasting/speed.py). The forecast from these costs is 16.9 s
-# and 1.6 GB for the same image. With eight truth maps (images of the true signals), Spark tasks use 1.55 to 1.71 GB;
-# darks and flats with four maps use 1.39 to 1.49 GB. nisp_p.py explains redraw_s, the cost to draw an earlier image for
-# its persistence.
+# Costs of an image (CPU seconds, memory) on the reference machine. The times were measured in runs of the requests
+# nisp_spectra (survey accuracy, galaxies to H = 24) and slitless (draft accuracy, to I_E = 25.5) with two workers on an
+# AMD EPYC, whose factor is 0.67 (forecasting/speed.py), and 1.25 more with two workers. Images of the sky took 38 and
+# 25 s. Both contained 1.6e4 spectra: three times the 5.6e3 sources on the detector with H < 24, because the spectra of
+# sources up to 10 arcmin around it fall on it. The spectra of fainter sources are not noticeable. With eight truth maps
+# (images of the true signals), Spark tasks use 1.6 to 2.3 GB; darks and flats with four maps use 1.4 to 1.8 GB.
+# nisp_p.py explains redraw_s, the cost to draw an earlier image for its persistence.
 COST = Cost(
     frame_s=0.05,
     sky_s=0.5,
-    galaxy_s=3.2e-3,
-    star_s=3.2e-3,
+    galaxy_s=7.6e-3,
+    star_s=7.6e-3,
     base_gb=0.6,
     bytes_per_pixel=190.0,
     sky_bytes_per_pixel=240.0,
     file_bytes_per_pixel=3.0,
-    redraw_s=0.65,
+    redraw_s=0.8,
     lamp_s=6.5,
+    most_sources=5600.0,
 )
 
 CHANNEL = Channel(

@@ -20,7 +20,7 @@ from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.render.planning.mission import mission_of
-from truesky.render.planning.source_counts import Densities
+from truesky.render.planning.source_counts import Densities, euclid_limit
 from truesky.request.area import Area
 from truesky.request.files import UserSources
 from truesky.request.schema import MissionChoice, Request, Universe
@@ -119,7 +119,8 @@ def _forecast_versions(versions: Mapping[str, read.Version], factor: float, new_
         facts, partitions = version.manifest["facts"], version.manifest["parts"]
         cells = [cell for partition in partitions for cell in partition["facts"].get("generation_cells", ())]
         if name in ("halos", "galaxies") and "galaxy_limit" in facts:
-            rows[name] = _galaxy_counts(facts["galaxy_limit"], len(cells))[name]
+            limits = {key: facts[key] for key in ("galaxy_limit", "galaxy_band") if key in facts}
+            rows[name] = _galaxy_counts(euclid_limit(Universe(**limits)), len(cells))[name]
         if name == "stars" and "star_limit" in facts:
             mission = mission_of(MissionChoice())
             rows[name] = _star_count(Densities(mission, Universe(star_limit=facts["star_limit"])), cells)
@@ -144,7 +145,7 @@ def _drawn_rows(request: Request, cells: Sequence[int]) -> dict[str, float]:
 
     `cells` are the order-8 HEALPix cells of the request's area.
     """
-    rows = {} if request.ingest.galaxies else _galaxy_counts(request.universe.galaxy_limit, len(cells))
+    rows = {} if request.ingest.galaxies else _galaxy_counts(euclid_limit(request.universe), len(cells))
     if request.stars.catalogue is None:
         mission, universe, brightest = mission_of(request.mission), request.universe, request.stars.bright_limit
         rows["stars"] = _star_count(Densities(mission, universe), cells)
@@ -169,7 +170,7 @@ def _given_rows(sources: UserSources, area: Area) -> dict[str, float]:
 
 
 def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
-    """Return the expected numbers of halos and galaxies brighter than a magnitude limit in `cells` order-8 cells.
+    """Return the expected numbers of halos and galaxies brighter than a limit in I_E in `cells` order-8 cells.
 
     The numbers are means over the sky; a limit outside the tabulated ones is extrapolated.
     """

@@ -71,7 +71,8 @@ class CostModel:
 
     Fields that end with `_s` are CPU seconds, with `_gb` gigabytes of memory, with `_bytes` bytes of files. They begin
     with `start_` (per detector), `pixel_` (per pixel of the detector), `read_` (per pixel read out, with prescan and
-    overscan), `galaxy_` or `star_` (per source). The methods also accept arrays of shape (n,) for n detectors.
+    overscan), `galaxy_` or `star_` (per source). At most `most_sources` sources take time. The methods also accept
+    arrays of shape (n,) for n detectors.
     """
 
     start_s: float
@@ -83,6 +84,7 @@ class CostModel:
     start_bytes: int
     pixel_bytes: float
     read_bytes: float
+    most_sources: float = np.inf
 
     def seconds(self, pixels: Int | int, galaxies: Float | float, stars: Float | float) -> Any:
         """Return the CPU time to render a detector, in seconds on one core of the reference machine (Xeon, 2.5 GHz).
@@ -99,7 +101,9 @@ class CostModel:
         float or float array
             Time in seconds.
         """
-        return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
+        drawn_share = np.minimum(1.0, self.most_sources / np.maximum(galaxies + stars, 1.0))
+        source_s = drawn_share * (galaxies * self.galaxy_s + stars * self.star_s)
+        return self.start_s + pixels * self.pixel_s + source_s
 
     def memory(self, pixels: Int | int) -> Any:
         """Return the peak memory in GB of a worker that renders a detector with `pixels` pixels after other tasks."""
@@ -179,4 +183,5 @@ def cost_model(
         read_bytes=0.0
         if written_bytes
         else images * (channel_cost.file_bytes_per_pixel + _WIDE_BYTES * files.has_32_bits),
+        most_sources=channel_cost.most_sources,
     )

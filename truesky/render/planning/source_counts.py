@@ -16,7 +16,18 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store import layout
 from lake_schema.store.read import Version
+from truesky.fluxes import passbands
 from truesky.request.schema import Universe
+
+# For passbands with these mean wavelengths (Angstrom), magnitude limits at which they have as many galaxies as there
+# are with I_E < 22, 24 and 25. They come from a catalogue of 0.47 deg2 to I_E = 26.3 with fluxes in u, g, r, z, y of
+# LSST and Y_E, J_E, H_E of Euclid; at the wavelength of I_E they are 22, 24 and 25.
+_WAVELENGTHS = (3724.0, 4807.0, 6221.0, 7335.0, 8680.0, 9753.0, 10832.0, 13690.0, 17741.0)
+_EQUAL_LIMITS = {
+    22.0: (23.68, 23.23, 22.46, 22.0, 21.54, 21.29, 21.10, 20.70, 20.35),
+    24.0: (24.95, 24.64, 24.27, 24.0, 23.66, 23.43, 23.24, 22.85, 22.50),
+    25.0: (25.79, 25.48, 25.18, 25.0, 24.78, 24.63, 24.49, 24.21, 23.95),
+}
 
 
 class Densities:
@@ -31,16 +42,12 @@ class Densities:
     catalogues : sequence of Version, optional
         Stored versions of the tables `galaxies` and `stars`: both in this order, or none.
 
-    Notes
-    -----
-    Without catalogues, the magnitude limit of galaxies is taken as a limit in the Euclid band I_E, even if the request
-    sets it in another band.
     """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
         self.published = [_catalogue_density(version) for version in catalogues]
         counts = np.array(mission.numbers("survey.galaxy_counts"))
-        self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
+        self.galaxies = float(np.exp(np.interp(euclid_limit(universe), counts[:, 0], np.log(counts[:, 1]))))
         stars = np.array(mission.numbers("survey.star_counts"))
         # The table of star counts has the columns Galactic l and b (deg), then stars per deg2 brighter than H = 8, 10,
         # .., 26 mag. The limits below are these magnitudes.
@@ -76,6 +83,24 @@ class Densities:
         low = (1 - s) * self.stars[i, j] + s * self.stars[i + 1, j]
         high = (1 - s) * self.stars[i, j + 1] + s * self.stars[i + 1, j + 1]
         return np.stack([np.full(lon.shape, self.galaxies), np.exp((1 - t) * low + t * high)])
+
+
+def euclid_limit(universe: Universe) -> float:
+    """Return the limit in I_E above which there are as many galaxies as above the magnitude limit of a request.
+
+    The limit of the request applies to its band `galaxy_band`. Both are AB magnitudes. The error is about 0.1 mag for
+    I_E from 22 to 25.
+    """
+    if universe.galaxy_band not in passbands.names():
+        # Catalogues of the user may have any band.
+        return universe.galaxy_limit
+    band = passbands.load(universe.galaxy_band)
+    wavelength = float(np.average(band.wavelength, weights=band.response))
+    equal = np.array([np.interp(wavelength, _WAVELENGTHS, limits) for limits in _EQUAL_LIMITS.values()])
+    # Interpolate between the two nearest limits, or extrapolate from them.
+    i = int(np.clip(np.searchsorted(equal, universe.galaxy_limit) - 1, 0, len(equal) - 2))
+    (first, last), (in_first, in_last) = equal[i : i + 2], list(_EQUAL_LIMITS)[i : i + 2]
+    return float(in_first + (universe.galaxy_limit - first) * (in_last - in_first) / (last - first))
 
 
 def _catalogue_density(version: Version) -> dict[int, float]:

@@ -38,6 +38,17 @@ def test_cost_increases_with_pixels_and_sources():
     assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
 
 
+def test_spectra_of_faint_sources_take_no_time():
+    costs = detector_costs.cost_model("NISP-S", True, registry.CHANNELS["NISP-S"].effects["science"])
+    most = costs.most_sources
+    bare, full, deeper = (costs.seconds(PIXELS, galaxies, 0.1 * most) for galaxies in (0.0, 0.9 * most, 9.9 * most))
+    assert bare < full == pytest.approx(deeper)
+    assert full - bare == pytest.approx(0.9 * most * costs.galaxy_s)
+    # Images without spectra show faint sources too.
+    direct = detector_costs.cost_model("NISP-P", True, registry.CHANNELS["NISP-P"].effects["science"])
+    assert direct.seconds(PIXELS, most, 0) < direct.seconds(PIXELS, 10 * most, 0)
+
+
 def test_images_in_electrons_have_more_bytes_and_no_overscan():
     """Compare with the files: of 2.3 million pixels read out, 2.1 million belong to the detector."""
     raw, read = 2_100_000, 2_300_000
