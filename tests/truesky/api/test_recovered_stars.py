@@ -31,6 +31,8 @@ RAMP = ("background", "pixel_response", "dark_map", "ramp_cosmic_rays", "ipc", "
 # Stars per row and column. Their positions within a pixel form a lattice as well, because the centroid of a star in
 # large pixels is wrong by up to 70 mas (NISP), with opposite signs on both sides of the middle of a pixel.
 N = 8
+# Smallest fraction of the stars that count: 1 in 1000 pixels of NISP is dead, and such a pixel may be in the core.
+GOOD = 0.98
 # Required accuracy: mag, mas.
 MAGNITUDE, POSITION = 0.01, 5.0
 
@@ -195,7 +197,7 @@ def test_stars_are_recovered_in_a_given_frame(tmp_path):
 @pytest.mark.parametrize("band", list(SETTINGS))
 def test_stars_are_recovered(lake, band):
     rows = recover(lake, band, np.random.default_rng(1), cosmic_rays=False)
-    check(rows, band)
+    check(rows, band, GOOD)
 
 
 @pytest.mark.nightly
@@ -206,5 +208,5 @@ def test_many_stars_are_recovered(lake, band, cosmic_rays):
     rows = pd.concat([recover(lake, band, rng, cosmic_rays) for _ in range(16)], ignore_index=True)
     # In a single exposure of VIS, a third of the stars have a cosmic ray in their aperture.
     check(
-        rows, f"{band}, {'noise and cosmic rays' if cosmic_rays else 'pairs of images'}", 0.5 if cosmic_rays else 0.99
+        rows, f"{band}, {'noise and cosmic rays' if cosmic_rays else 'pairs of images'}", 0.5 if cosmic_rays else GOOD
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lake_schema.arrays import Bool, Int
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -34,3 +36,45 @@ class Window:
         return Window(
             column, row, -(-last_column // multiple) * multiple - column, -(-last_row // multiple) * multiple - row
         )
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorPart:
+    """A window and the size of its detector, for patterns that belong to the pixels of the detector.
+
+    Attributes
+    ----------
+    window : Window
+        The window.
+    nx, ny : int
+        Number of columns and of rows of the detector.
+    """
+
+    window: Window
+    nx: int
+    ny: int
+
+    def find_pixels(self, rows: Int, columns: Int) -> tuple[Bool, Int, Int]:
+        """Find pixels of the detector in the window.
+
+        Parameters
+        ----------
+        rows, columns : int array, shape (n,)
+            Rows and columns on the detector, 0-based.
+
+        Returns
+        -------
+        is_inside : bool array, shape (n,)
+            True for pixels in the window.
+        window_rows, window_columns : int array, shape (m,)
+            Rows and columns in the window of these pixels.
+        """
+        up, right = rows - self.window.row, columns - self.window.column
+        is_inside = (up >= 0) & (up < self.window.ny) & (right >= 0) & (right < self.window.nx)
+        return is_inside, up[is_inside], right[is_inside]
+
+
+def whole(shape: tuple[int, ...]) -> DetectorPart:
+    """Return the window that contains all pixels of a detector; `shape` ends with its numbers of rows and columns."""
+    ny, nx = shape[-2:]
+    return DetectorPart(Window(0, 0, nx, ny), nx, ny)

@@ -20,6 +20,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
 from truesky.randomness.rng import GOLDEN, mix_bits
+from truesky.render.camera.windows import DetectorPart
 
 # Number of bits by which 64 random bits are shifted right, so that the remaining 53 fit into a float64.
 _S11 = np.uint64(11)
@@ -37,6 +38,33 @@ _AREA = 4.92867323399e-3
 def draw_key(rng: np.random.Generator) -> np.uint64:
     """Draw the 64-bit key of a frame, from which all of its pixels derive their random bits."""
     return rng.integers(0, 2**64, dtype=np.uint64)
+
+
+def split_key(key: np.uint64, part: DetectorPart) -> list[tuple[slice, np.uint64]]:
+    """Return keys with which the pixels of a window have the random bits that they have in the frame of the detector.
+
+    Parameters
+    ----------
+    key : uint64
+        Key of the frame of the detector.
+    part : DetectorPart
+        Window and size of the detector.
+
+    Returns
+    -------
+    list of (slice, uint64)
+        Range of flat indices in the window, and the key for the indices that begin at 0 in this range.
+    """
+    window = part.window
+    if window.nx == part.nx:
+        # The rows of the window follow each other in the frame of the detector.
+        ranges, first_pixels = [slice(None)], np.array([window.row * part.nx], np.uint64)
+    else:
+        ranges = [slice(row * window.nx, (row + 1) * window.nx) for row in range(window.ny)]
+        rows = np.arange(window.row, window.row + window.ny, dtype=np.uint64)
+        first_pixels = rows * np.uint64(part.nx) + np.uint64(window.column)
+    # `pixel_bits` adds GOLDEN to the key for each pixel. The sum of arrays wraps around at 2^64 without a warning.
+    return list(zip(ranges, np.array([key]) + first_pixels * GOLDEN, strict=True))
 
 
 def _layers() -> Float:

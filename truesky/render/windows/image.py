@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +13,7 @@ import pyarrow as pa
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from truesky.randomness import rng
-from truesky.render.camera.windows import Window
+from truesky.render.camera.windows import DetectorPart, Window
 from truesky.render.channels import readout
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamps, wings
@@ -183,11 +185,24 @@ def _add_noise(
 
     def stream(effect: Effect) -> np.random.Generator:
         identity = rendered_detector.random_identity(effect, aim.exposure, aim.detector.name, *seeds)
+        if effect.fixed:
+            return rng.stream(*identity)
         return rng.stream(*identity, "window", window.column, window.row, window.nx, window.ny)
 
+    part = DetectorPart(window, aim.detector.nx, aim.detector.ny)
+    local = tuple(_on_part(effect, part) if effect.fixed else effect for effect in local)
     final, decisions = apply_all(electrons, local, scene, stream)
     numbers = final if final.ndim == 2 else final[0]
     return adc.to_file_type(numbers, scene), decisions
+
+
+def _on_part(effect: Effect, part: DetectorPart) -> Effect:
+    """Return an effect that gives a window the fixed pattern of the same pixels of the detector."""
+
+    def parameters(scene: Scene) -> tuple[Any, ...]:
+        return effect.parameters(replace(scene, window=None))
+
+    return replace(effect, apply=partial(effect.apply, part=part), parameters=parameters)
 
 
 def _switches(local: tuple[Effect, ...], effects: Collection[str] | None, scene: Scene) -> dict[str, bool]:

@@ -9,6 +9,8 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.camera import windows
+from truesky.render.camera.windows import DetectorPart
 from truesky.render.effects import pixel_random
 from truesky.render.effects.charge import poisson
 from truesky.render.effects.effect import Effect, map_pixels
@@ -78,7 +80,9 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
             cumulative += term
 
 
-def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:
+def apply_hot(
+    frame: Frame, fraction: float, electrons: float, rng: np.random.Generator, part: DetectorPart | None = None
+) -> Frame:
     """Add electrons to randomly chosen hot pixels, which are the same in every exposure.
 
     Parameters
@@ -91,6 +95,8 @@ def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Ge
         Mean electrons of a hot pixel, at least 0, below 1e12. The distribution is exponential.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the hot pixels are the same.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -110,10 +116,11 @@ def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Ge
         raise OutOfRange("fraction of hot pixels", fraction, 0.0, 1.0)
     if not 0.0 <= electrons < 1e12:
         raise OutOfRange("hot electrons", electrons, 0.0, 1e12)
-    out = np.array(frame, dtype=float)
-    count = int(rng.binomial(out.size, fraction))
-    hot_pixels = rng.integers(0, max(out.size, 1), count)
-    np.add.at(out.reshape(-1), hot_pixels, np.rint(electrons * rng.standard_exponential(count)))
+    part, out = part or windows.whole(frame.shape), np.array(frame, dtype=float)
+    size = part.nx * part.ny
+    count = int(rng.binomial(size, fraction))
+    is_inside, rows, columns = part.find_pixels(*np.divmod(rng.integers(0, max(size, 1), count), max(part.nx, 1)))
+    np.add.at(out, (rows, columns), np.rint(electrons * rng.standard_exponential(count))[is_inside])
     return out
 
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.camera import windows
+from truesky.render.camera.windows import DetectorPart
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect, map_pixels
+from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
 # Upper limit on the mean dark electrons of a hot pixel in an exposure, far above every full well.
@@ -21,7 +23,13 @@ _MAX_HOT_ELECTRONS = 1e11
 
 
 def apply(
-    frame: Frame, electrons: float, spread: float, hot_fraction: float, hot_electrons: float, rng: np.random.Generator
+    frame: Frame,
+    electrons: float,
+    spread: float,
+    hot_fraction: float,
+    hot_electrons: float,
+    rng: np.random.Generator,
+    part: DetectorPart | None = None,
 ) -> Frame:
     """Add the expected dark current of each pixel to a frame; the pattern is the same in every exposure.
 
@@ -39,6 +47,8 @@ def apply(
         Mean additional electrons of a hot pixel, 0 to 1e12. The distribution is exponential.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the pattern does not change.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -57,10 +67,14 @@ def apply(
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
     # For a standard normal z, exp(s z) has the mean exp(s^2 / 2). Divide by it, so that the mean is `electrons`.
-    out = map_pixels(_add_dark, frame, electrons * np.exp(-0.5 * spread**2), spread, pixel_random.draw_key(rng))
-    count = int(rng.binomial(out.size, hot_fraction))
-    hot_pixels = rng.integers(0, max(out.size, 1), count)
-    np.add.at(out.reshape(-1), hot_pixels, hot_electrons * rng.standard_exponential(count))
+    part, out = part or windows.whole(frame.shape), np.empty(frame.shape)
+    pixels, out_pixels = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
+    for run, key in pixel_random.split_key(pixel_random.draw_key(rng), part):
+        _add_dark(pixels[run], out_pixels[run], electrons * np.exp(-0.5 * spread**2), spread, key)
+    size = part.nx * part.ny
+    count = int(rng.binomial(size, hot_fraction))
+    is_inside, rows, columns = part.find_pixels(*np.divmod(rng.integers(0, max(size, 1), count), max(part.nx, 1)))
+    np.add.at(out, (rows, columns), (hot_electrons * rng.standard_exponential(count))[is_inside])
     return out
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.camera import windows
+from truesky.render.camera.windows import DetectorPart, Window
 from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
@@ -35,6 +37,7 @@ def apply(
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
+    part: DetectorPart | None = None,
 ) -> Frame:
     """Multiply a frame by the sensitivity of each pixel, which is the same in every exposure.
 
@@ -57,6 +60,8 @@ def apply(
         register is above).
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the sensitivity does not change.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -68,7 +73,7 @@ def apply(
     OutOfRange
         If a number is outside its limits or NaN.
     """
-    out = response(frame.shape, rms, dead, dark_columns, dust, segments, rng)
+    out = response(frame.shape, rms, dead, dark_columns, dust, segments, rng, part)
     out *= frame
     return out
 
@@ -81,6 +86,7 @@ def response(
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
+    part: DetectorPart | None = None,
 ) -> Frame:
     """Return the sensitivity of every pixel relative to the mean, with dead pixels, dark columns and dust shadows.
 
@@ -104,6 +110,8 @@ def response(
         register is above).
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the sensitivity does not change.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -122,39 +130,47 @@ def response(
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
-    out = np.empty(shape)
-    _draw_sensitivity(out.reshape(-1), rms, pixel_random.draw_key(rng))
-    ny, nx = shape[-2:]
+    part, out = part or windows.whole(shape), np.empty(shape)
+    ny, nx, window = part.ny, part.nx, part.window
+    for run, key in pixel_random.split_key(pixel_random.draw_key(rng), part):
+        _draw_sensitivity(out.reshape(-1)[run], rms, key)
     count = int(rng.binomial(ny * nx, dead))
-    rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
-    out[..., rows, columns] = _MAX_DEAD * rng.random(count)
+    is_inside, rows, columns = part.find_pixels(rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count))
+    out[rows, columns] = (_MAX_DEAD * rng.random(count))[is_inside]
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
-        row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx))
+        row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx)) - window.column
         # Charge from pixels beyond the defect cannot pass the defect on its way to the serial register.
         for first, past, register_above in segments:
-            if first <= row < past:
-                out[..., slice(first, row + 1) if register_above else slice(row, past), column] = 0.0
+            if first <= row < past and 0 <= column < window.nx:
+                start, end = (first, row + 1) if register_above else (row, past)
+                out[max(start - window.row, 0) : max(end - window.row, 0), column] = 0.0
     count = int(rng.poisson(grains * ny * nx))
     shadows = rng.random((count, 2)) * (ny, nx), radius * rng.standard_exponential(count)
     for (y, x), sigma in zip(shadows[0].tolist(), shadows[1].tolist(), strict=True):
-        _multiply_shadow(out, y, x, sigma, depth)
+        _multiply_shadow(out, (y, x), sigma, depth, window)
     return out
 
 
-def _multiply_shadow(out: Frame, y: float, x: float, sigma: float, depth: float) -> None:
-    """Multiply sensitivities by the Gaussian shadow of one dust grain, in place.
+def _multiply_shadow(out: Frame, place: tuple[float, float], sigma: float, depth: float, window: Window) -> None:
+    """Multiply sensitivities in a window by the Gaussian shadow of one dust grain, in place.
 
-    `x`, `y` and `sigma` are its centre and standard deviation in pixels, and `depth` is the fraction of light absorbed
-    at the centre. Nothing changes if `sigma` is 0.
+    `place` (y, x) and `sigma` are the centre of the shadow on the detector and its standard deviation in pixels, and
+    `depth` is the fraction of light absorbed at the centre. Nothing changes if `sigma` is 0.
     """
-    if sigma == 0.0:
-        return
-    (rows, up), (columns, across) = (
-        (slice(first, last), np.exp(-0.5 * ((np.arange(first, last) + 0.5 - at) / sigma) ** 2))
-        for at, n in ((y, out.shape[-2]), (x, out.shape[-1]))
-        for first, last in [(max(int(at - _SHADOW_RANGE * sigma), 0), min(int(at + _SHADOW_RANGE * sigma) + 1, n))]
+    reach = _SHADOW_RANGE * sigma
+    (first_row, end_row), (first_column, end_column) = (
+        (max(int(at - reach), start), min(int(at + reach) + 1, start + count))
+        for at, start, count in zip(place, (window.row, window.column), out.shape, strict=True)
     )
-    out[..., rows, columns] *= 1.0 - depth * up[:, None] * across
+    if sigma == 0.0 or first_row >= end_row or first_column >= end_column:
+        return
+    up, across = (
+        np.exp(-0.5 * ((np.arange(first, end) + 0.5 - at) / sigma) ** 2)
+        for at, first, end in ((place[0], first_row, end_row), (place[1], first_column, end_column))
+    )
+    rows = slice(first_row - window.row, end_row - window.row)
+    columns = slice(first_column - window.column, end_column - window.column)
+    out[rows, columns] *= 1.0 - depth * up[:, None] * across
 
 
 @jit
@@ -172,9 +188,6 @@ def parameters(scene: Scene) -> Parameters:
     """
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
-    if scene.window is not None and scene.detector is not None:
-        # The number is that of the whole detector.
-        dark_columns *= scene.nx * scene.ny / (scene.detector.nx * scene.detector.ny)
     return rms, dead, dark_columns, dust, scene.column_segments
 
 

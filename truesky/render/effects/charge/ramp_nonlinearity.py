@@ -14,13 +14,17 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.camera import windows
+from truesky.render.camera.windows import DetectorPart
 from truesky.render.effects import pixel_random
 from truesky.render.effects.charge import ramp
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
 
-def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
+def apply(
+    frame: Frame, mean: float, spread: float, rng: np.random.Generator, part: DetectorPart | None = None
+) -> Frame:
     """Draw the nonlinearity coefficient b of each pixel, and add it to the frame as an additional plane.
 
     The effect `ramp`, which simulates the repeated reads of the detector, later uses this plane: N electrons are read
@@ -37,6 +41,8 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
         Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10. Negative values of b are set to 0.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that b does not change.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -50,11 +56,15 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
         If `mean` or `spread` is outside its limits or NaN.
     """
     out = ramp.with_planes(frame, 4)
-    _draw_coefficients(out[3].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
+    coefficients, limits = out[3].reshape(-1), _check_parameters(mean, spread)
+    for run, key in pixel_random.split_key(pixel_random.draw_key(rng), part or windows.whole(frame.shape)):
+        _draw_coefficients(coefficients[run], *limits, key)
     return out
 
 
-def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
+def apply_signal(
+    frame: Frame, mean: float, spread: float, rng: np.random.Generator, part: DetectorPart | None = None
+) -> Frame:
     """Apply the nonlinearity N (1 - b N) to the signal N that was estimated from a ramp (repeated reads).
 
     Parameters
@@ -67,6 +77,8 @@ def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Genera
         Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10. Negative values of b are set to 0.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that b does not change.
+    part : DetectorPart, optional
+        Part of the detector that the frame shows. By default the frame is the whole detector.
 
     Returns
     -------
@@ -84,7 +96,9 @@ def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Genera
     unchanged.
     """
     out = np.array(frame, dtype=float, order="C")
-    _bend_signal(out[0].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
+    signal, limits = out[0].reshape(-1), _check_parameters(mean, spread)
+    for run, key in pixel_random.split_key(pixel_random.draw_key(rng), part or windows.whole(frame.shape)):
+        _bend_signal(signal[run], *limits, key)
     return out
 
 
