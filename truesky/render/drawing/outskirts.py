@@ -66,6 +66,9 @@ _COARSEST = 1.0 / 16.0
 # Spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the width (minor
 # axis) that the galaxy's ellipse has at the distance of the ring.
 _SPACING_FRACTION = 0.2
+# Largest spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the smallest
+# apparent scale of the galaxy's disc. An edge-on disc is as thin far out as near its middle, unlike an ellipse.
+_DISC_FRACTION = 0.25
 # Number of nodes along the major axis, and along the minor axis, of the table of an inclined disc's light.
 _NODES = 76
 # Spacing of the nodes in the table of an inclined disc's light. Nodes are equally spaced in t = arsinh(u), where u is
@@ -284,10 +287,11 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
     is the case farther out.
     """
     slim, pixels = slimness(galaxy.light, galaxy.across), np.arange(size)
+    coarsest = min(_COARSEST * size, max(_DISC_FRACTION * _disc_scale(galaxy.light, galaxy.across), _FINEST))
     out, ring_sum, step = np.zeros((size, size)), np.zeros((1, 1)), 0
     remaining = _light_outside_square(galaxy.light, galaxy.across, 1.5 * size) / size**2
     for ring in range(2, _RINGS + 1):
-        ring_step = 2 ** int(np.log2(np.clip(_SPACING_FRACTION * slim * ring * size, _FINEST, _COARSEST * size)))
+        ring_step = 2 ** int(np.log2(np.clip(_SPACING_FRACTION * slim * ring * size, _FINEST, coarsest)))
         if ring_step != step:
             if step:
                 out += _spline(ring_sum, step)(pixels, pixels)
@@ -325,6 +329,20 @@ def slimness(light: Float, across: float) -> float:
             half, area = 0.5 * float((matrix**2).sum()), abs(float(matrices.determinant(matrix)))
             out = min(out, area / (half + np.sqrt(max(half**2 - area**2, 0.0))))
     return out
+
+
+def _disc_scale(light: Float, across: float) -> float:
+    """Return the smallest apparent scale of a galaxy's disc (length or height) in pixels; infinite without a disc.
+
+    `light` [11] (parameters of bulge and disc) and `across` (factor of the disc's minor axis) are attributes of
+    `Outskirts`.
+    """
+    if not light[DISK] > 0.0:
+        return np.inf
+    matrix = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2) / np.array([[1.0], [across]])
+    half, area = 0.5 * float((matrix**2).sum()), float(matrices.determinant(matrix))
+    # The inverse of the largest singular value of the matrix, in closed form.
+    return 1.0 / np.sqrt(half + np.sqrt(max(half**2 - area**2, 0.0)))
 
 
 def add(
