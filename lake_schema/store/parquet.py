@@ -7,7 +7,11 @@ decoder gets only verified bytes, including page headers and the footer.
 
 from __future__ import annotations
 
+import atexit
+import threading
+import time
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,10 @@ from lake_schema.store.plan import Json
 ROWS_PER_GROUP = 65_536
 
 _FORMAT = ds.ParquetFileFormat()
+# Linux folder with one folder per thread of this process.
+_THREADS = Path("/proc/self/task")
+# Longest time in s that the end of the process waits for threads, and time between two looks at them.
+_LONGEST_WAIT_S, _STEP_S = 1.0, 0.005
 
 
 def write(path: Path, rows: pa.Table, table: Table) -> None:
@@ -103,6 +111,7 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
     Damaged
         If the footer of a file or its number of rows differs from the manifest. The message names the file.
     """
+    _register_end_of_reads()
     files = [blocks.VerifiedFile(folder / entry["path"], entry) for entry in entries]
     fragments = [_FORMAT.make_fragment(file) for file in files]
     merged = Dataset(fragments, schema, _FORMAT)
@@ -139,6 +148,7 @@ def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> p
     Damaged
         If the file is missing or its bytes differ from the manifest. The message names the file.
     """
+    _register_end_of_reads()
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_table(file, columns=None if columns is None else list(columns))
 
@@ -155,3 +165,37 @@ def read_schema(folder: Folder, entry: Json) -> pa.Schema:
     """
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_schema(file)
+
+
+@cache
+def _register_end_of_reads() -> None:
+    """Make the end of the process wait for Arrow's threads, which may still release the bytes that they have read.
+
+    The bytes are Python objects. If a thread of Arrow releases one while Python shuts down, Python ends the thread in
+    the middle of C++ code, and the process aborts ("terminate called without an active exception").
+    """
+    atexit.register(_wait_for_threads)
+
+
+def _wait_for_threads() -> None:
+    """Wait until the other threads of this process have been idle twice in a row, but at most `_LONGEST_WAIT_S`."""
+    idle_looks, end = 0, time.monotonic() + _LONGEST_WAIT_S
+    while idle_looks < 2 and time.monotonic() < end:
+        # Threads that wait for the interpreter can go on while this one sleeps.
+        time.sleep(_STEP_S)
+        idle_looks = 0 if _is_any_thread_running() else idle_looks + 1
+
+
+def _is_any_thread_running() -> bool:
+    """Return True if a thread of this process other than the current one runs; always False without Linux."""
+    current = str(threading.get_native_id())
+    return any(_state(path) == "R" for path in _THREADS.glob("*") if path.name != current)
+
+
+def _state(thread: Path) -> str:
+    """Return the letter with which Linux describes the state of a thread, "" if it has ended."""
+    try:
+        # The name of the thread, in brackets, may contain spaces. The state follows it.
+        return (thread / "stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return ""

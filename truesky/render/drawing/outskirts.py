@@ -67,7 +67,8 @@ _COARSEST = 1.0 / 16.0
 # axis) that the galaxy's ellipse has at the distance of the ring.
 _SPACING_FRACTION = 0.2
 # Largest spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the smallest
-# apparent scale of the galaxy's disc. An edge-on disc is as thin far out as near its middle, unlike an ellipse.
+# apparent scale of the disc. Unlike the width of an ellipse, the thickness of an edge-on disc does not grow with the
+# distance.
 _DISC_FRACTION = 0.25
 # Number of nodes along the major axis, and along the minor axis, of the table of an inclined disc's light.
 _NODES = 76
