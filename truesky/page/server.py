@@ -154,8 +154,10 @@ async def _errors_to_json(
 async def _read_json(request: web.Request) -> dict[str, Any]:
     try:
         content = json.loads(await request.text())
-    except (ValueError, RecursionError):
-        raise BadInput("the body of the request is not JSON") from None
+        # JSON may contain lone surrogates as escape sequences, but they cannot be encoded again.
+        json.dumps(content, ensure_ascii=False).encode()
+    except (ValueError, LookupError, RecursionError):
+        raise BadInput("the body of the request is not JSON, or its characters cannot be encoded") from None
     if not isinstance(content, dict):
         raise BadInput("the body of the request is not a JSON object")
     return content

@@ -29,14 +29,22 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 async def read_parameters(request: web.Request) -> dict[str, str]:
     """Return the parameters of an HTTP request from its address and, for POST, from its form; names are upper-case.
 
-    BadInput is raised if the form contains a file.
+    BadInput is raised if the form cannot be read or contains a file, or if a parameter contains a character that XML
+    does not allow, because documents about jobs contain the parameters.
     """
     values = {name.upper(): value for name, value in request.query.items()}
     if request.method == "POST":
-        for name, value in (await request.post()).items():
+        try:
+            form = await request.post()
+        except (ValueError, LookupError) as error:
+            raise BadInput(f"the form of the request cannot be read: {error}") from None
+        for name, value in form.items():
             if not isinstance(value, str):
                 raise BadInput(f"{name[:40]} must be a string: uploads are not supported")
             values[name.upper()] = value
+    for name, value in values.items():
+        if forbidden := votables.NOT_XML.search(name + value):
+            raise BadInput(f"{name[:40]} contains the character U+{ord(forbidden[0]):04X}, which XML does not allow")
     return values
 
 
