@@ -82,7 +82,7 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
                 columns.trim()
                 return counting.inspect_columns(loaded)
 
-            cached_columns = await asyncio.to_thread(load_columns)
+            cached_columns = await lake.page_queries.threads.run(load_columns)
         # Keep the columns in memory, so that their checksums are verified once and not at every movement of a limit.
         while len(lake.cached_columns) >= _MAX_CACHED:
             lake.cached_columns.pop(next(iter(lake.cached_columns)))

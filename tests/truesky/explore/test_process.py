@@ -1,5 +1,7 @@
 """Process of queries: results piece by piece, a persistent session, and no mixing of answers."""
 
+import signal
+import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -122,6 +124,24 @@ def test_query_closed_by_another_thread_raises(process):
         with pytest.raises(BadInput, match="the lake was closed before the query was answered"):
             waiting.result(20)
     assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
+
+
+def test_a_discarded_process_starts_nothing(explored, monkeypatch):
+    """Neither if another thread discards it while a query starts it, nor later."""
+    discarded, started = Process(explored, [], 1e9), []
+
+    class Started(subprocess.Popen):
+        def __init__(self, *given, **options):
+            super().__init__(*given, **options)
+            started.append(self)
+            discarded.discard()
+
+    monkeypatch.setattr(subprocess, "Popen", Started)
+    for _ in range(2):
+        with pytest.raises(BadInput, match="the lake was closed before the query was answered"):
+            discarded.ask(SLOW, {}, 60.0)
+    (worker,) = started
+    assert worker.wait(60.0) == -signal.SIGKILL
 
 
 def test_an_answer_names_its_question(process):

@@ -8,11 +8,12 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
 import threading
 import time
 from contextlib import asynccontextmanager
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 import pytest
 
@@ -23,7 +24,7 @@ from tests.truesky.page.conftest import GALAXIES_N, asked, serving, star_rows
 from tests.universe import plain_plan, plain_work
 from truesky.explore.process import Process
 from truesky.page.lake_session import Closed, ProcessPool
-from truesky.page.tap.queries import Jobs
+from truesky.page.tap.queries import MAX_JOBS, PARALLEL_JOBS, Jobs
 
 
 def killed(lane):
@@ -108,6 +109,35 @@ def test_a_client_that_disconnects_stops_its_query(page):
     # The query itself would take days.
     until(lambda: lane._free.qsize() == 2)
     assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+
+
+def test_queries_are_answered_after_many_jobs_were_deleted(page, monkeypatch):
+    """No process works on for a deleted job, although some are deleted just when their process starts."""
+    until(page.server._warm_up_task.done)
+    monkeypatch.setattr(page.server.lake, "timeout", 300.0)
+    started, tap = [], f"/tap/{page.gate.tap_token}"
+
+    class Started(subprocess.Popen):
+        def __init__(self, *given, **options):
+            super().__init__(*given, **options)
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Started)
+    slow = "SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d"
+    form = urlencode({"LANG": "ADQL", "QUERY": slow, "PHASE": "RUN"}).encode()
+    kind = "application/x-www-form-urlencoded"
+    try:
+        jobs = [page.ask(f"{tap}/async", "POST", form, "", Content_Type=kind)[1]["Location"] for _ in range(MAX_JOBS)]
+        for job in jobs:
+            assert page.ask(job.removeprefix(page.origin), method="DELETE", cookie="")[0] == 303
+        before = time.monotonic()
+        status, _, body = page.ask(f"{tap}/sync?LANG=ADQL&QUERY=SELECT+7+AS+a", cookie="")
+        assert (status, b"<TD>7</TD>" in body) == (200, True)
+        assert time.monotonic() - before < 30.0
+        until(lambda: sum(one.poll() is None for one in started) <= PARALLEL_JOBS + 1)
+    finally:
+        for one in started:
+            one.kill()
 
 
 def test_a_new_version_of_a_table_is_announced(shown, tmp_path):

@@ -68,6 +68,29 @@ def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
     asyncio.run(run())
 
 
+def test_queries_are_answered_while_the_threads_for_other_work_are_busy(page):
+    """Threads that wait for answers are separate from those of `asyncio.to_thread`, and neither hold up the other."""
+    go, occupied = threading.Event(), threading.Event()
+    sync = f"/tap/{page.gate.tap_token}/sync?LANG=ADQL&QUERY=SELECT+7+AS+a"
+    assert page.ask(sync, cookie="")[0] == 200
+
+    def occupy():
+        # asyncio has at most 32 threads.
+        for _ in range(32):
+            page.loop.run_in_executor(None, go.wait, 60.0)
+        occupied.set()
+
+    page.loop.call_soon_threadsafe(occupy)
+    try:
+        assert occupied.wait(60.0)
+        assert b"<TD>7</TD>" in page.ask(sync, cookie="")[2]
+        assert page.json("sql", method="POST", body=b'{"sql": "SELECT 7 AS a"}')["rows"] == [[7]]
+        assert page.of_lake("export?format=csv&sql=SELECT+7+AS+a")[2] == b'"a"\n7\n'
+        assert page.of_lake("sky/galaxies/density?order=3")[0] == 200
+    finally:
+        go.set()
+
+
 def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monkeypatch):
     """If all threads for tiles are busy and their queue is full, tiles get status 429, but sky maps are answered."""
     go, started = threading.Event(), []
