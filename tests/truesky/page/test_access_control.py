@@ -9,6 +9,7 @@ from urllib.parse import quote
 
 import pytest
 
+from tests.waiting import PATIENCE
 from truesky.page import access_control, server
 from truesky.page.lake_session import MAX_WAITING
 
@@ -181,7 +182,7 @@ def test_queries_beyond_the_queue_are_refused(page):
             await one.__aexit__(None, None, None)
 
     def run(coroutine):
-        return asyncio.run_coroutine_threadsafe(coroutine, page.loop).result(60)
+        return asyncio.run_coroutine_threadsafe(coroutine, page.loop).result(PATIENCE)
 
     held = run(fill())
     try:

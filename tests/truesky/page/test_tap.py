@@ -12,6 +12,7 @@ import pytest
 
 from lake_schema import sky
 from lake_schema.store import read
+from tests.waiting import PATIENCE, until
 from truesky.explore import adql
 from truesky.page.tap import descriptions
 
@@ -53,7 +54,7 @@ def test_async(service):
     job = service.submit_job("SELECT count(*) AS n FROM galaxies", maxrec=10)
     try:
         assert job.phase == "PENDING"
-        job.run().wait(phases=["COMPLETED", "ERROR"], timeout=60)
+        job.run().wait(phases=["COMPLETED", "ERROR"], timeout=PATIENCE)
         assert job.fetch_result()["n"].tolist() == [3000]
         assert job.url in [f"{service.baseurl}/async/{one.jobid}" for one in service.get_job_list()]
     finally:
@@ -62,7 +63,7 @@ def test_async(service):
 
 def test_a_job_that_fails_says_why(service):
     job = service.submit_job("SELECT nothing FROM galaxies")
-    job.run().wait(phases=["COMPLETED", "ERROR"], timeout=60)
+    job.run().wait(phases=["COMPLETED", "ERROR"], timeout=PATIENCE)
     assert job.phase == "ERROR"
     with pytest.raises(pyvo.DALQueryError, match="nothing"):
         job.raise_if_error()
@@ -76,14 +77,10 @@ def test_a_job_can_be_aborted(service, page):
     free = len(lane._processes)
     job = service.submit_job("SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d")
     job.run()
-    ended = time.monotonic() + 30.0
-    while not (job.phase == "EXECUTING" and lane._free.qsize() == free - 1):
-        assert time.monotonic() < ended
+    until(lambda: job.phase == "EXECUTING" and lane._free.qsize() == free - 1)
     job.abort()
     assert job.phase == "ABORTED"
-    while lane._free.qsize() < free:
-        assert time.monotonic() < ended
-        time.sleep(0.02)
+    until(lambda: lane._free.qsize() == free)
     job.delete()
     assert service.search("SELECT 1 AS a")["a"].tolist() == [1]
 
@@ -169,7 +166,7 @@ def test_errors_are_reported_in_a_votable(service, query, words):
 
 def test_a_client_that_waits_zero_seconds_gets_an_answer_at_once(page):
     address = f"/tap/{page.gate.tap_token}/async"
-    slow = "SELECT sum(a.range * b.range) AS s FROM range(100000) a, range(100000) b"
+    slow = "SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d"
     form = urlencode({"LANG": "ADQL", "QUERY": slow, "PHASE": "RUN"}).encode()
     _, headers, _ = page.ask(
         address, method="POST", body=form, cookie="", Content_Type="application/x-www-form-urlencoded"
@@ -178,7 +175,8 @@ def test_a_client_that_waits_zero_seconds_gets_an_answer_at_once(page):
     for name in ("WAIT", "wait"):
         started = time.monotonic()
         status, _, body = page.ask(f"{job}?{name}=0", cookie="")
-        assert (status, time.monotonic() - started < 5) == (200, True)
+        # A client that does not limit its time waits for 60 s.
+        assert (status, time.monotonic() - started < 30) == (200, True)
         assert b"COMPLETED" not in body
     page.ask(job, method="DELETE", cookie="")
 
