@@ -82,6 +82,7 @@ class Process:
         self.max_bytes = int(memory * _RESULT_SHARE)
         self.command = [sys.executable, "-m", "truesky.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: _Worker | None = None
+        self._is_discarded = False
         # Answer whose batches are being read, None between two answers.
         self._answer: _Answer | None = None
         self._numbers = itertools.count(1)
@@ -113,6 +114,12 @@ class Process:
             worker.is_stopped = True
             worker.process.kill()
 
+    def discard(self) -> None:
+        """Kill the process as `stop` does, but let no query start a new one: further queries raise BadInput."""
+        # The order matters if another thread is just starting the process: see `_ensure_worker`.
+        self._is_discarded = True
+        self.stop()
+
     def ask(self, text: str, parameters: Mapping[str, object], timeout: float = TIMEOUT) -> pa.Table:
         """Return the result of a SELECT.
 
@@ -133,8 +140,8 @@ class Process:
         Notes
         -----
         BadInput is raised if the text is not an allowed SELECT, the query exceeds its time or memory, the result has
-        more bytes than half of the memory limit, or `stop` or `close` ends the query. Damaged is raised if the content
-        of a file does not agree with its checksum.
+        more bytes than half of the memory limit, or `stop`, `discard` or `close` ends the query. Damaged is raised if
+        the content of a file does not agree with its checksum.
         """
         with self._lock:
             return pa.Table.from_batches(list(self.batches(text, parameters, timeout, max_bytes=self.max_bytes)))
@@ -177,8 +184,9 @@ class Process:
         Notes
         -----
         BadInput is raised if the text is not an allowed SELECT, an item of `expressions` is not one expression, the
-        query exceeds its limits, or `stop`, `close` or the beginning of another query ends it. Damaged is raised if the
-        content of a file does not agree with its checksum. Both can be raised after some batches have been yielded.
+        query exceeds its limits, or `stop`, `discard`, `close` or the beginning of another query ends it. Damaged is
+        raised if the content of a file does not agree with its checksum. Both can be raised after some batches have
+        been yielded.
         """
         arguments.check_number("timeout", timeout, 0.0, TIMEOUT_HI)
         question = {"sql": text, "parameters": dict(parameters or {}), "rows": max_rows, "bytes": max_bytes}
@@ -253,10 +261,16 @@ class Process:
     def _ensure_worker(self) -> _Worker:
         if self._worker is None or not self._worker.is_alive:
             self._end()
+            if self._is_discarded:
+                raise BadInput(_CLOSED)
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
             # Arrow's other memory pools reserve a gigabyte at the start, which would count towards the memory limit.
             environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-            self._worker = _Worker(subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes))
+            worker = self._worker = _Worker(subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes))
+            # If `discard` was called while the process started, it found nothing to kill.
+            if self._is_discarded:
+                self.stop()
+            return worker
         return self._worker
 
 

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax import saxutils
 
 import pyarrow as pa
 
@@ -106,7 +106,7 @@ def pieces(
 
 def refusal(message: str) -> bytes:
     """Return a VOTable without rows that reports an error to a client of TAP, with `message` as its text."""
-    return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{_text(message)}</INFO>\n{_CLOSE}'.encode()
+    return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{escape(message)}</INFO>\n{_CLOSE}'.encode()
 
 
 def field_facts(column: pa.Field) -> Facts:
@@ -151,9 +151,9 @@ def _field(column: pa.Field) -> str:
     kind, size = datatype(column.type)
     attributes = {"name": column.name, "datatype": kind, "arraysize": size, "unit": facts.unit, "ucd": facts.ucd}
     attributes |= {"xtype": facts.xtype, "utype": facts.utype}
-    words = " ".join(f"{key}={_quote_attribute(value)}" for key, value in attributes.items() if value)
+    words = " ".join(f"{key}={quote_attribute(value)}" for key, value in attributes.items() if value)
     null = f'<VALUES null="{_NULLS[kind]}"/>' if kind in _NULLS else ""
-    description = f"<DESCRIPTION>{_text(facts.description)}</DESCRIPTION>" if facts.description else ""
+    description = f"<DESCRIPTION>{escape(facts.description)}</DESCRIPTION>" if facts.description else ""
     return f"<FIELD {words}>{description}{null}</FIELD>\n"
 
 
@@ -185,7 +185,7 @@ def _formatter(kind: pa.DataType) -> Callable[[Any], str]:
         return lambda value: _number(value, ".9g")
     if pa.types.is_floating(kind) or pa.types.is_decimal(kind):
         return lambda value: _number(float(value), ".17g") if value == value else "NaN"
-    return lambda value: _text(str(value))
+    return lambda value: escape(str(value))
 
 
 def _number(value: float, form: str) -> str:
@@ -194,14 +194,15 @@ def _number(value: float, form: str) -> str:
     return "NaN" if math.isnan(value) else ("+Inf" if value > 0 else "-Inf")
 
 
-# Characters that XML 1.0 does not allow.
-_NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+# A character that XML 1.0 does not allow, such as a control character or a lone surrogate.
+NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def _text(text: str) -> str:
+def escape(text: str) -> str:
     """Escape a text for XML; characters that XML 1.0 does not allow become U+FFFD, the replacement character."""
-    return escape(_NO_XML.sub("\N{REPLACEMENT CHARACTER}", text))
+    return saxutils.escape(NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
-def _quote_attribute(text: str) -> str:
-    return quoteattr(_text(text).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+def quote_attribute(text: str) -> str:
+    """Return a text in quotes, as the value of an XML attribute, with the same replacements as `escape`."""
+    return saxutils.quoteattr(NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text))

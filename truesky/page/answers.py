@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import struct
@@ -107,7 +106,7 @@ async def run_query(lake: LakeSession, request_body: Json) -> Json:
             batches = process.batches(text, {}, lake.timeout, MAX_ROWS + 1, MAX_BYTES)
             return pa.Table.from_batches(list(batches))
 
-        rows = await asyncio.to_thread(fetch_rows)
+        rows = await lake.user_queries.threads.run(fetch_rows)
     shown_rows = rows.slice(0, MAX_ROWS)
     columns = [
         votables.python_values(column, name)

@@ -82,7 +82,7 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
                 columns.trim()
                 return counting.inspect_columns(loaded)
 
-            cached_columns = await asyncio.to_thread(load_columns)
+            cached_columns = await lake.page_queries.threads.run(load_columns)
         # Keep the columns in memory, so that their checksums are verified once and not at every movement of a limit.
         while len(lake.cached_columns) >= _MAX_CACHED:
             lake.cached_columns.pop(next(iter(lake.cached_columns)))
@@ -142,8 +142,12 @@ def pack_counts(cached_columns: ChartColumns, question: Json, subsampling: int, 
     columns = cached_columns.columns
     try:
         charts = [_parse_chart(chart, cached_columns.spans) for chart in question["charts"]]
-        max_points = [min(max(int(chart.get("points") or 0), 0), MAX_POINTS) for chart in question["charts"]]
-        limits = {int(axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()}
+        max_points = [
+            min(max(_parse_integer("points", chart.get("points") or 0), 0), MAX_POINTS) for chart in question["charts"]
+        ]
+        limits = {
+            _parse_integer("limits", axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()
+        }
         if any(not 0 <= axis < len(columns) for axis in [*limits, *(a for chart in charts for a in chart.columns)]):
             raise BadInput("charts: an axis has no expression")
     except (TypeError, ValueError, LookupError, OverflowError, AttributeError) as error:
@@ -174,7 +178,7 @@ def pack_counts(cached_columns: ChartColumns, question: Json, subsampling: int, 
 
 
 def _parse_chart(specification: Json, spans: list[tuple[float, float]]) -> Chart:
-    axes = tuple(int(axis) for axis in specification["axes"])
+    axes = tuple(_parse_integer("axes", axis) for axis in specification["axes"])
     requested_spans = specification.get("spans") or [None] * len(axes)
     unlimited_axes = specification.get("own")
     return Chart(
@@ -183,6 +187,13 @@ def _parse_chart(specification: Json, spans: list[tuple[float, float]]) -> Chart
             spans[axis] if span is None else (float(span[0]), float(span[1]))
             for axis, span in zip(axes, requested_spans, strict=True)
         ),
-        tuple(int(bins) for bins in specification["bins"]),
-        None if unlimited_axes is None else frozenset(int(axis) for axis in unlimited_axes),
+        tuple(_parse_integer("bins", bins) for bins in specification["bins"]),
+        None if unlimited_axes is None else frozenset(_parse_integer("own", axis) for axis in unlimited_axes),
     )
+
+
+def _parse_integer(name: str, value: Any) -> int:
+    try:
+        return int(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadInput(f"charts: {name}: {error}") from None

@@ -37,9 +37,8 @@ async def export(lake: LakeSession, request: web.Request) -> web.StreamResponse:
         raise BadInput(f"format = {form[:40]!r} is not one of {', '.join(CONTENT_TYPES)}")
     async with lake.user_queries.process() as process:
         batches = process.batches(text, {}, lake.timeout)
-        return await send_stream(
-            request, iterate_in_thread(results.stream_file(batches, f".{form}")), CONTENT_TYPES[form], f"result.{form}"
-        )
+        data = iterate_in_thread(results.stream_file(batches, f".{form}"), lake.user_queries.threads)
+        return await send_stream(request, data, CONTENT_TYPES[form], f"result.{form}")
 
 
 def read_chunks(path: Path) -> Iterator[bytes]:

@@ -63,10 +63,17 @@ class ProcessPool:
         Function without arguments that returns a new `Process`.
     number : int
         Number of processes.
+
+    Attributes
+    ----------
+    threads : ThreadPool
+        One thread per process, in which a caller waits for its answer. Waiting may take minutes, and would keep the
+        threads of `asyncio.to_thread` from other work.
     """
 
     def __init__(self, start_process: Callable[[], Process], number: int) -> None:
         self._start_process, self._num_waiting, self._is_closed = start_process, 0, False
+        self.threads = ThreadPool(number)
         self._processes = {start_process() for _ in range(number)}
         self._free: asyncio.Queue[Process] = asyncio.Queue()
         for process in self._processes:
@@ -112,14 +119,14 @@ class ProcessPool:
         except BaseException:
             # The client may have left in the middle of an answer. Replace the process, so that the next query cannot
             # get the rest of this answer.
-            process.stop()
+            process.discard()
             self._processes.discard(process)
             process = self._start_process()
             self._processes.add(process)
             raise
         finally:
             if self._is_closed:
-                process.stop()
+                process.discard()
             self._free.put_nowait(process)
 
     def _refuse_closed(self) -> None:
@@ -130,14 +137,14 @@ class ProcessPool:
         """Start all processes with a trivial query, so that later queries need not wait for a start."""
         async with AsyncExitStack() as stack:
             processes = [await stack.enter_async_context(self.process()) for _ in range(len(self._processes))]
-            await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
+            await asyncio.gather(*(self.threads.run(process.ask, "SELECT 1", {}) for process in processes))
 
     def close(self) -> None:
         """Stop idle processes now, and busy processes when their queries end. Queries that wait raise Closed."""
         self._is_closed = True
         for _ in range(self._free.qsize()):
             process = self._free.get_nowait()
-            process.stop()
+            process.discard()
             self._free.put_nowait(process)
 
 
@@ -355,7 +362,7 @@ class LakeSession:
         BadInput if the query fails.
         """
         async with self.page_queries.process() as process:
-            return await asyncio.to_thread(process.ask, text, dict(parameters or {}), self.timeout)
+            return await self.page_queries.threads.run(process.ask, text, dict(parameters or {}), self.timeout)
 
     async def warm(self) -> None:
         """Start all query processes now, because otherwise the first query in each would wait for its start."""
@@ -376,8 +383,11 @@ def _table_keys(explorer: Explorer) -> tuple[dict[str, str], set[str]]:
     return {name: version.key for name, version in explorer.versions.items()}, {*explorer.damaged}
 
 
-async def iterate_in_thread(batches: Iterator[Item]) -> AsyncIterator[Item]:
-    """Yield the items of a blocking iterator, which runs in a thread, so that the server can do other work."""
-    sentinel = object()
-    while (piece := await asyncio.to_thread(next, batches, sentinel)) is not sentinel:
+async def iterate_in_thread(batches: Iterator[Item], threads: ThreadPool | None = None) -> AsyncIterator[Item]:
+    """Yield the items of a blocking iterator, which runs in a thread, so that the server can do other work.
+
+    By default it runs in the threads of `asyncio.to_thread`.
+    """
+    sentinel, run = object(), asyncio.to_thread if threads is None else threads.run
+    while (piece := await run(next, batches, sentinel)) is not sentinel:
         yield piece  # type: ignore[misc]

@@ -154,16 +154,23 @@ async def _errors_to_json(
 async def _read_json(request: web.Request) -> dict[str, Any]:
     try:
         content = json.loads(await request.text())
-    except (ValueError, RecursionError):
-        raise BadInput("the body of the request is not JSON") from None
+        # JSON may contain lone surrogates as escape sequences, but they cannot be encoded again.
+        json.dumps(content, ensure_ascii=False).encode()
+    except (ValueError, LookupError, RecursionError):
+        raise BadInput("the body of the request is not JSON, or its characters cannot be encoded") from None
     if not isinstance(content, dict):
         raise BadInput("the body of the request is not a JSON object")
     return content
 
 
-def _integer_parameter(request: web.Request, name: str) -> int:
+def _integer_parameter(request: web.Request, name: str, is_signed: bool = False) -> int:
+    """Return a whole number from the path or the query of an address; only if `is_signed` is True may it be negative.
+
+    BadInput is raised if the parameter is missing or anything else.
+    """
     text = request.match_info.get(name) or request.query.get(name, "")
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
+    digits = text.removeprefix("-") if is_signed else text
+    if not (digits.isascii() and digits.isdigit() and len(digits) < 10):
         raise BadInput(f"{name} must be a whole number with at most 9 digits")
     return int(text)
 
@@ -253,9 +260,9 @@ async def _cutout(lake: LakeSession, request: web.Request) -> web.StreamResponse
 async def _trace_strip(lake: LakeSession, request: web.Request) -> web.StreamResponse:
     from truesky.page import sources
 
-    order = _float_parameters(request, "order")
-    number, source = _integer_parameter(request, "number"), request.match_info["id"]
-    return _binary_response(await lake.pixel_pool.run(sources.trace_strip, lake, number, source, int(order[0])))
+    number, order = _integer_parameter(request, "number"), _integer_parameter(request, "order", is_signed=True)
+    source = request.match_info["id"]
+    return _binary_response(await lake.pixel_pool.run(sources.trace_strip, lake, number, source, order))
 
 
 async def _trace_at(lake: LakeSession, request: web.Request) -> web.StreamResponse:

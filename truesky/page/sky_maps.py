@@ -6,7 +6,6 @@ does not need them, is shown early.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -276,7 +275,7 @@ async def _run_query(lake: LakeSession, text: str, *expressions: str) -> pa.Tabl
         def fetch_rows() -> pa.Table:
             return pa.Table.from_batches(list(process.batches(text, {}, lake.timeout, expressions=expressions)))
 
-        return await asyncio.to_thread(fetch_rows)
+        return await lake.page_queries.threads.run(fetch_rows)
 
 
 def _catalogue_name(lake: LakeSession, table: str) -> str:

@@ -147,7 +147,7 @@ def _nearest_line(wavelength: float) -> str:
 
 def _parse_identifier(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 1 << 63):
-        raise BadInput(f"{text[:40]!r} is not an identifier of a source")
+        raise BadInput(f"id = {text[:40]!r} is not an identifier of a source")
     return int(text)
 
 

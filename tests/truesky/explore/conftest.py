@@ -8,6 +8,7 @@ from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import PLAIN, plain_plan, plain_work, rows_of
+from tests.waiting import PATIENCE
 from truesky.explore.explorer import Explorer
 
 ROWS = 500
@@ -41,5 +42,5 @@ def galaxies():
 
 @pytest.fixture(scope="package")
 def explorer(explored):
-    with Explorer(explored, timeout=30.0) as opened:
+    with Explorer(explored, timeout=PATIENCE) as opened:
         yield opened

@@ -7,6 +7,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.store import read
+from tests.waiting import PATIENCE
 from truesky.explore import guard
 from truesky.explore.explorer import Explorer
 from truesky.explore.session import Session
@@ -200,7 +201,7 @@ def small(explored):
 @pytest.mark.parametrize("text", ENDLESS + BOUNDLESS)
 def test_time_and_memory_have_a_limit(small, text):
     # The process is running, so the limit applies to the query.
-    small.timeout = 30.0
+    small.timeout = PATIENCE
     assert small.sql("SELECT 1 AS n")["n"][0] == 1
     small.timeout = 0.3 if text in ENDLESS else 1.0
     started = time.monotonic()
@@ -208,7 +209,7 @@ def test_time_and_memory_have_a_limit(small, text):
         small.sql(text)
     assert time.monotonic() - started < small.timeout + 60.0
     # The next query is answered by a new process or by the same one.
-    small.timeout = 30.0
+    small.timeout = PATIENCE
     assert small.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
 
 

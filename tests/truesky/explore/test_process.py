@@ -1,7 +1,8 @@
 """Process of queries: results piece by piece, a persistent session, and no mixing of answers."""
 
+import signal
+import subprocess
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import publish, read
 from tests.universe import plain_plan, plain_work
+from tests.waiting import PATIENCE, until
 from truesky.explore.process import Process
 from truesky.explore.session import Session
 
@@ -89,7 +91,7 @@ def test_unread_rows_do_not_block_other_threads(process):
     left = process.batches("SELECT range + 100 FROM range(100000000)")
     assert next(left).num_rows >= 0
     with ThreadPoolExecutor(1) as thread:
-        assert thread.submit(process.ask, "SELECT 7 AS a", {}, 20.0).result(20)["a"].to_pylist() == [7]
+        assert thread.submit(process.ask, "SELECT 7 AS a", {}, PATIENCE).result(PATIENCE)["a"].to_pylist() == [7]
     with pytest.raises(BadInput, match="another query began before all rows of this one were read"):
         next(left)
 
@@ -101,31 +103,48 @@ def test_abandoned_rows_do_not_wait_for_other_threads(process):
     def hold():
         with process._lock:
             is_locked.set()
-            return is_done.wait(20)
+            return is_done.wait(PATIENCE)
 
     with ThreadPoolExecutor(1) as thread:
         waiting = thread.submit(hold)
-        assert is_locked.wait(20)
+        assert is_locked.wait(PATIENCE)
         left.close()
         is_done.set()
-        assert waiting.result(20)
+        assert waiting.result(PATIENCE)
     assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
 
 
 def test_query_closed_by_another_thread_raises(process):
     process.ask("SELECT 1", {})
     with ThreadPoolExecutor(1) as thread:
-        waiting = thread.submit(process.ask, SLOW, {}, 60.0)
-        while process._answer is None:
-            time.sleep(0.01)
+        waiting = thread.submit(process.ask, SLOW, {}, PATIENCE)
+        until(lambda: process._answer is not None)
         process.close()
         with pytest.raises(BadInput, match="the lake was closed before the query was answered"):
-            waiting.result(20)
+            waiting.result(PATIENCE)
     assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
 
 
+def test_a_discarded_process_starts_nothing(explored, monkeypatch):
+    """Neither if another thread discards it while a query starts it, nor later."""
+    discarded, started = Process(explored, [], 1e9), []
+
+    class Started(subprocess.Popen):
+        def __init__(self, *given, **options):
+            super().__init__(*given, **options)
+            started.append(self)
+            discarded.discard()
+
+    monkeypatch.setattr(subprocess, "Popen", Started)
+    for _ in range(2):
+        with pytest.raises(BadInput, match="the lake was closed before the query was answered"):
+            discarded.ask(SLOW, {}, PATIENCE)
+    (worker,) = started
+    assert worker.wait(PATIENCE) == -signal.SIGKILL
+
+
 def test_an_answer_names_its_question(process):
-    answer = process._send({"sql": "SELECT 1", "parameters": {}}, 20.0)
+    answer = process._send({"sql": "SELECT 1", "parameters": {}}, PATIENCE)
     answer.number += 1
     with pytest.raises(LakeError, match="got the answer to question"):
         process._next(answer)

@@ -5,6 +5,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.store import publish
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+from tests.waiting import PATIENCE
 from truesky.explore.__main__ import main
 from truesky.explore.explorer import Explorer
 
@@ -21,7 +22,7 @@ def two(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def opened(two):
-    with Explorer(two, timeout=30.0) as explorer:
+    with Explorer(two, timeout=PATIENCE) as explorer:
         yield explorer
 
 
@@ -52,7 +53,7 @@ def test_other_schemas_are_refused(opened, text):
 
 
 def test_name_selects_a_request(two, capsys):
-    with Explorer(two, timeout=30.0, request="a") as explorer:
+    with Explorer(two, timeout=PATIENCE, request="a") as explorer:
         assert sorted(explorer.tables().index) == ["plain", "toy"]
         assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [1.0]
         with pytest.raises(BadInput, match="is not a table of the lake"):

@@ -9,6 +9,8 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.image import imread
 
+from tests.waiting import PATIENCE
+
 
 def at(view):
     """Return the address of a view, so that the default view is not drawn first."""
@@ -29,9 +31,9 @@ DRAWN = {
 HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
 
 
-def until(tab, expression, seconds=30.0):
+def until(tab, expression):
     """Wait for an expression without eval, which the security policy of the page forbids."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + PATIENCE
     while True:
         # While a page is loading, expressions raise an error of the browser.
         with suppress(Exception):

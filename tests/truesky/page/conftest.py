@@ -28,6 +28,7 @@ from lake_schema.tables.stars import STARS
 from lake_schema.tables.tasks import TASKS
 from tests.truesky.page.browsing import at, tab_of
 from tests.universe import plain_plan, plain_work, rows_of
+from tests.waiting import PATIENCE
 from truesky.page.access_control import AccessRules
 from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
@@ -180,7 +181,7 @@ class Page:
 
     def ask(self, path, method="GET", body=None, cookie=None, **headers):
         """Status, headers and body, of exactly this request."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.gate.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self.gate.port, timeout=PATIENCE)
         connection.putrequest(method, path, skip_host="Host" in headers)
         given = {"Cookie": self.cookie if cookie is None else cookie, **headers}
         if body is not None:
@@ -207,7 +208,7 @@ def serving(root):
     """Serve a lake within the context."""
     listening = socket.create_server(("127.0.0.1", 0))
     gate = AccessRules(("127.0.0.1", "localhost"), listening.getsockname()[1], TOKEN)
-    server = Server(lambda: LakeSession(root, memory=1e9, timeout=30.0), gate)
+    server = Server(lambda: LakeSession(root, memory=1e9, timeout=PATIENCE), gate)
     loop, ready = asyncio.new_event_loop(), threading.Event()
 
     async def start():
@@ -225,13 +226,13 @@ def serving(root):
     page = Page(gate, server, loop)
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    assert ready.wait(60)
+    assert ready.wait(PATIENCE)
     try:
         yield page
     finally:
-        asyncio.run_coroutine_threadsafe(page.runner.cleanup(), loop).result(60)
+        asyncio.run_coroutine_threadsafe(page.runner.cleanup(), loop).result(PATIENCE)
         loop.call_soon_threadsafe(loop.stop)
-        thread.join(60)
+        thread.join(PATIENCE)
 
 
 def unpacked(body):

@@ -9,6 +9,7 @@ from urllib.parse import quote
 
 import pytest
 
+from tests.waiting import PATIENCE
 from truesky.page import access_control, server
 from truesky.page.lake_session import MAX_WAITING
 
@@ -141,9 +142,14 @@ def test_a_large_body_is_refused(page):
                     Content_Type="application/x-www-form-urlencoded")[0] == 413  # fmt: skip
 
 
-@pytest.mark.parametrize("body", [b"", b"{", b"[]", b"1", b'{"sql": 3}', b"[" * 100_000, b"\xff"])
+@pytest.mark.parametrize(
+    "body", [b"", b"{", b"[]", b"1", b'{"sql": 3}', b"[" * 100_000, b"\xff", b'{"where": "\\ud800"}']
+)
 def test_bodies_that_are_not_json_objects_are_refused(page, body):
-    assert page.of_lake("sql", method="POST", body=body)[0] == 400
+    for address in ("sql", "charts"):
+        assert page.of_lake(address, method="POST", body=body)[0] == 400
+        nonsense = "application/json; charset=nonsense"
+        assert page.of_lake(address, method="POST", body=b"{}", Content_Type=nonsense)[0] == 400
 
 
 def test_methods(page):
@@ -176,7 +182,7 @@ def test_queries_beyond_the_queue_are_refused(page):
             await one.__aexit__(None, None, None)
 
     def run(coroutine):
-        return asyncio.run_coroutine_threadsafe(coroutine, page.loop).result(60)
+        return asyncio.run_coroutine_threadsafe(coroutine, page.loop).result(PATIENCE)
 
     held = run(fill())
     try:

@@ -12,11 +12,12 @@ from lake_schema.store import publish
 from tests.truesky.page.browsing import DRAWN, VIEWS, at, canvas_colours, tab_of, until
 from tests.truesky.page.conftest import serving
 from tests.universe import plain_plan, plain_work
+from tests.waiting import PATIENCE
 
 
-def until_colours(tab, selector, fewest, seconds=30.0):
+def until_colours(tab, selector, fewest):
     """Wait until a screenshot of an element has more colours."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + PATIENCE
     while canvas_colours(tab, selector) <= fewest:
         assert time.monotonic() < end, selector
         time.sleep(0.1)

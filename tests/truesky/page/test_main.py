@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE
 from truesky.page.__main__ import main
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -71,7 +72,7 @@ def test_other_machines_may_only_use_the_given_name(shown):
             for name, status in (
                 ("sky.example", 303), ("192.0.2.7", 303), ("127.0.0.1", 303), ("0.0.0.0", 403), ("evil.example", 403),
             ):  # fmt: skip
-                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
                 connection.request("GET", f"/?token={token}", headers={"Host": f"{name}:{port}"})
                 assert (name, connection.getresponse().status) == (name, status)
                 connection.close()
@@ -84,11 +85,11 @@ def test_it_answers_until_it_is_stopped(shown):
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         address = server.stdout.readline().split()[-1]
         tap = server.stdout.readline().split()[-1]
-        assert urllib.request.urlopen(f"{tap}/availability", timeout=30).status == 200
+        assert urllib.request.urlopen(f"{tap}/availability", timeout=PATIENCE).status == 200
         with pytest.raises(urllib.error.HTTPError, match="401"):
-            urllib.request.urlopen(address.partition("?")[0], timeout=30)
+            urllib.request.urlopen(address.partition("?")[0], timeout=PATIENCE)
         server.send_signal(signal.SIGINT)
-        assert server.wait(30) == 0
+        assert server.wait(PATIENCE) == 0
         assert server.stderr.read() == ""
 
 
@@ -97,6 +98,6 @@ def test_the_first_sky_waits_for_nothing_that_draws_images():
     slow = ("astropy", "galsim", "healpy.pixelfunc", "matplotlib", "numba", "scipy")
     text = f"import sys, truesky.page.__main__; print([name for name in {slow} if name in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
     )
     assert done.stdout == "[]\n"

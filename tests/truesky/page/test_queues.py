@@ -5,13 +5,13 @@ import io
 import json
 import socket
 import threading
-import time
 from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import quote
 
 import pytest
 
+from tests.waiting import PATIENCE, reach, until
 from truesky.explore.process import Process
 from truesky.page import downloads, pictures, sky_maps
 from truesky.page.lake_session import MAX_QUEUED, MAX_WAITING, PIXEL_THREADS, Busy, Closed, ProcessPool, ThreadPool
@@ -48,31 +48,51 @@ def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():
 
 
 def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
-    go = threading.Event()
+    go, started = threading.Event(), threading.Event()
 
     async def run():
         pool = ThreadPool(1, 0)
-        asked = asyncio.create_task(pool.run(go.wait))
-        await asyncio.sleep(0.05)
+        asked = asyncio.create_task(pool.run(lambda: started.set() or go.wait()))
+        await reach(started.is_set)
         asked.cancel()
         await asyncio.gather(asked, return_exceptions=True)
         with pytest.raises(Busy):
             await pool.run(divmod, 1, 1)
         go.set()
-        ended = time.monotonic() + 10.0
-        while pool._slots._value == 0:
-            assert time.monotonic() < ended
-            await asyncio.sleep(0.01)
+        await reach(lambda: pool._slots._value)
         assert await pool.run(divmod, 1, 1) == (1, 0)
 
     asyncio.run(run())
+
+
+def test_queries_are_answered_while_the_threads_for_other_work_are_busy(page):
+    """Queries are answered in threads of their own, and not in those of `asyncio.to_thread`."""
+    go, occupied = threading.Event(), threading.Event()
+    sync = f"/tap/{page.gate.tap_token}/sync?LANG=ADQL&QUERY=SELECT+7+AS+a"
+    assert page.ask(sync, cookie="")[0] == 200
+
+    def occupy():
+        # asyncio has at most 32 threads.
+        for _ in range(32):
+            page.loop.run_in_executor(None, go.wait, PATIENCE)
+        occupied.set()
+
+    page.loop.call_soon_threadsafe(occupy)
+    try:
+        assert occupied.wait(PATIENCE)
+        assert b"<TD>7</TD>" in page.ask(sync, cookie="")[2]
+        assert page.json("sql", method="POST", body=b'{"sql": "SELECT 7 AS a"}')["rows"] == [[7]]
+        assert page.of_lake("export?format=csv&sql=SELECT+7+AS+a")[2] == b'"a"\n7\n'
+        assert page.of_lake("sky/galaxies/density?order=3")[0] == 200
+    finally:
+        go.set()
 
 
 def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monkeypatch):
     """If all threads for tiles are busy and their queue is full, tiles get status 429, but sky maps are answered."""
     go, started = threading.Event(), []
     real = pictures.picture
-    monkeypatch.setattr(pictures, "picture", lambda *given: started.append(1) or (go.wait(30.0) and real(*given)))
+    monkeypatch.setattr(pictures, "picture", lambda *given: started.append(1) or (go.wait(PATIENCE) and real(*given)))
     told = []
     number = PIXEL_THREADS + MAX_QUEUED
     asking = [
@@ -82,10 +102,7 @@ def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monke
     for one in asking:
         one.start()
     try:
-        ended = time.monotonic() + 30.0
-        while page.server.lake.pixel_pool._slots._value:
-            assert time.monotonic() < ended
-            time.sleep(0.02)
+        until(lambda: not page.server.lake.pixel_pool._slots._value)
         status, _, body = page.of_lake("tile/0/0/0/0")
         assert (status, "waiting" in json.loads(body)["error"]) == (429, True)
         assert page.of_lake("source/1")[0] == 429
@@ -94,23 +111,25 @@ def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monke
     finally:
         go.set()
     for one in asking:
-        one.join(30.0)
+        one.join(PATIENCE)
     assert told == [200] * number
     assert page.of_lake("tile/0/0/0/0")[0] == 200
 
 
 def test_tiles_and_other_requests_have_separate_queues(page, monkeypatch):
     go = threading.Event()
-    monkeypatch.setattr(sky_maps, "coverage", lambda *given: go.wait(30.0) and b"")
+    monkeypatch.setattr(sky_maps, "coverage", lambda *given: go.wait(PATIENCE) and b"")
+    free = page.server.lake.table_pool._slots._value
     asking = [threading.Thread(target=page.of_lake, args=("coverage?order=5",), daemon=True) for _ in range(4)]
     for one in asking:
         one.start()
     try:
+        until(lambda: page.server.lake.table_pool._slots._value == free - len(asking))
         assert page.of_lake("tile/0/0/0/0")[0] == 200
     finally:
         go.set()
         for one in asking:
-            one.join(30.0)
+            one.join(PATIENCE)
 
 
 # ------------------------------------------------------------------------------------------------ jobs
@@ -134,8 +153,8 @@ def test_jobs_beyond_those_that_run_are_queued():
         many = [jobs.add({"number": k}, 1.0) for k in range(PARALLEL_JOBS + MAX_WAITING + 5)]
         for job in many:
             jobs.start(job)
-        await asyncio.sleep(0.05)
-        assert [job.phase for job in many] == ["EXECUTING"] * PARALLEL_JOBS + ["QUEUED"] * (len(many) - PARALLEL_JOBS)
+        await reach(lambda: [job.phase for job in many[:PARALLEL_JOBS]] == ["EXECUTING"] * PARALLEL_JOBS)
+        assert {job.phase for job in many[PARALLEL_JOBS:]} == {"QUEUED"}
         assert all(job.start_time is None for job in many[PARALLEL_JOBS:])
         jobs.abort(many[PARALLEL_JOBS])
         go.set()
@@ -231,11 +250,12 @@ def test_an_aborted_job_leaves_nothing():
 
 
 def test_others_are_answered_while_a_result_is_written(monkeypatch):
-    go = threading.Event()
+    go, writing = threading.Event(), threading.Event()
 
     class Slow(io.BytesIO):
         def write(self, piece):
-            assert go.wait(10.0)
+            writing.set()
+            assert go.wait(PATIENCE)
             return super().write(piece)
 
     monkeypatch.setattr(Path, "open", lambda self, mode: Slow())
@@ -252,7 +272,7 @@ def test_others_are_answered_while_a_result_is_written(monkeypatch):
         job = jobs.add({}, 1.0)
         jobs.start(job)
         # The event loop must continue, or the write would never be allowed to finish.
-        await asyncio.sleep(0.05)
+        await reach(writing.is_set)
         assert job.phase == "EXECUTING"
         go.set()
         await job.task
@@ -266,10 +286,8 @@ def test_a_client_that_does_not_read_loses_its_process(page, monkeypatch):
     """A stalled client is disconnected, and its process is free for others."""
     monkeypatch.setattr(downloads, "STALL_TIMEOUT", 0.5)
     lane = page.server.lake.user_queries
-    ended = time.monotonic() + 30.0
-    while not (page.server._warm_up_task.done() and lane._free.qsize() == 2):
-        assert time.monotonic() < ended
-        time.sleep(0.02)
+    until(lambda: page.server._warm_up_task.done() and lane._free.qsize() == 2)
+    before = set(lane._processes)
     sql = quote("SELECT range AS a FROM range(100000000)")
     head = (
         f"GET /api/{page.server.lake.key}/export?format=csv&sql={sql} HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
@@ -277,8 +295,5 @@ def test_a_client_that_does_not_read_loses_its_process(page, monkeypatch):
     with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
         connection.sendall(f"{head}Cookie: {page.cookie}\r\n\r\n".encode())
         assert connection.recv(100).startswith(b"HTTP/1.1 200")
-        assert lane._free.qsize() == 1
-        while lane._free.qsize() < 2:
-            assert time.monotonic() < ended
-            time.sleep(0.02)
+        until(lambda: lane._processes != before and lane._free.qsize() == 2)
     assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]

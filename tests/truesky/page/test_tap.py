@@ -6,12 +6,15 @@ import shutil
 import subprocess
 import time
 from urllib.parse import urlencode
+from xml.etree import ElementTree
 
 import pytest
 
 from lake_schema import sky
 from lake_schema.store import read
+from tests.waiting import PATIENCE, until
 from truesky.explore import adql
+from truesky.page.tap import descriptions
 
 pyvo = pytest.importorskip("pyvo")
 
@@ -51,7 +54,7 @@ def test_async(service):
     job = service.submit_job("SELECT count(*) AS n FROM galaxies", maxrec=10)
     try:
         assert job.phase == "PENDING"
-        job.run().wait(phases=["COMPLETED", "ERROR"], timeout=60)
+        job.run().wait(phases=["COMPLETED", "ERROR"], timeout=PATIENCE)
         assert job.fetch_result()["n"].tolist() == [3000]
         assert job.url in [f"{service.baseurl}/async/{one.jobid}" for one in service.get_job_list()]
     finally:
@@ -60,7 +63,7 @@ def test_async(service):
 
 def test_a_job_that_fails_says_why(service):
     job = service.submit_job("SELECT nothing FROM galaxies")
-    job.run().wait(phases=["COMPLETED", "ERROR"], timeout=60)
+    job.run().wait(phases=["COMPLETED", "ERROR"], timeout=PATIENCE)
     assert job.phase == "ERROR"
     with pytest.raises(pyvo.DALQueryError, match="nothing"):
         job.raise_if_error()
@@ -74,14 +77,10 @@ def test_a_job_can_be_aborted(service, page):
     free = len(lane._processes)
     job = service.submit_job("SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d")
     job.run()
-    ended = time.monotonic() + 30.0
-    while not (job.phase == "EXECUTING" and lane._free.qsize() == free - 1):
-        assert time.monotonic() < ended
+    until(lambda: job.phase == "EXECUTING" and lane._free.qsize() == free - 1)
     job.abort()
     assert job.phase == "ABORTED"
-    while lane._free.qsize() < free:
-        assert time.monotonic() < ended
-        time.sleep(0.02)
+    until(lambda: lane._free.qsize() == free)
     job.delete()
     assert service.search("SELECT 1 AS a")["a"].tolist() == [1]
 
@@ -167,7 +166,7 @@ def test_errors_are_reported_in_a_votable(service, query, words):
 
 def test_a_client_that_waits_zero_seconds_gets_an_answer_at_once(page):
     address = f"/tap/{page.gate.tap_token}/async"
-    slow = "SELECT sum(a.range * b.range) AS s FROM range(100000) a, range(100000) b"
+    slow = "SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d"
     form = urlencode({"LANG": "ADQL", "QUERY": slow, "PHASE": "RUN"}).encode()
     _, headers, _ = page.ask(
         address, method="POST", body=form, cookie="", Content_Type="application/x-www-form-urlencoded"
@@ -176,7 +175,8 @@ def test_a_client_that_waits_zero_seconds_gets_an_answer_at_once(page):
     for name in ("WAIT", "wait"):
         started = time.monotonic()
         status, _, body = page.ask(f"{job}?{name}=0", cookie="")
-        assert (status, time.monotonic() - started < 5) == (200, True)
+        # A client that does not limit its time waits for 60 s.
+        assert (status, time.monotonic() - started < 30) == (200, True)
         assert b"COMPLETED" not in body
     page.ask(job, method="DELETE", cookie="")
 
@@ -207,6 +207,76 @@ def test_other_formats_and_uploads(page):
     ):
         status, _, body = sync(**{**query, **wrong})
         assert (status, b'value="ERROR"' in body) == (400, True)
+
+
+FORM = "application/x-www-form-urlencoded"
+
+
+@pytest.mark.parametrize(
+    "character", ["\0", "\1", "\x1f", "\x7f", "\t", "\n", "\ufffe", "\uffff", "\ud800", "\U0001f30c"]
+)
+@pytest.mark.parametrize("place", ["name", "form", "address", "change"])
+def test_documents_about_jobs_can_be_read_whatever_the_parameters_contain(page, character, place):
+    """Jobs keep characters that XML allows; a parameter with any other character is refused and named."""
+    address, query, form = f"/tap/{page.gate.tap_token}/async", "", {"LANG": "ADQL", "QUERY": "SELECT 1 AS a"}
+
+    def post(address, form):
+        encoded = urlencode(form, errors="surrogatepass").encode()
+        return page.ask(address, method="POST", body=encoded, cookie="", Content_Type=FORM)
+
+    own = {f"RUNID{character}": "x"} if place == "name" else {"RUNID": f"x{character}"}
+    if place == "address":
+        query = f"?{urlencode(own, errors='surrogatepass')}"
+    status, headers, body = post(address + query, form if place in ("address", "change") else {**form, **own})
+    if place == "change":
+        job = headers["Location"].removeprefix(page.origin)
+        status, _, body = post(f"{job}/parameters", own)
+        if status != 303:
+            page.ask(job, method="DELETE", cookie="")
+    if character in "\0\1\x1f\ufffe\uffff":
+        text = ElementTree.fromstring(body).find(".//{*}INFO").text
+        assert (status, text.startswith("RUNID"), f"U+{ord(character):04X}" in text) == (400, True, True)
+        return
+    assert status == 303
+    job = headers["Location"].removeprefix(page.origin)
+    for part in ("", "/parameters"):
+        parameters = ElementTree.fromstring(page.ask(job + part, cookie="")[2]).iterfind(".//{*}parameter")
+        (found,) = (one.get("id") + one.text for one in parameters if one.get("id").startswith("RUNID"))
+        # The HTTP library replaces the three bytes of a surrogate, which are not valid UTF-8.
+        shown = "\ufffd" * 3 if character == "\ud800" else character
+        assert found == (f"RUNID{shown}x" if place == "name" else f"RUNIDx{shown}")
+    page.ask(job, method="DELETE", cookie="")
+
+
+@pytest.mark.parametrize(
+    ("content_type", "body"),
+    [
+        (f"{FORM}; charset=nonsense", b"LANG=ADQL"),
+        (f"{FORM}; charset=utf-16", b"LANG=ADQL"),
+        (FORM, b"LANG=\xff"),
+        ("multipart/form-data", b"LANG=ADQL"),
+        ("multipart/form-data; boundary=X", b"LANG=ADQL"),
+        ("multipart/form-data; boundary=X",
+         b'--X\r\nContent-Disposition: form-data; name="LANG"\r\n\r\n\xed\xa0\x80\r\n--X--\r\n'),
+        ("multipart/form-data; boundary=X",
+         b'--X\r\nContent-Disposition: form-data; name="LANG"\r\nContent-Type: text/plain; charset=utf-7\r\n\r\n+2AA-'
+         b"\r\n--X--\r\n"),
+    ],
+)  # fmt: skip
+def test_forms_that_cannot_be_read_are_refused(page, content_type, body):
+    for address in ("async", "sync"):
+        path = f"/tap/{page.gate.tap_token}/{address}"
+        status, _, answer = page.ask(path, method="POST", body=body, cookie="", Content_Type=content_type)
+        assert (status, b'value="ERROR"' in answer) == (400, True)
+
+
+def test_errors_and_descriptions_of_documents_can_be_read():
+    """Texts of the lake and of errors may contain any character."""
+    text = "a\0\ufffe\ud800<&\"'z"
+    document = descriptions.describe_job({"runId": text}, {text: text}, f"http://x/{text}", text)
+    root = ElementTree.fromstring(document.encode())
+    assert root.find("{*}runId").text == root.find(".//{*}message").text == "a\ufffd\ufffd\ufffd<&\"'z"
+    assert root.find(".//{*}parameter").get("id") == root.find(".//{*}parameter").text == root.find("{*}runId").text
 
 
 def test_unknown_addresses(page):

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from xml.sax.saxutils import escape, quoteattr
 
+from truesky.explore.votables import escape, quote_attribute
 from truesky.page.tap.tables import FOREIGN_KEYS, SCHEMA_DESCRIPTIONS, TableEntry, describe_columns
 
 FORMATS = {
@@ -120,8 +120,8 @@ def _column(column: Mapping[str, object]) -> str:
         )
         if column[key]
     )
-    shape_attributes = f" arraysize={quoteattr(str(column['arraysize']))}" if column["arraysize"] else ""
-    shape_attributes += f" extendedType={quoteattr(str(column['xtype']))}" if column["xtype"] else ""
+    shape_attributes = f" arraysize={quote_attribute(str(column['arraysize']))}" if column["arraysize"] else ""
+    shape_attributes += f" extendedType={quote_attribute(str(column['xtype']))}" if column["xtype"] else ""
     flags = "<flag>indexed</flag>" if column["indexed"] else ""
     type_element = f'<dataType xsi:type="vs:VOTableType"{shape_attributes}>{column["datatype"]}</dataType>'
     return f'<column std="{"true" if column["std"] else "false"}">{text_elements}{type_element}{flags}</column>\n'
@@ -158,7 +158,8 @@ def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], res
 def describe_parameters(parameters: Mapping[str, str], is_document: bool = True) -> str:
     """Return the parameters of a UWS job as an XML document, or as an element of one if `is_document` is False."""
     rows = "".join(
-        f"<uws:parameter id={quoteattr(name)}>{escape(value)}</uws:parameter>" for name, value in parameters.items()
+        f"<uws:parameter id={quote_attribute(name)}>{escape(value)}</uws:parameter>"
+        for name, value in parameters.items()
     )
     return _wrap_element("parameters", rows, is_document)
 
@@ -168,14 +169,14 @@ def describe_results(result: str | None, is_document: bool = True) -> str:
 
     `result` is the URL of the only result; None makes an empty list.
     """
-    row = f'<uws:result id="result" xlink:type="simple" xlink:href={quoteattr(result)}/>' if result else ""
+    row = f'<uws:result id="result" xlink:type="simple" xlink:href={quote_attribute(result)}/>' if result else ""
     return _wrap_element("results", row, is_document)
 
 
 def list_jobs(rows: Iterable[tuple[str, str, str, datetime]]) -> str:
     """Return the UWS document (XML) that lists jobs; each row is (identifier, URL, phase, creation time in UTC)."""
     references = "".join(
-        f'<uws:jobref id={quoteattr(name)} xlink:type="simple" xlink:href={quoteattr(address)}>'
+        f'<uws:jobref id={quote_attribute(name)} xlink:type="simple" xlink:href={quote_attribute(address)}>'
         f"<uws:phase>{phase}</uws:phase><uws:creationTime>{format_time(creation_time)}</uws:creationTime></uws:jobref>\n"
         for name, address, phase, creation_time in rows
     )

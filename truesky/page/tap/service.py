@@ -149,7 +149,7 @@ class Service:
                 data = votables.pieces(batches, votables.RowLimit(max_rows))
             else:
                 data = results.stream_file(_limit_rows(batches, max_rows), suffix)
-            yield content_type, iterate_in_thread(data)
+            yield content_type, iterate_in_thread(data, lake_processes.process_pool.threads)
 
     def check_parameters(self, parameters: dict[str, str]) -> None:
         """Raise BadInput if the parameters of TAP do not describe a query that this service can run.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from datetime import UTC, datetime
 
 from aiohttp import web
@@ -29,14 +29,22 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 async def read_parameters(request: web.Request) -> dict[str, str]:
     """Return the parameters of an HTTP request from its address and, for POST, from its form; names are upper-case.
 
-    BadInput is raised if the form contains a file.
+    BadInput is raised if the form cannot be read or contains a file, or if a parameter contains a character that XML
+    does not allow, because documents about jobs contain the parameters.
     """
     values = {name.upper(): value for name, value in request.query.items()}
     if request.method == "POST":
-        for name, value in (await request.post()).items():
+        try:
+            form = await request.post()
+        except (ValueError, LookupError) as error:
+            raise BadInput(f"the form of the request cannot be read: {error}") from None
+        for name, value in form.items():
             if not isinstance(value, str):
                 raise BadInput(f"{name[:40]} must be a string: uploads are not supported")
             values[name.upper()] = value
+    for name, value in values.items():
+        if forbidden := votables.NOT_XML.search(name + value):
+            raise BadInput(f"{name[:40]} contains the character U+{ord(forbidden[0]):04X}, which XML does not allow")
     return values
 
 
@@ -142,11 +150,9 @@ class Routes:
             (self._jobs.start if phase == "RUN" else self._jobs.abort)(job)
         elif attribute == "executionduration":
             # A duration of 0 means the limit of the service.
-            job.max_seconds = _parse_seconds(
-                values.get("EXECUTIONDURATION", ""), self._max_seconds(), zero=self._max_seconds()
-            )
+            job.max_seconds = _parse_seconds("EXECUTIONDURATION", values, self._max_seconds(), zero=self._max_seconds())
         elif attribute == "destruction":
-            job.destruction_time = min(_parse_time(values.get("DESTRUCTION", "")), job.creation_time + RETENTION)
+            job.destruction_time = min(_parse_time("DESTRUCTION", values), job.creation_time + RETENTION)
         elif attribute in ("", "parameters"):
             if job.phase != "PENDING":
                 raise BadInput("parameters can be changed only before a job is started")
@@ -193,7 +199,7 @@ async def _wait_for_change(job: Job, request: web.Request) -> None:
         return
     if job.phase == "PENDING":
         return
-    seconds = _MAX_WAIT if wait == "-1" else _parse_seconds(wait, _MAX_WAIT, zero=0.0)
+    seconds = _MAX_WAIT if wait == "-1" else _parse_seconds("WAIT", parameters, _MAX_WAIT, zero=0.0)
     changed = job.phase_changed
     try:
         await asyncio.wait_for(changed.wait(), seconds)
@@ -201,15 +207,17 @@ async def _wait_for_change(job: Job, request: web.Request) -> None:
         return
 
 
-def _parse_seconds(text: str, max_seconds: float, zero: float) -> float:
-    """Parse a whole number of seconds; 0 becomes `zero`, and numbers above `max_seconds` become `max_seconds`.
+def _parse_seconds(name: str, parameters: Mapping[str, str], max_seconds: float, zero: float) -> float:
+    """Parse a parameter that is a whole number of seconds.
 
     Parameters
     ----------
-    text : str
-        The number. BadInput is raised for other texts.
+    name : str
+        Name of the parameter. BadInput is raised if it is missing or not a whole number.
+    parameters : mapping of str to str
+        Values of all parameters by name.
     max_seconds : float
-        Largest result, s.
+        Largest result, s; it replaces larger numbers.
     zero : float
         Result for the number 0, s.
 
@@ -218,14 +226,16 @@ def _parse_seconds(text: str, max_seconds: float, zero: float) -> float:
     float
         The time, s.
     """
+    text = parameters.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise BadInput(f"{text[:40]!r} is not a number of seconds")
+        raise BadInput(f"{name} = {text[:40]!r} is not a number of seconds")
     return min(float(text) or zero, max_seconds)
 
 
-def _parse_time(text: str) -> datetime:
+def _parse_time(name: str, parameters: Mapping[str, str]) -> datetime:
+    text = parameters.get(name, "")
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise BadInput(f"{text[:40]!r} is not a date and time in ISO 8601") from None
+        raise BadInput(f"{name} = {text[:40]!r} is not a date and time in ISO 8601") from None
     return time if time.tzinfo else time.replace(tzinfo=UTC)
