@@ -110,14 +110,14 @@ def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant)
     Returns
     -------
     tuple of NeighbourDetector
-        Other detectors of the board with their bright stars; empty if crosstalk is not noticeable.
+        Other detectors of the board with their bright stars; empty if crosstalk is not noticeable, or stars have no
+        light in an exposure of 0 s.
     """
     exposure = aim.exposure
-    if not is_noticeable(aim, variant):
+    electrons = _PEAK_FRACTION * electron_rate(exposure) * exposure.exposure_time_s
+    if electrons == 0.0 or not is_noticeable(aim, variant):
         return ()
-    min_flux = _noticeable_electrons(scene_factory.from_aim(aim, variant)) / (
-        _PEAK_FRACTION * electron_rate(exposure) * exposure.exposure_time_s
-    )
+    min_flux = _noticeable_electrons(scene_factory.from_aim(aim, variant)) / electrons
     neighbours = other_detectors(exposure.camera, aim.detector.name, variant.mission)
     queries = [
         catalogue_rows.BrightQuery(
