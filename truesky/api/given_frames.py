@@ -93,6 +93,7 @@ class GivenFrame:
     psf: Psf
     planes: dict[str, _Plane]
 
+    @arguments.refuse_missing('frame.with_sources({"ra": [53.1], "dec": [-27.8], "mag": [21.0]})')
     def with_sources(
         self,
         rows: Any,
@@ -197,6 +198,7 @@ class InjectedFrame:
     seed: int
     noise: bool
 
+    @arguments.refuse_missing('frame.write("image.fits")')
     def write(self, path: str | Path) -> list[Path]:
         """Write a copy of the original file with the new image, and a table INJECTED of the added sources.
 

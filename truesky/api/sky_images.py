@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow.compute as pc
 
-from lake_schema import sky
+from lake_schema import arguments, sky
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -237,6 +237,7 @@ class SkyImage:
         image = stamps.draw(star, np.array([model.side]), model, side, side) / _PSF_ELECTRONS
         return PsfImage(image, 1, float(image.sum()))
 
+    @arguments.refuse_missing('image.write("image.fits")')
     def write(self, path: str | Path) -> Path:
         """Write the image to a FITS file.
 
