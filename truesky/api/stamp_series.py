@@ -69,7 +69,7 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
         renamed = {name: title for title in titles for name in synonyms.find_columns(title, ("stars",), missing)}
         hints = [f"{name}; did you mean {renamed[name]}? Rename it to {name}" for name in missing if name in renamed]
         raise bad_input(f"{place}: has no column {text}" for text in (hints or missing))
-    base = image_options.check_request((0.0, 0.0), size, band, options)
+    base = image_options.check_request((0.0, 0.0), size, band, options, "stamps")
     requests = []
     for row in range(len(columns["ra"])):
         values = {name: float(column[row]) for name, column in columns.items() if not np.isnan(column[row])}
