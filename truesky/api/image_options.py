@@ -96,6 +96,8 @@ class ImageRequest:
         Identifiers of sources that are left out.
     extra : object
         Table of sources that are added; None for none.
+    title : str
+        Row of the user's table of places, for messages, such as "places.csv, row 1"; "" without a table.
     """
 
     ra: float
@@ -111,6 +113,7 @@ class ImageRequest:
     effects: tuple[str, ...] | None
     without: tuple[int, ...]
     extra: Any
+    title: str = ""
 
 
 def check_request(

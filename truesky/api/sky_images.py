@@ -387,6 +387,10 @@ class SkyPainter:
         """Return the mask [n] of the places (deg) that are in a cell of the catalogue."""
         return np.isin(sky.cell_at(ra, dec, GENERATION_ORDER), self._cells)
 
+    def outside_area(self, ra: float, dec: float) -> BadInput:
+        """Return the error for a place (deg) outside the catalogue."""
+        return inputs.outside_area(self._cells, ra, dec)
+
     def check(self, request: ImageRequest) -> None:
         """Raise BadInput if an image cannot be drawn because of its options, or its place is outside the catalogue."""
         if request.exposure is None:

@@ -290,6 +290,18 @@ def test_the_command_names_its_options(lake, tmp_path, capsys):
         assert not (tmp_path / "stamps").exists()
 
 
+def test_exchanged_arguments_and_other_columns_are_named(lake, tmp_path, capsys):
+    root, places, out = str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "stamps")
+    pd.DataFrame({"RA": [RA], "DEC": [DEC]}).to_csv(places, index=False)
+    assert main(["stamps", root, places, out]) == 2
+    problem = "has no columns ra, dec; did you mean RA, DEC? Rename them"
+    assert capsys.readouterr().err == f"truesky stamps: {places}: {problem}\n"
+    with pytest.raises(SystemExit):
+        main(["stamps", places, root, out, "--size", "5"])
+    call = f"truesky stamps {root} {places} {out} --size 5"
+    assert capsys.readouterr().err == f"truesky stamps: the lake comes before the places: write {call}\n"
+
+
 def test_the_command_writes_stamps(lake, tmp_path, capsys):
     pd.DataFrame(PLACES)[:2].to_csv(tmp_path / "places.csv", index=False)
     words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "new" / "stamps")]
@@ -307,7 +319,7 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
     # A place that cannot be drawn leaves nothing behind.
     pd.DataFrame({"ra": [RA, 10.0], "dec": [DEC, 10.0]}).to_csv(tmp_path / "places.csv", index=False)
     assert main([*words[:3], str(tmp_path / "other"), *options, "--size", "4"]) == 2
-    assert "table, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
+    assert "places.csv, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"places.csv", "new"}
 
 
@@ -327,9 +339,10 @@ def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, n
     ("table", "options", "message"),
     [
         ({"ra": [RA]}, {}, "table: has no column dec"),
-        ({"RAJ2000": [RA], "DEJ2000": [DEC]}, {}, r"column ra; did you mean RAJ2000\? Rename it to ra; .* DEJ2000\?"),
+        ({"RAJ2000": [RA], "DEJ2000": [DEC]}, {}, r"no columns ra, dec; did you mean RAJ2000, DEJ2000\? "),
         ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes': did you mean size"),
-        ({"RA": [RA], "DEC": [DEC]}, {}, "table: column 'RA': did you mean ra"),
+        ({"RA": [RA], "DEC": [DEC]}, {}, r"^table: has no columns ra, dec; did you mean RA, DEC\? Rename them$"),
+        ([(RA, DEC)], {}, r"^table must be a table, .*, got list; for example: \{.ra.: \[53.1\], .dec.: \[-27.8\]\}$"),
         ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),
         ({"ra": [RA], "dec": [95.0]}, {}, "table, row 1: dec = 95.0 is outside"),
         ({"ra": [RA], "dec": [DEC], "seed": [1.5]}, {}, "table, row 1: seed = 1.5: must be a whole number"),
@@ -343,10 +356,10 @@ def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, n
         ({"ra": [RA], "dec": [DEC]}, {"sizes": 3}, r"lake.stamps has no argument sizes: did you mean size\? .*: table"),
         ({"ra": [RA], "dec": [DEC], "seed": [2.0**53]}, {}, r"table, row 1: seed = .* must be below 2\^53"),
         ({"ra": [RA], "dec": [DEC], "size": [np.inf]}, {}, "table, row 1: size"),
-        ({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, {}, r"table, row 2: ra 10.00000, dec 10.00000: outside the area"),
+        ({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, {}, r"table, row 2: ra 10.0.*, which is near ra 5.*, dec -2"),
         ({"ra": [RA], "dec": [DEC]}, {"exposure": 9}, "^exposure 9: the lake has no exposure with this number"),
         ({"ra": [RA], "dec": [DEC]}, {"effects": ["ghosts"]}, "^effects: 'ghosts' cannot be applied to a window"),
-        ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows"),
+        ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows: 1, 2$"),
         (3, {}, "table must be a table"),
     ],
 )
@@ -396,6 +409,7 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ),
         ({"date": "2001-02-30"}, "date"),
         ({"extra": {"ra": [RA], "dec": [DEC]}}, "^extra: column mag is missing"),
+        ({"extra": "nowhere.csv"}, "^extra: nowhere.csv: no such file"),
         ({"extra": {"ra": [RA], "dec": [DEC], "mag": [99.0]}}, "^extra: column mag of row 1 is 99, but must be"),
     ],
 )
