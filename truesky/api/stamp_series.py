@@ -82,15 +82,15 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
 def _check_titles(place: Path, titles: Sequence[str]) -> None:
     """Raise BadInput if `ra` or `dec` is not among the titles of a table, or another title is nearly one of ours."""
     missing = [name for name in ("ra", "dec") if name not in titles]
-    others = [title for title in titles if title not in _COLUMNS]
+    unused = [title for title in titles if title not in _COLUMNS]
     mistakes = []
     if missing:
-        similar = [title for title in others if title.lower() in missing or _meant(title, missing)]
+        similar = [title for title in unused if title.lower() in missing or _meant(title, missing)]
         remedy = (
             f"; did you mean {', '.join(similar)}? Rename {'them' if len(similar) > 1 else 'it'}" if similar else ""
         )
         mistakes.append(f"{place}: has no column{'s' if len(missing) > 1 else ''} {', '.join(missing)}{remedy}")
-    for title in others:
+    for title in unused:
         if meant := spelling.closest_names(title, _OPTIONAL, 1):
             mistakes.append(f"{place}: column {title!r}: did you mean {meant[0]}? Other names are ignored")
     refuse_mistakes(mistakes)

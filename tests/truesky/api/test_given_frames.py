@@ -328,7 +328,7 @@ def test_wrong_files_are_refused(tmp_path):
     (tmp_path / "folder.fits").mkdir()
     with pytest.raises(BadInput, match="exists and is not a file"):
         new.write(tmp_path / "folder.fits")
-    with pytest.raises(BadInput, match="x.png: the name of the file must end in .fits or .fit"):
+    with pytest.raises(BadInput, match=r"x\.png: the name of the file must end in \.fits or \.fit"):
         new.write(tmp_path / "x.png")
     frame_file(file, pixels=np.zeros((5, 6), np.float32))
     with pytest.raises(BadInput, match="extension 0 has changed: it must be an image of the same size"):

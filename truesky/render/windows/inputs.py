@@ -133,7 +133,20 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
 
 
 def outside_area(cells: Int, ra: float, dec: float) -> BadInput:
-    """Return the error for a place (deg) outside the order-8 cells of a catalogue. It tells where the cells are."""
+    """Return the error for a place outside the cells of a catalogue.
+
+    Parameters
+    ----------
+    cells : int array
+        Cells of the catalogue, of order 8.
+    ra, dec : float
+        The place, deg.
+
+    Returns
+    -------
+    BadInput
+        The error, which tells where the cells are, or asks whether ra and dec are exchanged.
+    """
     return BadInput(f"{_format_place(ra, dec)}: outside the area of the catalogue{_where(cells, ra, dec)}")
 
 
