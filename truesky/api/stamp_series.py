@@ -86,9 +86,8 @@ def _check_titles(place: Path, titles: Sequence[str]) -> None:
     mistakes = []
     if missing:
         similar = [title for title in unused if title.lower() in missing or _meant(title, missing)]
-        remedy = (
-            f"; did you mean {', '.join(similar)}? Rename {'them' if len(similar) > 1 else 'it'}" if similar else ""
-        )
+        it = "them" if len(similar) > 1 else "it"
+        remedy = f"; did you mean {', '.join(similar)}? Rename {it}" if similar else ""
         mistakes.append(f"{place}: has no column{'s' if len(missing) > 1 else ''} {', '.join(missing)}{remedy}")
     for title in unused:
         if meant := spelling.closest_names(title, _OPTIONAL, 1):
