@@ -8,7 +8,7 @@ import math
 import numbers
 import operator
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
@@ -29,24 +29,27 @@ _ANGLE = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s]*
 def refuse_missing(call: str) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
     """Return a decorator of a function that raises BadInput instead of TypeError for missing and unknown arguments.
 
-    The signature of the function does not change. `call` is an example of a call, for the message, such as
-    "lake.render(ra, dec)". If one of the arguments is a SkyCoord, the message says how to give it as numbers.
+    The signature of the function does not change. `call` is an example of a call, for the messages, such as
+    "lake.render(ra, dec)"; its text before the bracket is the name of the function. If one of the arguments is a
+    SkyCoord, the message says how to give it as numbers.
     """
 
     def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         signature = inspect.signature(function)
         takes_any = inspect.Parameter.VAR_KEYWORD in [parameter.kind for parameter in signature.parameters.values()]
         required = [name for name, parameter in signature.parameters.items() if _is_required(parameter)]
+        unnamed = [name for name in required if signature.parameters[name].kind is inspect.Parameter.POSITIONAL_ONLY]
 
         @functools.wraps(function)
         def call_function(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
-            given: list[str] = [*list(signature.parameters)[: len(args)], *map(str, kwargs)]
+            given: dict[str, object] = dict(zip(signature.parameters, args, strict=False))
+            # The name of an argument that is given without its name may also be that of a parameter of an SQL query.
+            given |= {str(name): value for name, value in kwargs.items() if name not in unnamed}
             for name in [] if takes_any else [name for name in given if name not in signature.parameters]:
                 hint = spelling.choices(name, [other for other in signature.parameters if other != "self"])
-                raise BadInput(f"{function.__name__} has no argument {name}: {hint}")
+                raise BadInput(f"{call.partition('(')[0]} has no argument {name}: {hint}")
             if missing := [name for name in required if name not in given]:
-                values: list[object] = [*args, *kwargs.values()]
-                for name, value in zip(given, values, strict=False):
+                for name, value in given.items():
                     refuse_coordinates(name, value)
                 raise BadInput(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing: write {call}")
             return function(*args, **kwargs)
@@ -244,24 +247,26 @@ def check_integers(name: str, value: Iterable[object], lo: int, hi: int) -> list
     Raises
     ------
     BadInput
-        If `value` is not iterable, or if an element is not an integer.
+        If `value` is a text or not iterable, or if an element is not an integer.
     OutOfRange
         If an element lies outside the bounds.
     """
-    if not isinstance(value, Iterable):
-        raise BadInput(f"{name} = {value!r} is not a list of whole numbers")
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        is_number = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        remedy = f": write {name}=[{value}]" if is_number else ""
+        raise BadInput(f"{name} = {value!r} is not a list of whole numbers{remedy}")
     return [check_integer(name, item, lo, hi) for item in value]
 
 
-def check_names(name: str, value: str | Sequence[str]) -> tuple[str, ...]:
-    """Return a str as a tuple of length 1, and a sequence of str as a tuple.
+def check_names(name: str, value: str | Iterable[str]) -> tuple[str, ...]:
+    """Return a str as a tuple of length 1, and a list or another iterable of str as a tuple.
 
     `name` is the name of the argument, for the message.
 
     Raises
     ------
     BadInput
-        If `value` is neither a str nor a sequence of str.
+        If `value` is neither a str nor an iterable of str.
     """
     if isinstance(value, str):
         return (value,)

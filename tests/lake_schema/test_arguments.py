@@ -74,6 +74,8 @@ def test_a_missing_argument_is_named():
         area(1, size=3.0)
     with pytest.raises(BadInput, match=r"^ra must be a number in degrees, got a SkyCoord: write c\.ra\.deg"):
         area(SkyCoord(53.2, -28.1, unit="deg"), band="r")
+    with pytest.raises(BadInput, match=r"^ra and dec are missing: write area\(ra, dec\)$"):
+        area(ra=1, dec=2, band="r")
     assert list(inspect.signature(area).parameters) == ["ra", "dec", "band", "size", "options"]
 
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 # Name of the extension with the table of the added sources.
 TABLE_NAME = "INJECTED"
-_NUMBER = re.compile(r"\s*\d*\.?\d+\s*")
+# A number with or without a unit, such as 0.8arcsec.
+_NUMBER = re.compile(r"\s*\d*\.?\d+\s*(?P<unit>[^\d\s.]*)\s*")
 # Largest seed.
 _MAX_SEED = 2**63 - 1
 # Columns of the table of added sources: unit and meaning.
@@ -93,6 +94,7 @@ class GivenFrame:
     psf: Psf
     planes: dict[str, _Plane]
 
+    @arguments.refuse_missing('frame.with_sources({"ra": [53.1], "dec": [-27.8], "mag": [21.0]})')
     def with_sources(
         self,
         rows: Any,
@@ -197,6 +199,7 @@ class InjectedFrame:
     seed: int
     noise: bool
 
+    @arguments.refuse_missing('frame.write("image.fits")')
     def write(self, path: str | Path) -> list[Path]:
         """Write a copy of the original file with the new image, and a table INJECTED of the added sources.
 
@@ -217,11 +220,10 @@ class InjectedFrame:
         Raises
         ------
         BadInput
-            If an original file no longer exists or its image has changed its size, or the folder does not exist.
+            If an original file no longer exists or its image has changed its size, the name does not end in .fits or
+            .fit, or the folder does not exist.
         """
-        target = user_files.expand_path(path)
-        if not target.parent.is_dir():
-            raise BadInput(f"{user_files.format_path(target)}: the folder does not exist")
+        target = check_target(path)
         planes = self.original.planes
         pixels = {"image": self.image, "weight": self.weight, "flags": self.flags}
         frames: dict[Path, dict[int, Array]] = {}
@@ -229,7 +231,7 @@ class InjectedFrame:
             array = pixels[name]
             assert array is not None
             frames.setdefault(plane.file, {})[plane.number] = array
-        image_file, stem = planes["image"].file, target.name.removesuffix(".fits")
+        image_file, stem = planes["image"].file, target.stem
         outputs = {image_file: target}
         for name, plane in planes.items():
             outputs.setdefault(plane.file, target.with_name(f"{stem}.{name}.fits"))
@@ -308,9 +310,8 @@ def frame(
         weights = mistakes.read(_read_plane, file, weight, "weight", image.shape)
         bits = mistakes.read(_read_plane, file, flags, "flags", image.shape)
     pixel_scale = frame_wcs.pixel_scale(system, nx, ny)
-    if isinstance(psf, str) and _NUMBER.fullmatch(psf):
-        raise BadInput(f"psf = {psf!r} is a number in quotes: write psf={psf} for the FWHM in arcsec")
-    model = frame_psf.load_psf(user_files.expand_path(psf) if isinstance(psf, str | Path) else psf, nx, ny, pixel_scale)
+    psf = _check_psf(psf) if isinstance(psf, str | Path) else psf
+    model = frame_psf.load_psf(psf, nx, ny, pixel_scale)
     if weights is not None:
         planes["weight"] = weights[1]
     if bits is not None:
@@ -319,6 +320,22 @@ def frame(
         image, None if weights is None else weights[0], None if bits is None else bits[0], system,
         calibration.zero_point, calibration.gain, calibration.saturation, model, planes,
     )  # fmt: skip
+
+
+def check_target(path: str | Path) -> Path:
+    """Return the path of a FITS file that can be written; raises BadInput for another ending or a missing folder."""
+    return user_files.check_target(user_files.expand_path(path), (".fits", ".fit"))
+
+
+def _check_psf(psf: str | Path) -> Path:
+    """Return the path of the file of a PSF; raises BadInput if it does not exist or is a FWHM instead."""
+    file = user_files.expand_path(psf)
+    if isinstance(psf, str) and not file.exists() and (match := _NUMBER.fullmatch(psf)):
+        if not match["unit"]:
+            raise BadInput(f"psf = {psf!r} is a number in quotes: write psf={psf} for the FWHM in arcsec")
+        arguments.refuse_angle("psf", psf, "of arcsec or a file", "arcsec")
+        raise BadInput(f"psf must be a number of arcsec or a file, got {psf!r}")
+    return user_files.check_file(file, "PSF", "psf")
 
 
 def _float_type(kind: np.dtype[Any]) -> type[Any]:

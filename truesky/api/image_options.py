@@ -8,15 +8,17 @@ from typing import Any, TypedDict
 
 from lake_schema import arguments
 from lake_schema.errors import BadInput
+from lake_schema.texts import spelling, synonyms
 from truesky.request import sky_notation
 from truesky.request.accuracy import Accuracy
 from truesky.request.from_toml import from_table
-from truesky.request.toml_values import refuse_name
 
 # Largest number of an exposure and largest identifier of a source, which are signed 64-bit integers.
 _MAX_INT64 = 2**63 - 1
 # Largest side of an image in arcsec.
 _MAX_SIZE = 3600.0
+# Other arguments of the methods that take `ImageOptions`.
+_ARGUMENTS = {"render": ("ra", "dec", "size", "band"), "stamps": ("table", "size", "band", "processes")}
 
 
 class ImageOptions(TypedDict, total=False):
@@ -94,6 +96,8 @@ class ImageRequest:
         Identifiers of sources that are left out.
     extra : object
         Table of sources that are added; None for none.
+    title : str
+        Row of the user's table of places, for messages, such as "places.csv, row 1"; "" without a table.
     """
 
     ra: float
@@ -109,12 +113,13 @@ class ImageRequest:
     effects: tuple[str, ...] | None
     without: tuple[int, ...]
     extra: Any
+    title: str = ""
 
 
 def check_request(
-    place: tuple[float | str, float | str], size: float, band: str, options: ImageOptions
+    place: tuple[float | str, float | str], size: float, band: str, options: ImageOptions, method: str = "render"
 ) -> ImageRequest:
-    """Check the arguments of `Lake.render`.
+    """Check the arguments of `Lake.render` or `Lake.stamps`.
 
     Parameters
     ----------
@@ -126,6 +131,8 @@ def check_request(
         Name of the passband.
     options : ImageOptions
         The other arguments.
+    method : str, optional
+        Name of the method, "render" or "stamps", for messages about unknown arguments.
 
     Returns
     -------
@@ -137,10 +144,9 @@ def check_request(
     BadInput
         If an option is unknown or its value is not valid. The message names the option and the allowed values.
     """
-    names = tuple(ImageOptions.__annotations__)
-    for name in options:
-        if name not in names:
-            raise BadInput(f"render: {refuse_name(name, names)}")
+    _refuse_unknown(method, options)
+    if not isinstance(band, str):
+        raise BadInput(f"band must be the name of one passband, got {band!r}: call lake.{method} once for each band")
     exposure, date, seed = (options.get(name) for name in ("exposure", "date", "seed"))
     effects, without, noise = options.get("effects"), options.get("without", ()), options.get("noise", True)
     if noise not in (True, False):
@@ -148,17 +154,41 @@ def check_request(
     return ImageRequest(
         *check_place(*place),
         check_size(size),
-        str(band),
+        band,
         options.get("camera"),
-        None if exposure is None else check_count("exposure", exposure),
+        None if exposure is None else _check_exposure(exposure),
         None if date is None else sky_notation.mjd(date, "date"),
         parse_accuracy(options.get("accuracy", "survey")),
         bool(noise),
         None if seed is None else check_count("seed", seed),
-        None if effects is None else tuple(effects),
-        tuple(arguments.check_integers("without", without, 0, _MAX_INT64)) if len(without) else (),
+        None if effects is None else _check_effects(effects),
+        tuple(arguments.check_integers("without", without, 0, _MAX_INT64)),
         options.get("extra"),
     )
+
+
+def _refuse_unknown(method: str, options: ImageOptions) -> None:
+    """Raise BadInput for an option that does not exist. The message lists the arguments of the method."""
+    allowed = (*_ARGUMENTS[method], *ImageOptions.__annotations__)
+    for name in options:
+        if name not in allowed:
+            question = spelling.did_you_mean(name, allowed)
+            if synonyms.find_columns(name, ("exposures",), ("exposure_time_s",)):
+                question = "the exposure time is that of the camera, or of the planned exposure exposure=N;"
+            raise BadInput(f"lake.{method} has no argument {name}: {question} allowed: {', '.join(allowed)}")
+
+
+def _check_exposure(exposure: Any) -> int:
+    if isinstance(exposure, str):
+        numbers = 'lake.table("exposures", "exposure_id") lists them'
+        raise BadInput(f"exposure must be the number of a planned exposure, got {exposure!r}; {numbers}")
+    return check_count("exposure", exposure)
+
+
+def _check_effects(effects: Collection[str]) -> tuple[str, ...]:
+    if isinstance(effects, str):
+        raise BadInput(f'effects must be a list such as ["poisson"], got {effects!r}; effects=[] for none')
+    return arguments.check_names("effects", effects)
 
 
 def check_place(ra: float | str, dec: float | str) -> tuple[float, float]:
@@ -171,7 +201,7 @@ def check_place(ra: float | str, dec: float | str) -> tuple[float, float]:
 
 def check_size(size: float) -> float:
     """Return the side of an image in arcsec; raises BadInput if it is not a number from 0 to 3600."""
-    arguments.refuse_angle("size", size, f"of arcsec from 0 to {_MAX_SIZE:g}", "arcsec")
+    arguments.refuse_angle("size", size, "of arcsec", "arcsec")
     return arguments.check_number("size", size, 0.0, _MAX_SIZE, "arcsec")
 
 

@@ -97,6 +97,7 @@ class Lake(LakeTables):
         files["file"] = [f"products/v-{version.key}/{path}" for path in files["path"]]
         return files if content is None else files[files["content"] == content].reset_index(drop=True)
 
+    @arguments.refuse_missing("lake.image(path); lake.images() lists the paths")
     def image(self, path: str, electrons: bool = False) -> Image:
         """Read an image file as one array with all pixels of the detector, without overscan.
 
@@ -126,6 +127,7 @@ class Lake(LakeTables):
         file = self._image_file(path)
         return read_back.electrons(file) if electrons else read_back.frame(file)
 
+    @arguments.refuse_missing("lake.extensions(path); lake.images() lists the paths")
     def extensions(self, path: str) -> list[Image]:
         """Read all extensions of an image file as they are stored, with overscans and arrays of quality flags.
 
@@ -149,6 +151,7 @@ class Lake(LakeTables):
         """
         return images.read_images(self._image_file(path))
 
+    @arguments.refuse_missing("lake.wcs(path); lake.images() lists the paths")
     def wcs(self, path: str) -> WCS:
         """Return the world coordinate system of the pixels of an image.
 
@@ -181,6 +184,7 @@ class Lake(LakeTables):
             warnings.simplefilter("ignore", FITSFixedWarning)
             return WCS(header)
 
+    @arguments.refuse_missing("lake.models(exposure_id, detector); lake.images() lists both")
     def models(
         self, exposure_id: int, detector: str, sources: Sequence[int] | None = None
     ) -> Iterator[tuple[int, Float]]:
@@ -257,6 +261,7 @@ class Lake(LakeTables):
 
         return self._painter.draw(image_options.check_request((ra, dec), size, band, options), refuse_unknown=True)
 
+    @arguments.refuse_missing('lake.stamps({"ra": [53.1], "dec": [-27.8]}), in degrees')
     def stamps(
         self,
         table: Any,
@@ -306,6 +311,7 @@ class Lake(LakeTables):
         stamp_series.check_places(self._painter, requests)
         return stamp_series.draw_all(self._painter, requests, number)
 
+    @arguments.refuse_missing("lake.frame(exposure, detector); lake.images() lists both")
     def frame(self, exposure: int, detector: str) -> LakeFrame:
         """Return the raw image of a detector in the lake, to which sources can be added.
 
@@ -343,6 +349,7 @@ class Lake(LakeTables):
 
         return sky_images.painter(sky_images.find_tables(self._explorer.versions, self._explorer.root))
 
+    @arguments.refuse_missing("lake.truth(exposure_id, detector); lake.images() lists both")
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lake_schema import arguments
 from lake_schema.arrays import Array, Float32
 from lake_schema.errors import BadInput
 from lake_schema.store import read
@@ -69,6 +70,7 @@ class LakeFrame:
         self._rendered: RenderedDetector | None = None
         self._has_maps = False
 
+    @arguments.refuse_missing('frame.with_sources({"ra": [53.1], "dec": [-27.8], "mag": [21.0]})')
     def with_sources(self, rows: Any) -> LakeFrame:
         """Return the image with additional sources.
 
@@ -140,6 +142,7 @@ class LakeFrame:
         truth = self.truth
         return truth[added.is_added(truth["id"].to_numpy())].reset_index(drop=True)
 
+    @arguments.refuse_missing('frame.write("image.fits")')
     def write(self, path: str | Path) -> Path:
         """Write the raw image in the format of the images of the lake; an existing file is replaced.
 

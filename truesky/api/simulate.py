@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _MAX_DETECTORS = 2**63 - 1
 
 
+@arguments.refuse_missing('truesky.check("request.toml")')
 def check(request: str | Path | Mapping[str, Any]) -> Request:
     """Check a request for a simulation as completely as the jobs do, without writing anything.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow.compute as pc
 
-from lake_schema import sky
+from lake_schema import arguments, sky
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 
 # Largest and smallest size of an image in pixels.
 _MAX_PIXELS, _MIN_PIXELS = 4096, 1
+# Largest number of exposures that an error message lists.
+_MAX_LISTED = 8
 # Shapes of no galaxies.
 _NO_SHAPES = galaxy_shapes.shapes(GALAXIES.empty().select(visible_sources.SHAPE_COLUMNS))
 # Electrons of the star that is drawn to show a PSF. They are many, so that rounding to 1e-6 electrons does not matter.
@@ -237,6 +239,7 @@ class SkyImage:
         image = stamps.draw(star, np.array([model.side]), model, side, side) / _PSF_ELECTRONS
         return PsfImage(image, 1, float(image.sum()))
 
+    @arguments.refuse_missing('image.write("image.fits")')
     def write(self, path: str | Path) -> Path:
         """Write the image to a FITS file.
 
@@ -358,7 +361,7 @@ class SkyPainter:
         is_number = pc.field("exposure_id") == number
         exposure_rows = exposure_chunks.rows(self.planned["exposures"], [number], where=is_number).to_pylist()
         if not exposure_rows:
-            raise BadInput(f"exposure {number}: the lake has no exposure with this number")
+            raise BadInput(f"exposure {number}: the lake has no exposure with this number; {self._first_exposures()}")
         exposure = ExposureRow.from_row(exposure_rows[0])
         variant = variants.variant(exposure.settings, self.mission, request.accuracy, self.forced)
         tasks = exposure_chunks.rows(self.planned["tasks"], [number], where=is_number).to_pylist()
@@ -370,9 +373,23 @@ class SkyPainter:
                 return _with_window(aim, request), variant
         raise BadInput(f"ra {request.ra:.5f}, dec {request.dec:.5f}: on none of the {len(tasks)} planned detectors")
 
+    def _first_exposures(self) -> str:
+        """Return the first numbers of planned exposures, for a message."""
+        numbers: list[int] = []
+        for rows in exposure_chunks.rows_by_partition(self.planned["exposures"], ["exposure_id"]):
+            numbers += rows["exposure_id"].to_pylist()
+            if len(numbers) > _MAX_LISTED:
+                break
+        rest = ", .." if len(numbers) > _MAX_LISTED else ""
+        return f"it has {', '.join(map(str, sorted(numbers)[:_MAX_LISTED]))}{rest}" if numbers else "it has none"
+
     def covers(self, ra: Float, dec: Float) -> Bool:
         """Return the mask [n] of the places (deg) that are in a cell of the catalogue."""
         return np.isin(sky.cell_at(ra, dec, GENERATION_ORDER), self._cells)
+
+    def outside_area(self, ra: float, dec: float) -> BadInput:
+        """Return the error for a place (deg) outside the catalogue."""
+        return inputs.outside_area(self._cells, ra, dec)
 
     def check(self, request: ImageRequest) -> None:
         """Raise BadInput if an image cannot be drawn because of its options, or its place is outside the catalogue."""

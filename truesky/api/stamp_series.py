@@ -6,11 +6,12 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lake_schema.errors import BadInput, bad_input
+from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.texts import spelling, synonyms
 from truesky.api import image_options, sky_images
 from truesky.api.image_options import ImageOptions, ImageRequest
@@ -18,8 +19,9 @@ from truesky.api.sky_images import PainterTables, SkyImage, SkyPainter
 from truesky.catalogue import injected_rows
 from truesky.request import sky_notation
 
-# Columns of a table of places, besides `ra` and `dec`.
+# Columns of a table of places that may be missing, and all that are used.
 _OPTIONAL = ("size", "exposure", "seed", "date")
+_COLUMNS = ("ra", "dec", *_OPTIONAL)
 # Largest number of images that a process draws before it sends them, and their largest number of pixels together.
 _MAX_BATCH, _BATCH_PIXELS = 8, 4e6
 # Time without work after which a process ends, s.
@@ -29,7 +31,6 @@ _MAX_EXACT = 2.0**53
 # Environment of the processes. loky restarts a process whose memory grows by more than a limit; ours keep rows and PSFs
 # of a limited size.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LOKY_MAX_MEMORY_LEAK_SIZE": "1e12"}
-_Batch = list[tuple[int, ImageRequest]]
 _Drawn = tuple[list[SkyImage], BadInput | None]
 
 
@@ -56,38 +57,46 @@ def read_places(table: Any, size: float, band: str, options: ImageOptions) -> li
     ------
     BadInput
         If `ra` or `dec` is missing, the name of a column is misspelt, or a value is not valid. The message names the
-        row, from 1.
+        table or its file, and the row, from 1.
     """
     titles: list[str] = []
 
     def is_used(title: str) -> bool:
         titles.append(title)
-        return _is_used(title)
+        return title in _COLUMNS
 
     place, columns = injected_rows.table_columns(table, "table", is_used)
-    if missing := [name for name in ("ra", "dec") if name not in columns]:
-        renamed = {name: title for title in titles for name in synonyms.find_columns(title, ("stars",), missing)}
-        hints = [f"{name}; did you mean {renamed[name]}? Rename it to {name}" for name in missing if name in renamed]
-        raise bad_input(f"{place}: has no column {text}" for text in (hints or missing))
-    base = image_options.check_request((0.0, 0.0), size, band, options)
+    _check_titles(place, titles)
+    base = image_options.check_request((0.0, 0.0), size, band, options, "stamps")
     requests = []
     for row in range(len(columns["ra"])):
         values = {name: float(column[row]) for name, column in columns.items() if not np.isnan(column[row])}
+        title = f"{place}, row {row + 1}"
         try:
-            requests.append(_with_place(base, values))
+            requests.append(_with_place(replace(base, title=title), values))
         except BadInput as error:
-            raise BadInput(f"{place}, row {row + 1}: {error}") from None
+            raise error.with_prefix(title) from None
     return requests
 
 
-def _is_used(name: str) -> bool:
-    """Return True for a column that is used, and raise BadInput for a name that is nearly the same."""
-    used = ("ra", "dec", *_OPTIONAL)
-    if name in used:
-        return True
-    if similar := [word for word in used if word == name.lower()] or spelling.closest_names(name, _OPTIONAL, 1):
-        raise BadInput(f"table: column {name!r}: did you mean {similar[0]}? Other names are ignored")
-    return False
+def _check_titles(place: Path, titles: Sequence[str]) -> None:
+    """Raise BadInput if `ra` or `dec` is not among the titles of a table, or another title is nearly one of ours."""
+    missing = [name for name in ("ra", "dec") if name not in titles]
+    unused = [title for title in titles if title not in _COLUMNS]
+    mistakes = []
+    if missing:
+        similar = [title for title in unused if title.lower() in missing or _meant(title, missing)]
+        it = "them" if len(similar) > 1 else "it"
+        remedy = f"; did you mean {', '.join(similar)}? Rename {it}" if similar else ""
+        mistakes.append(f"{place}: has no column{'s' if len(missing) > 1 else ''} {', '.join(missing)}{remedy}")
+    for title in unused:
+        if meant := spelling.closest_names(title, _OPTIONAL, 1):
+            mistakes.append(f"{place}: column {title!r}: did you mean {meant[0]}? Other names are ignored")
+    refuse_mistakes(mistakes)
+
+
+def _meant(title: str, missing: Sequence[str]) -> list[str]:
+    return synonyms.find_columns(title, ("stars",), missing)
 
 
 def _with_place(base: ImageRequest, values: Mapping[str, float]) -> ImageRequest:
@@ -120,7 +129,7 @@ def check_places(painter: SkyPainter, requests: Sequence[ImageRequest]) -> None:
     """
     ra, dec = (np.array([getattr(request, name) for request in requests]) for name in ("ra", "dec"))
     for row in np.flatnonzero(~painter.covers(ra, dec))[:1].tolist():
-        raise BadInput(f"table, row {row + 1}: ra {ra[row]:.5f}, dec {dec[row]:.5f}: outside the area of the catalogue")
+        raise painter.outside_area(ra[row], dec[row]).with_prefix(requests[row].title)
     for request in requests[:1]:
         painter.check(request)
 
@@ -149,15 +158,14 @@ def draw_all(painter: SkyPainter, requests: Sequence[ImageRequest], processes: i
     """
     batch_size = _batch_size(painter, requests, processes)
     if processes == 1:
-        for number, request in enumerate(requests, 1):
-            yield _draw(painter, number, request)
+        for request in requests:
+            yield _draw(painter, request)
         return
     # The processes of this library do not import the user's script, so that scripts and notebooks need no guard.
     import loky
     from loky.process_executor import TerminatedWorkerError
 
-    numbered = list(enumerate(requests, 1))
-    batches = [numbered[first : first + batch_size] for first in range(0, len(numbered), batch_size)]
+    batches = [requests[first : first + batch_size] for first in range(0, len(requests), batch_size)]
     executor = loky.ProcessPoolExecutor(min(processes, max(len(batches), 1)), timeout=_IDLE_S, env=_ENVIRONMENT)
     try:
         waiting: deque[Future[_Drawn]] = deque()
@@ -195,19 +203,19 @@ def _results(painter: SkyPainter, task: Future[_Drawn]) -> Iterator[SkyImage]:
         raise error
 
 
-def _draw_batch(tables: PainterTables, batch: _Batch) -> _Drawn:
+def _draw_batch(tables: PainterTables, batch: Sequence[ImageRequest]) -> _Drawn:
     """Return the images of a batch before the first error, and the error."""
     painter, images = sky_images.shared_painter(tables), []
-    for number, request in batch:
+    for request in batch:
         try:
-            images.append(_draw(painter, number, request))
+            images.append(_draw(painter, request))
         except BadInput as error:
             return images, error
     return images, None
 
 
-def _draw(painter: SkyPainter, number: int, request: ImageRequest) -> SkyImage:
+def _draw(painter: SkyPainter, request: ImageRequest) -> SkyImage:
     try:
         return painter.draw(request)
     except BadInput as error:
-        raise BadInput(f"table, row {number}: {error}") from None
+        raise error.with_prefix(request.title) from None

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import csv
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from lake_schema import user_files
-from lake_schema.errors import BadInput, bad_input
+from lake_schema.errors import BadInput
 from truesky.api.image_options import ImageOptions
 from truesky.api.lake import Lake
 from truesky.api.sky_images import SkyImage
+from truesky.command_line import injection
 from truesky.commands import submit
 
 # Options of the command that are arguments of `Lake.stamps`.
@@ -44,17 +44,12 @@ def run_command(options: argparse.Namespace) -> int:
         try:
             images = lake.stamps(options.places, options.size, options.band, options.processes, **chosen)
         except BadInput as error:
-            raise bad_input(map(_name_option, error.messages)) from None
+            raise injection.name_options(error, _OPTIONS) from None
         with user_files.create_folder(out) as folder:
             rows = list(_write(images, folder))
             _write_list(rows, folder / "stamps.csv")
     print(f"{out}: {len(rows)} images, listed in stamps.csv")
     return 0
-
-
-def _name_option(message: str) -> str:
-    """Return a message that begins with the name of an argument of `Lake.stamps` with the option of the command."""
-    return f"--{message}" if re.split(r"[ :]", message, maxsplit=1)[0] in _OPTIONS else message
 
 
 def _write(images: Iterator[SkyImage], folder: Path) -> Iterator[Sequence[str | int | float]]:

@@ -34,6 +34,7 @@ class LakeTables:
         Time in seconds after which a query is stopped, 0 to 1e6.
     """
 
+    @arguments.refuse_missing('truesky.open("my_lake")')
     def __init__(
         self, path: str | Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
     ) -> None:
@@ -72,6 +73,7 @@ class LakeTables:
         """
         return self._explorer.tables()
 
+    @arguments.refuse_missing('lake.columns("galaxies"); lake.tables() lists the tables')
     def columns(self, table: str) -> pd.DataFrame:
         """List the columns of a table.
 
@@ -92,6 +94,7 @@ class LakeTables:
         """
         return self._explorer.describe(table)
 
+    @arguments.refuse_missing('lake.table("galaxies"); lake.tables() lists the tables')
     def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "pandas") -> Any:
         """Read all rows of a table into memory.
 
@@ -119,6 +122,7 @@ class LakeTables:
         self._explorer.check_columns(name, names or ())
         return results.convert(self._explorer._version(name).rows(names), into)
 
+    @arguments.refuse_missing('lake.sql("SELECT count(*) FROM galaxies")')
     def sql(self, query: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Run one SELECT over the tables of the lake.
 
@@ -187,6 +191,7 @@ class LakeTables:
         """
         return self._explorer.cone(table, ra, dec, radius, _names(columns), on, into)
 
+    @arguments.refuse_missing('lake.export("SELECT id FROM galaxies", "galaxies.csv")')
     def export(self, query: str, path: str | Path, /, **parameters: object) -> Path:
         """Write the result of an SQL query to a file.
 

@@ -338,6 +338,8 @@ def _check_titles(
                 unknown.remove(similar[0])
                 mapped = f", or map {_MAPPING.format(name, similar[0])}" if can_map else ""
                 hint = f"; did you mean {similar[0]}? Rename it to {name}{mapped}"
+            elif name == "mag" and any("flux" in title.lower() for title in unknown):
+                hint = "; compute it from the flux: mag = zero_point - 2.5 log10(flux)"
             messages.append(f"{file}: column {name} is missing{hint}")
     if unknown:
         listed = [

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lake_schema import user_files
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.external import rows as external_rows
@@ -21,9 +22,10 @@ from lake_schema.external.mistakes import TableMistakes
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from lake_schema.texts import spelling
 from truesky.catalogue import given_sources
-from truesky.catalogue.external.ellipticity import CONVENTIONS
+from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
 from truesky.catalogue.galaxies import morphology
 from truesky.request.files import SOURCES_KIND
+from truesky.request.toml_values import refuse_name
 
 TABLES = ("galaxies", "stars")
 # Columns of galaxies that distinguish a table of galaxies from a table of stars, because stars do not have them.
@@ -87,6 +89,9 @@ def read_rows(rows: Any, ellipticity: str | None = None, axes: str | None = None
     BadInput
         If a table cannot be read, a column is unknown or missing, or a value is missing or out of range.
     """
+    for name, setting, allowed in (("ellipticity", ellipticity, CONVENTIONS), ("axes", axes, FRAMES)):
+        if setting is not None and setting not in allowed:
+            raise BadInput(f"{name}: {refuse_name(str(setting), allowed)}")
     settings = {key: value for key, value in (("ellipticity", ellipticity), ("frame", axes)) if value is not None}
     with Mistakes() as mistakes:
         checked = {
@@ -174,14 +179,15 @@ def table_columns(
         If the table cannot be read, a column has no numbers, or columns have different numbers of rows.
     """
     if isinstance(table, str | Path):
-        return _columns_of_file(Path(table), is_wanted)
+        return _columns_of_file(user_files.check_file(Path(table), SOURCES_KIND, name), is_wanted)
     place = Path(name)
     titles = [title for title in _titles(table, name) if is_wanted(title)]
     with Mistakes() as mistakes:
         columns = {title: mistakes.read(_numbers, table[title], f"{place}: column {title}", title) for title in titles}
     lengths = {title: len(values) for title, values in columns.items()}
     if len(set(lengths.values())) > 1:
-        raise BadInput(f"{place}: columns {', '.join(lengths)} have different numbers of rows")
+        counts = ", ".join(map(str, lengths.values()))
+        raise BadInput(f"{place}: columns {', '.join(lengths)} have different numbers of rows: {counts}")
     return place, columns
 
 
@@ -192,7 +198,8 @@ def _titles(table: Any, name: str) -> list[str]:
             return [str(title) for title in (titles() if callable(titles) else titles)]
     if isinstance(table, np.ndarray) and table.dtype.names:
         return list(table.dtype.names)
-    raise BadInput(f"{name} must be a table, a mapping of columns or a file, got {type(table).__name__}")
+    kind, example = type(table).__name__, '{"ra": [53.1], "dec": [-27.8]}'
+    raise BadInput(f"{name} must be a table, a mapping of columns or a file, got {kind}; for example: {example}")
 
 
 def _columns_of_file(file: Path, is_wanted: Callable[[str], bool]) -> tuple[Path, dict[str, Float]]:
@@ -222,5 +229,7 @@ def _numbers(column: Any, where: str, title: str) -> Float:
     except (TypeError, ValueError) as error:
         raise BadInput(f"{where} must hold numbers: {' '.join(str(error).split())[:200]}") from None
     if numbers.ndim != 1:
-        raise BadInput(f"{where} must be one number per row, got an array of shape {numbers.shape}")
+        got = "one number" if numbers.ndim == 0 else f"an array of shape {numbers.shape}"
+        remedy = f": write [{column}]" if numbers.ndim == 0 else ""
+        raise BadInput(f"{where} must be one number per row, got {got}{remedy}")
     return np.asarray(numbers)

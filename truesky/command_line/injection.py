@@ -2,7 +2,29 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
+
+from lake_schema.errors import BadInput, bad_input
 from truesky.command_line.parser import Parser
+
+# Positional arguments of the commands, by the name that they have in Python.
+_POSITIONS = {"rows": "ROWS", "table": "PLACES"}
+# Place in a message where an argument is named: the beginning, or the remedy.
+_NAMED = re.compile(r"(^|: give )(\w+)(?=[ :,])")
+
+
+def name_options(error: BadInput, names: Collection[str]) -> BadInput:
+    """Return an error of the Python interface that names the options of a command.
+
+    `names` are the arguments in Python that are options of the command, such as zero_point for --zero-point.
+    """
+
+    def name_option(match: re.Match[str]) -> str:
+        place, name = match.groups()
+        return place + _POSITIONS.get(name, f"--{name.replace('_', '-')}" if name in names else name)
+
+    return bad_input(_NAMED.sub(name_option, message) for message in error.messages)
 
 
 def add_inject_arguments(parser: Parser) -> None:

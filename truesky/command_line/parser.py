@@ -13,11 +13,13 @@ from typing import Any, NoReturn
 from lake_schema import command
 from lake_schema.texts import spelling
 
+# Names of the option for a forecast of the cost.
+_FORECASTS = ("--dry-run", "--forecast", "--simulate")
 # Options with the same meaning in different commands or in other programs.
 _SYNONYMS = (
     ("--delete", "--prune", "--remove", "--clean", "--clear"),
     ("--out", "--output"),
-    ("--dry-run", "--forecast", "--simulate"),
+    _FORECASTS,
     ("--bands", "--filters"),
     ("--detectors", "--ccds", "--chips"),
     ("--processes", "--threads", "--workers", "--jobs"),
@@ -37,6 +39,7 @@ _SENTENCES = (
 _MISSING = "the following arguments are required: "
 _CHOICE = re.compile(r"argument (?P<name>\S+): invalid choice: '(?P<value>.*)' \(choose from (?P<choices>.*)\)")
 _REQUEST_ENDING = ".toml"
+_TABLE_ENDINGS = (".csv", ".parquet", ".parq", ".hdf5", ".h5")
 _QUERY = re.compile(r"\s*(?:SELECT|WITH|FROM)\s", re.IGNORECASE)
 
 
@@ -98,6 +101,7 @@ class Parser(argparse.ArgumentParser):
         self._refuse_commas(parsed)
         self._refuse_swapped(parsed)
         self._refuse_swapped_query(parsed)
+        self._refuse_swapped_table(parsed)
         self._refuse_open_query(parsed, rest)
         self._refuse_needless_lake(parsed, rest)
         return parsed, rest
@@ -113,6 +117,8 @@ class Parser(argparse.ArgumentParser):
         """Return the suggestion of an option with a similar name or with the same meaning, or ""."""
         existing = self._option_string_actions
         meant = [option for names in _SYNONYMS if name in names for option in names if option in existing]
+        if name in _FORECASTS and not meant and self._names_of_positions == ["--request", "--lake"]:
+            return "; truesky plan REQUEST LAKE --dry-run prints a forecast"
         return f'; did you mean "{meant[0]}"?' if meant else suggestion(name, existing)
 
     def _refuse_commas(self, parsed: argparse.Namespace) -> None:
@@ -143,6 +149,16 @@ class Parser(argparse.ArgumentParser):
         if _QUERY.match(lake) and not os.path.isdir(lake):
             call = self._call([query or "LAKE", f'"{lake}"'], [query, lake])
             self._stop(f"the lake comes before the query: write {call}")
+
+    def _refuse_swapped_table(self, parsed: argparse.Namespace) -> None:
+        """End the process if a table of places or sources is before the lake or the image to which it belongs."""
+        for first, second in (("lake", "places"), ("image", "rows")):
+            given, table = (str(getattr(parsed, name, None) or "") for name in (first, second))
+            is_table = given.lower().endswith(_TABLE_ENDINGS) and not os.path.isdir(given)
+            is_swapped = is_table and not table.lower().endswith(_TABLE_ENDINGS)
+            if table and (is_swapped or (os.path.isfile(given) and os.path.isdir(table))):
+                call = self._call([table, given, str(parsed.out)])
+                self._stop(f"the {first} comes before the {second}: write {call}")
 
     def _refuse_open_query(self, parsed: argparse.Namespace, rest: Sequence[str]) -> None:
         """End the process if a query has no quotes, so that its words are several arguments."""

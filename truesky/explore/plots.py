@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema import sky
+from lake_schema import arguments, sky
 from lake_schema.arrays import Float, Int
 from truesky.explore.explorer import ORDER
 
 
+@arguments.refuse_missing("truesky.plots.hist(counts, edges), with the result of lake.hist")
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
     """Draw a histogram as steps.
 
@@ -38,6 +39,7 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
     return axes
 
 
+@arguments.refuse_missing("truesky.plots.heatmap(counts, x_edges, y_edges), with the result of lake.heatmap")
 def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **style: Any) -> Any:
     """Draw a two-dimensional histogram as colours on a logarithmic scale, with a colour bar.
 
@@ -71,6 +73,7 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     return axes
 
 
+@arguments.refuse_missing("truesky.plots.skymap(cells, counts, order), with the result of lake.skymap")
 def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **style: Any) -> Any:
     """Draw a sky map in HEALPix cells: the number of rows per square degree, with east to the left.
 

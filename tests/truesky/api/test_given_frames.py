@@ -17,6 +17,7 @@ import truesky
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from tests.truesky.api.given_frame_files import LINEAR, NX, NY, SIP, TPV, frame_file, psf_file
+from truesky.commands import __main__ as command
 from truesky.render.injection import add_sources
 from truesky.render.injection.source_light import SourceLight
 
@@ -245,7 +246,9 @@ def test_magnification_makes_galaxies_brighter(given):
         ({"ra": [1.0], "dec": [2.0]}, "rows: column mag is missing"),
         ({**STAR, "mag": [99.0]}, r"rows: column mag of row 1 is 99, but must be from -5 to 60"),
         ({**STAR, "mag": [np.nan]}, "rows: column mag of row 1 is NaN, but must be a number from"),
-        ({**STAR, "ra": [1.0, 2.0]}, "rows: columns ra, dec, mag have different numbers of rows"),
+        ({**STAR, "ra": [1.0, 2.0]}, "rows: columns ra, dec, mag have different numbers of rows: 2, 1, 1$"),
+        ({**STAR, "ra": 150.1}, r"^rows: column ra must be one number per row, got one number: write \[150.1\]$"),
+        ({"ra": [1.0], "dec": [2.0], "flux": [9.0]}, r"mag is missing; compute it .*: mag = zero_point - 2.5 log10\(f"),
         ({**STAR, "mag": ["x"]}, "rows: column mag must hold numbers"),
         ({**STAR, "a_v": [0.3]}, "rows: column a_v of row 1 is 0.3, but must be 0: give magnitudes"),
         ({**STAR, "id": [0.5]}, "rows: column id of row 1 is 0.5, but must be a whole number"),
@@ -255,8 +258,8 @@ def test_magnification_makes_galaxies_brighter(given):
             "galaxies: columns e1 and e2 require the argument ellipticity, .*: shear, d",
         ),
         ({"galaxies": {**STAR, "kappa": [1.0], "gamma1": [0.0], "gamma2": [0.0]}}, "galaxies: .* near a caustic"),
-        (3, "rows must be a table, a mapping of columns or a file, got int"),
-        ("nowhere.csv", "nowhere.csv: no such file"),
+        (3, "rows must be a table, a mapping of columns or a file, got int; for example: {.ra.: .53.1."),
+        ("nowhere.csv", "^rows: nowhere.csv: no such file"),
     ],
 )  # fmt: skip
 def test_wrong_rows_are_refused(given, rows, text):
@@ -277,7 +280,9 @@ def test_wrong_rows_are_refused(given, rows, text):
         ({"CD1_1": 0.0, "CD1_2": 0.0}, {}, "its WCS cannot be used"),
         ({"A_2_0": 1e-2}, {}, "its WCS cannot be inverted"),
         ({}, {"psf": 0.1}, "psf: the FWHM of the PSF, 0.1 arcsec, is below one pixel"),
-        ({}, {"psf": "nowhere.psf"}, "nowhere.psf: no such file"),
+        ({}, {"psf": "nowhere.psf"}, "^psf: nowhere.psf: no such file"),
+        ({}, {"psf": "0.8 arcsec"}, "^psf must be a number of arcsec or a file, got '0.8 arcsec': write 0.8$"),
+        ({}, {"psf": "2.5pix"}, "^psf must be a number of arcsec or a file, got '2.5pix'$"),
         ({}, {"psf": "0.8"}, "psf = '0.8' is a number in quotes: write psf=0.8 for the FWHM"),
         ({}, {"extension": 4}, "has no extension 4; it has 0 to 0"),
         ({}, {"extension": "SCI"}, "has no extension 'SCI'"),
@@ -318,25 +323,25 @@ def test_wrong_files_are_refused(tmp_path):
     with pytest.raises(BadInput, match="extension 1 is compressed: unpack the file with funpack"):
         truesky.frame(tmp_path / "p.fits", psf=0.8)
     new = truesky.frame(file, psf=0.8).with_sources(STAR)
-    with pytest.raises(BadInput, match="the folder does not exist"):
+    with pytest.raises(BadInput, match="its folder does not exist"):
         new.write(tmp_path / "none" / "x.fits")
     (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(IsADirectoryError):
+    with pytest.raises(BadInput, match="exists and is not a file"):
         new.write(tmp_path / "folder.fits")
+    with pytest.raises(BadInput, match=r"x\.png: the name of the file must end in \.fits or \.fit"):
+        new.write(tmp_path / "x.png")
     frame_file(file, pixels=np.zeros((5, 6), np.float32))
     with pytest.raises(BadInput, match="extension 0 has changed: it must be an image of the same size"):
         new.write(tmp_path / "x.fits")
 
 
 def test_the_command_writes_the_same_file(tmp_path, capsys):
-    from truesky.commands import __main__ as command
-
     file, psf = frame_file(tmp_path / "a.fits", MAGZERO=None), psf_file(tmp_path)
     Table(STAR).write(tmp_path / "rows.csv")
     words = ["inject", str(file), str(tmp_path / "rows.csv"), str(tmp_path / "out.fits"), "--psf", str(psf)]
     assert command.main(words) == 2
     assert "truesky inject: " in (text := capsys.readouterr().err)
-    assert "give zero_point" in text
+    assert "give --zero-point" in text
     assert command.main([*words[:3], str(file), "--psf", "0.8", "--zero-point", "29"]) == 2
     assert "is the file IMAGE: write the new image to another file" in capsys.readouterr().err
     assert command.main([*words, "--zero-point", "29", "--gain", "3", "--seed", "4"]) == 0
@@ -347,10 +352,43 @@ def test_the_command_writes_the_same_file(tmp_path, capsys):
     assert fits.getdata(tmp_path / "out.fits").sum(dtype=float) == pytest.approx(10**3.6, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("cards", "words", "problems"),
+    [
+        ({}, "a.fits rows.csv b.fits --psf 0.8arcsec",
+         ["--psf must be a number of arcsec or a file, got '0.8arcsec': write 0.8"]),
+        ({}, "a.fits rows.csv b.fits --psf a.psf", ["--psf: a.psf: no such file"]),
+        ({}, "a.fits rows.csv b.png --psf 0.8", ["b.png: the name of the file must end in .fits or .fit"]),
+        ({}, "a.fits far.csv b.fits --psf 0.8",
+         ["far.csv: no source is on the frame, whose middle is at ra 150.00012, dec 2.20039; "
+          "row 1 is at ra 10.00000, dec 2.19800"]),
+        ({}, "rows.csv a.fits b.fits --psf 0.8",
+         ["the image comes before the rows: write truesky inject a.fits rows.csv b.fits --psf 0.8"]),
+        ({}, "a.fits none.csv b.fits --psf 0.8", ["ROWS: none.csv: no such file"]),
+        ({}, "a.fits rows.csv b.fits --psf 0.8 --ellipticity g",
+         ["--ellipticity: 'g' is not one of shear, distortion, conformal, flattening"]),
+        ({"MAGZERO": None, "GAIN": None}, "a.fits rows.csv b.fits --psf 0.8",
+         ["a.fits: has none of the cards MAGZERO, PHOTZP, MAGZPT, ZEROPNT: give --zero-point, the AB magnitude of "
+          "one count", "a.fits: has no card GAIN: give --gain, the electrons per count"]),
+    ],
+)  # fmt: skip
+def test_mistakes_at_the_command_are_named_by_its_options(tmp_path, monkeypatch, capsys, cards, words, problems):
+    monkeypatch.chdir(tmp_path)
+    frame_file("a.fits", **cards)
+    Table(STAR).write("rows.csv")
+    Table({**STAR, "ra": [10.0]}).write("far.csv")
+    before = set(tmp_path.iterdir())
+    try:
+        status = command.main(["inject", *words.split()])
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    assert capsys.readouterr().err.splitlines() == [f"truesky inject: {problem}" for problem in problems]
+    assert set(tmp_path.iterdir()) == before
+
+
 def test_the_example_of_the_page_works(tmp_path, monkeypatch, capsys):
     """The blocks of docs/injection.md; the command writes the same file as Python."""
-    from truesky.commands import __main__ as command
-
     monkeypatch.chdir(tmp_path)
     page, names = (ROOT / "docs" / "injection.md").read_text(), {}
     for code in re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL):

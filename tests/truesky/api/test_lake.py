@@ -1,5 +1,6 @@
 """A lake opened from Python: tables, queries and errors. Images and truth are tested in tests/test_field.py."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -18,6 +19,9 @@ from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.products import PRODUCTS
 from tests import requests
 from tests.universe import CELLS, plain_plan, plain_work, rows_of, toy_plan, toy_work
+from truesky.api.given_frames import GivenFrame, InjectedFrame
+from truesky.api.lake_frames import LakeFrame
+from truesky.api.sky_images import SkyImage
 from truesky.render import models
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -110,6 +114,9 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         ),
         (lambda lake: lake.export("few.csv", "SELECT id FROM plain"), r"write lake.export\(query, 'few.csv'\)$"),
         (lambda lake: truesky.run("a.toml", "lake", detector="3-4"), r"no argument detector: did you mean detectors\?"),
+        (lambda lake: lake.truth(1), r"^detector is missing: write lake.truth\(exposure_id, detector\); lake.images"),
+        (lambda lake: lake.frame(1, ccd="3-4"), "^lake.frame has no argument ccd: allowed: exposure, detector$"),
+        (lambda lake: lake.sql(query="SELECT 1"), r'^query is missing: write lake.sql\("SELECT count\(\*\) FROM'),
         (lambda lake: lake.truth(1, "3-4"), "has no table products"),
         (lambda lake: lake.wcs("a.fits"), "has no table products"),
         (lambda lake: lake.extensions("a.fits"), "has no table products"),
@@ -122,6 +129,25 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
 def test_missing_tables_and_images_are_named(opened, ask, said):
     with pytest.raises(truesky.BadInput, match=said):
         ask(opened)
+
+
+def public_functions():
+    """Return the functions and methods of users that require an argument."""
+    yield from (truesky.Lake.__init__, truesky.check, truesky.run, truesky.frame)
+    for owner in (truesky.Lake, LakeFrame, SkyImage, GivenFrame, InjectedFrame, truesky.plots):
+        for name, function in inspect.getmembers(owner, inspect.isfunction):
+            required = [each for each in inspect.signature(function).parameters.values() if each.default is each.empty]
+            names = [each.name for each in required if each.name != "self" and each.kind is not each.VAR_KEYWORD]
+            # Only truesky itself calls `attach`.
+            if names and not name.startswith("_") and name != "attach":
+                yield function
+
+
+@pytest.mark.parametrize("function", list(public_functions()), ids=lambda function: function.__qualname__)
+def test_missing_arguments_are_named_with_a_call(function):
+    is_method = "self" in inspect.signature(function).parameters
+    with pytest.raises(truesky.BadInput, match=r"(is|are) missing: write (lake|truesky|frame|image)\."):
+        function(*([None] if is_method else []))
 
 
 def test_models_use_the_versions_of_the_open_lake(lake, monkeypatch):

@@ -282,12 +282,24 @@ def test_the_command_names_its_options(lake, tmp_path, capsys):
     words = ["stamps", str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "stamps")]
     for option, problem in (
         (["--band", "VIS"], "--band: 'VIS' is not allowed: did you mean euclid_vis?"),
-        (["--band", "lsst_r", "--exposure", "9"], "--exposure 9: the lake has no exposure with this number"),
+        (["--band", "lsst_r", "--exposure", "9"], "--exposure 9: the lake has no exposure with this number; it has 1"),
         (["--size", "-1"], "--size = -1.0 is outside [0.0, 3600.0] arcsec"),
     ):
         assert main([*words, *option]) == 2
         assert capsys.readouterr().err == f"truesky stamps: {problem}\n"
         assert not (tmp_path / "stamps").exists()
+
+
+def test_exchanged_arguments_and_other_columns_are_named(lake, tmp_path, capsys):
+    root, places, out = str(lake._explorer.root), str(tmp_path / "places.csv"), str(tmp_path / "stamps")
+    pd.DataFrame({"RA": [RA], "DEC": [DEC]}).to_csv(places, index=False)
+    assert main(["stamps", root, places, out]) == 2
+    problem = "has no columns ra, dec; did you mean RA, DEC? Rename them"
+    assert capsys.readouterr().err == f"truesky stamps: {places}: {problem}\n"
+    with pytest.raises(SystemExit):
+        main(["stamps", places, root, out, "--size", "5"])
+    call = f"truesky stamps {root} {places} {out} --size 5"
+    assert capsys.readouterr().err == f"truesky stamps: the lake comes before the places: write {call}\n"
 
 
 def test_the_command_writes_stamps(lake, tmp_path, capsys):
@@ -307,7 +319,7 @@ def test_the_command_writes_stamps(lake, tmp_path, capsys):
     # A place that cannot be drawn leaves nothing behind.
     pd.DataFrame({"ra": [RA, 10.0], "dec": [DEC, 10.0]}).to_csv(tmp_path / "places.csv", index=False)
     assert main([*words[:3], str(tmp_path / "other"), *options, "--size", "4"]) == 2
-    assert "table, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
+    assert "places.csv, row 2: ra 10.00000, dec 10.00000: outside the area" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"places.csv", "new"}
 
 
@@ -327,9 +339,10 @@ def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, n
     ("table", "options", "message"),
     [
         ({"ra": [RA]}, {}, "table: has no column dec"),
-        ({"RAJ2000": [RA], "DEJ2000": [DEC]}, {}, r"column ra; did you mean RAJ2000\? Rename it to ra; .* DEJ2000\?"),
+        ({"RAJ2000": [RA], "DEJ2000": [DEC]}, {}, r"no columns ra, dec; did you mean RAJ2000, DEJ2000\? "),
         ({"ra": [RA], "dec": [DEC], "sizes": [3.0]}, {}, "table: column 'sizes': did you mean size"),
-        ({"RA": [RA], "DEC": [DEC]}, {}, "table: column 'RA': did you mean ra"),
+        ({"RA": [RA], "DEC": [DEC]}, {}, r"^table: has no columns ra, dec; did you mean RA, DEC\? Rename them$"),
+        ([(RA, DEC)], {}, r"^table must be a table, .*, got list; for example: \{.ra.: \[53.1\], .dec.: \[-27.8\]\}$"),
         ({"ra": [RA, np.nan], "dec": [DEC, DEC]}, {}, "table, row 2: ra is missing"),
         ({"ra": [RA], "dec": [95.0]}, {}, "table, row 1: dec = 95.0 is outside"),
         ({"ra": [RA], "dec": [DEC], "seed": [1.5]}, {}, "table, row 1: seed = 1.5: must be a whole number"),
@@ -340,12 +353,13 @@ def test_a_stopped_command_leaves_nothing(lake, tmp_path, capsys, monkeypatch, n
             "^band: 'euclid_vs' is not allowed: did you mean euclid_vis",
         ),
         ({"ra": [RA], "dec": [DEC]}, {"processes": 0}, "processes"),
+        ({"ra": [RA], "dec": [DEC]}, {"sizes": 3}, r"lake.stamps has no argument sizes: did you mean size\? .*: table"),
         ({"ra": [RA], "dec": [DEC], "seed": [2.0**53]}, {}, r"table, row 1: seed = .* must be below 2\^53"),
         ({"ra": [RA], "dec": [DEC], "size": [np.inf]}, {}, "table, row 1: size"),
-        ({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, {}, r"table, row 2: ra 10.00000, dec 10.00000: outside the area"),
+        ({"ra": [RA, 10.0], "dec": [DEC, 10.0]}, {}, r"table, row 2: ra 10.0.*, which is near ra 5.*, dec -2"),
         ({"ra": [RA], "dec": [DEC]}, {"exposure": 9}, "^exposure 9: the lake has no exposure with this number"),
         ({"ra": [RA], "dec": [DEC]}, {"effects": ["ghosts"]}, "^effects: 'ghosts' cannot be applied to a window"),
-        ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows"),
+        ({"ra": [RA], "dec": [DEC, DEC]}, {}, "columns ra, dec have different numbers of rows: 1, 2$"),
         (3, {}, "table must be a table"),
     ],
 )
@@ -366,22 +380,36 @@ def test_bad_tables_of_places_are_refused(lake, table, options, message):
         ({"noise": "no"}, "noise = 'no' must be True or False"),
         ({"size": 0.0}, "size = 0: must be 0.2 to 801 arcsec, at most a detector"),
         ({"size": np.nan}, "size"),
-        ({"size": "30 arcsec"}, "^size must be a number of arcsec from 0 to 3600, got '30 arcsec': write 30$"),
+        ({"size": "30 arcsec"}, "^size must be a number of arcsec, got '30 arcsec': write 30$"),
         ({"ra": DEC, "dec": 153.1}, r"^dec = 153.1 is outside \[-90.0, 90.0\]: are ra and dec exchanged\?$"),
         ({"band": "euclid_vs"}, "band: 'euclid_vs' is not allowed: did you mean euclid_vis"),
         ({"band": "nisp_red"}, "band nisp_red: spectra through a grism cannot be drawn"),
         ({"band": "lsst_i"}, "band lsst_i: the lake has fluxes in .*; add the band to fluxes.bands"),
         ({"camera": "lsscam"}, "camera: 'lsscam' is not allowed: did you mean lsstcam"),
         ({"camera": "vis"}, "band: 'lsst_r' is not one of euclid_vis"),
-        ({"exposure": 9}, "exposure 9: the lake has no exposure with this number"),
+        ({"exposure": 9}, "exposure 9: the lake has no exposure with this number; it has 1$"),
+        ({"exposure": "VIS"}, r"^exposure must be the number of a planned exposure, got 'VIS'; lake.table\("),
+        (
+            {"exposure_time": 600.0},
+            "^lake.render has no argument exposure_time: the exposure time is that of the camera.*; allowed: ra, dec",
+        ),
+        ({"sizes": 3.0}, r"^lake.render has no argument sizes: did you mean size\? allowed: ra, dec, size, band, cam"),
+        ({"band": ["euclid_vis", "lsst_r"]}, "^band must be the name of one passband, .*: call lake.render once for"),
         ({"exposure": 1, "ra": 53.4, "dec": DEC}, "on none of the 1 planned detectors"),
         ({"ra": "x"}, "ra = 'x' must be a number in degrees, or hours"),
         ({"accuracy": "fast"}, "accuracy = 'fast' is not one of quicklook"),
         ({"without": [3]}, "without: there is no source or arc 3 in this image or around it"),
         ({"without": [3.0]}, "without = 3.0 is not a whole number"),
+        ({"without": 12345}, r"^without = 12345 is not a list of whole numbers: write without=\[12345\]$"),
+        ({"without": "all"}, "^without = 'all' is not a list of whole numbers$"),
         ({"effects": ["ghosts"]}, "effects: 'ghosts' cannot be applied to a window"),
+        (
+            {"effects": "none", "ra": 10.0},
+            r"""^effects must be a list such as \["poisson"\], got 'none'; effects=\[\] for none$""",
+        ),
         ({"date": "2001-02-30"}, "date"),
         ({"extra": {"ra": [RA], "dec": [DEC]}}, "^extra: column mag is missing"),
+        ({"extra": "nowhere.csv"}, "^extra: nowhere.csv: no such file"),
         ({"extra": {"ra": [RA], "dec": [DEC], "mag": [99.0]}}, "^extra: column mag of row 1 is 99, but must be"),
     ],
 )

@@ -130,6 +130,18 @@ def test_request_and_lake_may_be_options_of_a_job():
         (["render", "r", "l", "--limit"], "truesky render: --limit requires a value; see truesky render --help"),
         (["render", "r", "l", "--detectors"], "truesky render: --detectors requires at least one value"),
         (["run", "r", "l", "--dry-run=1"], "truesky run: --dry-run takes no value, got '1'"),
+        (
+            ["render", "r", "l", "--dry-run"],
+            "truesky render: there is no option --dry-run; truesky plan REQUEST LAKE --dry-run prints a forecast;",
+        ),
+        (
+            ["inject", "a.csv", "a.fits", "--psf", "0.8", "b.fits"],
+            "truesky inject: the image comes before the rows: write truesky inject a.fits a.csv b.fits --psf 0.8",
+        ),
+        (
+            ["stamps", "a.parquet", "l", "out"],
+            "truesky stamps: the lake comes before the places: write truesky stamps l a.parquet out",
+        ),
         (["cache", "--prune", "--all", "--limit", "1"], "truesky cache: --limit must not be used with --all"),
         (["list", "l", "galaxies", "stars"], "truesky list: unexpected argument stars"),
         (["list", "l", "galaxies", "a", "b"], "truesky list: unexpected arguments a b"),

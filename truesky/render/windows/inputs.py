@@ -126,11 +126,32 @@ def refuse_uncovered(catalogue: read.Version, task: Mapping[str, Any]) -> None:
     nearby_cells = sky.cells_in_cone(task["ra"], task["dec"], task["radius"], READ_ORDER)
     inside = np.isin(sky.parent(nearby_cells, READ_ORDER, GENERATION_ORDER), cells)
     if not inside.all():
-        place = f"ra {task['ra']:.5f}, dec {task['dec']:.5f}"
         if not inside.any():
-            raise BadInput(f"{place}: outside the area of the catalogue{_where(cells, task['ra'], task['dec'])}")
-        percent = 100.0 * inside.mean()
+            raise outside_area(cells, task["ra"], task["dec"])
+        place, percent = _format_place(task["ra"], task["dec"]), 100.0 * inside.mean()
         raise BadInput(f"{place}: cut by the edge of the catalogue, which has {percent:.0f} % of the surroundings")
+
+
+def outside_area(cells: Int, ra: float, dec: float) -> BadInput:
+    """Return the error for a place outside the cells of a catalogue.
+
+    Parameters
+    ----------
+    cells : int array
+        Cells of the catalogue, of order 8.
+    ra, dec : float
+        The place, deg.
+
+    Returns
+    -------
+    BadInput
+        The error, which tells where the cells are, or asks whether ra and dec are exchanged.
+    """
+    return BadInput(f"{_format_place(ra, dec)}: outside the area of the catalogue{_where(cells, ra, dec)}")
+
+
+def _format_place(ra: float, dec: float) -> str:
+    return f"ra {ra:.5f}, dec {dec:.5f}"
 
 
 def refuse_unknown(rows: Rows, without: Sequence[int]) -> None:
