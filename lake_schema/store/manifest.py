@@ -27,6 +27,8 @@ from lake_schema.store.provenance import canonical, digest, file_sha256
 
 # Keys that every manifest must have, and the types of their values.
 _FACT_TYPES = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+# Keys that the entry of each partition in a manifest must have, and the types of their values.
+_PART_TYPES = {"name": str, "facts": dict}
 # Keys that the entry of each file in a manifest must have, and the types of their values.
 _ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
@@ -53,7 +55,7 @@ def load(folder: Folder, table: str) -> Manifest:
     path = folder / MANIFEST
     try:
         facts = _read_manifest(path) if isinstance(path, ObjectPath) else _read_once(path, *file_state(path))
-    except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
         raise Damaged(f"{path} belongs to table {facts['table']}, version {facts['key']}")
@@ -101,6 +103,8 @@ def _read_once(path: Path, *state: int) -> Manifest:
 
 def _read_manifest(path: Folder) -> Manifest:
     facts = json.loads(path.read_bytes())
+    if not isinstance(facts, dict):
+        raise Damaged(f"{path}: must contain a JSON object")
     seal = facts.pop("digest")
     if digest(facts) != seal:
         raise Damaged(f"{path} has changed since it was written: its digest differs")
@@ -113,7 +117,7 @@ def _is_manifest(facts: Any) -> bool:
     return (
         _has_types(facts, _FACT_TYPES)
         and type(facts.get("deflection_deg", 0.0)) is float
-        and all(_has_types(part, {"name": str}) for part in facts["parts"])
+        and all(_has_types(part, _PART_TYPES) for part in facts["parts"])
         and all(_is_entry(entry) for entry in facts["files"])
     )
 
