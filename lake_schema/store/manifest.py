@@ -18,8 +18,8 @@ from uuid import uuid4
 
 import pyarrow as pa
 
-from lake_schema import sky
-from lake_schema.errors import Damaged
+from lake_schema import sky, user_files
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import blocks, layout, parquet
 from lake_schema.store.object_storage.s3 import MANIFEST, Folder, ObjectPath
 from lake_schema.store.plan import Json
@@ -50,11 +50,15 @@ def load(folder: Folder, table: str) -> Manifest:
     Raises
     ------
     Damaged
-        If the manifest is missing, incomplete, or changed since it was written, or belongs to another version or table.
+        If the manifest is missing, not a regular file, too large, incomplete, or changed since it was written, or
+        belongs to another version or table.
     """
     path = folder / MANIFEST
     try:
         facts = _read_manifest(path) if isinstance(path, ObjectPath) else _read_once(path, *file_state(path))
+    except BadInput as error:
+        # The file is not a regular file, or too large.
+        raise Damaged(error) from None
     except (OSError, ValueError, KeyError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
@@ -102,7 +106,8 @@ def _read_once(path: Path, *state: int) -> Manifest:
 
 
 def _read_manifest(path: Folder) -> Manifest:
-    facts = json.loads(path.read_bytes())
+    # Object storage has neither pipes nor devices, and `ObjectPath.read_bytes` limits the size.
+    facts = json.loads(path.read_bytes() if isinstance(path, ObjectPath) else user_files.read_bytes(path, "manifest"))
     if not isinstance(facts, dict):
         raise Damaged(f"{path}: must contain a JSON object")
     seal = facts.pop("digest")

@@ -1,10 +1,13 @@
 """Manifests with wrong contents are refused in one line by every reader."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
-from lake_schema import listing
+from lake_schema import listing, user_files
 from lake_schema.errors import Damaged
 from lake_schema.store import garbage, manifest, publish, read
 from lake_schema.store.provenance import digest
@@ -49,4 +52,38 @@ def test_a_manifest_that_is_not_an_object_is_damaged(lake, published, reader, te
 def test_facts_of_a_partition_must_be_an_object(published, value):
     rewrite(published, lambda facts: facts["parts"][0].update(facts=value))
     with pytest.raises(Damaged, match="not a valid manifest"):
+        manifest.load(published, "plain")
+
+
+# Program that prints the row of a lake's only version, with limited memory.
+LIST = """
+import resource, sys
+from pathlib import Path
+from lake_schema import listing
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+(row,) = listing.rows(Path(sys.argv[1]))
+print(row["rows"], row["error"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("replace", "kind"),
+    [
+        (os.mkfifo, "pipe"),
+        (lambda path: path.symlink_to("/dev/zero"), "device"),
+        (lambda path: path.mkdir(), "folder"),
+    ],
+)
+def test_a_manifest_that_is_not_a_regular_file_is_damaged(lake, published, replace, kind):
+    """Another process reads it, because a process that waits for a pipe must be killed."""
+    path = published / "manifest.json"
+    path.unlink()
+    replace(path)
+    result = subprocess.run([sys.executable, "-c", LIST, lake], capture_output=True, text=True, timeout=20)
+    assert result.stdout == f"None {path}: is a {kind}, but must be a file: a manifest\n", result.stderr
+
+
+def test_a_large_manifest_is_refused_unread(published, monkeypatch):
+    monkeypatch.setitem(user_files.MAX_BYTES, "manifest", 100)
+    with pytest.raises(Damaged, match=r"manifest\.json: is larger than 100 bytes, the limit for a manifest"):
         manifest.load(published, "plain")
