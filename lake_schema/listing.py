@@ -63,7 +63,8 @@ def _version_rows(root: Folder, name: str, table_names: Sequence[str]) -> list[d
         requests = sorted(request for request, held_key in keys_by_request.items() if held_key == key)
         row: dict[str, Any] = {"table": name, "version": key, "names": requests, "current": key == current}
         try:
-            contents = manifest.load(folder, name)
+            # The path is checked again, because a folder of the table can be a link that leads out of the lake.
+            contents = manifest.load(layout.version_folder(root, name, key), name)
             published_at = datetime.fromtimestamp((folder / MANIFEST).stat().st_mtime, UTC)
             row |= {
                 "published": f"{published_at:%Y-%m-%dT%H:%M:%SZ}",

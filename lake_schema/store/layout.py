@@ -228,8 +228,13 @@ def version_folder(root: Below, table_name: str, key: str) -> Below:
     -------
     Path or ObjectPath
         The folder, which need not exist.
+
+    Raises
+    ------
+    BadInput
+        If a name is not valid, or the folder is a link that leads out of the lake.
     """
-    return table_folder(root, table_name) / f"v-{check_name(key)}"
+    return check_inside(root, root / check_name(table_name) / f"v-{check_name(key)}")
 
 
 def current_link(root: Below, table_name: str) -> Below:

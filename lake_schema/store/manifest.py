@@ -55,7 +55,11 @@ def load(folder: Folder, table: str) -> Manifest:
     """
     path = folder / MANIFEST
     try:
-        facts = _read_manifest(path) if isinstance(path, ObjectPath) else _read_once(path, *file_state(path))
+        if isinstance(path, Path):
+            refuse_links(path.parent, MANIFEST)
+            facts = _read_once(path, *file_state(path))
+        else:
+            facts = _read_manifest(path)
     except BadInput as error:
         # The file is not a regular file, or too large.
         raise Damaged(error) from None
@@ -139,7 +143,7 @@ def _is_entry(entry: Any) -> bool:
     return not path.is_absolute() and ".." not in path.parts
 
 
-def _has_types(value: Any, types: dict[str, type]) -> bool:
+def _has_types(value: Any, types: Mapping[str, type]) -> bool:
     return isinstance(value, dict) and all(type(value.get(key)) is expected for key, expected in types.items())
 
 
@@ -163,14 +167,29 @@ def check_size(folder: Folder, entry: Json) -> Folder:
     Raises
     ------
     Damaged
-        If the file is on disc, and is missing or has another size.
+        If the file is on disc, and is missing or has another size, or the file or a folder above it is a symbolic link.
     """
-    path: Folder = folder / entry["path"]
-    if isinstance(path, ObjectPath):
-        return path
+    relative: str = entry["path"]
+    if isinstance(folder, ObjectPath):
+        return folder / relative
+    refuse_links(folder, relative)
+    path = folder / relative
     if fault := _size_fault(path, entry):
         raise Damaged(fault)
     return path
+
+
+def refuse_links(folder: Path, relative: str) -> None:
+    """Raise Damaged if a file or folder of a version, or a folder above it in the version, is a symbolic link.
+
+    `folder` is the folder of the version and `relative` the path in it. truesky makes no such links, and one could lead
+    out of the lake.
+    """
+    path = folder
+    for name in PurePosixPath(relative).parts:
+        path /= name
+        if path.is_symlink():
+            raise Damaged(f"{path} is a symbolic link, but the files of a version must not be linked")
 
 
 def check_contents(folder: Folder, entry: Json) -> Path:
@@ -212,7 +231,7 @@ def _size_fault(path: Path, entry: Json) -> str:
 
 
 def _size_difference(path: Path, entry: Json) -> str:
-    if not path.is_file() or path.is_symlink():
+    if not path.is_file():
         return f"{path} is missing"
     size = path.stat().st_size
     if size != entry["bytes"]:

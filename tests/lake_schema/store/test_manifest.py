@@ -67,20 +67,22 @@ print(row["rows"], row["error"])
 
 
 @pytest.mark.parametrize(
-    ("replace", "kind"),
+    ("replace", "words"),
     [
-        (os.mkfifo, "pipe"),
-        (lambda path: path.symlink_to("/dev/zero"), "device"),
-        (lambda path: path.mkdir(), "folder"),
+        (os.mkfifo, "is a pipe, but must be a file: a manifest"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a symbolic link"),
+        (lambda path: path.mkdir(), "is a folder, but must be a file: a manifest"),
     ],
 )
-def test_a_manifest_that_is_not_a_regular_file_is_damaged(lake, published, replace, kind):
+def test_a_manifest_that_is_not_a_regular_file_is_damaged(lake, published, replace, words):
     """Another process reads it, because a process that waits for a pipe must be killed."""
     path = published / "manifest.json"
     path.unlink()
     replace(path)
     result = subprocess.run([sys.executable, "-c", LIST, lake], capture_output=True, text=True, timeout=20)
-    assert result.stdout == f"None {path}: is a {kind}, but must be a file: a manifest\n", result.stderr
+    assert result.stdout.startswith("None "), result.stderr
+    assert str(path) in result.stdout
+    assert words in result.stdout
 
 
 def test_a_large_manifest_is_refused_unread(published, monkeypatch):

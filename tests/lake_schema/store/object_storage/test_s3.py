@@ -129,5 +129,5 @@ def test_versions_of_two_tables_are_not_confused(monkeypatch):
 def test_a_large_object_is_refused_unread(monkeypatch):
     monkeypatch.setitem(user_files.MAX_BYTES, "manifest", 100)
     monkeypatch.setattr(s3.ObjectStore, "open", lambda store, *parts: pa.BufferReader(bytes(101)))
-    with pytest.raises(Damaged, match="^s3://sky/a/stars/current is larger than 100 bytes$"):
+    with pytest.raises(Damaged, match=r"^s3://sky/a/stars/current is larger than 100 bytes$"):
         (layout.open_lake("s3://sky/a") / "stars/current").read_bytes()
