@@ -104,7 +104,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     Raises
     ------
     BadInput
-        If there is no such table.
+        If there is no such table, or the lake cannot be written.
     Damaged
         If a link or a manifest is broken, so that it is unknown which versions are needed. Nothing is removed then.
     """
@@ -119,6 +119,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     # same name below.
     removed = _delete_marked(root, selected)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(layout.report_unwritable(root))
         # Lock all tables, so that nothing is published during the removal. Then follow the links again, because a
         # version may have been published since the first pass.
         for table in existing_tables:
