@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 
 from lake_schema import listing, user_files
-from lake_schema.errors import Damaged
-from lake_schema.store import garbage, manifest, publish, read
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import garbage, layout, manifest, publish, read
 from lake_schema.store.provenance import digest
 from tests.universe import plain_plan, plain_work
 
@@ -88,4 +89,54 @@ def test_a_manifest_that_is_not_a_regular_file_is_damaged(lake, published, repla
 def test_a_large_manifest_is_refused_unread(published, monkeypatch):
     monkeypatch.setitem(user_files.MAX_BYTES, "manifest", 100)
     with pytest.raises(Damaged, match=r"manifest\.json: is larger than 100 bytes, the limit for a manifest"):
+        manifest.load(published, "plain")
+
+
+def test_blanks_around_a_manifest_mean_nothing(published):
+    path = published / "manifest.json"
+    expected = manifest.load(published, "plain")
+    path.write_bytes(b" \n" * 1000 + path.read_bytes() + b"\r\t" * 1000)
+    assert manifest.load(published, "plain") == expected
+
+
+def test_a_manifest_with_too_many_values_is_refused_before_it_is_parsed(published, monkeypatch):
+    monkeypatch.setattr(manifest, "_MAX_VALUES", 1000)
+    (published / "manifest.json").write_text("[" + "{}," * 1000 + "this is not JSON")
+    with pytest.raises(Damaged, match=r"manifest\.json: has more than 1000 values, the limit for a manifest"):
+        manifest.load(published, "plain")
+
+
+def test_a_manifest_that_readers_would_refuse_is_not_published(lake, monkeypatch):
+    monkeypatch.setattr(manifest, "_MAX_VALUES", 10)
+    with pytest.raises(BadInput, match=r"manifest\.json: has more than 10 values, the limit for a manifest"):
+        publish.make_version(lake, plain_plan(), plain_work)
+    assert layout.current_key(lake, "plain") is None
+
+
+@pytest.mark.parametrize("read_keys", [listing.rows, garbage.collect])
+def test_many_keys_in_a_manifest_take_linear_time(lake, published, read_keys):
+    """A look for the folder of each key would take 80 microseconds."""
+    keys = [f"{i:016x}" for i in range(100_000)]
+    rewrite(published, lambda facts: facts["facts"].update(keys=keys))
+    began = time.process_time()
+    read_keys(lake)
+    assert time.process_time() - began < 3.0
+
+
+def test_many_files_in_a_manifest_are_all_checked(published):
+    def add_files(facts):
+        (entry, *_) = facts["files"]
+        facts["files"] += [{**entry, "path": f"dataset/x{i}.parquet"} for i in range(10_000)]
+
+    rewrite(published, add_files)
+    assert len(manifest.load(published, "plain").by_path) == 10_003
+    rewrite(published, lambda facts: facts["files"][-1].update(bytes=1))
+    with pytest.raises(Damaged, match="not a valid manifest"):
+        manifest.load(published, "plain")
+
+
+@pytest.mark.parametrize("entry", [{"path": "/etc/passwd"}, {"path": "dataset/../../x"}, {"blocks": "AAAA"}])
+def test_a_wrong_entry_of_a_file_is_damaged(published, entry):
+    rewrite(published, lambda facts: facts["files"][1].update(entry))
+    with pytest.raises(Damaged, match="not a valid manifest"):
         manifest.load(published, "plain")
