@@ -195,7 +195,7 @@ def check_size(folder: Folder, entry: Json) -> Folder:
 
 
 def refuse_links(folder: Path, relative: str) -> None:
-    """Raise Damaged if a file or folder of a version, or a folder above it in the version, is a symbolic link.
+    """Raise Damaged if a file or folder of a version, or a folder above it in the version, is a link or unreadable.
 
     `folder` is the folder of the version and `relative` the path in it. truesky makes no such links, and one could lead
     out of the lake.
@@ -203,7 +203,12 @@ def refuse_links(folder: Path, relative: str) -> None:
     path = folder
     for name in PurePosixPath(relative).parts:
         path /= name
-        if path.is_symlink():
+        try:
+            is_link = path.is_symlink()
+        except OSError as error:
+            # The name is too long, for example.
+            raise Damaged(f"{path} cannot be read: {error.strerror}") from None
+        if is_link:
             raise Damaged(f"{path} is a symbolic link, but the files of a version must not be linked")
 
 

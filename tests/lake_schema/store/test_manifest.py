@@ -140,3 +140,9 @@ def test_a_wrong_entry_of_a_file_is_damaged(published, entry):
     rewrite(published, lambda facts: facts["files"][1].update(entry))
     with pytest.raises(Damaged, match="not a valid manifest"):
         manifest.load(published, "plain")
+
+
+@pytest.mark.parametrize("path", ["dataset/" + "x" * 300, "x/" * 100_000 + "0.parquet"])
+def test_a_path_that_is_too_long_is_damaged(published, path):
+    with pytest.raises(Damaged, match="cannot be read: File name too long"):
+        manifest.check_size(published, {"path": path, "bytes": 1})
