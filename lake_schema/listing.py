@@ -5,7 +5,7 @@ A version is one publication of a table; a request is a named set of settings fo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from datetime import UTC, datetime
 from typing import Any
 
@@ -45,31 +45,32 @@ def rows(root: Folder) -> list[dict[str, Any]]:
     """
     if not (table_names := garbage.table_names(root)):
         raise layout.missing_table(root)
+    existing_keys = {name: garbage.existing_versions(root, name) for name in table_names}
     return [
         row
         for name in table_names
-        for row in sorted(_version_rows(root, name, table_names), key=lambda row: row["published"])
+        for row in sorted(_version_rows(root, name, existing_keys), key=lambda row: row["published"])
     ]
 
 
-def _version_rows(root: Folder, name: str, table_names: Sequence[str]) -> list[dict[str, Any]]:
+def _version_rows(root: Folder, name: str, existing_keys: Mapping[str, Set[str]]) -> list[dict[str, Any]]:
     current, keys_by_request, version_rows = (
         layout.current_key(root, name),
         request_links.keys_by_request(root, name),
         [],
     )
-    for folder in layout.table_folder(root, name).glob("v-*"):
-        key = folder.name.removeprefix("v-")
+    for key in sorted(existing_keys[name]):
         requests = sorted(request for request, held_key in keys_by_request.items() if held_key == key)
         row: dict[str, Any] = {"table": name, "version": key, "names": requests, "current": key == current}
         try:
+            folder = layout.version_folder(root, name, key)
             contents = manifest.load(folder, name)
             published_at = datetime.fromtimestamp((folder / MANIFEST).stat().st_mtime, UTC)
             row |= {
                 "published": f"{published_at:%Y-%m-%dT%H:%M:%SZ}",
                 "rows": contents["rows"],
                 "bytes": sum(entry["bytes"] for entry in contents["files"]),
-                "made_of": _input_keys(root, contents["facts"], table_names),
+                "made_of": _input_keys(contents["facts"], existing_keys),
             }
         except (LakeError, OSError) as error:
             row |= {"published": "", "rows": None, "bytes": None, "made_of": {}, "error": str(error)}
@@ -77,12 +78,9 @@ def _version_rows(root: Folder, name: str, table_names: Sequence[str]) -> list[d
     return version_rows
 
 
-def _input_keys(root: Folder, facts: Mapping[str, Any], table_names: Sequence[str]) -> dict[str, list[str]]:
-    keys = sorted(set(request_links.version_keys_in(facts)))
-    keys_by_table = {
-        name: [key for key in keys if layout.version_folder(root, name, key).exists()] for name in table_names
-    }
-    return {name: existing_keys for name, existing_keys in keys_by_table.items() if existing_keys}
+def _input_keys(facts: Mapping[str, Any], existing_keys: Mapping[str, Set[str]]) -> dict[str, list[str]]:
+    keys = set(request_links.version_keys_in(facts))
+    return {name: sorted(keys & existing) for name, existing in existing_keys.items() if keys & existing}
 
 
 def format_table(version_rows: Sequence[Mapping[str, Any]]) -> str:

@@ -40,7 +40,7 @@ MAX_BYTES = {
     "run log": _GB,
     "master frame": _GB,
     "calibrated image": 16 * _GB,
-    "manifest": 4 * _GB,
+    "manifest": _GB,
 }
 # Largest number of characters of a path in an error message; the middle of a longer path is left out.
 _MAX_SHOWN_LENGTH = 200
@@ -172,19 +172,28 @@ _FILE_TYPES = (
 )
 
 
+def read_bytes(path: Path, kind: str) -> bytes:
+    """Return the contents of a regular file.
+
+    `kind` is the type of file, a key of `MAX_BYTES`. BadInput is raised if the file cannot be read, is larger than the
+    limit of its type, or grows while it is read.
+    """
+    with open_file(path, kind) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        data = stream.read(size + 1)
+    if len(data) > size:
+        raise BadInput(f"{format_path(path)}: has grown while it was read")
+    return data
+
+
 def read_text(path: Path, kind: str) -> str:
     """Return the text of a UTF-8 file, without the byte order mark that Excel and Notepad write at its start.
 
     `kind` is the type of file, a key of `MAX_BYTES`. BadInput is raised if the file cannot be read, is larger than the
-    limit of its type, or is not UTF-8.
+    limit of its type, grows while it is read, or is not UTF-8.
     """
-    with open_file(path, kind) as stream:
-        # Read at most one byte more than the limit, because the file may have grown since `open_file` checked its size.
-        data = stream.read(MAX_BYTES[kind] + 1)
-    if len(data) > MAX_BYTES[kind]:
-        raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the limit for a {kind}")
     try:
-        return data.decode("utf-8-sig")
+        return read_bytes(path, kind).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInput(f"{format_path(path)}: {error}") from None
 

@@ -14,13 +14,12 @@ import base64
 import hashlib
 import io
 import os
+import struct
 import zlib
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from lake_schema.errors import Damaged
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
@@ -31,7 +30,8 @@ from lake_schema.store.plan import Json
 _MIN_BYTES = 16 << 10
 # Largest size in bytes of a block, a range of a file with one checksum. A larger range is divided.
 _MAX_BYTES = 8 << 20
-_RECORD = np.dtype([("bytes", "<u4"), ("crc", "<u4")])
+# Form of the record of a block in the manifest: its size in bytes and its CRC-32.
+_RECORD = struct.Struct("<II")
 
 
 def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
             data = stream.read(end - start)
             file_hash.update(data)
             block_checksums.append((len(data), zlib.crc32(data)))
-    blocks = base64.b64encode(np.array(block_checksums, _RECORD).tobytes()).decode()
+    blocks = base64.b64encode(b"".join(_RECORD.pack(*block) for block in block_checksums)).decode()
     return {"bytes": size, "sha256": file_hash.hexdigest(), "blocks": blocks}
 
 
@@ -89,11 +89,17 @@ def decode_blocks(entry: Json) -> list[tuple[int, int]]:
         If the entry has no key "blocks", its value is not valid base64, it lists no blocks, or their sizes do not add
         up to the size of the file.
     """
-    blocks = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
-    ends = np.cumsum(blocks["bytes"], dtype=np.int64)
-    if not ends.size or ends[-1] != entry["bytes"]:
+    data = base64.b64decode(entry["blocks"], validate=True)
+    if len(data) % _RECORD.size:
+        raise ValueError("the last record of a block is cut short")
+    # For the few blocks of a file, the standard library is faster than numpy. A manifest can have 1e5 files.
+    end, blocks = 0, []
+    for size, crc in _RECORD.iter_unpack(data):
+        end += size
+        blocks.append((end, crc))
+    if not blocks or end != entry["bytes"]:
         raise ValueError("the blocks do not add up to the size of the file")
-    return list(zip(ends.tolist(), blocks["crc"].tolist(), strict=True))
+    return blocks
 
 
 class VerifiedFile(io.RawIOBase):

@@ -32,6 +32,11 @@ def table_names(root: Folder) -> list[str]:
     return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.table_names(root)))
 
 
+def existing_versions(root: Folder, name: str) -> set[str]:
+    """Return the keys of all versions of a table, whether or not a link leads to them."""
+    return {path.name.removeprefix("v-") for path in layout.table_folder(root, name).glob("v-*")}
+
+
 def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
     """Return the keys of the versions that must be kept, because a link leads to them or a kept version used them.
 
@@ -66,7 +71,7 @@ def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) ->
             raise Damaged(f"{link} leads to v-{key}, which is missing: nothing is removed")
     kept_keys: dict[str, set[str]] = defaultdict(set, {name: set(keys) for name, keys in (previous or {}).items()})
     pending = [(name, key) for name, key, _ in links if key is not None]
-    existing_tables = table_names(root)
+    existing_keys = {name: existing_versions(root, name) for name in table_names(root)}
     while pending:
         name, key = pending.pop()
         if key in kept_keys[name]:
@@ -75,9 +80,7 @@ def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) ->
         made_of = set(
             request_links.version_keys_in(manifest.load(layout.version_folder(root, name, key), name)["facts"])
         )
-        pending += [
-            (other, k) for other in existing_tables for k in made_of if layout.version_folder(root, other, k).exists()
-        ]
+        pending += [(other, k) for other, existing in existing_keys.items() for k in made_of & existing]
     return kept_keys
 
 
@@ -104,7 +107,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     Raises
     ------
     BadInput
-        If there is no such table.
+        If there is no such table, or the lake cannot be written.
     Damaged
         If a link or a manifest is broken, so that it is unknown which versions are needed. Nothing is removed then.
     """
@@ -119,6 +122,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     # same name below.
     removed = _delete_marked(root, selected)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(layout.report_unwritable(root))
         # Lock all tables, so that nothing is published during the removal. Then follow the links again, because a
         # version may have been published since the first pass.
         for table in existing_tables:

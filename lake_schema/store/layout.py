@@ -18,9 +18,11 @@ one version of each table. The layout of a lake is::
 
 from __future__ import annotations
 
+import errno
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -35,6 +37,8 @@ _CELL_PATH = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
 _VERSION_LINK = re.compile(r"(?:\.\./\.\./(?P<table>[a-z0-9_-]+)/)?v-(?P<key>[0-9a-f]{16})", re.ASCII)
 _NAMES, _RUNS = "names", "runs"
 _REMOTE_ADDRESS = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
+# Numbers of the errors of the operating system that mean that a file or folder cannot be written.
+UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 _FILE_URL = re.compile(r"file:(?://(?:localhost)?)?(/(?!/).*)", re.IGNORECASE | re.DOTALL)
 
 
@@ -228,8 +232,13 @@ def version_folder(root: Below, table_name: str, key: str) -> Below:
     -------
     Path or ObjectPath
         The folder, which need not exist.
+
+    Raises
+    ------
+    BadInput
+        If a name is not valid, or the folder is a link that leads out of the lake.
     """
-    return table_folder(root, table_name) / f"v-{check_name(key)}"
+    return check_inside(root, root / check_name(table_name) / f"v-{check_name(key)}")
 
 
 def current_link(root: Below, table_name: str) -> Below:
@@ -487,3 +496,20 @@ def check_inside(root: Below, path: Below) -> Below:
     if not inside:
         raise BadInput(f"path {user_files.format_path(path)} is outside {root}")
     return path
+
+
+@contextmanager
+def report_unwritable(root: Path) -> Iterator[None]:
+    """Raise BadInput in the body of a `with` statement if the operating system does not allow writing to a lake.
+
+    The message names `root`, the folder of the lake. Errors that concern files outside the lake are not changed.
+    """
+    try:
+        yield
+    except OSError as error:
+        path = root if error.filename is None else Path(os.fsdecode(error.filename))
+        # If the lake does not exist yet, the error concerns a folder above it.
+        if error.errno not in UNWRITABLE or not (path.is_relative_to(root) or root.is_relative_to(path)):
+            raise
+        place = "" if path == root else f": {user_files.format_path(path)}"
+        raise BadInput(f"lake {root} cannot be written{place}: {error.strerror}") from None

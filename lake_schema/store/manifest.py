@@ -18,8 +18,8 @@ from uuid import uuid4
 
 import pyarrow as pa
 
-from lake_schema import sky
-from lake_schema.errors import Damaged
+from lake_schema import sky, user_files
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import blocks, layout, parquet
 from lake_schema.store.object_storage.s3 import MANIFEST, Folder, ObjectPath
 from lake_schema.store.plan import Json
@@ -27,8 +27,13 @@ from lake_schema.store.provenance import canonical, digest, file_sha256
 
 # Keys that every manifest must have, and the types of their values.
 _FACT_TYPES = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+# Keys that the entry of each partition in a manifest must have, and the types of their values.
+_PART_TYPES = {"name": str, "facts": dict}
 # Keys that the entry of each file in a manifest must have, and the types of their values.
 _ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
+# Largest number of values in a manifest. An image has about 35, so that this is sufficient for 900,000 images. A value
+# takes up to 72 bytes of memory, an empty list for example.
+_MAX_VALUES = 1 << 25
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
@@ -36,10 +41,12 @@ def write(folder: Path, facts: Json) -> None:
     """Write the manifest of a version into its folder, and sync it to disc.
 
     It contains `facts` (JSON values: files, rows, inputs) and their sha256 as "digest". An existing manifest is
-    replaced in one rename. ValueError is raised for NaN or an infinity in `facts`.
+    replaced in one rename. ValueError is raised for NaN or an infinity in `facts`, and BadInput if the manifest is too
+    large for readers.
     """
-    plain = json.loads(canonical(facts))
-    write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
+    plain, path = json.loads(canonical(facts)), folder / MANIFEST
+    write_json(path, {**plain, "digest": digest(plain)})
+    _refuse_many_values(path, user_files.read_bytes(path, "manifest"))
 
 
 def load(folder: Folder, table: str) -> Manifest:
@@ -48,12 +55,20 @@ def load(folder: Folder, table: str) -> Manifest:
     Raises
     ------
     Damaged
-        If the manifest is missing, incomplete, or changed since it was written, or belongs to another version or table.
+        If the manifest is missing, not a regular file, too large, incomplete, or changed since it was written, or
+        belongs to another version or table.
     """
     path = folder / MANIFEST
     try:
-        facts = _read_manifest(path) if isinstance(path, ObjectPath) else _read_once(path, *file_state(path))
-    except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        if isinstance(path, Path):
+            refuse_links(path.parent, MANIFEST)
+            facts = _read_once(path, *file_state(path))
+        else:
+            facts = _read_manifest(path)
+    except BadInput as error:
+        # The file is not a regular file, is too large or has too many values.
+        raise Damaged(error) from None
+    except (OSError, ValueError, KeyError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
         raise Damaged(f"{path} belongs to table {facts['table']}, version {facts['key']}")
@@ -100,7 +115,14 @@ def _read_once(path: Path, *state: int) -> Manifest:
 
 
 def _read_manifest(path: Folder) -> Manifest:
-    facts = json.loads(path.read_bytes())
+    # Object storage has neither pipes nor devices, and `ObjectPath.read_bytes` limits the size.
+    data = path.read_bytes() if isinstance(path, ObjectPath) else user_files.read_bytes(path, "manifest")
+    _refuse_many_values(path, data)
+    # Strip the text first, because the JSON reader takes 30 ns for each blank at its start or end. A character of an
+    # ASCII text takes one byte of memory, of another text up to four.
+    facts = json.loads(data.decode("ascii").strip())
+    if not isinstance(facts, dict):
+        raise Damaged(f"{path}: must contain a JSON object")
     seal = facts.pop("digest")
     if digest(facts) != seal:
         raise Damaged(f"{path} has changed since it was written: its digest differs")
@@ -109,11 +131,17 @@ def _read_manifest(path: Folder) -> Manifest:
     return Manifest(facts)
 
 
+def _refuse_many_values(path: Folder, data: bytes) -> None:
+    # Each value in JSON follows a comma or an opening bracket, except the value of the file itself.
+    if sum(data.count(mark) for mark in (b",", b"[", b"{")) > _MAX_VALUES:
+        raise BadInput(f"{path}: has more than {_MAX_VALUES} values, the limit for a manifest")
+
+
 def _is_manifest(facts: Any) -> bool:
     return (
         _has_types(facts, _FACT_TYPES)
         and type(facts.get("deflection_deg", 0.0)) is float
-        and all(_has_types(part, {"name": str}) for part in facts["parts"])
+        and all(_has_types(part, _PART_TYPES) for part in facts["parts"])
         and all(_is_entry(entry) for entry in facts["files"])
     )
 
@@ -121,16 +149,16 @@ def _is_manifest(facts: Any) -> bool:
 def _is_entry(entry: Any) -> bool:
     if not _has_types(entry, _ENTRY_TYPES) or type(entry.get("rows", 0)) is not int:
         return False
-    path = PurePosixPath(entry["path"])
-    if path.suffix == ".parquet" or "blocks" in entry:
+    path = entry["path"]
+    if path.endswith(".parquet") or "blocks" in entry:
         try:
             blocks.decode_blocks(entry)
         except (LookupError, TypeError, ValueError):
             return False
-    return not path.is_absolute() and ".." not in path.parts
+    return not path.startswith("/") and ".." not in path.split("/")
 
 
-def _has_types(value: Any, types: dict[str, type]) -> bool:
+def _has_types(value: Any, types: Mapping[str, type]) -> bool:
     return isinstance(value, dict) and all(type(value.get(key)) is expected for key, expected in types.items())
 
 
@@ -154,14 +182,34 @@ def check_size(folder: Folder, entry: Json) -> Folder:
     Raises
     ------
     Damaged
-        If the file is on disc, and is missing or has another size.
+        If the file is on disc, and is missing or has another size, or the file or a folder above it is a symbolic link.
     """
-    path: Folder = folder / entry["path"]
-    if isinstance(path, ObjectPath):
-        return path
+    relative: str = entry["path"]
+    if isinstance(folder, ObjectPath):
+        return folder / relative
+    refuse_links(folder, relative)
+    path = folder / relative
     if fault := _size_fault(path, entry):
         raise Damaged(fault)
     return path
+
+
+def refuse_links(folder: Path, relative: str) -> None:
+    """Raise Damaged if a file or folder of a version, or a folder above it in the version, is a link or unreadable.
+
+    `folder` is the folder of the version and `relative` the path in it. truesky makes no such links, and one could lead
+    out of the lake.
+    """
+    path = folder
+    for name in PurePosixPath(relative).parts:
+        path /= name
+        try:
+            is_link = path.is_symlink()
+        except OSError as error:
+            # The name is too long, for example.
+            raise Damaged(f"{path} cannot be read: {error.strerror}") from None
+        if is_link:
+            raise Damaged(f"{path} is a symbolic link, but the files of a version must not be linked")
 
 
 def check_contents(folder: Folder, entry: Json) -> Path:
@@ -203,7 +251,7 @@ def _size_fault(path: Path, entry: Json) -> str:
 
 
 def _size_difference(path: Path, entry: Json) -> str:
-    if not path.is_file() or path.is_symlink():
+    if not path.is_file():
         return f"{path} is missing"
     size = path.stat().st_size
     if size != entry["bytes"]:

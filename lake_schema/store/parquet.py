@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from lake_schema import votable
 from lake_schema.columns import Table
-from lake_schema.errors import Damaged
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import blocks
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
@@ -30,6 +31,14 @@ from lake_schema.store.plan import Json
 # circles on the sky and a small footer.
 ROWS_PER_GROUP = 65_536
 
+# Largest size in bytes of the numbers in a Parquet file after decoding, and of the texts. A compressed file can be a
+# million times smaller than its contents, so the size of the file does not limit the memory that reading it takes.
+MAX_DECODED_BYTES = 4 << 30
+# Texts are measured only if they may be larger than this, because they must be decoded for it.
+_MIN_MEASURED_BYTES = 64 << 20
+# Bytes per decoded number, by physical type of the column. The other types have values of different lengths.
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96": 12}
+_TEXT = "BYTE_ARRAY"
 _FORMAT = ds.ParquetFileFormat()
 # Linux folder with one folder per thread of this process.
 _THREADS = Path("/proc/self/task")
@@ -48,7 +57,14 @@ def write(path: Path, rows: pa.Table, table: Table) -> None:
         Rows. They are not compared with the declaration.
     table : Table
         Declaration of the table, which sets the compression and encoding of each column.
+
+    Raises
+    ------
+    BadInput
+        If the rows take more memory than the limit of a file.
     """
+    if rows.nbytes > MAX_DECODED_BYTES:
+        raise BadInput(f"table {table.name}: {rows.num_rows} rows of one file need {_describe_excess(rows.nbytes)}")
     with pq.ParquetWriter(path, rows.schema, **table.parquet_options()) as file:
         file.write_table(rows, row_group_size=ROWS_PER_GROUP)
         file.add_key_value_metadata(votable.footer_metadata(rows, table))
@@ -60,8 +76,12 @@ def file_checksums(path: Path) -> dict[str, Any]:
     A block is a range of bytes that is verified as a whole: the pages of one column of a row group with their headers.
     A small column shares its block with the next column, and a large column is divided into several blocks. The last
     blocks contain the page index and the footer. The result is that of `blocks.file_checksums`.
+
+    BadInput is raised if the numbers in the file take more memory than `MAX_DECODED_BYTES`.
     """
     metadata = pq.read_metadata(path)
+    if (size := _size_of_numbers(metadata)) > MAX_DECODED_BYTES:
+        raise BadInput(f"{path} needs {_describe_excess(size)}")
     starts, end = [], 4  # A Parquet file begins with a magic number of 4 bytes.
     for group in range(metadata.num_row_groups):
         for column in range(metadata.num_columns):
@@ -87,6 +107,15 @@ class Dataset(ds.FileSystemDataset):  # type: ignore[misc]
         """Message about the first file that differs from its checksums or cannot be read, "" without such a file."""
         return next((file.fault for file in self.verified_files if file.fault), "")
 
+    def to_table(self, columns: Sequence[str] | None = None, **options: Any) -> pa.Table:
+        """Return the rows as `pyarrow.dataset.Dataset.to_table` does, with the same arguments.
+
+        Damaged is raised if the texts of a file take more memory than `MAX_DECODED_BYTES`.
+        """
+        for file, fragment in zip(self.verified_files, self.get_fragments(), strict=True):
+            _refuse_large_texts(file, fragment.metadata, columns)
+        return super().to_table(columns=columns, **options)
+
 
 def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
     """Open Parquet files of a version of a table as one Arrow dataset, in the given order.
@@ -109,7 +138,8 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
     Raises
     ------
     Damaged
-        If the footer of a file or its number of rows differs from the manifest. The message names the file.
+        If the footer of a file or its number of rows differs from the manifest, or the numbers in the file take more
+        memory than `MAX_DECODED_BYTES`. The message names the file.
     """
     _register_end_of_reads()
     files = [blocks.VerifiedFile(folder / entry["path"], entry) for entry in entries]
@@ -123,7 +153,78 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
         rows = fragment.metadata.num_rows
         if rows != entry.get("rows", rows):
             raise Damaged(f"{file.path} has {rows} rows, the manifest says {entry['rows']}")
+        _refuse_large_numbers(file, fragment.metadata)
     return merged
+
+
+def _refuse_large_numbers(file: blocks.VerifiedFile, metadata: pq.FileMetaData) -> None:
+    if (size := _size_of_numbers(metadata)) > MAX_DECODED_BYTES:
+        raise Damaged(f"{file.path} needs {_describe_excess(size)}")
+
+
+def _size_of_numbers(metadata: pq.FileMetaData) -> int:
+    """Return the size in bytes of all decoded numbers of a file, from the numbers of values in its footer."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    num_rows: int = sum(group.num_rows for group in groups)
+    size = 0
+    for i in range(metadata.num_columns):
+        column = metadata.schema.column(i)
+        if column.physical_type == _TEXT:
+            continue
+        is_list = column.max_repetition_level > 0
+        count: int = sum(group.column(i).num_values for group in groups) if is_list else num_rows
+        width: int = _WIDTHS.get(column.physical_type, column.length)
+        size += count * width
+    return size
+
+
+def _refuse_large_texts(
+    file: blocks.VerifiedFile, metadata: pq.FileMetaData, columns: Sequence[str] | None = None
+) -> None:
+    """Raise Damaged if the texts in some columns (by default all) take more memory than `MAX_DECODED_BYTES`."""
+    size = 0
+    for i in range(metadata.num_columns):
+        column = metadata.schema.column(i)
+        if column.physical_type == _TEXT and (columns is None or column.path.partition(".")[0] in columns):
+            size += _size_of_texts(file, metadata, i)
+            if size > MAX_DECODED_BYTES:
+                raise Damaged(f"{file.path} needs {_describe_excess(size)}")
+
+
+def _size_of_texts(file: blocks.VerifiedFile, metadata: pq.FileMetaData, number: int) -> int:
+    """Return the size in bytes of the decoded texts in a column, or an upper limit if it is small."""
+    chunks = [metadata.row_group(i).column(number) for i in range(metadata.num_row_groups)]
+    # A text in a dictionary is stored once for any number of rows, so that each row can have the size of the chunk.
+    size: int = sum(
+        max(chunk.total_uncompressed_size, chunk.total_compressed_size)
+        * (chunk.num_values if chunk.has_dictionary_page else 1)
+        for chunk in chunks
+    )
+    if size <= _MIN_MEASURED_BYTES:
+        return size
+    path = metadata.schema.column(number).path
+    reader, size = pq.ParquetFile(file, metadata=metadata, read_dictionary=[path]), 0
+    for group in range(metadata.num_row_groups):
+        # Texts that are read as a dictionary are not repeated in memory.
+        for texts in reader.read_row_group(group, columns=[path]).column(0).chunks:
+            size += _num_bytes(texts)
+        if size > MAX_DECODED_BYTES:
+            break
+    return size
+
+
+def _num_bytes(texts: pa.Array) -> int:
+    while pa.types.is_list(texts.type):
+        texts = pc.list_flatten(texts)
+    if pa.types.is_dictionary(texts.type):
+        lengths = pc.binary_length(texts.dictionary).take(texts.indices)
+    else:
+        lengths = pc.binary_length(texts)
+    return int(pc.sum(lengths).as_py() or 0)
+
+
+def _describe_excess(size: int) -> str:
+    return f"{size / 1e9:.3g} GB of memory, more than the limit of {MAX_DECODED_BYTES / 1e9:.3g} GB"
 
 
 def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
@@ -146,10 +247,14 @@ def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> p
     Raises
     ------
     Damaged
-        If the file is missing or its bytes differ from the manifest. The message names the file.
+        If the file is missing, its bytes differ from the manifest, or its numbers or the texts in the columns take more
+        memory than `MAX_DECODED_BYTES`. The message names the file.
     """
     _register_end_of_reads()
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
+        metadata = pq.read_metadata(file)
+        _refuse_large_numbers(file, metadata)
+        _refuse_large_texts(file, metadata, columns)
         return pq.read_table(file, columns=None if columns is None else list(columns))
 
 

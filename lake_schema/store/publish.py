@@ -101,6 +101,8 @@ def make_version(
 
     Raises
     ------
+    BadInput
+        If the lake cannot be written.
     TasksFailed
         If tasks failed. The output of the other tasks is kept for the next run.
     Superseded
@@ -119,17 +121,18 @@ def make_version(
         # created in a lake that is not writable.
         _refuse_damaged(target, table)
         return target
-    folder.mkdir(parents=True, exist_ok=True)
-    if name is not None:
-        _pin_inputs(root, plan, name)
-    with locks.hold(lock, f"table {table}: another run is making version {key}", locks.SHORT_TIMEOUT):
-        if target.exists():
-            _refuse_damaged(target, table)
-        else:
-            stage = layout.stage_folder(root, table, key)
-            stage.mkdir(exist_ok=True)
-            _finish_stage(stage, plan, _run_tasks(root, plan, task_function, mapper, name))
-        _publish(root, plan, base, name)
+    with layout.report_unwritable(root):
+        folder.mkdir(parents=True, exist_ok=True)
+        if name is not None:
+            _pin_inputs(root, plan, name)
+        with locks.hold(lock, f"table {table}: another run is making version {key}", locks.SHORT_TIMEOUT):
+            if target.exists():
+                _refuse_damaged(target, table)
+            else:
+                stage = layout.stage_folder(root, table, key)
+                stage.mkdir(exist_ok=True)
+                _finish_stage(stage, plan, _run_tasks(root, plan, task_function, mapper, name))
+            _publish(root, plan, base, name)
     return target
 
 

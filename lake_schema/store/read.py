@@ -196,8 +196,8 @@ class Version:
     def sidecar_folder(self, relative: str) -> Path:
         """Return the path of a folder of the version, such as its folder of images.
 
-        A folder on disc is returned without any check. On object storage, all files in it are copied to a temporary
-        folder after their sha256 have been compared.
+        The files in a folder on disc are not checked. On object storage, all files in the folder are copied to a
+        temporary folder after their sha256 have been compared.
 
         Parameters
         ----------
@@ -212,13 +212,14 @@ class Version:
         Raises
         ------
         Damaged
-            If a copied file differs from the manifest.
+            If the folder or a folder above it in the version is a symbolic link, or a copied file differs from the
+            manifest.
         """
-        folder = self.folder / relative
-        if isinstance(folder, Path):
-            return folder
+        if isinstance(self.folder, Path):
+            manifest.refuse_links(self.folder, relative)
+            return self.folder / relative
         copies = [self.sidecar_path(path) for path in self._entries_by_path() if path.startswith(f"{relative}/")]
-        return folder.gather_copies(copies)
+        return (self.folder / relative).gather_copies(copies)
 
     def has_file(self, relative: str) -> bool:
         """Return True if the manifest lists a file.

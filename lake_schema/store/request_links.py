@@ -155,9 +155,17 @@ def write_area(root: Path, name: str, area: Mapping[str, Any]) -> None:
         Name of the request.
     area : mapping
         The area as JSON values.
+
+    Raises
+    ------
+    BadInput
+        If the area is not recorded yet and the lake cannot be written.
+    Damaged
+        If the area was recorded in a file that is not valid.
     """
     if read_area(root, name) != area:
-        write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, area)
+        with layout.report_unwritable(root):
+            write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, area)
 
 
 def read_area(root: Folder, name: str) -> dict[str, Any] | None:

@@ -16,7 +16,6 @@ from pathlib import Path
 from lake_schema.errors import Damaged
 from lake_schema.store import layout, manifest, request_links
 from lake_schema.store.plan import Json, Task
-from lake_schema.store.provenance import file_sha256
 from lake_schema.store.stage import write_receipt
 
 PRODUCT = "product"
@@ -97,18 +96,16 @@ def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task])
         files = [entry for path in previous["files"] if (entry := _intact_entry(version, entries[path])) is not None]
         if len(files) == len(previous["files"]):
             for entry in files:
-                _link_file(version / entry["path"], stage / entry["path"])
+                _link_file(version / entry["path"], layout.check_inside(stage, stage / entry["path"]))
             receipt = {"part": task.name, "rows": previous["rows"], "files": files, "machine": previous["machine"]}
             write_receipt(stage, {**receipt, "span": previous["span"]} if "span" in previous else receipt)
 
 
 def _intact_entry(folder: Path, entry: Json) -> Json | None:
     """Return the manifest entry of a file without its key "rows", or None if the file is missing or has changed."""
-    path = str(entry["path"])
     try:
-        if file_sha256(folder / path) != str(entry["sha256"]):
-            return None
-    except OSError:
+        manifest.check_contents(folder, entry)
+    except Damaged:
         return None
     return {key: value for key, value in entry.items() if key != "rows"}
 

@@ -18,6 +18,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -151,6 +153,8 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]], 
     BadInput
         If `make` returns no arrays, a name is not allowed as a file name, or the stored arrays cannot be read after
         three attempts.
+    OSError
+        If the arrays cannot be written. If the disc is full, the message names the folder of the cache.
     """
     # Include the kind of this machine (instruction set and C library) in the key. Machines of different kinds may share
     # the cache, and the last bits of their results may differ.
@@ -335,7 +339,11 @@ def _store(arrays: Mapping[str, Array], staged: Path) -> None:
     if not arrays:
         raise BadInput(f"cache {staged.name}: the computation returned no arrays")
     for stem, array in arrays.items():
-        np.save(staged / f"{layout.check_name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
+        with (staged / f"{layout.check_name(stem)}{_ARRAY}").open("wb") as stream:
+            # Hide from numpy that the stream is a file. For a file it calls a function of C, whose error lacks the
+            # reason, such as a full disc.
+            writer: Any = SimpleNamespace(write=stream.write)
+            np.lib.format.write_array(writer, np.ascontiguousarray(array), allow_pickle=False)
     store_checksums(staged, [f"{stem}{_ARRAY}" for stem in arrays])
 
 

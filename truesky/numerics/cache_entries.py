@@ -10,6 +10,7 @@ removes the lock when the process ends. An entry with a locked lease is not remo
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -55,6 +56,8 @@ _CHECK_INTERVAL_S, _LARGE_BYTES = 60.0, 100e6
 _RECENT_S = 600.0
 # Names of the folder with the leases, and of the file whose modification time is that of the last check of the limit.
 _LEASES, _CHECKED = ".in_use", ".limit_checked"
+# Numbers of the errors of the operating system that mean that the disc or the quota of a user is full.
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 # Folders of arrays and of user catalogues end with 32 hexadecimal digits of a hash.
 _HASHED = re.compile(r"(?P<name>[^.].*)-[0-9a-f]{32}")
 
@@ -216,12 +219,18 @@ def used_names(root: Path) -> frozenset[str]:
 def staging_folder(folder: Path) -> Iterator[Path]:
     """Make a temporary folder in which an entry is made; its name contains that of the entry.
 
-    The folder is removed at the end, unless it was renamed.
+    The folder is removed at the end, unless it was renamed. If the disc is full, the OSError names the folder of the
+    cache.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     staged = Path(tempfile.mkdtemp(prefix=f"{MAKING}{folder.name}-", dir=folder.parent))
     try:
         yield staged
+    except OSError as error:
+        # Errors of writing to an open file do not contain its path.
+        if error.errno in _FULL and error.filename is None:
+            raise OSError(error.errno, os.strerror(error.errno), str(folder.parent)) from None
+        raise
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 

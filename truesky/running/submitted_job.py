@@ -271,7 +271,6 @@ def _run_step(job: Job, step: Step, root: Path, request: Request, verbose: bool,
                 log.write(result)
                 yield result
 
-    root.mkdir(parents=True, exist_ok=True)
     try:
         publish.make_version(root, plan, step.run_task, mapper, name=request.name)
     except BaseException as error:
@@ -301,30 +300,35 @@ def _print_summary(version: read.Version, tasks_run: int, seconds: float, existe
 class _RunLog:
     """Log of the making of one table, a file in LAKE/runs with one JSON object per line.
 
-    It has one line at the start, one per task, and one at the end. If the log file cannot be created, a message is
-    printed and nothing is logged.
+    It has one line at the start, one per task, and one at the end. If the log file cannot be created, nothing is logged
+    and a message is printed at the end. There is no message if nothing was made because the lake is not writable.
     """
 
     def __init__(self, root: Path, job: Job, step: Step, request: Request, extra_facts: Json) -> None:
         folder = layout.runs_folder(root)
         now = datetime.now(UTC)
         self.common = {"job": job.name, "table": step.plan.table.name}
+        self.problem: OSError | None = None
+        self.num_lines = 0
         path = folder / f"{now:%Y%m%dT%H%M%S.%f}-{step.plan.table.name}-{os.getpid()}.jsonl"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self.stream: IO[str] = path.open("w")
         except OSError as error:
-            command.print_error(job.name, f"no log of this run: {error}", 0)
-            self.stream = io.StringIO()
+            self.problem, self.stream = error, io.StringIO()
         facts = {"started": now.isoformat(), "request": request.name, "key": step.plan.key, **extra_facts}
         self.write({**facts, "truesky": __version__, "commit": git_commit(), "parts": len(step.plan.tasks)})
 
     def write(self, line: Json) -> None:
         fields = {k: v for k, v in line.items() if k not in ("files", "final")}
         print(json.dumps({**self.common, **fields}), file=self.stream, flush=True)
+        self.num_lines += 1
 
     def close(self, seconds: float, error: BaseException | None = None) -> None:
         last_line: dict[str, Any] = {"ended": datetime.now(UTC).isoformat(), "seconds": seconds, "status": "done"}
+        has_results = self.num_lines > 1
+        if self.problem is not None and (has_results or self.problem.errno not in layout.UNWRITABLE):
+            command.print_error(self.common["job"], f"no log of this run: {self.problem}", 0)
         if error is not None:
             last_line |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
             last_line["traceback"] = "".join(traceback.format_exception(error))

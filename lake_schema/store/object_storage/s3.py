@@ -23,6 +23,7 @@ from types import SimpleNamespace
 from typing import Any, NoReturn, TypeAlias, TypeVar
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput, Damaged
 
 # Name of the link to the version of a table that was published last; on object storage, name of the list of versions.
@@ -285,8 +286,13 @@ class ObjectStore:
         return self.files.open_input_file(self.object_path(*parts))
 
     def read_object(self, *parts: str) -> bytes:
-        """Return all bytes of an object, which must fit into memory; raise FileNotFoundError or another OSError."""
+        """Return all bytes of an object; raise FileNotFoundError or another OSError if it cannot be read.
+
+        Damaged is raised if the object is larger than the limit of a manifest.
+        """
         with self.open(*parts) as stream:
+            if stream.size() > (limit := user_files.MAX_BYTES["manifest"]):
+                raise Damaged(f"{self.address.plain}/{'/'.join(parts)} is larger than {limit} bytes")
             data: bytes = stream.read()
             return data
 

@@ -1,5 +1,6 @@
 """gc removes no version that a name links to, nor a version from which such a version was made, even indirectly."""
 
+import errno
 import fcntl
 import tempfile
 import threading
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lake_schema.errors import Damaged
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import garbage, layout, locks, manifest, publish, read, request_links
 from lake_schema.store.plan import Plan, Task
 from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
@@ -165,3 +166,14 @@ def test_a_name_that_is_removed_by_hand_keeps_nothing(lake):
     layout.request_link(lake, "a", "plain").parent.rmdir()
     assert request_links.request_names(lake) == ["b"]
     assert garbage.collect(lake, delete=True) == [first]
+
+
+def test_a_lake_that_is_not_writable_is_named(lake, monkeypatch):
+    publish.make_version(lake, plain_plan(), plain_work)
+
+    def refuse(path, mode="r", *args):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(BadInput, match=f"^lake {lake} cannot be written: {lake}/plain/.lock: Read-only file system$"):
+        garbage.collect(lake, delete=True)

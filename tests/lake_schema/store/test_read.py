@@ -7,9 +7,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from lake_schema import sky
+from lake_schema import listing, sky
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output
 from tests import hats_readers
 from tests.universe import CELLS, toy_plan, toy_work
 
@@ -83,6 +84,47 @@ def test_damage_is_named(toy, harm):
             toy.rows()
 
 
+def image_work(root, facts):
+    return Output(toy_work(root, facts).rows, {f"images/{facts['cell']}.fits": lambda path: path.write_bytes(b"image")})
+
+
+# Functions that read files of a version, by the folder of these files.
+READERS = {
+    "toy/dataset/Norder=5": lambda version: version.rows(),
+    "toy/dataset": lambda version: version.partition_path(version.partitions[0]),
+    "toy": lambda version: version.rows_in_cells([1607 >> 4], 3),
+    "toy_margin": lambda version: version.read_margin(version.partitions[0]),
+    "toy_margin/dataset": lambda version: version.read_sidecar(f"toy_margin/dataset/{version.partitions[0]}"),
+    "images": lambda version: version.sidecar_path("images/1607.fits"),
+    "./images": lambda version: version.sidecar_folder("images"),
+}
+
+
+@pytest.mark.parametrize("folder", READERS)
+def test_a_linked_folder_is_refused(lake, tmp_path, folder):
+    """The linked folder has the right files, but may be outside the lake."""
+    publish.make_version(lake, toy_plan(), image_work)
+    version = read.version(lake, "toy")
+    assert read.find_faults(version, deep=True) == []
+    READERS[folder](version)
+    path = version.folder / folder
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(Damaged, match=f"{path} is a symbolic link"):
+        READERS[folder](version)
+    for deep in (False, True):
+        assert any(f"{path} is a symbolic link" in fault for fault in read.find_faults(version, deep))
+
+
+def test_a_version_that_is_linked_outside_the_lake_is_refused(lake, tmp_path, toy):
+    toy.folder.rename(tmp_path / toy.folder.name)
+    toy.folder.symlink_to(tmp_path / toy.folder.name)
+    with pytest.raises(BadInput, match=f"path {toy.folder} is outside {lake}"):
+        read.version(lake, "toy")
+    (row,) = listing.rows(lake)
+    assert row["error"] == f"path {toy.folder} is outside {lake}"
+
+
 def test_any_hats_reader_can_open_it(toy):
     folder = layout.current_link(toy.folder.parents[1], "toy")
     assert hats_readers.is_valid(folder)
@@ -96,7 +138,6 @@ def test_any_hats_reader_can_open_it(toy):
 
 def test_pairs_across_cell_edges_are_matched(lake):
     """Every source has a twin 1" away in another catalogue; with the margin, no pair is lost at an edge."""
-    from lake_schema.store.plan import Output
     from tests.universe import TOY
 
     edge = sky.cell_range(5, 1608)[0]

@@ -1,5 +1,6 @@
 """The cache: one make a key, published whole, mapped read-only."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -111,6 +112,29 @@ def test_a_failed_make_leaves_nothing():
     with pytest.raises(BadInput, match="returned no arrays"):
         cache.cached_arrays("thing", "0" * 64, dict)
     assert stored_names() == []
+
+
+def test_a_full_disc_is_named(tmp_path):
+    """The file of the array is a device that is always full."""
+
+    def make():
+        (staged,) = cache.cache_dir().glob(".making-thing-*")
+        (staged / "a.npy").symlink_to("/dev/full")
+        return {"a": np.zeros(5000)}
+
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path / 'cache'}'") as caught:
+        cache.cached_arrays("thing", "0" * 64, make)
+    assert caught.value.errno == errno.ENOSPC
+    assert stored_names() == []
+
+
+def test_stored_files_are_those_of_numpy(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3).T, "b": np.array(["x", "yz"]), "c": np.zeros((0, 2)), "d": np.array(1)}
+    cache.cached_arrays("thing", "0" * 64, lambda: arrays)
+    for name, array in arrays.items():
+        np.save(tmp_path / name, np.ascontiguousarray(array))
+        (stored,) = cache.cache_dir().glob(f"thing-*/{name}.npy")
+        assert stored.read_bytes() == (tmp_path / f"{name}.npy").read_bytes()
 
 
 def test_the_loser_of_a_race_uses_the_winners_arrays(monkeypatch):

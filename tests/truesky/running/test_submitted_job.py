@@ -166,6 +166,52 @@ def test_what_is_already_there_needs_no_log(run, lake, capsys):
     assert "no log of this run" in err
 
 
+@pytest.fixture(params=[errno.EROFS, errno.EACCES])
+def make_read_only(request, monkeypatch):
+    """Return a function after whose call nothing can be written, as on a read-only disc."""
+
+    def refuse(path, *args, **options):
+        raise OSError(request.param, os.strerror(request.param), os.fspath(path))
+
+    def open_for_reading(path, mode="r", *args, **options):
+        return refuse(path) if set(mode) & set("wax+") else open(path, mode, *args, **options)
+
+    def refuse_all():
+        for name in ("mkdir", "unlink", "rename", "replace", "symlink"):
+            monkeypatch.setattr(os, name, refuse)
+        monkeypatch.setattr(Path, "open", open_for_reading)
+
+    return refuse_all
+
+
+def test_a_lake_that_is_not_writable_is_one_line_and_status_2(run, lake, capsys, make_read_only):
+    make_read_only()
+    assert run(plain_work) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"toy_job: lake {lake} cannot be written: {lake}/plain: ")
+    assert err.count("\n") == 1
+
+
+def test_an_area_that_cannot_be_written_is_one_line_and_status_2(run, lake, capsys, make_read_only):
+    assert run(plain_work) == 0
+    (lake / "names" / "small" / "area.json").unlink()
+    make_read_only()
+    assert run(plain_work) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"toy_job: lake {lake} cannot be written: {lake}/names/small/")
+    assert err.count("\n") == 1
+
+
+def test_a_complete_lake_that_is_not_writable_needs_no_message(run, lake, capsys, make_read_only):
+    assert run(plain_work) == 0
+    make_read_only()
+    assert run(plain_work) == 0
+    out, err = capsys.readouterr()
+    assert "already there" in out
+    assert err == ""
+
+
 def test_the_error_is_one_line_if_java_ends_during_its_start(lake, request_file, capsys, monkeypatch):
     def dead(name):
         raise Py4JNetworkError("Answer from Java side is empty\nTraceback ...")

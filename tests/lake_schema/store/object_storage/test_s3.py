@@ -3,8 +3,10 @@
 import time
 from types import SimpleNamespace
 
+import pyarrow as pa
 import pytest
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout, publish, read
 from lake_schema.store.object_storage import s3
@@ -122,3 +124,10 @@ def test_versions_of_two_tables_are_not_confused(monkeypatch):
 
     monkeypatch.setattr(s3.ObjectPath, "_file_info", file_info)
     assert [(lake / table / ("v-" + "0" * 16)).exists() for table in ("galaxies", "stars")] == [False, True]
+
+
+def test_a_large_object_is_refused_unread(monkeypatch):
+    monkeypatch.setitem(user_files.MAX_BYTES, "manifest", 100)
+    monkeypatch.setattr(s3.ObjectStore, "open", lambda store, *parts: pa.BufferReader(bytes(101)))
+    with pytest.raises(Damaged, match=r"^s3://sky/a/stars/current is larger than 100 bytes$"):
+        (layout.open_lake("s3://sky/a") / "stars/current").read_bytes()
