@@ -343,7 +343,7 @@ def _disc_scale(light: Float, across: float) -> float:
     matrix = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2) / np.array([[1.0], [across]])
     half, area = 0.5 * float((matrix**2).sum()), float(matrices.determinant(matrix))
     # The inverse of the largest singular value of the matrix, in closed form.
-    return 1.0 / np.sqrt(half + np.sqrt(max(half**2 - area**2, 0.0)))
+    return float(1.0 / np.sqrt(half + np.sqrt(max(half**2 - area**2, 0.0))))
 
 
 def add(
