@@ -54,6 +54,8 @@ MISTAKES = {
     ),
     "an effect that every image needs": (GOOD + '[effects]\noff = ["adc"]\n', "effects.off: 'adc' cannot be switched"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
+    "before the launch": (pointed("60905.0", "58979.0"), "pointing[0].mjd: MJD 58979 is before the launch of Euclid"),
+    "a bias before the launch": (BIAS + "mjd = 58979\n", "observation[0].mjd: MJD 58979 is before the launch of"),
     "an area too small": (pointed("0.2 }", "0.01 }"), "enough: area.cone = { ra = 53.117, dec = -27.808, radius"),
     "an area elsewhere": (
         pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 detector positions see sky outside",

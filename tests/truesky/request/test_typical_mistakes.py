@@ -353,6 +353,11 @@ MISTAKES = {
         "mission.overrides.vis.gain: the unit must be electron / adu",
         "got mm",
     ),
+    "a unit in capitals": (
+        section("mission.overrides", '"vis.read_noise" = { value = 5.0, unit = "ADU" }'),
+        "mission.overrides.vis.read_noise: 'ADU' is not a unit: ",
+        "the unit must be electron or a unit that converts to it",
+    ),
     "a list of values": (
         section("explore", '"vis.gain" = [3.0, 3.5]'),
         "explore.vis.gain",
@@ -501,6 +506,13 @@ def test_all_wrong_values_of_parameters_are_reported_in_the_order_of_the_file(tm
     names = [message.removeprefix("mission.overrides.").split(" ")[0].rstrip(":") for message in messages]
     wrong = ["vis.readnoise", "vis.gain", "vis.biass", "vis.full_well", "vis.read_noise"]
     assert names == [*wrong, "vis.bias@9-9"]
+
+
+def test_a_wrong_unit_does_not_hide_an_unknown_detector(tmp_path):
+    line = '"vis.dark_current@34" = { value = 1, unit = "mm" }'
+    messages = read_valid_parts(tomllib.loads(section("mission.overrides", line)), tmp_path).messages
+    assert ["the unit must be" in text for text in messages] == [True, False]
+    assert "vis has no detector '34'" in messages[1]
 
 
 def test_there_are_more_than_60_mistakes():
