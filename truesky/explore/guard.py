@@ -139,6 +139,8 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
         text.encode()
     except UnicodeEncodeError as error:
         raise BadInput(f"SQL: {one_line(error)}") from None
+    if (name := text.strip().rstrip(";").lower()) in table_names:
+        raise BadInput(f"SQL: {name} is a table: write SELECT * FROM {name}")
     tree = _parse(text, connection)
     used: set[str] = set()
     for node, visible in _nodes(tree):

@@ -42,9 +42,11 @@ _FLUX_NAME = re.compile(
     rf"|(?:(?<=^{_FILTER})|(?<=^vis))(?:mag|flux)$|^(?:mag|flux)(?={_FILTER}$|vis$)"
 )
 _BAND_PREFIX = "f_nu_"
-# Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i" or "lsst_i_flux".
+# Beginnings of the names of passbands.
+_SURVEY = "(?:bessell|cfis|des|euclid|gaia|hsc|jedis|lsst|lsst2016|nisp|ps1|sdss|twomass)"
+# Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i", "lsst_i_flux" or "lsst_i".
 _IN_BAND = re.compile(
-    rf"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
+    rf"^(?:f_nu|flux|mag|magnitude)_\w|^{_SURVEY}_\w|\w_(?:flux|mag)$|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
 )
 # End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
 _EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")
@@ -53,6 +55,8 @@ _AMBIGUOUS = re.compile(r'Ambiguous reference to column name "(?P<name>.+?)" \(u
 _UNKNOWN_FUNCTION = re.compile(
     r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
 )
+# Angle in hours or degrees, minutes and seconds: its sign and three numbers.
+_SEXAGESIMAL = re.compile(r"([-+]?)(\d{1,3})\s*[:hd°\s]\s*(\d{1,2})(?:\s*[:m'\s]\s*(\d{1,2}(?:\.\d*)?)\s*[s\"]?)?")
 _REFUSED_TEXT = r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)"
 # Words that begin the parts of a query.
 _KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
@@ -64,12 +68,13 @@ _BEFORE_CONDITION = re.compile(
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
 # Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
-# table functions with a position and a radius (arcmin), and percentiles.
+# names that users try for such conditions, table functions with a position and a radius (arcmin), and percentiles.
 _DISTANCES = {
     "angdist", "angsep", "angular_distance", "angular_separation", "angulardistance", "greatcircleangle", "q3c_dist",
     "sphdist", "sphere_distance", "st_distance", "st_distancesphere", "st_distance_sphere",
 }  # fmt: skip
 _IN_CIRCLE = {"q3c_join", "q3c_radial_query", "st_dwithin"}
+_CONES = {"cone", "cone_search", "conesearch", "in_circle", "in_cone"}
 _AROUND = {"fgetnearbyobjalleq", "fgetnearbyobjeq", "fgetnearestobjalleq", "fgetnearestobjeq"}
 _PERCENTILES = {"approx_percentile", "percentile", "percentile_approx"}
 # Example of a condition for a circle.
@@ -116,6 +121,10 @@ _SENTENCES = (
     (
         r"No function matches the given name and argument types '(.+?)\((.*?)\)'",
         r"\1 does not accept arguments of type \2",
+    ),
+    (
+        r'Macro "?in_area[^\n]* does not support the supplied arguments',
+        f"in_area(ra, dec) selects the area of the request; for a circle write {_CIRCLE}",
     ),
     (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
 )
@@ -216,7 +225,8 @@ def explain_missing_column(
     columns : mapping of str to collection of str
         Columns of each table that the query reads, or of the table of `entry`.
     other_tables : mapping of str to collection of str
-        Columns of the other tables of the query and of the lake that may be suggested.
+        Columns of the other tables of the query and of the lake. Those of tables that share an identifier with the
+        tables of the query may be suggested.
     message : str, optional
         Message of DuckDB about the column, which contains the names of columns of subqueries.
     aliases : mapping of str to str, optional
@@ -231,12 +241,14 @@ def explain_missing_column(
     """
     qualifier = f"{entry}." if entry else ""
     problem = f"column {qualifier}{name} does not exist"
+    keys = {column for names in columns.values() for column in names if column.endswith("id")}
+    related = {table: names for table, names in other_tables.items() if table in aliases or keys & {*names}}
     prefixes = {table: f"{aliases.get(table, table)}." for table in (*columns, *other_tables)}
     if entry or len(columns) == 1:
         prefixes |= dict.fromkeys(columns, qualifier)
     if targets := _targets(name, columns):
         return f"{problem}; use {_as_text(targets, prefixes)}"
-    if targets := _targets(name, other_tables):
+    if targets := _targets(name, related):
         hint = "" if {target.table for target in targets} & {*aliases} else _join_hint(targets, columns, other_tables)
         return f"{problem}; use {_as_text(targets, prefixes)}{hint}"
     # Names of columns of subqueries are in the message only.
@@ -402,6 +414,9 @@ def replace_function(name: str, arguments: Sequence[str]) -> str:
         return f"separation({', '.join(arguments if len(arguments) == 4 else ('ra', 'dec', 'RA', 'DEC'))}) (deg)"
     if name in _IN_CIRCLE:
         return circle_condition(arguments)
+    if name in _CONES:
+        # A radius after a position only may be in any unit.
+        return circle_condition(("ra", "dec", *arguments[:2], "RADIUS") if len(arguments) == 3 else arguments)
     if name in _AROUND:
         position = ("ra", "dec", *arguments[:2])
         is_complete = len(arguments) == 3
@@ -462,6 +477,18 @@ def explain_code(column: str, sign: str, text: str, codes: str) -> str:
     number = numbers[meant[0]] if meant else "one of these numbers"
     remedy = f"{column} {sign} {number}" if meant and sign else f"{number} in place of '{text}'"
     return f"column {column} contains numbers ({codes}): write {remedy}"
+
+
+def explain_angle(column: str, text: str) -> str:
+    """Return a message about a text such as '53:00:00' that is compared with a column in deg, "" for other texts."""
+    match = _SEXAGESIMAL.fullmatch(text.strip())
+    if match is None:
+        return ""
+    size = sum(float(part or 0.0) / 60.0**power for power, part in enumerate(match.groups()[1:]))
+    problem = f"column {column} is in deg: write"
+    if column.startswith("ra") and size < 24.0:
+        return f"{problem} {15.0 * size:.7g} in place of '{text}', if this is in hours"
+    return f"{problem} {match[1] if match[1] == '-' else ''}{size:.7g} in place of '{text}'"
 
 
 def _missing_condition(word: str, extract: re.Match[str] | None, query: str) -> str:
