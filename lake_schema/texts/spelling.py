@@ -51,7 +51,7 @@ def _names_with_part(lower: str, existing: Iterable[str]) -> list[str]:
 
 
 def related_bands(name: str, existing: Iterable[str]) -> str:
-    """Return the passbands of the survey of a passband that does not exist, and those of other surveys in its filter.
+    """Return the passbands of a survey that does not have a passband, and the passbands of other surveys in its filter.
 
     Parameters
     ----------
@@ -63,19 +63,19 @@ def related_bands(name: str, existing: Iterable[str]) -> str:
     Returns
     -------
     str
-        Text such as "hsc has hsc_g, hsc_z; i exists as lsst_i, des_i"; "" if the name is not one of a known survey, or
-        if the passband exists with another spelling.
+        Text such as "allowed with hsc: hsc_g, hsc_z; allowed with i: lsst_i, des_i"; "" if the name is not that of a
+        known survey, or if the passband exists with another spelling.
     """
     band = _BAND.fullmatch(name.lower()[:100])
     if band is None:
         return ""
-    bands = [(other, match) for other in existing if (match := _BAND.fullmatch(other.lower()))]
-    same_survey = [other for other, match in bands if match[1] == band[1]]
-    same_filter = [other for other, match in bands if match[2] == band[2]]
+    bands = [(other, re.split("[-_. ]", other.lower())) for other in existing]
+    same_survey = [other for other, parts in bands if parts[0] == band[1]]
+    same_filter = [other for other, parts in bands if parts[1:] == [band[2]]]
     if not same_survey or {*same_survey} & {*same_filter}:
         return ""
-    parts = ((f"{band[1]} has", same_survey), (f"{band[2]} exists as", same_filter))
-    return "; ".join(f"{words} {', '.join(names[:_EXAMPLES])}" for words, names in parts if names)
+    lists = ((f"allowed with {band[1]}:", same_survey), (f"allowed with {band[2]}:", same_filter))
+    return "; ".join(f"{words} {', '.join(names[:_EXAMPLES])}" for words, names in lists if names)
 
 
 def _letters(text: str) -> str:

@@ -18,7 +18,8 @@ import duckdb
 
 from lake_schema import tables as declarations
 from lake_schema.errors import BadInput
-from truesky.explore.suggestions import circle_condition, plain_message, replace_function, suggest_tables
+from truesky.explore.foreign_functions import circle_condition, replace_function
+from truesky.explore.suggestions import plain_message, suggest_tables
 
 # Largest number of characters of a query.
 _MAX_CHARACTERS = 100_000

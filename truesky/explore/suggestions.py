@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from lake_schema import tables as declarations
 from lake_schema.texts import spelling
 from lake_schema.texts.synonyms import Synonym, load_synonyms
+from truesky.explore import foreign_functions
 
 # Messages of DuckDB about a column that does not exist. The named group is the name of the column.
 _MISSING_COLUMN = (
@@ -67,18 +68,6 @@ _BEFORE_CONDITION = re.compile(
 )
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
-# Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
-# names that users try for such conditions, table functions with a position and a radius (arcmin), and percentiles.
-_DISTANCES = {
-    "angdist", "angsep", "angular_distance", "angular_separation", "angulardistance", "greatcircleangle", "q3c_dist",
-    "sphdist", "sphere_distance", "st_distance", "st_distancesphere", "st_distance_sphere",
-}  # fmt: skip
-_IN_CIRCLE = {"q3c_join", "q3c_radial_query", "st_dwithin"}
-_CONES = {"cone", "cone_search", "conesearch", "in_circle", "in_cone"}
-_AROUND = {"fgetnearbyobjalleq", "fgetnearbyobjeq", "fgetnearestobjalleq", "fgetnearestobjeq"}
-_PERCENTILES = {"approx_percentile", "percentile", "percentile_approx"}
-# Example of a condition for a circle.
-_CIRCLE = "separation(ra, dec, RA, DEC) < RADIUS (deg)"
 # Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
 _SENTENCES = (
     (
@@ -124,7 +113,7 @@ _SENTENCES = (
     ),
     (
         r'Macro "?in_area[^\n]* does not support the supplied arguments',
-        f"in_area(ra, dec) selects the area of the request; for a circle write {_CIRCLE}",
+        f"in_area(ra, dec) selects the area of the request; for a circle write {foreign_functions.CIRCLE}",
     ),
     (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
 )
@@ -225,8 +214,8 @@ def explain_missing_column(
     columns : mapping of str to collection of str
         Columns of each table that the query reads, or of the table of `entry`.
     other_tables : mapping of str to collection of str
-        Columns of the other tables of the query and of the lake. Those of tables that share an identifier with the
-        tables of the query may be suggested.
+        Columns of the other tables of the query and of the lake. A table may be suggested if it shares an identifier
+        with a table of the query.
     message : str, optional
         Message of DuckDB about the column, which contains the names of columns of subqueries.
     aliases : mapping of str to str, optional
@@ -392,65 +381,6 @@ def plain_message(message: str, query: str = "") -> str:
     word = _wrong_word(extract) if extract else ""
     place = f" (near {word})" if word and word not in body else ""
     return body.strip().rstrip("!") + place
-
-
-def replace_function(name: str, arguments: Sequence[str]) -> str:
-    """Return the SQL for a function of another database, or "" if the function is not known.
-
-    Parameters
-    ----------
-    name : str
-        Name of the function in lower case.
-    arguments : sequence of str
-        SQL of its arguments, in which numbers replace points and circles. If their number is wrong, the result is an
-        example.
-
-    Returns
-    -------
-    str
-        Text such as "separation(ra, dec, 53.1, -27.8) < 0.1 (deg)".
-    """
-    if name in _DISTANCES:
-        return f"separation({', '.join(arguments if len(arguments) == 4 else ('ra', 'dec', 'RA', 'DEC'))}) (deg)"
-    if name in _IN_CIRCLE:
-        return circle_condition(arguments)
-    if name in _CONES:
-        # A radius after a position only may be in any unit.
-        return circle_condition(("ra", "dec", *arguments[:2], "RADIUS") if len(arguments) == 3 else arguments)
-    if name in _AROUND:
-        position = ("ra", "dec", *arguments[:2])
-        is_complete = len(arguments) == 3
-        condition = circle_condition((*position, _divide(arguments[2], 60)) if is_complete else ())
-        return f"FROM galaxies WHERE {condition}"
-    if name in _PERCENTILES and len(arguments) >= 2:
-        column, percent = arguments[:2]
-        # Some databases have fractions in place of percent.
-        is_fraction = (number := _number(percent)) is not None and number <= 1.0
-        return f"quantile_cont({column}, {percent if is_fraction else _divide(percent, 100)})"
-    return "quantile_cont(z_obs, 0.5)" if name in _PERCENTILES else ""
-
-
-def circle_condition(arguments: Sequence[str]) -> str:
-    """Return the condition that a position is in a circle; `arguments` are ra, dec, the centre and the radius, in SQL.
-
-    With another number of arguments, an example is returned.
-    """
-    if len(arguments) != 5:
-        return _CIRCLE
-    *positions, radius = arguments
-    return f"separation({', '.join(positions)}) < {radius} (deg)"
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
-
-
-def _divide(text: str, divisor: int) -> str:
-    number = _number(text)
-    return f"{text} / {divisor}" if number is None else f"{number / divisor:.6g}"
 
 
 def explain_code(column: str, sign: str, text: str, codes: str) -> str:

@@ -36,8 +36,9 @@ def test_words_are_joined():
 def test_another_filter_is_not_suggested():
     bands = ("hsc_g", "hsc_z", "lsst_g", "lsst_i", "ps1_i", "euclid_vis")
     for name in ("HSC-i", "hsc_i"):
-        assert spelling.choices(name, bands) == "hsc has hsc_g, hsc_z; i exists as lsst_i, ps1_i"
+        assert spelling.choices(name, bands) == "allowed with hsc: hsc_g, hsc_z; allowed with i: lsst_i, ps1_i"
     assert spelling.choices("lsst-g", bands).startswith("did you mean lsst_g?")
+    assert spelling.choices("euclid_y", bands) == "allowed with euclid: euclid_vis"
     assert spelling.related_bands("wfi_g", bands) == ""
 
 

@@ -425,7 +425,7 @@ MISTAKES = {
     "a band that a survey has not": (
         GROUND + 'bands = ["lsst_x"]\n',
         "survey lsst has no band 'lsst_x': ",
-        "lsst has lsst_u, lsst_g",
+        "allowed with lsst: lsst_u, lsst_g",
     ),
     "a flat list of vertices": (
         area("polygon = [150.0, 2.0, 150.3, 2.0, 150.3, 2.3]"),

@@ -243,7 +243,22 @@ def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguratio
 
 
 def check_launch(mjd: float, mission: MissionConfiguration, where: str) -> None:
-    """Raise BadInput, which begins with `where`, if a date (MJD) of an exposure of Euclid is before the launch."""
+    """Check that a date of an exposure of Euclid is not before the launch.
+
+    Parameters
+    ----------
+    mjd : float
+        Date (MJD).
+    mission : MissionConfiguration
+        Mission database, with the date of the launch.
+    where : str
+        Place in the user's input that gives the date, quoted in the error message.
+
+    Raises
+    ------
+    BadInput
+        If the date is before the launch.
+    """
     launch = mission.value("svm.launch", "d")
     if mjd < launch:
         raise BadInput(f"{where}: {_before_launch(mjd, launch)}")

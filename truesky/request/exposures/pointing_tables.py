@@ -213,7 +213,7 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
             names = lines.fieldnames or []
             mistakes.read(_refuse_columns, path, names, channels)
             # The rows are also checked if the table has unknown columns.
-            for row in lines if {*_required(channels)} <= {*names} else ():
+            for row in lines if {*_required_columns(channels)} <= {*names} else ():
                 if len(rows) >= _MAX_ROWS:
                     raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
                 rows.append(mistakes.read(_row_from_line, row, path, line_number, channels, image_type))
@@ -224,12 +224,12 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     return rows
 
 
-def _required(channels: Sequence[str]) -> tuple[str, ...]:
+def _required_columns(channels: Sequence[str]) -> tuple[str, ...]:
     return (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
 
 
 def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
-    missing = [name for name in _required(channels) if name not in names]
+    missing = [name for name in _required_columns(channels) if name not in names]
     if missing:
         csv_headers.check_header(path, names)
     similar = {name: _similar_name(name) for name in names if name not in _NAMES}
