@@ -44,10 +44,11 @@ _FLUX_NAME = re.compile(
 )
 _BAND_PREFIX = "f_nu_"
 # Beginnings of the names of passbands.
-_SURVEY = "(?:bessell|cfis|des|euclid|gaia|hsc|jedis|lsst|lsst2016|nisp|ps1|sdss|twomass)"
+_SURVEY = "bessell|cfis|des|euclid|gaia|hsc|jedis|lsst|lsst2016|nisp|ps1|sdss|twomass"
 # Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i", "lsst_i_flux" or "lsst_i".
 _IN_BAND = re.compile(
-    rf"^(?:f_nu|flux|mag|magnitude)_\w|^{_SURVEY}_\w|\w_(?:flux|mag)$|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
+    rf"^(?:f_nu|flux|mag|magnitude|{_SURVEY})_\w|\w_(?:flux|mag)$"
+    rf"|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
 )
 # End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
 _EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")

@@ -368,7 +368,7 @@ def _coordinate_lists(
     form = "[ra, dec]" if read_radius is None else "[ra, dec, radius]"
     count = form.count(",") + 1
     if isinstance(value, list) and len(value) >= count and all(isinstance(item, (int, float, str)) for item in value):
-        raise BadInput(f"{path} must be a list of {form} in degrees: write [{value[:count]}, ..]")
+        raise BadInput(f"{path} must be a list of {form} in degrees: write [{quote_value(value[:count])}, ..]")
     if not isinstance(value, list) or not min_count <= len(value) <= max_count:
         actual = len(value) if isinstance(value, list) else quote_value(value)
         raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form} in degrees, got {actual}")

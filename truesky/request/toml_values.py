@@ -36,7 +36,7 @@ _SYNONYMS = {
 # Keys that users know from other programs and that a request does not have, with the reason.
 _FIXED = {
     **dict.fromkeys(
-        ("h0", "h", "hubble", "omega_m", "omega_b", "omega_lambda", "sigma_8", "sigma8", "n_s", "cosmology"),
+        ("h0", "hubble", "omega_m", "omega_b", "omega_lambda", "sigma_8", "sigma8", "n_s", "cosmology"),
         "the cosmology is fixed: flat, H0 = 67, Omega_m = 0.319, Omega_b = 0.049, sigma_8 = 0.83, n_s = 0.96",
     ),
     **dict.fromkeys(("star_band", "stars_band"), "star_limit is always in H (Vega)"),

@@ -317,9 +317,8 @@ def _explain_property(
     if meant := synonyms.find_columns(key, ("given_galaxies", "galaxies", "halos"), legal):
         return meant, f"did you mean {' or '.join(meant)}?"
     if "mag" in legal and _BAND_FLUX.fullmatch(key.lower()):
-        return [
-            "mag"
-        ], f"write mag for AB magnitudes; for fluxes write {flux_entry(entry if isinstance(entry, str) else '..')}"
+        fluxes = flux_entry(entry if isinstance(entry, str) else "..")
+        return ["mag"], f"write mag for AB magnitudes; for fluxes write {fluxes}"
     return spelling.closest_names(key, legal, 1), spelling.choices(key, list(legal))
 
 

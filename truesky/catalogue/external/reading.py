@@ -331,7 +331,8 @@ def _check_absolute_magnitude(
     if too_bright.any():
         field, row = columns.fields[magnitude], int(np.argmax(too_bright))
         problem = f"is {format_number(absolute[row])} ({magnitude} = {format_number(apparent[row])})"
-        flux = f": if {field.column} is a flux, write {flux_entry(field.column)}" if field.is_plain() else ""
+        can_be_flux = magnitude == "mag" and field.is_plain()
+        flux = f": if {field.column} is a flux, write {flux_entry(field.column)}" if can_be_flux else ""
         mistakes.add_rows(piece.file, piece.first_row, titles, too_bright, problem, f"{allowed}{flux}", noun)
 
 
