@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from lake_schema import tables as declarations
 from lake_schema.texts import spelling
 from lake_schema.texts.synonyms import Synonym, load_synonyms
-from truesky.explore import foreign_functions
 
 # Messages of DuckDB about a column that does not exist. The named group is the name of the column.
 _MISSING_COLUMN = (
@@ -69,6 +68,8 @@ _BEFORE_CONDITION = re.compile(
 )
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
+# Example of a condition for a circle.
+CIRCLE = "separation(ra, dec, RA, DEC) < RADIUS (deg)"
 # Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
 _SENTENCES = (
     (
@@ -114,7 +115,7 @@ _SENTENCES = (
     ),
     (
         r'Macro "?in_area[^\n]* does not support the supplied arguments',
-        f"in_area(ra, dec) selects the area of the request; for a circle write {foreign_functions.CIRCLE}",
+        f"in_area(ra, dec) selects the area of the request; for a circle write {CIRCLE}",
     ),
     (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
 )
