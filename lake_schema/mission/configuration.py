@@ -220,7 +220,8 @@ class MissionConfiguration:
             configuration = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
             for name in names:
                 key, _ = detector_overrides.split_name(name, self._parameters_by_key)
-                if name in chosen and key != name:
+                # A wrong value does not hide that the detector does not exist.
+                if key in chosen and key != name:
                     mistakes.read(detector_overrides.check_override, name, configuration)
         return configuration
 

@@ -145,28 +145,44 @@ def record_identity(record: MissionRecord) -> Identity:
 
 
 @cache
-def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
+def parse_unit(text: str, where: str = "mission", allowed: str = "") -> u.UnitBase:
     """Return the astropy unit for a unit string.
 
-    Raise BadInput if the string is not a unit, or is a logarithmic unit such as mag(um). `where` is the name of the
-    quantity, with which the message begins.
+    Parameters
+    ----------
+    text : str
+        The unit string.
+    where : str, optional
+        Name of the quantity, with which the error message begins.
+    allowed : str, optional
+        Words about the units that are allowed, for the error message.
+
+    Returns
+    -------
+    Unit
+        The unit.
+
+    Raises
+    ------
+    BadInput
+        If the string is not a unit, or is a logarithmic unit such as mag(um).
     """
     import astropy.units as u
 
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):
-        raise BadInput(f"{where}: {text!r} is not a unit") from None
+        raise BadInput(f"{where}: {text!r} is not a unit{f': the unit must be {allowed}' if allowed else ''}") from None
     if not isinstance(unit, u.UnitBase):
         # Refuse logarithmic units: astropy would convert a value in mag(um) to um without computing the power of ten.
         raise BadInput(f"{where}: {text!r} is a logarithmic or structured unit: use a linear unit, or mag")
     return unit
 
 
-def _check_unit(text: str, where: str) -> None:
-    """Raise BadInput if a text is not a unit that `parse_unit` accepts. The message begins with `where`."""
+def _check_unit(text: str, where: str, allowed: str = "") -> None:
+    """Raise BadInput, with the arguments of `parse_unit`, if a text is not a unit that it accepts."""
     if text not in _SHIPPED_UNITS:
-        parse_unit(text, where)
+        parse_unit(text, where, allowed)
 
 
 @cache
@@ -209,12 +225,12 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     BadInput
         If a unit is unknown or the units are not convertible.
     """
+    allowed = f"{to} or a unit that converts to it" if to else "empty, for a number without a unit"
     if (unit, to) not in _FACTORS:
-        _check_unit(unit, where)
+        _check_unit(unit, where, allowed)
         _check_unit(to, where)
     factor = _conversion_factor(unit, to)
     if factor is None:
-        allowed = f"{to} or a unit that converts to it" if to else "empty, for a number without a unit"
         raise BadInput(f"{where}: the unit must be {allowed}, got {unit or 'no unit'}")
     return value * factor
 

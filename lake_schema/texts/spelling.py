@@ -11,6 +11,8 @@ _LEAST_SIMILARITY = 0.6
 # Largest number of names that are compared or listed, and the number of first names that stand for a longer list. After
 # a suggestion, a list of more than this number of names is left out.
 _MAX_COMPARED, _MAX_LISTED, _EXAMPLES = 10_000, 60, 8
+# Name of a passband: a survey and a filter.
+_BAND = re.compile(r"([a-z0-9]{2,})[-_. ]([a-z])")
 # Largest number of suggestions if the name is a part of several names.
 _MAX_WITH_PART = 3
 
@@ -46,6 +48,34 @@ def closest_names(name: str, existing: Iterable[str], count: int = 3) -> list[st
 
 def _names_with_part(lower: str, existing: Iterable[str]) -> list[str]:
     return [other for other in existing if lower and lower in re.split("[-_.]", other)]
+
+
+def related_bands(name: str, existing: Iterable[str]) -> str:
+    """Return the passbands of a survey that does not have a passband, and the passbands of other surveys in its filter.
+
+    Parameters
+    ----------
+    name : str
+        Name, such as "hsc_i" or "HSC-i". Upper and lower case are the same.
+    existing : iterable of str
+        Names that exist.
+
+    Returns
+    -------
+    str
+        Text such as "allowed with hsc: hsc_g, hsc_z; allowed with i: lsst_i, des_i"; "" if the name is not that of a
+        known survey, or if the passband exists with another spelling.
+    """
+    band = _BAND.fullmatch(name.lower()[:100])
+    if band is None:
+        return ""
+    bands = [(other, re.split("[-_. ]", other.lower())) for other in existing]
+    same_survey = [other for other, parts in bands if parts[0] == band[1]]
+    same_filter = [other for other, parts in bands if parts[1:] == [band[2]]]
+    if not same_survey or {*same_survey} & {*same_filter}:
+        return ""
+    lists = ((f"allowed with {band[1]}:", same_survey), (f"allowed with {band[2]}:", same_filter))
+    return "; ".join(f"{words} {', '.join(names[:_EXAMPLES])}" for words, names in lists if names)
 
 
 def _letters(text: str) -> str:
@@ -100,6 +130,8 @@ def choices(name: str, existing: Sequence[str], count: int = 1) -> str:
     str
         Text such as "did you mean des_r? allowed: des_g, des_r".
     """
+    if related := related_bands(name, existing):
+        return related
     suggestion = did_you_mean(name, existing, count)
     if suggestion and len(existing) > _EXAMPLES:
         return suggestion

@@ -70,5 +70,5 @@ def suggest_title(column: str, titles: Sequence[str]) -> str:
     """
     if similar := spelling.suggestion(column, titles):
         return similar
-    meant = [title for title in titles if find_columns(title, _CATALOGUES, [column])]
+    meant = [title for title in titles if find_columns(title, _CATALOGUES, [column.lower()])]
     return f" (did you mean {meant[0]}?)" if meant else ""

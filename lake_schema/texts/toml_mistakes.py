@@ -59,7 +59,7 @@ def _explain(message: str, lines: Sequence[str], number: int, column: int) -> tu
     line = lines[number - 1]
     head, rest = line[: column - 1], line[column - 1 :]
     if message.startswith(("Cannot", "Duplicate")):
-        return _explain_repeated(message, lines, number), number
+        return _explain_repeated(message, lines, number)
     if message == "Unclosed array" and (not rest.strip("# ") or re.match(r"\s*([\w.\"-]+\s*=|\[)", rest)):
         opening = next((n for n in range(number, 0, -1) if lines[n - 1].count("[") > lines[n - 1].count("]")), number)
         return "the bracket [ is not closed by ]", opening
@@ -138,20 +138,26 @@ def _explain_rest(head: str, rest: str, word: str) -> str:
     return f"there is text after the value, {rest.strip()[:60]}"
 
 
-def _explain_repeated(message: str, lines: Sequence[str], number: int) -> str:
-    """Return which key or section is given twice, and in which line it is first, if this is known."""
+def _explain_repeated(message: str, lines: Sequence[str], number: int) -> tuple[str, int]:
+    """Return which key or section is given twice, and in which line it is first, if this is known.
+
+    Return also the number of the line with the mistake.
+    """
     line = lines[number - 1]
     if header := _HEADER.match(line):
         name = f"{header[1]}{header[2]}{']' * len(header[1])}"
         earlier = [n for n in range(1, number) if (m := _HEADER.match(lines[n - 1])) and m[2] == header[2]]
-        return f"{name} is given twice{_first_line(earlier)}: give its keys once, in one place"
+        single = [n for n in (*earlier, number) if "[[" not in lines[n - 1]]
+        if earlier and 0 < len(single) <= len(earlier):
+            return f"write [[{header[2]}]] in place of [{header[2]}] for a list of tables", single[0]
+        return f"{name} is given twice{_first_line(earlier)}: give its keys once, in one place", number
     if message.startswith("Duplicate"):
-        return f"{message.removeprefix('Duplicate inline table key ').strip(chr(39))} is given twice"
+        return f"{message.removeprefix('Duplicate inline table key ').strip(chr(39))} is given twice", number
     key = line.partition("=")[0].strip()
     first = max((n for n in range(1, number) if _HEADER.match(lines[n - 1])), default=0)
     section = _HEADER.match(lines[first - 1]) if first else None
     earlier = [n for n in range(first + 1, number) if lines[n - 1].partition("=")[0].strip() == key]
-    return f"{section[2] + '.' if section else ''}{key} is given twice{_first_line(earlier)}"
+    return f"{section[2] + '.' if section else ''}{key} is given twice{_first_line(earlier)}", number
 
 
 def _first_line(earlier: Sequence[int]) -> str:

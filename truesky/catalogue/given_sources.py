@@ -313,7 +313,15 @@ def _columns(file: Path, name: str, source_tables: UserSources) -> Columns:
     if set(entries) <= set(_SETTINGS):
         # The request maps no column, so the columns of the file have the names of the properties.
         titles = external_rows.column_names(file, SOURCES_KIND)
-        _check_titles(titles, file, bounds, [key for (key,) in required], can_map=True)
+        with Mistakes() as mistakes:
+            if placed := [title for title in titles if title in _POSITION and source_tables.spacing]:
+                remedy = 'remove them, or write only = "table"'
+                problem = (
+                    f'columns {" and ".join(placed)} are not possible with only = "grid", which sets the positions'
+                )
+                mistakes.add(BadInput(f"{file}: {problem}: {remedy}"))
+                titles = [title for title in titles if title not in placed]
+            mistakes.read(_check_titles, titles, file, bounds, [key for (key,) in required], can_map=True)
         entries |= {title: title for title in titles}
         path = f"sources.{name}: {file.name}"
     return _parse(entries, name, defaults, bounds, path, required)
@@ -399,7 +407,7 @@ def _add_outside(file: Path, values: Mapping[str, Array], titles: str, area: Are
     outside = ~np.isin(sky.cell_at(sky.wrap_angle(ra), dec, GENERATION_ORDER), area.cells(GENERATION_ORDER))
     if outside.any():
         first = int(np.argmax(outside))
-        hint = ingest.radians_hint(np.abs(ra).max(), np.abs(dec).max())
+        hint = ingest.unit_hint((ra.min(), ra.max()), (dec.min(), dec.max()), area)
         problem = f"are {ra[first]:g} and {dec[first]:g} deg"
         mistakes.add_rows(file, 1, titles, outside, problem, f"must be in the area, {area.describe()}{hint}", "columns")
 

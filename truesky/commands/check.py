@@ -52,7 +52,7 @@ def run_command(options: argparse.Namespace) -> int:
         request, cost = checked_request(read_valid_parts(table, path.resolve().parent), options.plan)
     except BadInput as error:
         raise request_lines.with_request_file(error, path) from None
-    understood = list(sky_notation.understood_values(table))
+    understood = [*sky_notation.understood_values(table), *checks.unused_values(table)]
     counts = {
         "pointings": len(request.pointings),
         "observations": len(request.observations),

@@ -18,7 +18,7 @@ import duckdb
 
 from lake_schema import tables as declarations
 from lake_schema.errors import BadInput
-from truesky.explore.suggestions import circle_condition, plain_message, replace_function, suggest_tables
+from truesky.explore.suggestions import CIRCLE, plain_message, suggest_tables
 
 # Largest number of characters of a query.
 _MAX_CHARACTERS = 100_000
@@ -38,6 +38,16 @@ _FUNCTION_PREFIXES = ("pg_", "duckdb_", "read_", "json_execute")
 _GEOMETRY = {"area", "box", "centroid", "circle", "coord1", "coord2", "distance", "intersects", "point", "polygon"}
 # Functions of ADQL and other databases that make a point or a circle from numbers.
 _POINTS = {"circle", "point", "st_makepoint", "st_point"}
+# Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
+# names that users try for such conditions, table functions with a position and a radius (arcmin), and percentiles.
+_DISTANCES = {
+    "angdist", "angsep", "angular_distance", "angular_separation", "angulardistance", "greatcircleangle", "q3c_dist",
+    "sphdist", "sphere_distance", "st_distance", "st_distancesphere", "st_distance_sphere",
+}  # fmt: skip
+_IN_CIRCLE = {"q3c_join", "q3c_radial_query", "st_dwithin"}
+_CONES = {"cone", "cone_search", "conesearch", "in_circle", "in_cone"}
+_AROUND = {"fgetnearbyobjalleq", "fgetnearbyobjeq", "fgetnearestobjalleq", "fgetnearestobjeq"}
+_PERCENTILES = {"approx_percentile", "percentile", "percentile_approx"}
 # TOP of ADQL, which DuckDB cannot parse.
 _TOP = re.compile(r"\bSELECT\s+(?:(?:DISTINCT|ALL)\s+)?TOP\s+(\d+)\b", re.IGNORECASE)
 
@@ -139,6 +149,8 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
         text.encode()
     except UnicodeEncodeError as error:
         raise BadInput(f"SQL: {one_line(error)}") from None
+    if (name := text.strip().rstrip(";").lower()) in table_names:
+        raise BadInput(f"SQL: {name} is a table: write SELECT * FROM {name}")
     tree = _parse(text, connection)
     used: set[str] = set()
     for node, visible in _nodes(tree):
@@ -332,7 +344,7 @@ def _refuse_function(node: Tree, data: bytes) -> None:
     if name in _GEOMETRY or has_region:
         is_distance = name == "distance"
         numbers = [*_flat_arguments(node, data)]
-        circle = replace_function("st_distance", numbers) if is_distance else circle_condition(numbers)
+        circle = _replace_function("st_distance", numbers) if is_distance else _circle_condition(numbers)
         remedy = (
             f"write {circle}"
             if is_distance
@@ -344,7 +356,7 @@ def _refuse_function(node: Tree, data: bytes) -> None:
 def _refuse_foreign(node: Tree, data: bytes) -> None:
     """Raise BadInput with the SQL to write if a function is one that other databases have; `data` is the query."""
     name = _name(node)
-    if remedy := replace_function(name, [*_flat_arguments(node, data)]):
+    if remedy := _replace_function(name, [*_flat_arguments(node, data)]):
         raise BadInput(f"SQL: function {one_line(name)} does not exist: write {one_line(remedy)}")
 
 
@@ -432,3 +444,62 @@ def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str,
 def _table_name(source: Tree) -> str:
     """Return the name of a table in FROM, in lower case: "galaxies", or "demo.galaxies" with the name of a request."""
     return ".".join(str(source[key]).lower() for key in ("schema_name", "table_name") if source.get(key))
+
+
+def _replace_function(name: str, arguments: Sequence[str]) -> str:
+    """Return the SQL for a function of another database, or "" if the function is not known.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function in lower case.
+    arguments : sequence of str
+        SQL of its arguments, in which numbers replace points and circles. If their number is wrong, the result is an
+        example.
+
+    Returns
+    -------
+    str
+        Text such as "separation(ra, dec, 53.1, -27.8) < 0.1 (deg)".
+    """
+    if name in _DISTANCES:
+        return f"separation({', '.join(arguments if len(arguments) == 4 else ('ra', 'dec', 'RA', 'DEC'))}) (deg)"
+    if name in _IN_CIRCLE:
+        return _circle_condition(arguments)
+    if name in _CONES:
+        # A radius after a position only may be in any unit.
+        return _circle_condition(("ra", "dec", *arguments[:2], "RADIUS") if len(arguments) == 3 else arguments)
+    if name in _AROUND:
+        position = ("ra", "dec", *arguments[:2])
+        is_complete = len(arguments) == 3
+        condition = _circle_condition((*position, _divide(arguments[2], 60)) if is_complete else ())
+        return f"FROM galaxies WHERE {condition}"
+    if name in _PERCENTILES and len(arguments) >= 2:
+        column, percent = arguments[:2]
+        # Some databases have fractions in place of percent.
+        is_fraction = (number := _number(percent)) is not None and number <= 1.0
+        return f"quantile_cont({column}, {percent if is_fraction else _divide(percent, 100)})"
+    return "quantile_cont(z_obs, 0.5)" if name in _PERCENTILES else ""
+
+
+def _circle_condition(arguments: Sequence[str]) -> str:
+    """Return the condition that a position is in a circle; `arguments` are ra, dec, the centre and the radius, in SQL.
+
+    With another number of arguments, an example is returned.
+    """
+    if len(arguments) != 5:
+        return CIRCLE
+    *positions, radius = arguments
+    return f"separation({', '.join(positions)}) < {radius} (deg)"
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _divide(text: str, divisor: int) -> str:
+    number = _number(text)
+    return f"{text} / {divisor}" if number is None else f"{number / divisor:.6g}"

@@ -162,15 +162,17 @@ class Session:
         return _join(problems[:_MAX_MISSING]) or one_line(suggestions.plain_message(message))
 
     def _explain_code(self, error: Exception, query: Query) -> str:
-        """Return a message if an error is about a text that is compared with a column of numeric codes, else ""."""
+        """Return a message if an error is about a text that is compared with a column of codes or angles, else ""."""
         if (text := suggestions.refused_text(str(error))) is None:
             return ""
         for name, sign in shared_columns.compared_columns(query.tree, text):
             for table in query.tables:
                 if table in self.open_tables and name in self.open_tables[table].schema.names:
-                    codes = (self.open_tables[table].schema.field(name).metadata or {}).get(b"codes", b"").decode()
-                    if codes:
+                    facts = self.open_tables[table].schema.field(name).metadata or {}
+                    if codes := facts.get(b"codes", b"").decode():
                         return suggestions.explain_code(name, sign, text, codes)
+                    if facts.get(b"unit") == b"deg" and (problem := suggestions.explain_angle(name, text)):
+                        return problem
         return ""
 
     def _missing_names(self, query: Query, columns: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:

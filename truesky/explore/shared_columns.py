@@ -216,7 +216,8 @@ def compared_columns(tree: Tree, text: str) -> Iterator[tuple[str, str]]:
         if kind in ("COMPARE_IN", "COMPARE_NOT_IN"):
             operands = node.get("children", [])
         else:
-            operands = [node.get("left"), node.get("right")] if kind.startswith("COMPARE_") else []
+            keys = ("left", "right", "input", "lower", "upper") if kind.startswith("COMPARE_") else ()
+            operands = [node.get(key) for key in keys]
         literals = [operand.get("literal", {}) for operand in operands if operand]
         if {"kind": "STRING", "text": text} in literals:
             for operand in operands:

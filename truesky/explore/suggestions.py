@@ -42,9 +42,12 @@ _FLUX_NAME = re.compile(
     rf"|(?:(?<=^{_FILTER})|(?<=^vis))(?:mag|flux)$|^(?:mag|flux)(?={_FILTER}$|vis$)"
 )
 _BAND_PREFIX = "f_nu_"
-# Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i" or "lsst_i_flux".
+# Beginnings of the names of passbands.
+_SURVEY = "bessell|cfis|des|euclid|gaia|hsc|jedis|lsst|lsst2016|nisp|ps1|sdss|twomass"
+# Names of fluxes and magnitudes in a band, such as "f_nu_lsst_i", "lsst_i_flux" or "lsst_i".
 _IN_BAND = re.compile(
-    rf"^(?:f_nu|flux|mag|magnitude)_\w|\w_(?:flux|mag)$|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
+    rf"^(?:f_nu|flux|mag|magnitude|{_SURVEY})_\w|\w_(?:flux|mag)$"
+    rf"|^(?:{_FILTER}|vis)(?:mag|flux)$|^(?:mag|flux)(?:{_FILTER}|vis)$"
 )
 # End of a message: "LINE 1: SELECT ... " and a line with carets below the wrong word.
 _EXTRACT = re.compile(r"\s*\n(?P<line>LINE \d+: [^\n]*)\n(?P<blanks> *)(?P<carets>\^+)\s*\Z")
@@ -53,6 +56,8 @@ _AMBIGUOUS = re.compile(r'Ambiguous reference to column name "(?P<name>.+?)" \(u
 _UNKNOWN_FUNCTION = re.compile(
     r'Function with name (?P<name>.+?) does not exist!(?:\s*Did you mean "(?P<other>.+?)"\?)?'
 )
+# Angle in hours or degrees, minutes and seconds: its sign and three numbers.
+_SEXAGESIMAL = re.compile(r"([-+]?)(\d{1,3})\s*[:hd°\s]\s*(\d{1,2})(?:\s*[:m'\s]\s*(\d{1,2}(?:\.\d*)?)\s*[s\"]?)?")
 _REFUSED_TEXT = r"Could not convert string '([^\n]*?)' to (?:FLOAT|DOUBLE|U?INT\d*|DECIMAL\S*)"
 # Words that begin the parts of a query.
 _KEYWORDS = ("SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "LIMIT", "JOIN", "DISTINCT")
@@ -63,17 +68,8 @@ _BEFORE_CONDITION = re.compile(
 )
 # Functions of DuckDB for names that users know from other languages.
 _FUNCTIONS = {"average": "avg", "mean": "avg", "std": "stddev", "stdev": "stddev", "len": "count"}
-# Functions of other databases: distances between two positions, conditions that a distance is below a radius (deg),
-# table functions with a position and a radius (arcmin), and percentiles.
-_DISTANCES = {
-    "angdist", "angsep", "angular_distance", "angular_separation", "angulardistance", "greatcircleangle", "q3c_dist",
-    "sphdist", "sphere_distance", "st_distance", "st_distancesphere", "st_distance_sphere",
-}  # fmt: skip
-_IN_CIRCLE = {"q3c_join", "q3c_radial_query", "st_dwithin"}
-_AROUND = {"fgetnearbyobjalleq", "fgetnearbyobjeq", "fgetnearestobjalleq", "fgetnearestobjeq"}
-_PERCENTILES = {"approx_percentile", "percentile", "percentile_approx"}
 # Example of a condition for a circle.
-_CIRCLE = "separation(ra, dec, RA, DEC) < RADIUS (deg)"
+CIRCLE = "separation(ra, dec, RA, DEC) < RADIUS (deg)"
 # Messages of DuckDB, as patterns that match the beginning, and sentences that replace them.
 _SENTENCES = (
     (
@@ -116,6 +112,10 @@ _SENTENCES = (
     (
         r"No function matches the given name and argument types '(.+?)\((.*?)\)'",
         r"\1 does not accept arguments of type \2",
+    ),
+    (
+        r'Macro "?in_area[^\n]* does not support the supplied arguments',
+        f"in_area(ra, dec) selects the area of the request; for a circle write {CIRCLE}",
     ),
     (r'Macro "?(\w+)[^\n]* does not support the supplied arguments.*Candidate macros:\s*([^\n]*)', r"write \2 for \1"),
 )
@@ -216,7 +216,8 @@ def explain_missing_column(
     columns : mapping of str to collection of str
         Columns of each table that the query reads, or of the table of `entry`.
     other_tables : mapping of str to collection of str
-        Columns of the other tables of the query and of the lake that may be suggested.
+        Columns of the other tables of the query and of the lake. A table may be suggested if it shares an identifier
+        with a table of the query.
     message : str, optional
         Message of DuckDB about the column, which contains the names of columns of subqueries.
     aliases : mapping of str to str, optional
@@ -231,12 +232,14 @@ def explain_missing_column(
     """
     qualifier = f"{entry}." if entry else ""
     problem = f"column {qualifier}{name} does not exist"
+    keys = {column for names in columns.values() for column in names if column.endswith("id")}
+    related = {table: names for table, names in other_tables.items() if table in aliases or keys & {*names}}
     prefixes = {table: f"{aliases.get(table, table)}." for table in (*columns, *other_tables)}
     if entry or len(columns) == 1:
         prefixes |= dict.fromkeys(columns, qualifier)
     if targets := _targets(name, columns):
         return f"{problem}; use {_as_text(targets, prefixes)}"
-    if targets := _targets(name, other_tables):
+    if targets := _targets(name, related):
         hint = "" if {target.table for target in targets} & {*aliases} else _join_hint(targets, columns, other_tables)
         return f"{problem}; use {_as_text(targets, prefixes)}{hint}"
     # Names of columns of subqueries are in the message only.
@@ -382,62 +385,6 @@ def plain_message(message: str, query: str = "") -> str:
     return body.strip().rstrip("!") + place
 
 
-def replace_function(name: str, arguments: Sequence[str]) -> str:
-    """Return the SQL for a function of another database, or "" if the function is not known.
-
-    Parameters
-    ----------
-    name : str
-        Name of the function in lower case.
-    arguments : sequence of str
-        SQL of its arguments, in which numbers replace points and circles. If their number is wrong, the result is an
-        example.
-
-    Returns
-    -------
-    str
-        Text such as "separation(ra, dec, 53.1, -27.8) < 0.1 (deg)".
-    """
-    if name in _DISTANCES:
-        return f"separation({', '.join(arguments if len(arguments) == 4 else ('ra', 'dec', 'RA', 'DEC'))}) (deg)"
-    if name in _IN_CIRCLE:
-        return circle_condition(arguments)
-    if name in _AROUND:
-        position = ("ra", "dec", *arguments[:2])
-        is_complete = len(arguments) == 3
-        condition = circle_condition((*position, _divide(arguments[2], 60)) if is_complete else ())
-        return f"FROM galaxies WHERE {condition}"
-    if name in _PERCENTILES and len(arguments) >= 2:
-        column, percent = arguments[:2]
-        # Some databases have fractions in place of percent.
-        is_fraction = (number := _number(percent)) is not None and number <= 1.0
-        return f"quantile_cont({column}, {percent if is_fraction else _divide(percent, 100)})"
-    return "quantile_cont(z_obs, 0.5)" if name in _PERCENTILES else ""
-
-
-def circle_condition(arguments: Sequence[str]) -> str:
-    """Return the condition that a position is in a circle; `arguments` are ra, dec, the centre and the radius, in SQL.
-
-    With another number of arguments, an example is returned.
-    """
-    if len(arguments) != 5:
-        return _CIRCLE
-    *positions, radius = arguments
-    return f"separation({', '.join(positions)}) < {radius} (deg)"
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
-
-
-def _divide(text: str, divisor: int) -> str:
-    number = _number(text)
-    return f"{text} / {divisor}" if number is None else f"{number / divisor:.6g}"
-
-
 def explain_code(column: str, sign: str, text: str, codes: str) -> str:
     """Return a message about a text that is compared with a column of numeric codes.
 
@@ -462,6 +409,18 @@ def explain_code(column: str, sign: str, text: str, codes: str) -> str:
     number = numbers[meant[0]] if meant else "one of these numbers"
     remedy = f"{column} {sign} {number}" if meant and sign else f"{number} in place of '{text}'"
     return f"column {column} contains numbers ({codes}): write {remedy}"
+
+
+def explain_angle(column: str, text: str) -> str:
+    """Return a message about a text such as '53:00:00' that is compared with a column in deg, "" for other texts."""
+    match = _SEXAGESIMAL.fullmatch(text.strip())
+    if match is None:
+        return ""
+    size = sum(float(part or 0.0) / 60.0**power for power, part in enumerate(match.groups()[1:]))
+    problem = f"column {column} is in deg: write"
+    if column.startswith("ra") and size < 24.0:
+        return f"{problem} {15.0 * size:.7g} in place of '{text}', if this is in hours"
+    return f"{problem} {match[1] if match[1] == '-' else ''}{size:.7g} in place of '{text}'"
 
 
 def _missing_condition(word: str, extract: re.Match[str] | None, query: str) -> str:

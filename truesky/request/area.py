@@ -366,13 +366,16 @@ def _coordinate_lists(
     which names `path`, if the value is not such a list.
     """
     form = "[ra, dec]" if read_radius is None else "[ra, dec, radius]"
+    count = form.count(",") + 1
+    if isinstance(value, list) and len(value) >= count and all(isinstance(item, (int, float, str)) for item in value):
+        raise BadInput(f"{path} must be a list of {form} in degrees: write [{quote_value(value[:count])}, ..]")
     if not isinstance(value, list) or not min_count <= len(value) <= max_count:
         actual = len(value) if isinstance(value, list) else quote_value(value)
         raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form} in degrees, got {actual}")
     places = []
     with Mistakes() as mistakes:
         for i, place in enumerate(value):
-            if not isinstance(place, list) or len(place) != form.count(",") + 1:
+            if not isinstance(place, list) or len(place) != count:
                 mistakes.add(BadInput(f"{path}[{i}] must be {form} in degrees, got {quote_value(place)}"))
                 continue
             ra = mistakes.read(sky_notation.angle, place[0], f"{path}[{i}].ra", "ra", RA_LIMITS)

@@ -15,10 +15,12 @@ from lake_schema.tables.exposures import RENDERED_TYPES
 from truesky.request import instruments
 from truesky.request.files import Ingest
 from truesky.request.schema import MissionChoice, Override, Request, Stars
-from truesky.request.toml_values import as_table, number, quote_value, string
+from truesky.request.toml_values import Toml, as_table, number, quote_value, string
 
 # Largest distance in degrees from the area to a pointing that may belong to it.
 _NEAR_AREA = 3.0
+# Keys of the section `universe` that only select or count sources that truesky draws.
+_DRAWN_SOURCES = ("galaxy_limit", "galaxy_band", "star_limit", "high_redshift_boost", "quasar_boost")
 # Starts of messages about mission parameters.
 _OVERRIDE, _PARAMETER = "mission override ", "mission parameter "
 
@@ -39,6 +41,16 @@ def check_sources(request: Request) -> None:
     present = [key for key, is_present in other_sections.items() if is_present]
     if request.sources is not None and present:
         raise bad_input(f"sources: the tables contain all sources, the section {key} is not allowed" for key in present)
+
+
+def unused_values(table: Toml) -> Iterator[str]:
+    """Yield one line for each key of a valid request that has no effect, because the section `sources` is given.
+
+    `table` is the parsed request.
+    """
+    for key in _DRAWN_SOURCES if table.get("sources") else ():
+        if key in table.get("universe", {}):
+            yield f"universe.{key} has no effect: the tables in [sources] contain all sources"
 
 
 def check_places(request: Request) -> None:

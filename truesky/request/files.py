@@ -355,11 +355,20 @@ def _passbands(table: Toml, folder: Path) -> tuple[tuple[str, Curves], ...]:
     filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
     with Mistakes() as mistakes:
         for key in filters:
-            mistakes.read(layout.check_name, key)
+            mistakes.read(_check_passband_name, key)
         curves = [
             mistakes.read(_curves, value, f"fluxes.passbands.{key}", folder, True) for key, value in filters.items()
         ]
     return tuple(zip(filters, curves, strict=True))
+
+
+def _check_passband_name(name: str) -> None:
+    """Raise BadInput for a name that SQL does not take without quotes, because f_nu_NAME is the name of a column."""
+    layout.check_name(name)
+    if "-" in name:
+        raise BadInput(
+            f"fluxes.passbands.{name}: a name has only letters, digits and _: write {name.replace('-', '_')}"
+        )
 
 
 def _extinction_laws(table: Toml, folder: Path) -> tuple[tuple[int, Curves], ...]:

@@ -419,7 +419,7 @@ def _lensing(value: object) -> tuple[float, float] | None:
         raise BadInput(f"{path} must be {form}, got {_quote_value(value)}")
     table = _as_table(value, path, ("g1", "g2"))
     with Mistakes() as mistakes:
-        g1, g2 = (mistakes.read(_number, table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
+        g1, g2 = (mistakes.read(_number, table, f"{path}.{key}", -MAX_SHEAR, MAX_SHEAR) for key in ("g1", "g2"))
     if (size := math.hypot(g1, g2)) > MAX_SHEAR:
         raise BadInput(f"{path} = {_quote_value(value)}: |g| = {size:.4g} must be at most {MAX_SHEAR}")
     return g1, g2
@@ -534,7 +534,8 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
         checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
         return tuple(json.dumps([number, unit]) for number in checked)
     if not isinstance(value, list):
-        raise BadInput(f"{path} must be a list, got {_quote_value(value)}")
+        form = f"; write [{json.dumps(value)}]" if isinstance(value, (str, bool)) else ""
+        raise BadInput(f"{path} must be a list, got {_quote_value(value)}{form}")
     if key == "accuracy":
         return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
     effect = key.removeprefix("effects.")

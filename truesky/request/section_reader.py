@@ -42,6 +42,13 @@ _PLACES: dict[str, str] = {
     **{key: "[area]" for key in ("cone", "box", "polygon", "tile", "patches", "wide")},
     **{key: f"[{name}]" for name, keys in _SECTIONS.items() for key in keys if key not in _SECTIONS},
 }
+# The same for keys in the section itself, whose other meanings are in other sections.
+_PLACES_IN: dict[str, dict[str, str]] = {
+    "ingest": {
+        "columns": "did you mean [ingest.galaxies.columns]?",
+        **dict.fromkeys(("files", "format"), "[ingest.galaxies]"),
+    },
+}
 
 
 class RequestReader:
@@ -85,7 +92,11 @@ class RequestReader:
         """Return a section, {} if it is missing or not a table. Its unknown keys are mistakes."""
         values = self.read(key, section, self.table, key, None)
         if values is not None and _SECTIONS[key]:
-            places = {**_PLACES, **(_places_of_parameters(values) if key == "mission" else {})}
+            places = {
+                **_PLACES,
+                **_PLACES_IN.get(key, {}),
+                **(_places_of_parameters(values) if key == "mission" else {}),
+            }
             self.read(key, check_keys, values, key, _SECTIONS[key], places)
         return values or {}
 

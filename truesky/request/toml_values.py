@@ -30,7 +30,16 @@ _MAX_LISTED = 8
 _SYNONYMS = {
     "pa": "position_angle", "filter": "band", "filters": "bands", "exptime": "exposure_time_s", "depth": "galaxy_limit",
     "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
+    "date": "mjd", "date_obs": "mjd",
     "gamma1": "g1", "gamma2": "g2", "gamma_1": "g1", "gamma_2": "g2", "shear1": "g1", "shear2": "g2",
+}  # fmt: skip
+# Keys that users know from other programs and that a request does not have, with the reason.
+_FIXED = {
+    **dict.fromkeys(
+        ("h0", "hubble", "omega_m", "omega_b", "omega_lambda", "sigma_8", "sigma8", "n_s", "cosmology"),
+        "the cosmology is fixed: flat, H0 = 67, Omega_m = 0.319, Omega_b = 0.049, sigma_8 = 0.83, n_s = 0.96",
+    ),
+    **dict.fromkeys(("star_band", "stars_band"), "star_limit is always in H (Vega)"),
 }  # fmt: skip
 # Other names of values: ground cameras and surveys belong to one channel, cameras to a survey, and I_E is euclid_vis.
 _VALUES = {
@@ -39,6 +48,7 @@ _VALUES = {
     "hsc": ("EXT", "wishes"), "megacam": ("EXT", "cfis"), "gpc1": ("EXT", "ps1"),
     **dict.fromkeys(("pan-starrs", "panstarrs"), ("EXT", "ps1")),
     **dict.fromkeys(("off", "no", "false"), ("none",)), "noiseless": ("noise_free",),
+    "noise": ("poisson", "read_noise", "group_noise", "injection_noise"),
     **{f"{filter}{mark}e": (band,) for mark in ("", "_") for filter, band in
        (("i", "euclid_vis"), ("y", "euclid_y"), ("j", "euclid_j"), ("h", "euclid_h"))},
 }  # fmt: skip
@@ -79,6 +89,10 @@ def _hint(key: str, path: str, missing: Sequence[str], allowed: Sequence[str], p
     """Return where an unknown key belongs, or which allowed key the user may have meant, preferably a missing one."""
     if path and key in TOP_KEYS:
         return "it belongs at the top of the file, before the first [section]; "
+    if key.lower() in _FIXED:
+        return f"{_FIXED[key.lower()]}; "
+    if other := next((name for name in missing if path and name in (f"{key}s", key.removesuffix("s"))), ""):
+        return f"did you mean {other}?{' ' if len(allowed) <= _MAX_LISTED else ''}"
     if key in places:
         place = places[key]
         return place if place.endswith("?") else f"it belongs in {place}; "
@@ -280,9 +294,12 @@ def known_name(name: str, legal: Collection[str]) -> str:
 
 def refuse_name(name: str, legal: Sequence[str]) -> str:
     """Return the end of an error message about a name: the most similar legal name, if any, and the legal names."""
-    if (meant := known_name(name, legal)) != name:
-        return f"{quote_value(name)} is not allowed: {spelling.choices(meant, legal)}"
-    if spelling.did_you_mean(name, legal):
+    meant = [other for other in _VALUES.get(name.lower(), ()) if other in legal]
+    if len(meant) > 1:
+        return f"{quote_value(name)} is not allowed: did you mean {spelling.join_words(meant)}?"
+    if meant:
+        return f"{quote_value(name)} is not allowed: {spelling.choices(meant[0], legal)}"
+    if spelling.related_bands(name, legal) or spelling.did_you_mean(name, legal):
         return f"{quote_value(name)} is not allowed: {spelling.choices(name, legal)}"
     return f"{quote_value(name)} is not one of {', '.join(legal)}"
 
@@ -313,13 +330,22 @@ def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = 
     """
     texts = table.get(path.rpartition(".")[2], [])
     if not isinstance(texts, list) or not all(isinstance(item, str) for item in texts):
-        form = f"[{quote_value(texts)}]" if isinstance(texts, str) else '[".."]'
-        raise BadInput(f"{path} must be a list of texts such as {form}, got {quote_value(texts)}")
+        raise BadInput(f"{path} must be a list of texts such as {_list_form(texts, legal)}, got {quote_value(texts)}")
     if unknown := [item for item in texts if legal and item not in legal]:
         raise bad_input(f"{path}: {refuse_name(item, legal)}" for item in unknown)
     if distinct and len(set(texts)) != len(texts):
         raise BadInput(f"{path} = {quote_value(texts)} contains a text twice")
     return tuple(texts)
+
+
+def _list_form(value: object, legal: Sequence[str]) -> str:
+    """Return an example of a list of texts: a text alone, or the legal text that it means, becomes a list."""
+    if not isinstance(value, str):
+        return '[".."]'
+    if not legal or value in legal:
+        return f"[{quote_value(value)}]"
+    meant = spelling.closest_names(known_name(value, legal), legal, 1) or legal
+    return f"[{quote_value(meant[0])}] (allowed: {', '.join(legal)})"
 
 
 def number(table: Toml, path: str, lo: float, hi: float, default: float | None = None, unit: str = "") -> float:

@@ -33,6 +33,15 @@ def test_words_are_joined():
     assert spelling.join_words(("LAKE", "--out", "--name"), "and") == "LAKE, --out and --name"
 
 
+def test_another_filter_is_not_suggested():
+    bands = ("hsc_g", "hsc_z", "lsst_g", "lsst_i", "ps1_i", "euclid_vis")
+    for name in ("HSC-i", "hsc_i"):
+        assert spelling.choices(name, bands) == "allowed with hsc: hsc_g, hsc_z; allowed with i: lsst_i, ps1_i"
+    assert spelling.choices("lsst-g", bands).startswith("did you mean lsst_g?")
+    assert spelling.choices("euclid_y", bands) == "allowed with euclid: euclid_vis"
+    assert spelling.related_bands("wfi_g", bands) == ""
+
+
 def test_a_suggestion_stands_before_the_allowed_names():
     assert spelling.choices("VIS", BANDS) == f"did you mean euclid_vis? allowed: {', '.join(BANDS)}"
     assert spelling.choices("whatever", BANDS) == f"allowed: {', '.join(BANDS)}"

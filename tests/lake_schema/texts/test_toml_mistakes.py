@@ -43,6 +43,8 @@ MISTAKES = {
     "a key twice": ("[u]\na = 1\n[v]\nb = 1\na = 2\nb = 3\n", 6, "v.b is given twice, first in line 4"),
     "a key twice in a table": ("c = { a = 1, a = 2 }", 1, "a is given twice"),
     "a section twice": ("[u]\na = 1\n[u]\nb = 1", 3, "[u] is given twice, first in line 1: give its keys once"),
+    "a list of tables with one bracket": ("[u]\na = 1\n[[u]]\nb = 1", 1, "write [[u]] in place of [u] for a list"),
+    "the second table with one bracket": ("[[u]]\na = 1\n[u]\nb = 1", 3, "write [[u]] in place of [u] for a list"),
     "a date": ("mjd = 2027-02-30", 1, "there is no such date or time"),
     "a backslash": (r'a = "C:\data"', 1, r"write \\ for \ between double quotes"),
     "no key": ("= 3", 1, "the key before the equals sign is missing"),

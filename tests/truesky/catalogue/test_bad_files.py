@@ -85,7 +85,7 @@ def test_a_file_that_is_cut_short(tmp_path, monkeypatch, capsys, text, values):
 
 def test_a_band_that_is_not_there(tmp_path, capsys):
     said = refused(tmp_path, '[universe]\ngalaxy_band = "euclid_x"\n', capsys)
-    assert "universe.galaxy_band = 'euclid_x' is not allowed: did you mean euclid_" in said
+    assert "universe.galaxy_band = 'euclid_x' is not allowed: allowed with euclid: euclid_vis, euclid_y" in said
 
 
 def test_a_map_in_the_wrong_ordering(tmp_path, capsys):

@@ -8,6 +8,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.tables import all_tables
 from truesky.explore import explorer, suggestions
+from truesky.fluxes import passbands
 
 BANDS = ["euclid_vis", "lsst_r", "des_r"]
 TABLES = {table.name: list(table.names) for table in all_tables(BANDS)}
@@ -63,6 +64,19 @@ def test_columns_of_other_tables():
     assert "use stars.teff (effective temperature)" in explained("teff")
 
 
+def test_columns_of_unrelated_tables_are_not_suggested():
+    """Rows of galaxies and of emission lines have no common identifier."""
+    assert "pivot_wavelength" in TABLES["passbands"]
+    assert explained("pivot_wavelength").startswith("column pivot_wavelength does not exist; use one of id, ")
+    assert explained("pivot", "galaxies").startswith("column pivot does not exist; use one of id, ")
+    assert "use exposures.mjd (" in explained("mjd", "products")
+
+
+def test_names_of_passbands_are_recognised():
+    for name in passbands.names():
+        assert suggestions._IN_BAND.search(name), name
+
+
 def test_similar_names_and_names_of_subqueries():
     assert explained("z_ob") == "column z_ob does not exist; did you mean z_obs?"
     assert explained("zz") == "column zz does not exist; did you mean zzz?"
@@ -97,7 +111,19 @@ def test_the_missing_column_of_a_message(message, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["f_nu_lsst_i", "f_nu_euclid_vs", "mag_lsst_i", "lsst_i_flux", "flux_g", "kmag", "g_mag", "magk", "hflux"]
+    "name",
+    [
+        "gaia_g",
+        "f_nu_lsst_i",
+        "f_nu_euclid_vs",
+        "mag_lsst_i",
+        "lsst_i_flux",
+        "flux_g",
+        "kmag",
+        "g_mag",
+        "magk",
+        "hflux",
+    ],
 )
 def test_no_other_band_is_suggested(name):
     remedy = "the lake has fluxes only in euclid_vis, lsst_r and des_r; fluxes.bands in the request adds other bands"
@@ -181,6 +207,7 @@ def test_tables(name, found):
             "SELECT galaxies.id, galaxy_fluxes.f_nu_euclid_vis FROM galaxies",
             r"alias galaxy_fluxes; it has galaxies; add JOIN galaxy_fluxes USING \(id\)$",
         ),
+        ("SELECT name, ra FROM galaxies", r"^SQL: column name does not exist; use id \(identifier of the source\)$"),
         ("SELECT id FROM galaxy", "'galaxy' is not a table of the lake; did you mean galaxies?"),
         ("SELECT id FROM nothing_like_it", r"is not a table of the lake \(galaxies, galaxy_fluxes"),
     ],
@@ -341,6 +368,27 @@ def test_other_messages_are_unchanged():
         ("SELECT id FROM galaxies ORDER z_obs", "syntax error near z_obs: write ORDER BY$"),
         ("SELECT id FROM galaxies WHERE kind IS 'QSO'", "write = 'QSO' in place of IS 'QSO'$"),
         ("SELECT id FROM galaxies LIMIT 10 WHERE z_obs > 1", "WHERE comes before GROUP BY, ORDER BY and LIMIT$"),
+        (
+            "SELECT id FROM galaxies WHERE cone(53.1, -27.8, 60)",
+            r"^SQL: function cone does not exist: write separation\(ra, dec, 53.1, -27.8\) < RADIUS \(deg\)$",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE in_area(53.1, -27.8, 0.1)",
+            r"^SQL: in_area\(ra, dec\) selects the area of the request; for a circle write separation\(ra, dec, RA,",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE ra BETWEEN '53:30:00' AND '53:40:00'",
+            "^SQL: column ra is in deg: write 53.5 in place of '53:30:00'$",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE ra > '03:32:28'",
+            "^SQL: column ra is in deg: write 53.11667 in place of '03:32:28', if this is in hours$",
+        ),
+        (
+            "SELECT id FROM galaxies WHERE dec < '-27:48'",
+            "^SQL: column dec is in deg: write -27.8 in place of '-27:48'$",
+        ),
+        ("galaxies", r"^SQL: galaxies is a table: write SELECT \* FROM galaxies$"),
         ("SHOW TABLES", r"SHOW and DESCRIBE are not possible: truesky sql LAKE lists the tables, .* lake.tables"),
         ("DELETE FROM galaxies", "^SQL: DELETE is not possible: write a SELECT, because the tables can only be read$"),
         ("SELECT 1; SELECT 2", r"^SQL: the text contains 2 statements \(SELECT, SELECT\): write a single SELECT$"),

@@ -1,5 +1,7 @@
 """Compare distances with astropy, adaptive quadrature and the series for small redshifts."""
 
+import re
+
 import numpy as np
 import pytest
 from astropy.cosmology import FlatLambdaCDM
@@ -7,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lake_schema.errors import OutOfRange
+from lake_schema.errors import BadInput, OutOfRange
 from truesky.fluxes import cosmology
+from truesky.request.toml_values import check_keys
 
 ORACLE = FlatLambdaCDM(H0=100.0, Om0=0.319, Tcmb0=0.0)
 Z = np.geomspace(1e-3, 20.0, 40)
@@ -89,3 +92,16 @@ def test_ages():
         whole = quad(lambda x: 1.0 / ((1.0 + x) * float(cosmology.expansion_rate(x))), z, np.inf)[0]
         assert float(cosmology.age(z)) == pytest.approx(whole * 9.777922 / 0.67, rel=1e-6)
     assert float(cosmology.age(0.0, 0.3, 0.7)) == pytest.approx(13.47, abs=0.01)
+
+
+def test_a_request_with_another_cosmology_names_the_values():
+    with pytest.raises(BadInput) as caught:
+        check_keys({"Omega_m": 0.3}, "universe", ("z_max",))
+    values = (
+        100.0 * cosmology.HUBBLE,
+        cosmology.OMEGA_M,
+        cosmology.OMEGA_B,
+        cosmology.SIGMA_8,
+        cosmology.SPECTRAL_INDEX,
+    )
+    assert re.findall(r"= ([\d.]+\d)", str(caught.value)) == [f"{value:g}" for value in values]

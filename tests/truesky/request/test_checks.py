@@ -121,3 +121,12 @@ def test_every_job_lists_types_that_are_only_planned(tmp_path, capsys):
     assert capsys.readouterr().err == (
         "sleep: EXT standard_star: planned and forecast, skipped by rendering (no simulator yet)\n"
     )
+
+
+def test_keys_without_effect_beside_given_sources_are_listed():
+    universe = {"galaxy_limit": 25.0, "star_limit": 20.0, "lensing": "none"}
+    assert list(checks.unused_values({"universe": universe})) == []
+    assert list(checks.unused_values({"universe": universe, "sources": {"only": "table"}})) == [
+        f"universe.{key} has no effect: the tables in [sources] contain all sources"
+        for key in ("galaxy_limit", "star_limit")
+    ]

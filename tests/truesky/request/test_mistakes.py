@@ -2,7 +2,9 @@
 
 import pytest
 
+from lake_schema.errors import BadInput
 from truesky.commands import check, plan
+from truesky.request.exposures import pointing_tables
 from truesky.running import submitted_job
 
 HEAD = 'name = "x"\nseed = 1\n'
@@ -54,6 +56,8 @@ MISTAKES = {
     ),
     "an effect that every image needs": (GOOD + '[effects]\noff = ["adc"]\n', "effects.off: 'adc' cannot be switched"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
+    "before the launch": (pointed("60905.0", "58979.0"), "pointing[0].mjd: MJD 58979 is before the launch of Euclid"),
+    "a bias before the launch": (BIAS + "mjd = 58979\n", "observation[0].mjd: MJD 58979 is before the launch of"),
     "an area too small": (pointed("0.2 }", "0.01 }"), "enough: area.cone = { ra = 53.117, dec = -27.808, radius"),
     "an area elsewhere": (
         pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 detector positions see sky outside",
@@ -199,3 +203,14 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsy
         assert words in said.err
         assert (said.out, said.err.count("\n")) == ("", 1)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_unknown_column_does_not_hide_wrong_values(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("ra,dec,exptime\n53.1,95,30\n")
+    with pytest.raises(BadInput) as caught:
+        pointing_tables.read(path, ("VIS",), "science")
+    first, second = caught.value.messages
+    assert first.endswith("column exptime is unknown: did you mean exposure_time_s?")
+    assert "line 2: dec" in second
+    assert "95.0 is outside" in second

@@ -353,6 +353,11 @@ MISTAKES = {
         "mission.overrides.vis.gain: the unit must be electron / adu",
         "got mm",
     ),
+    "a unit in capitals": (
+        section("mission.overrides", '"vis.read_noise" = { value = 5.0, unit = "ADU" }'),
+        "mission.overrides.vis.read_noise: 'ADU' is not a unit: ",
+        "the unit must be electron or a unit that converts to it",
+    ),
     "a list of values": (
         section("explore", '"vis.gain" = [3.0, 3.5]'),
         "explore.vis.gain",
@@ -391,6 +396,74 @@ MISTAKES = {
         "did you mean none? allowed: box, none",
     ),
     "truth without noise": (section("products", 'truth = ["noiseless"]'), "products.truth", "did you mean noise_free?"),
+    "a date of an observation": (EUCLID + 'date = "2027-11-20"\n', "observation[0].date", "did you mean mjd?"),
+    "a band of the stars' limit": (
+        section("universe", 'star_band = "gaia_g"'),
+        "universe.star_band is not a key of a request; star_limit is always in H (Vega); ",
+        "allowed here: alignment, box_cells",
+    ),
+    "another cosmology": (
+        section("universe", "H0 = 70"),
+        "universe.H0 is not a key of a request; the cosmology is fixed: flat, H0 = 67, ",
+        "Omega_m = 0.319",
+    ),
+    "an unknown truth without brackets": (
+        section("products", 'truth = "noiseless"'),
+        "products.truth must be a list of texts such as ['noise_free'] (allowed: noise_free, ",
+        "got 'noiseless'",
+    ),
+    "a truth of no known name without brackets": (
+        section("products", 'truth = "qqqq"'),
+        "such as ['noise_free'] (allowed: noise_free, ",
+        "got 'qqqq'",
+    ),
+    "a band of the fluxes": (
+        section("fluxes", 'band = ["euclid_y"]'),
+        "fluxes.band is not a key of a request; ",
+        "did you mean bands? allowed",
+    ),
+    "a band that a survey has not": (
+        GROUND + 'bands = ["lsst_x"]\n',
+        "survey lsst has no band 'lsst_x': ",
+        "allowed with lsst: lsst_u, lsst_g",
+    ),
+    "a flat list of vertices": (
+        area("polygon = [150.0, 2.0, 150.3, 2.0, 150.3, 2.3]"),
+        "area.polygon must be",
+        "write [[150.0, 2.0], ..]",
+    ),
+    "a flat list of circles": (area("patches = [150.0, 2.0, 0.3]"), "area.patches", "write [[150.0, 2.0, 0.3], ..]"),
+    "a large shear": (section("universe", "lensing = { g1 = 2.0, g2 = 0 }"), "universe.lensing.g1 = 2", "[-0.9, 0.9]"),
+    "any noise": (
+        section("effects", 'off = ["noise"]'),
+        "effects.off: 'noise' is not allowed: ",
+        "did you mean poisson, read_noise, group_noise or injection_noise?",
+    ),
+    "an explored accuracy without brackets": (
+        section("explore", 'accuracy = "survey"'),
+        "explore.accuracy must be a list",
+        'write ["survey"]',
+    ),
+    "an explored effect without brackets": (
+        section("explore", '"effects.poisson" = true'),
+        "explore.effects.poisson must be a list",
+        "write [true]",
+    ),
+    "columns of no catalogue": (
+        section("ingest.columns", 'ra = "RA"'),
+        "ingest.columns is not a key of a request; ",
+        "did you mean [ingest.galaxies.columns]?",
+    ),
+    "files of no catalogue": (
+        section("ingest", 'files = ["x.csv"]'),
+        "ingest.files is not a key",
+        "it belongs in [ingest.galaxies]",
+    ),
+    "a hyphen in the name of a passband": (
+        section("fluxes.passbands.my-g", 'file = "x.dat"\nmedium = "air"\nformat = "passband_ascii"'),
+        "fluxes.passbands.my-g: a name has only letters, digits and _: ",
+        "write my_g",
+    ),
     "one file": (section("ingest.galaxies", 'file = "x.parquet"'), "ingest.galaxies.file", "did you mean files?"),
 }
 
@@ -433,6 +506,13 @@ def test_all_wrong_values_of_parameters_are_reported_in_the_order_of_the_file(tm
     names = [message.removeprefix("mission.overrides.").split(" ")[0].rstrip(":") for message in messages]
     wrong = ["vis.readnoise", "vis.gain", "vis.biass", "vis.full_well", "vis.read_noise"]
     assert names == [*wrong, "vis.bias@9-9"]
+
+
+def test_a_wrong_unit_does_not_hide_an_unknown_detector(tmp_path):
+    line = '"vis.dark_current@34" = { value = 1, unit = "mm" }'
+    messages = read_valid_parts(tomllib.loads(section("mission.overrides", line)), tmp_path).messages
+    assert ["the unit must be" in text for text in messages] == [True, False]
+    assert "vis has no detector '34'" in messages[1]
 
 
 def test_there_are_more_than_60_mistakes():

@@ -149,9 +149,28 @@ def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns
     return Split(folder, checksums, **json.loads((folder / _SUMMARY_FILE).read_text()))
 
 
-def radians_hint(largest_ra: float, largest_dec: float) -> str:
-    """Return words that ask for degrees if the largest absolute coordinates of all rows would fit radians, or ""."""
-    fit = largest_ra < _MAX_RADIANS[0] and largest_dec < _MAX_RADIANS[1]
+def unit_hint(ra_limits: tuple[float, float], dec_limits: tuple[float, float], area: Area) -> str:
+    """Return words that ask for degrees if the positions of all rows would fit hours or radians, or "".
+
+    Parameters
+    ----------
+    ra_limits, dec_limits : (float, float)
+        Smallest and largest coordinates of the rows.
+    area : Area
+        Area of the request. Right ascensions fit hours if they are then near it.
+
+    Returns
+    -------
+    str
+        The words, which continue an error message.
+    """
+    ra, dec, radius = area.bounding_circle()
+    width = radius / max(float(np.cos(np.radians(dec))), 1e-3)
+    in_deg, in_hours = (factor * ra_limits[0] - width <= ra <= factor * ra_limits[1] + width for factor in (1.0, 15.0))
+    near_dec = dec_limits[0] - radius <= dec <= dec_limits[1] + radius
+    if in_hours and not in_deg and near_dec and max(ra_limits) <= 24.0:
+        return "; if the right ascensions are in hours, write ra = { column = .., scale = 15 }"
+    fit = max(map(abs, ra_limits)) < _MAX_RADIANS[0] and max(map(abs, dec_limits)) < _MAX_RADIANS[1]
     return "; if the positions are in radians, convert them to degrees" if fit else ""
 
 
@@ -206,7 +225,7 @@ def _outside_area(
     """Return the error about a catalogue without rows in the area; `limits` are the ranges of its positions (deg)."""
     titles = [reading.column_titles(columns, key) for key in keys]
     ranges = " and ".join(f"{title} from {lo:g} to {hi:g}" for title, (lo, hi) in zip(titles, limits, strict=True))
-    hint = radians_hint(*(max(map(abs, pair)) for pair in limits))
+    hint = unit_hint(limits[0], limits[1], area)
     more_files = f" and {len(files) - 1} more file{'s' if len(files) > 2 else ''}" if len(files) > 1 else ""
     place = f"{user_files.format_path(files[0])}{more_files}"
     return BadInput(f"{place}: no row is in the area, {area.describe()}: the rows have {ranges} deg{hint}")
@@ -250,13 +269,17 @@ def check_rows(files: Sequence[Path], sha256: Sequence[str], columns: Columns, a
                     highs.append((ra.max(), dec.max()))
             identifiers.refuse_duplicates(files, _identifier_title(columns))
         if not rows:
-            raise BadInput(f"{files[0]}: the table has no rows")
+            raise _no_rows(files)
         limits = np.array([np.min(lows, axis=0), np.max(highs, axis=0)]) if lows else np.zeros((2, 2))
         return {"rows": np.array([rows]), "cells": np.unique(np.concatenate(cells)), "limits": limits}
 
     checked = cache.cached_arrays("checked_rows", _content_key(sha256, columns), count_rows)
     if area is not None and not np.isin(checked["cells"], area.cells(GENERATION_ORDER)).any():
         raise _outside_area(files, columns, keys, [tuple(pair) for pair in checked["limits"].T.tolist()], area)
+
+
+def _no_rows(files: Sequence[Path]) -> BadInput:
+    return BadInput(f"{user_files.format_path(files[0])}: the table has no rows")
 
 
 def _content_key(sha256: Sequence[str], columns: Columns) -> str:
@@ -359,6 +382,8 @@ def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict
             buffered, buffered_rows, piece_number = [], 0, piece_number + 1
     _write_cells(folder, buffered, piece_number)
     identifiers.refuse_duplicates(files, _identifier_title(columns))
+    if not count:
+        raise _no_rows(files)
     return {"rows": count, "z_max": z_max, "ebv_max": ebv_max}
 
 

@@ -28,6 +28,8 @@ Bounds = Mapping[str, tuple[float, float]]
 _FILE = Path(__file__).with_name("ingest_formats.toml")
 # Pattern of a unit of surface brightness.
 _PER_AREA = re.compile(r"/|arcsec|deg|sr")
+# Names of flux densities in a band, which truesky has only as magnitudes.
+_BAND_FLUX = re.compile(r"(flux|f_?nu)(es)?(_[a-z]|_\w+_[a-z])?")
 IDENTIFIER_KEYS = ("origin_id", "halo")
 _FIELD_KEYS = (
     "column", "plus", "minus", "over", "kpc_at", "power10", "log10", "scale", "offset", "unit", "value", "beside",
@@ -269,13 +271,13 @@ def parse_columns(
     fields, suggested = {}, set()
     for key, entry in entries.items():
         if key not in legal:
-            meant = synonyms.find_columns(key, ("given_galaxies", "galaxies", "halos"), legal)
-            suggested |= {*(meant or spelling.closest_names(key, legal, 1))}
-            hint = f"did you mean {' or '.join(meant)}?" if meant else spelling.choices(key, list(legal))
+            meant, hint = _explain_property(key, entry, legal, entries)
+            suggested |= {*meant}
             messages.append(f"{path}.{key} is not a known property: {hint}")
         elif key not in legal_settings:
             try:
-                fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
+                field = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
+                fields[key] = _with_stated_unit(key, field, f"{path}.{key}")
             except BadInput as error:
                 messages.append(str(error))
     messages += _wrong_settings(settings, path)
@@ -287,6 +289,53 @@ def parse_columns(
     refuse_mistakes(messages)
     companion_prefixes = tuple(settings.pop("beside", ()))
     return Columns(fields, bounds, nullable, companion_prefixes=companion_prefixes, path=path, **settings)
+
+
+def _explain_property(
+    key: str, entry: object, legal: Collection[str], given: Collection[str]
+) -> tuple[Sequence[str], str]:
+    """Return the properties that a user may have meant by an unknown one, and the end of an error message about it.
+
+    Parameters
+    ----------
+    key : str
+        The unknown property.
+    entry : object
+        Column or definition that the request gives for it.
+    legal : collection of str
+        Properties that exist.
+    given : collection of str
+        All keys of the mapping.
+
+    Returns
+    -------
+    (sequence of str, str)
+        The properties and the end of the message.
+    """
+    if isinstance(entry, str) and entry in legal and entry not in given:
+        return [entry], f'the key is the property, and the value its column: write {entry} = "{key}"'
+    if meant := synonyms.find_columns(key, ("given_galaxies", "galaxies", "halos"), legal):
+        return meant, f"did you mean {' or '.join(meant)}?"
+    if "mag" in legal and _BAND_FLUX.fullmatch(key.lower()):
+        fluxes = flux_entry(entry if isinstance(entry, str) else "..")
+        return ["mag"], f"write mag for AB magnitudes; for fluxes write {fluxes}"
+    return spelling.closest_names(key, legal, 1), spelling.choices(key, list(legal))
+
+
+def flux_entry(column: str) -> str:
+    """Return the entry of a mapping that converts a column of flux densities to AB magnitudes, for a message."""
+    entry = f'mag = {{ column = "{column}", log10 = true, scale = -2.5, offset = 23.9 }}'
+    return f"{entry} (microjansky; offset = -48.6 for erg/s/cm2/Hz)"
+
+
+def _with_stated_unit(key: str, field: Field, path: str) -> Field:
+    """Return an entry that converts the unit which the request states for a column that is not computed."""
+    if not field.unit or not replace(field, unit="").is_plain():
+        return field
+    try:
+        return replace(field, scale=factor_of_unit(key, field.unit))
+    except BadInput as error:
+        raise BadInput(f"{path} {error}") from None
 
 
 def with_last_template(columns: Columns, last: int) -> Columns:

@@ -18,7 +18,7 @@ from lake_schema.arrays import Array
 from lake_schema.errors import BadInput, Mistakes, bad_input
 from lake_schema.external import rows as external_rows
 from lake_schema.external.files import check_column_names
-from lake_schema.external.mistakes import TableMistakes, format_range
+from lake_schema.external.mistakes import TableMistakes, format_number, format_range
 from lake_schema.external.rows import RowBatch
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue.external import ellipticity
@@ -32,6 +32,7 @@ from truesky.catalogue.external.mapping import (
     Field,
     companion_file,
     factor_of_unit,
+    flux_entry,
     parse_unit,
     unit_of,
 )
@@ -323,9 +324,16 @@ def _check_absolute_magnitude(
     z = np.clip(np.where(valid, z, 1.0), MIN_REDSHIFT, None)
     absolute = apparent - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
-    is_wrong = valid & ~((absolute >= lo) & (absolute <= hi))
     titles, noun = column_titles(columns, magnitude, z_key), "the absolute magnitude from columns"
-    mistakes.add_rows(piece.file, piece.first_row, titles, is_wrong, absolute, f"must be from {lo:g} to {hi:g}", noun)
+    allowed = f"must be from {lo:g} to {hi:g}"
+    mistakes.add_rows(piece.file, piece.first_row, titles, valid & (absolute > hi), absolute, allowed, noun)
+    too_bright = valid & ~(absolute >= lo)
+    if too_bright.any():
+        field, row = columns.fields[magnitude], int(np.argmax(too_bright))
+        problem = f"is {format_number(absolute[row])} ({magnitude} = {format_number(apparent[row])})"
+        can_be_flux = magnitude == "mag" and field.is_plain()
+        flux = f": if {field.column} is a flux, write {flux_entry(field.column)}" if can_be_flux else ""
+        mistakes.add_rows(piece.file, piece.first_row, titles, too_bright, problem, f"{allowed}{flux}", noun)
 
 
 def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:

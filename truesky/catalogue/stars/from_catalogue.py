@@ -7,8 +7,9 @@ line with another number of fields.
 
 from __future__ import annotations
 
+import re
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 from itertools import islice
@@ -186,16 +187,23 @@ def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
         lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
         head: list[str] = []
         similar: list[str] = []
+        previous: list[str] = []
+        probable_head: list[str] = []
         for line in islice(lines, _MAX_HEADER_LINES):
             candidate = _split_line(line)
             if set(titles) <= set(candidate):
                 head = candidate
                 break
             similar = max(similar, candidate, key=lambda names: len(set(titles) & set(names)))
+            if not probable_head and len(candidate) == len(previous) > 1 and _has_number(candidate):
+                probable_head = [] if _has_number(previous) else previous
+            previous = candidate
         if not head:
             # The line with the names of the columns has at least half of them.
             if 2 * len(set(titles) & set(similar)) >= len(set(titles)):
                 check_column_names(file, similar, titles)
+            if probable_head:
+                check_column_names(file, probable_head, titles)
             raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines has the columns {', '.join(titles)}")
         if duplicates := [title for title in titles if head.count(title) > 1]:
             raise BadInput(f"{file}: the column name {duplicates[0]} must not occur twice")
@@ -214,6 +222,10 @@ def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
                     mistakes.add_row(file, title, "number", f"{file}: {problem}")
     mistakes.refuse()
     return {title: np.array(column) for title, column in values.items()}
+
+
+def _has_number(fields: Sequence[str]) -> bool:
+    return any(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", field, re.IGNORECASE) for field in fields)
 
 
 def _split_line(line: str) -> list[str]:

@@ -273,7 +273,11 @@ def check_curve(path: Path, wavelength: Float, value: Float, form: Mapping[str, 
         ends = f"{wavelength[0]:g} .. {wavelength[-1]:g}"
         raise BadInput(f"{path}: covers {ends} A, not {first:g} .. {last:g} A: is the unit right?")
     wide = (np.diff(np.log(wavelength)) > form["largest_gap"]) & (wavelength[1:] > first) & (wavelength[:-1] < last)
-    _refuse(path, np.append(False, wide), "follows a gap")
+    for row in np.flatnonzero(wide)[:1].tolist():
+        lower, upper = wavelength[row : row + 2].tolist()
+        largest = lower * np.expm1(form["largest_gap"])
+        problem = f"row {row + 2} ({upper:g} A) follows a gap of {upper - lower:g} A"
+        raise BadInput(f"{path}: {problem}, but at most {largest:.4g} A is allowed there: add rows")
 
 
 def _refuse(path: Path, bad: Bool, problem: str) -> None:

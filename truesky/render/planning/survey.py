@@ -35,7 +35,7 @@ from truesky.render.planning.planned_exposures import (
     ramp_overrides,
     through_grism,
 )
-from truesky.render.sky.solar_aspect import check_aspect
+from truesky.render.sky.solar_aspect import check_aspect, check_launch
 from truesky.request.area import Area
 from truesky.request.exposures import pointing_tables
 from truesky.request.exposures.observations import Observation
@@ -372,6 +372,8 @@ def _schedule_block(
     if _is_undated(block) and {"NISP-P", "NISP-S"} & {*block.channels}:
         start = nisp_free_mjd
     try:
+        if block.mjd is not None and block.field_centre is None and "EXT" not in block.channels:
+            check_launch(block.mjd, mission, "mjd")
         check_macc(block, mission)
         scheduled = _schedule_exposures(block, area, request.seed, start, mission)
         # Check only the first visits with an even and an odd number: visits of Euclid fields differ only in the grism.

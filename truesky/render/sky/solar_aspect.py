@@ -221,20 +221,51 @@ def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguratio
     Raises
     ------
     BadInput
-        If the angle from the Sun is outside the limits; the message contains the next allowed dates.
+        If the date is before the launch, or the angle from the Sun is outside the limits. The message contains the next
+        allowed dates.
     """
-    if is_allowed(ra, dec, mjd, mission):
+    launch = mission.value("svm.launch", "d")
+    if mjd >= launch and is_allowed(ra, dec, mjd, mission):
         return
     lowest, highest = limits(mission)
     angle = solar_aspect(ra, dec, mjd)
     stretches = [
-        f"{_date(first, 'up')} to {_date(last, 'down')}" for first, last in allowed_intervals(ra, dec, mjd, mission)
+        f"{_date(first, 'up')} to {_date(last, 'down')}"
+        for first, last in allowed_intervals(ra, dec, max(mjd, launch), mission)
     ]
     when = f"next allowed: MJD {', '.join(stretches[:2])}" if stretches else "no day of the next year is allowed"
-    raise BadInput(
-        f"{where}: the pointing is {angle:.1f} deg from the Sun on MJD {mjd:g}, but {lowest:g} to {highest:g} deg is "
-        f"allowed; {when}"
+    problem = (
+        f"the pointing is {angle:.1f} deg from the Sun on MJD {mjd:g}, but {lowest:g} to {highest:g} deg is allowed"
     )
+    if mjd < launch:
+        problem = _before_launch(mjd, launch)
+    raise BadInput(f"{where}: {problem}; {when}")
+
+
+def check_launch(mjd: float, mission: MissionConfiguration, where: str) -> None:
+    """Check that a date of an exposure of Euclid is not before the launch.
+
+    Parameters
+    ----------
+    mjd : float
+        Date (MJD).
+    mission : MissionConfiguration
+        Mission database, with the date of the launch.
+    where : str
+        Place in the user's input that gives the date, quoted in the error message.
+
+    Raises
+    ------
+    BadInput
+        If the date is before the launch.
+    """
+    launch = mission.value("svm.launch", "d")
+    if mjd < launch:
+        raise BadInput(f"{where}: {_before_launch(mjd, launch)}")
+
+
+def _before_launch(mjd: float, launch: float) -> str:
+    return f"MJD {mjd:g} is before the launch of Euclid on MJD {_date(launch, 'up')}"
 
 
 def _date(mjd: float, towards: str) -> str:

@@ -210,8 +210,10 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     rows: list[Row] = []
     with Mistakes() as mistakes:
         try:
-            _refuse_columns(path, lines.fieldnames or [], channels)
-            for row in lines:
+            names = lines.fieldnames or []
+            mistakes.read(_refuse_columns, path, names, channels)
+            # The rows are also checked if the table has unknown columns.
+            for row in lines if {*_required_columns(channels)} <= {*names} else ():
                 if len(rows) >= _MAX_ROWS:
                     raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
                 rows.append(mistakes.read(_row_from_line, row, path, line_number, channels, image_type))
@@ -222,9 +224,12 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     return rows
 
 
+def _required_columns(channels: Sequence[str]) -> tuple[str, ...]:
+    return (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
+
+
 def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
-    required = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
-    missing = [name for name in required if name not in names]
+    missing = [name for name in _required_columns(channels) if name not in names]
     if missing:
         csv_headers.check_header(path, names)
     similar = {name: _similar_name(name) for name in names if name not in _NAMES}

@@ -120,6 +120,66 @@ def test_an_impossible_absolute_magnitude_is_named(tmp_path):
     assert line.endswith("must be from -30 to 5")
 
 
+def test_a_flux_in_place_of_a_magnitude_is_explained(tmp_path):
+    columns = {**table(), "MAG": np.full(50, 2.5e-28)}
+    (line,) = mistakes(tmp_path, written(tmp_path, columns), galaxies())
+    assert "row 1 is -" in line
+    assert ' (mag = 2.5e-28), but must be from -30 to 5: if MAG is a flux, write mag = { column = "MAG"' in line
+    assert line.endswith(
+        ' = "MAG", log10 = true, scale = -2.5, offset = 23.9 } (microjansky; offset = -48.6 for erg/s/cm2/Hz)'
+        " (49 more rows)"
+    )
+    scaled = galaxies(mag={"column": "MAG", "log10": True, "scale": -2.5, "offset": -48.6})
+    (rows,) = reading.read(written(tmp_path, columns), scaled)
+    assert rows.values["mag"] == pytest.approx(-2.5 * np.log10(2.5e-28) - 48.6)
+
+
+@pytest.mark.parametrize(
+    ("entries", "replaced", "line"),
+    [
+        (
+            {"flux": "F"},
+            ["mag", "band"],
+            'flux is not a known property: write mag for AB magnitudes; for fluxes write mag = { column = "F", log10',
+        ),
+        ({"f_nu_lsst_i": "F"}, ["mag"], "f_nu_lsst_i is not a known property: write mag for AB magnitudes; "),
+        ({"flux_halfa": "F"}, [], "flux_halfa is not a known property: did you mean flux_halpha"),
+        (
+            {"DEC": "dec"},
+            ["dec"],
+            'DEC is not a known property: the key is the property, and the value its column: write dec = "DEC"',
+        ),
+        (
+            {"half_light_radius": {"column": "R", "unit": "pixel"}},
+            [],
+            "half_light_radius has the unit pixel, but must be in arcsec or a unit that converts to it",
+        ),
+    ],
+)
+def test_the_remedy_of_a_wrong_entry(entries, replaced, line):
+    # The entry is meant for one of these properties, which is then not missing.
+    given = {name: entry for name, entry in GALAXIES.items() if name not in replaced}
+    with pytest.raises(BadInput) as caught:
+        galaxies(given, **entries)
+    assert [text.startswith(f"ingest.galaxies.columns.{line}") for text in caught.value.messages] == [True]
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("arcsec", 1.0), ("arcmin", 60.0), ("deg", 3600.0)])
+def test_a_unit_that_the_request_states_is_converted(tmp_path, unit, factor):
+    path = tmp_path / "x.csv"
+    path.write_text("RA,DEC,Z,MAG,ID,R\n53,-27,0.5,21,1,0.01\n")
+    (rows,) = reading.read([path], galaxies(half_light_radius={"column": "R", "unit": unit}))
+    assert rows.values["disk_half_light_radius"] == pytest.approx(0.01 * factor)
+
+
+def test_a_catalogue_without_rows_is_refused(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("RA,DEC,Z,MAG,ID\n")
+    files, sha256 = ingest.files_with_checksums([path], galaxies())
+    with pytest.raises(BadInput, match=r"x\.csv: the table has no rows"):
+        ingest.split_by_cell(files, sha256, galaxies())
+
+
 def test_properties_of_a_whole_galaxy_become_those_of_its_components(tmp_path):
     columns = {**table(2), "Q": np.array([0.5, 1.0]), "R": np.array([0.3, 0.4])}
     (rows,) = reading.read(written(tmp_path, columns), galaxies(axis_ratio="Q", half_light_radius="R"))
@@ -252,3 +312,15 @@ def test_a_catalogue_outside_the_area_is_refused(tmp_path, kind, shift, hint):
     assert message.startswith("0.parquet: no row is in the area, the circle of 0.2 deg at ra 53.5, dec -27.5: the rows")
     assert f"have RA from {values['RA'].min():g} to {values['RA'].max():g} and DEC from" in message
     assert ("radians" in message) is hint
+
+
+def test_right_ascensions_in_hours_are_recognised(tmp_path):
+    values = table()
+    values["RA"] /= 15.0
+    files = written(tmp_path, values)
+    with pytest.raises(
+        BadInput, match=r"deg; if the right ascensions are in hours, write ra = \{ column = \.\., scale = 15 \}$"
+    ):
+        ingest.check_rows(*ingest.files_with_checksums(files, halos()), halos(), Area(ra=53.5, dec=-27.5, radius=0.2))
+    assert ingest.unit_hint((3.0, 54.0), (-28.0, -27.0), Area(ra=53.5, dec=-27.5, radius=0.2)) == ""
+    assert ingest.unit_hint((1.0, 10.0), (-28.0, -27.0), Area(ra=5.0, dec=-27.5, radius=0.2)) == ""

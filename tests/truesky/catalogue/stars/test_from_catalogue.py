@@ -95,6 +95,17 @@ def test_bad_tables_are_named(tmp_path, change, words):
     assert "field.resu" in str(caught.value)
 
 
+def test_the_columns_of_a_table_with_other_names_are_listed(tmp_path):
+    file = tmp_path / "own.txt"
+    file.write_text("Made in 2020\nRAJ2000 DEJ2000 Gmag Teff\n53.1 -27.8 15.2 5800\n53.2 -27.9 16.2 5100\n")
+    with pytest.raises(BadInput) as caught:
+        from_catalogue.load(file, "0", {"ra": "RA", "dec": "DEC", "mag_h": "Hmag", "teff": "T_EFF"})
+    assert str(caught.value) == (
+        f"stars.catalogue: {file} has no column RA (did you mean RAJ2000?), DEC (did you mean DEJ2000?), "
+        "Hmag (did you mean Gmag?), T_EFF (did you mean Teff?); it has RAJ2000, DEJ2000, Gmag, Teff"
+    )
+
+
 @pytest.mark.parametrize(
     ("columns", "words"),
     [

@@ -123,7 +123,7 @@ def broken(name):
         ("nm", "is the unit right"),
         ("um", "is the unit right"),
         ("m", "is the unit right"),
-        ("gap", "row 21 follows a gap"),
+        ("gap", r"row 21 \(\d+ A\) follows a gap of \d+ A, but at most \d+ A is allowed there: add rows$"),
     ],
 )
 @pytest.mark.parametrize("form", ["passband_ascii", "passband_svo"])

@@ -53,6 +53,19 @@ def test_a_refusal_names_dates_that_are_allowed():
         assert solar_aspect.is_allowed(53.117, -27.808, date, MISSION)
 
 
+def test_dates_before_the_launch_are_refused():
+    launch = MISSION.value("svm.launch", "d")
+    words = r"here: MJD 58979 is before the launch of Euclid on MJD 60126\.0 \(2023-07-01\)"
+    with pytest.raises(BadInput, match=rf"^{words}; next allowed: MJD (60\d+)") as refused:
+        solar_aspect.check_aspect(53.117, -27.808, 58979.0, MISSION, "here")
+    assert "deg from the Sun" not in str(refused.value)
+    with pytest.raises(BadInput, match=f"^{words}$"):
+        solar_aspect.check_launch(58979.0, MISSION, "here")
+    solar_aspect.check_launch(launch, MISSION, "here")
+    earlier = resolve(overrides={"svm.launch": (58000.0, "d")})
+    solar_aspect.check_launch(58979.0, earlier, "here")
+
+
 def test_where_nothing_is_allowed_it_is_said():
     never = resolve(overrides={"svm.solar_aspect_min": (179.9, "deg"), "svm.solar_aspect_max": (180.0, "deg")})
     with pytest.raises(BadInput, match="no day of the next year"):
