@@ -18,7 +18,7 @@ _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 # Degrees per unit of an angle, by the names of the unit in texts such as "1 arcmin".
 _DEGREES = {
-    **dict.fromkeys(("", "deg", "degree", "degrees", "d", "°"), 1.0),
+    **dict.fromkeys(("deg", "degree", "degrees", "d", "°"), 1.0),
     **dict.fromkeys(("arcmin", "arcminute", "arcminutes", "'", "′"), 1.0 / 60.0),
     **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", '"', "″"), 1.0 / 3600.0),
     **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1.0)),
@@ -143,6 +143,9 @@ def refuse_angle(name: str, value: object, form: str, unit: str = "deg", digits:
     """
     if isinstance(value, str):
         match = _ANGLE.fullmatch(value)
+        if match and not match[2]:
+            # A number in quotes has the unit of the argument.
+            raise BadInput(f"{name} must be a number {form}, got {value!r} in quotes: write {match[1]}")
         scale = _DEGREES.get(match[2].lower()) if match else None
         degrees = float(match[1]) * scale if match and scale else None
         text = repr(value)

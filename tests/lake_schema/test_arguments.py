@@ -31,7 +31,7 @@ def test_another_number_is_refused(value):
         ("1 arcmin", "got '1 arcmin': write 0.016667"),
         ("30''", "is not a number"),
         ('18"', "write 0.005"),
-        ("0.1", "got '0.1': write 0.1"),
+        ("0.1", "got '0.1' in quotes: write 0.1"),
         ("0.1deg", "write 0.1"),
         ("3 Jy", "is not a number"),
         (Quantity(2.0, "arcmin"), "got 2.0 arcmin: write 0.033333"),
@@ -53,6 +53,11 @@ def test_angles_with_units_are_refused_with_their_number_of_degrees(value, remed
 def test_angles_with_units_are_refused_with_their_number_of_arcsec(value):
     with pytest.raises(BadInput, match=r"^size must be a number of arcsec from 0 to 60, got .*: write 30$"):
         arguments.refuse_angle("size", value, "of arcsec from 0 to 60", "arcsec")
+
+
+def test_a_number_in_quotes_has_the_unit_of_the_argument():
+    with pytest.raises(BadInput, match=r"^size must be a number of arcsec, got '30' in quotes: write 30$"):
+        arguments.refuse_angle("size", "30", "of arcsec", "arcsec")
 
 
 @pytest.mark.parametrize(

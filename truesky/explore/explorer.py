@@ -205,6 +205,8 @@ class Explorer:
         return pd.DataFrame(rows).set_index("column")
 
     def _version(self, table: str) -> read.Version:
+        if not isinstance(table, str):
+            raise BadInput(f"the table must be a name such as {min(self.versions)!r}, got {table!r}")
         if error := self.damaged.get(table) or self._ambiguous.get(table):
             raise error
         if table not in self.versions:

@@ -305,6 +305,9 @@ def _cone(value: object, path: str) -> Area:
 
 
 def _box(value: object, path: str) -> Area:
+    if isinstance(value, dict) and not value.keys() & {"ra", "dec"}:
+        given = f"got {', '.join(value)}" if value else "it has neither"
+        raise BadInput(f"{path} must have ra and dec, {given}: write box = {{ ra = [150, 151], dec = [2, 3] }} (deg)")
     box = as_table(value, path, ("ra", "dec"))
     with Mistakes() as mistakes:
         ra_range = mistakes.read(_angle_pair, box, f"{path}.ra", "ra", _BOX_RA_LIMITS)

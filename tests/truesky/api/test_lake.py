@@ -123,6 +123,7 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         (lambda lake: lake.models(1, "3-4"), "has no table products"),
         (lambda lake: lake.table("plan"), r"has no table plan; did you mean plain\?"),
         (lambda lake: lake.table("plain", into="polars"), "polars"),
+        (lambda lake: lake.cone(53.1, -27.8, 0.05, "plain"), "^the table must be a name such as '[a-z]+', got 53.1$"),
         (lambda lake: lake.table("plain", [3]), r"columns = \[3\] is not a name or a list of names"),
     ],
 )

@@ -127,6 +127,11 @@ MISTAKES = {
         "area.box.ra",
         "the second must be east of the first",
     ),
+    "a box with other keys": (
+        area("box = { ra_min = 52, ra_max = 54, dec_min = -29, dec_max = -27 }"),
+        "area.box must have ra and dec, got ra_min, ra_max, dec_min, dec_max",
+        "write box = { ra = [150, 151], dec = [2, 3] } (deg)",
+    ),
     "a circle": (
         area("circle = { ra = 1, dec = 2, radius = 1 }"),
         "area.circle",

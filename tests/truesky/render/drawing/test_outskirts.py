@@ -171,9 +171,9 @@ def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
     found, expected, size = drawn_and_expected(camera, psf_of(camera), shape, mag, place, 1)
     # Light outside a smaller stamp is below the limit of the settings, which adds to the error.
     share = 0.1 if size == stamp_sizes.SIZES[-1] else 0.2
-    # Interpolation between the nodes of distant copies of an edge-on disc has an error of up to 2.7e-11 of its light. A
-    # thin bulge with a sharp edge (Sersic index 0.3) in a smaller stamp has up to 5.1e-11 of its light outside.
-    relative = 3e-11 if shape["bulge_fraction"] == 0.0 else 1e-10
+    # Interpolation between the nodes of distant copies of an edge-on disc has an error of up to 2.7e-11 of its light.
+    # Memory limits the size of stamps, so thin bulges may have 2e-10 of their light in the corners.
+    relative = 3e-11 if shape["bulge_fraction"] == 0.0 else 2e-10
     least = max(share * NOISE[camera], relative * BRIGHT[camera] * 10 ** (-0.4 * mag))
     np.testing.assert_allclose(found, expected, rtol=4e-3, atol=least)
 
