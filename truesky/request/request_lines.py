@@ -69,7 +69,9 @@ def _without_quotes(name: str) -> str:
 
 
 def _without_last_part(path: str) -> str:
-    return _LAST_PART.sub("", path)
+    shorter = _LAST_PART.sub("", path)
+    # A key in quotes can have brackets, so that the path does not end with one of its parts.
+    return "" if shorter == path else shorter
 
 
 def _line_number(lines: dict[str, int], message: str) -> int:

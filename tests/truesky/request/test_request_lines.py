@@ -68,3 +68,11 @@ def test_each_message_has_its_line(tmp_path):
 def test_a_file_that_is_gone_has_no_lines(tmp_path):
     error = request_lines.with_request_file(BadInput("pointing[0].ra is wrong"), tmp_path / "a.toml")
     assert str(error) == f"request {tmp_path / 'a.toml'}: pointing[0].ra is wrong"
+
+
+@pytest.mark.parametrize("key", ["vis.]", "vis.  ]", "[", "a]b[", "x[1", "]."])
+def test_brackets_in_a_key_in_quotes_are_not_indices(tmp_path, key):
+    file = tmp_path / "r.toml"
+    file.write_text(f'name = "x"\n[mission.overrides]\n"{key}" = 1.0\n')
+    error = request_lines.with_request_file(BadInput(f"mission.overrides.{key}: is not a parameter"), file)
+    assert str(error).startswith(f"request {file} line ")
