@@ -237,12 +237,20 @@ def suggest_similar(path: Path, ending: str) -> str:
 
 def _nearest_folder(folder: Path) -> Path | None:
     """Return a folder, or the one with the most similar path if it does not exist, else None."""
-    if folder.is_dir() or folder == folder.parent:
-        return folder
-    if (above := _nearest_folder(folder.parent)) is None:
-        return None
-    renamed = above / folder.name
-    return renamed if renamed.is_dir() else similar_folder(renamed)
+    # A loop and not a recursion, because a path may have thousands of parts.
+    missing: list[str] = []
+    while not folder.is_dir() and folder != folder.parent:
+        missing.append(folder.name)
+        folder = folder.parent
+    for name in reversed(missing):
+        renamed = folder / name
+        if not renamed.is_dir():
+            similar = similar_folder(renamed)
+            if similar is None:
+                return None
+            renamed = similar
+        folder = renamed
+    return folder
 
 
 def similar_folder(path: Path) -> Path | None:

@@ -502,7 +502,14 @@ def check_inside(root: Below, path: Below) -> Below:
 def report_unwritable(root: Path) -> Iterator[None]:
     """Raise BadInput in the body of a `with` statement if the operating system does not allow writing to a lake.
 
-    The message names `root`, the folder of the lake. Errors that concern files outside the lake are not changed.
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake, which the message names.
+
+    Notes
+    -----
+    Errors that concern files outside the lake are not changed.
     """
     try:
         yield

@@ -91,6 +91,7 @@ def test_mutations_are_reproducible():
         ("manifest", 4206),
         ("manifest", 9229),
         ("bodies, FITS", 4175),
+        ("path", 156),
         ("path", 816),
         ("path", 9385),
         ("pointings", 865),
