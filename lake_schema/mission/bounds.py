@@ -14,7 +14,8 @@ _WILDCARDS = frozenset("*?[")
 
 
 @cache
-def _read_bounds() -> tuple[tuple[str, float, float, str], ...]:
+def read_bounds() -> tuple[tuple[str, float, float, str], ...]:
+    """Return the rows of bounds.csv: pattern of the names of parameters, lowest and highest value, and unit."""
     with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
         return tuple((r["pattern"], float(r["lo"]), float(r["hi"]), r["unit"]) for r in csv.DictReader(stream))
 
@@ -25,7 +26,7 @@ def _read_counts() -> tuple[str, ...]:
         return tuple(row["pattern"] for row in csv.DictReader(stream))
 
 
-def _matches(key: str, pattern: str) -> bool:
+def matches(key: str, pattern: str) -> bool:
     """Return True if the name of a parameter matches a pattern with *, ? or [...], as in fnmatch.
 
     Most patterns are a name, or end in a name after one *. They are compared directly, because compiling a regular
@@ -44,13 +45,13 @@ def bounds_of_parameter(key: str) -> tuple[tuple[float, float, str], ...]:
 
     The result is () if no pattern in bounds.csv matches the name `key`.
     """
-    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _read_bounds() if _matches(key, pattern))
+    return tuple((lo, hi, unit) for pattern, lo, hi, unit in read_bounds() if matches(key, pattern))
 
 
 @cache
 def is_count(key: str) -> bool:
     """Return True if the parameter with the name `key` counts something, so that it must be a whole number."""
-    return any(_matches(key, pattern) for pattern in _read_counts())
+    return any(matches(key, pattern) for pattern in _read_counts())
 
 
 def check_bounds(parameter: Parameter, key: str) -> None:
