@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.resources import files
@@ -76,5 +77,7 @@ def check_bounds(parameter: Parameter, key: str) -> None:
         raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
     for lo, hi, unit in bounds_of_parameter(key):
         value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
-        if not lo <= value <= hi:
+        # The conversion of a value at a limit to the unit of the limit may be rounded.
+        tolerance = 0.0 if unit == parameter.unit else 1e-15
+        if not (lo <= value <= hi or any(math.isclose(value, limit, rel_tol=tolerance) for limit in (lo, hi))):
             raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)

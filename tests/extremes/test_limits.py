@@ -23,6 +23,10 @@ from lake_schema.mission.parameter import convert
 from lake_schema.store.validate import find_violations
 from scripts import limits_tables, request_keys
 from truesky.catalogue import given_sources, injected_rows
+from truesky.render.camera import detectors
+from truesky.render.effects.light import straylight
+from truesky.render.effects.readout import nonlinearity, trap_pumping
+from truesky.render.effects.scene import Scene
 from truesky.request import checks, from_toml, instruments
 from truesky.request.accuracy import Accuracy
 from truesky.request.exposures import pointing_tables
@@ -207,11 +211,11 @@ def test_all_numbers_of_the_records_of_a_request_are_listed():
 
 @cache
 def mission_numbers():
-    """Return (parameter, unit of its values, ranges in this unit) for each parameter of the mission database."""
+    """Return (parameter, unit, lowest and highest value) for each parameter, in the unit of its tightest range."""
     found = []
     for parameter in MISSION.parameters:
         ranges = bounds.bounds_of_parameter(parameter.key)
-        unit = ranges[0][2]
+        unit = min(ranges, key=lambda limits: convert(limits[1], limits[2], ranges[0][2], ""))[2]
         scaled = [tuple(convert(limit, other, unit, "") for limit in (lo, hi)) for lo, hi, other in ranges]
         found.append((parameter.key, unit, max(lo for lo, _ in scaled), min(hi for _, hi in scaled)))
     return found
@@ -247,6 +251,29 @@ def test_all_parameters_have_limits():
         ranges = bounds.bounds_of_parameter(parameter.key)
         assert ranges
         assert all(np.isfinite([lo, hi]).all() for lo, hi, _ in ranges)
+
+
+def test_limits_may_be_given_in_other_units():
+    MISSION.with_overrides({"nisp.filter.thickness": (100.0, "mm")})
+
+
+@pytest.mark.parametrize(
+    ("effect", "key"),
+    [
+        (straylight.EFFECT, "halo.radius"), (trap_pumping.EFFECT, "cti.dwell_time"),
+        (nonlinearity.EFFECT, "nonlinearity.low"), (nonlinearity.EFFECT, "nonlinearity.high"),
+        (nonlinearity.EFFECT, "nonlinearity.low_scale"), (straylight.EFFECT, "halo.fraction"),
+        (trap_pumping.EFFECT, "pumping.shuffles"), (trap_pumping.EFFECT, "pumping.phase_time"),
+    ],
+)  # fmt: skip
+def test_effects_can_be_computed_at_the_limits_of_their_parameters(effect, key):
+    for name, unit, *limits in mission_numbers():
+        for value in limits if name == f"vis.{key}" else ():
+            mission = MISSION.with_overrides({name: (value, unit)})
+            scene = Scene(mission, "vis", 560.0, 0.25, 1e4, detectors.detector("vis", "3-4", mission))
+            with np.errstate(divide="raise", invalid="raise", over="raise"):
+                effect.parameters(scene)
+                assert np.isfinite(effect.margin(scene))
 
 
 # ------------------------------------------------------------------------------------------------ tables
