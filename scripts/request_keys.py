@@ -136,9 +136,9 @@ def read_keys(sample: dict[str, Any]) -> list[Key]:
 
     with ExitStack() as patched:
         for reader in _VALUE_KINDS:
-            noting = _noting(reader, note)
+            recording = _record_calls(reader, note)
             for module, name in _names_of(reader):
-                patched.enter_context(patch.object(module, name, noting))
+                patched.enter_context(patch.object(module, name, recording))
         from_toml.from_table(sample)
     return list(keys.values())
 
@@ -150,11 +150,11 @@ def _names_of(reader: Callable[..., object]) -> Iterator[tuple[ModuleType, str]]
             yield from ((module, name) for name, value in list(vars(module).items()) if value is reader)
 
 
-def _noting(reader: Callable[..., object], note: Callable[[Key], None]) -> Callable[..., object]:
+def _record_calls(reader: Callable[..., object], note: Callable[[Key], None]) -> Callable[..., object]:
     """Return a function that does what `reader` does, and first calls `note` with the key that is read."""
     arguments = inspect.signature(reader)
 
-    def note_and_read(*positional: object, **keywords: object) -> object:
+    def record_and_read(*positional: object, **keywords: object) -> object:
         bound = arguments.bind(*positional, **keywords).arguments
         default = bound.get("default")
         note(
@@ -170,7 +170,7 @@ def _noting(reader: Callable[..., object], note: Callable[[Key], None]) -> Calla
         )
         return reader(*positional, **keywords)
 
-    return note_and_read
+    return record_and_read
 
 
 def all_keys() -> dict[str, Key]:
