@@ -134,8 +134,11 @@ def _arguments() -> list[str]:
 
     def rows() -> Iterator[Sequence[str]]:
         for path in sorted([*(_ROOT / "truesky").rglob("*.py"), *(_ROOT / "lake_schema").rglob("*.py")]):
+            source = path.read_text(encoding="utf-8")
+            if "arguments.check_" not in source:
+                continue
             module = ".".join(path.relative_to(_ROOT).with_suffix("").parts)
-            for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for call in ast.walk(ast.parse(source)):
                 if isinstance(call, ast.Call) and ast.unparse(call.func).startswith("arguments.check_"):
                     yield from _argument_row(module, call)
 

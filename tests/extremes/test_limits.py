@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from lake_schema import tables
+from lake_schema.columns import round_mantissa
 from lake_schema.errors import BadInput, quote_value
 from lake_schema.mission import bounds
 from lake_schema.mission.configuration import resolve
@@ -230,6 +231,10 @@ def value_of_parameter(number):
 def check_parameter(number, value):
     key, unit, lo, hi = number
     inside = is_inside(value, lo, hi) and not (bounds.is_count(key) and value % 1)
+    is_converted = unit != MISSION.parameter(key).unit
+    # The conversion to the unit of the database may round a value next to a limit to the limit.
+    near = abs(value) < 1e300 and any(math.isclose(value, limit, rel_tol=1e-14, abs_tol=1e-300) for limit in (lo, hi))
+    assume(inside or not (is_converted and near))
 
     def read():
         override = checks.parse_override({"value": value, "unit": unit}, key, True, units_of_parameters())
@@ -309,7 +314,8 @@ def check_column(number, value):
     inside = is_inside(value, column.lo, column.hi)
     if column.type.startswith("float"):
         with np.errstate(over="ignore"):
-            inside = is_inside(kind(value), *limits)
+            stored = round_mantissa(np.array([value], kind), column.mantissa_bits or 64)[0]
+        inside = is_inside(stored, *limits)
     else:
         inside = inside and value == round(value) and np.iinfo(kind).min <= value <= np.iinfo(kind).max
 
