@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
-from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.errors import BadInput, OutOfRange, quote_value
 from lake_schema.texts import spelling
 
 _Parameters = ParamSpec("_Parameters")
@@ -154,7 +154,7 @@ def refuse_angle(name: str, value: object, form: str, unit: str = "deg", digits:
             degrees = float(value.to_value("deg"))  # type: ignore[attr-defined]
         except (AttributeError, TypeError, ValueError):
             degrees = None
-        text = str(value)
+        text = quote_value(value, str)
     if degrees is not None:
         angle = degrees / _DEGREES["arcsec"] if unit == "arcsec" else degrees
         number = f"{round(angle, digits):.12g}" if abs(angle) >= 1e-3 else f"{angle:.6g}"
@@ -188,10 +188,14 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
         If the value is NaN or lies outside its bounds.
     """
     try:
-        # Compare before converting: the comparison raises TypeError for a str, which float() might accept.
-        is_within, converted = bool(lo <= value <= hi), float(value)  # type: ignore[operator, arg-type]
-    except (TypeError, ValueError, OverflowError):
-        raise BadInput(f"{name} = {value!r} is not a number") from None
+        # Compare before converting: the comparison raises TypeError for a str, which float() might accept, and float()
+        # fails for huge whole numbers.
+        is_within = bool(lo <= value <= hi)  # type: ignore[operator]
+        converted = float(value) if is_within else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        is_within = False
+    except (TypeError, ValueError):
+        raise BadInput(f"{name} = {quote_value(value)} is not a number") from None
     if not is_within:
         raise OutOfRange(name, value, lo, hi, unit)
     return converted

@@ -273,6 +273,11 @@ def _arrow_array(table: str, column: Column, values: Any, rows: int) -> pa.Array
             if np.dtype(target_type).kind in "iu" and values.dtype.kind == "f":
                 raise BadInput(f"table {table}: column {column.name} must be {column.type}, got {values.dtype}")
             values = _cast_in_range(table, column, values, np.dtype(target_type))
+        elif isinstance(values, list) and column.type.startswith("int"):
+            # Arrow would drop the fractions.
+            for value in values:
+                if isinstance(value, float) and value % 1.0:
+                    raise BadInput(f"table {table}: column {column.name} must be {column.type}, got {value}")
         array = pa.array(values, column.arrow_type, mask=mask)
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
         raise BadInput(f"table {table}: column {column.name} must be {column.type}: {error}") from None

@@ -25,6 +25,16 @@ def one_line(message: object) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[: half - 3]}...{text[-half:]}"
 
 
+def quote_value(value: object, to_text: Callable[[object], str] = repr) -> str:
+    """Return repr(value), or the result of another function, for an error message, cut to at most 60 characters."""
+    try:
+        text = to_text(value)
+    except ValueError:
+        # Python does not print whole numbers of more than 4300 digits.
+        text = "a whole number of thousands of digits"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 class LakeError(Exception):
     """Base class of the exceptions of truesky; the message is turned into one line of at most 1000 characters."""
 
@@ -189,7 +199,7 @@ class OutOfRange(BadInput):
     """
 
     def __init__(self, name: str, value: object, lo: object, hi: object, unit: str = "", question: str = "") -> None:
-        limits = f"{name} = {value} is outside [{lo}, {hi}] {unit}".rstrip()
+        limits = f"{name} = {quote_value(value, str)} is outside [{lo}, {hi}] {unit}".rstrip()
         super().__init__(f"{limits}: {question}" if question else limits)
         self._arguments = name, value, lo, hi, unit, question
 

@@ -7,11 +7,7 @@ the settings of accuracy, and the Python interface.
 from __future__ import annotations
 
 import inspect
-import json
 import pkgutil
-import re
-from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -22,6 +18,8 @@ import numpy as np
 from benchmarks import effects as scene_of_effects
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
+from scripts import request_keys
+from scripts.request_keys import Key
 from truesky.fluxes import passbands
 from truesky.randomness.rng import stream
 from truesky.render.camera import detectors, traces
@@ -32,7 +30,7 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.readout import quadrants
 from truesky.render.effects.scene import Frame, Lights, NeighbourCharge, Scene
 from truesky.render.exposure import sky_through_grism
-from truesky.request import accuracy, from_toml, schema, sky_notation, toml_values
+from truesky.request import accuracy, from_toml, schema
 from truesky.request.exposures import observations, pointings
 
 # Modules, classes and functions of the page of the Python interface, in order.
@@ -57,32 +55,6 @@ API = (
 _SIDE = 320
 
 
-# A valid request (as the dictionary of its TOML file) with one entry in each list, so that the parser reads every key.
-_SAMPLE_REQUEST = {
-    "name": "x",
-    "seed": 1,
-    "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}},
-    "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
-    "observation": [{"channels": ["VIS"]}],
-}
-# Functions of truesky.request.toml_values and sky_notation that read one value of a request, and the type of the value
-# for the page.
-_VALUE_KINDS = {
-    "number": "number",
-    "optional_number": "number",
-    "integer": "whole number",
-    "integer_choice": "whole number",
-    "string": "text",
-    "strings": "list of texts",
-    "boolean": "true or false",
-    "ra_of": "number (deg) or text (hours)",
-    "optional_ra": "number (deg) or text (hours)",
-    "dec_of": "number or text (deg)",
-    "optional_dec": "number or text (deg)",
-    "optional_mjd": "number (MJD, UTC) or date",
-}
-
-
 def request_page() -> str:
     """Return the Markdown page about the keys of a request (TOML file of a user).
 
@@ -92,49 +64,20 @@ def request_page() -> str:
     head = inspect.cleandoc(from_toml.__doc__ or "")
     lines = ["# Keys of a request", "", "```text", head, "```", "", "## Values, bounds, defaults", ""]
     lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
-    for path, (kind, bounds, default) in sorted(_request_keys().items()):
-        lines.append(f"| `{path}` | {kind} | {bounds} | {default} |")
+    for name, key in sorted(request_keys.all_keys().items()):
+        default = f"`{key.default}`" if key.default else ""
+        lines.append(f"| `{name}` | {key.kind} | {_describe_limits(key)} | {default} |")
     for record in (schema.Universe, schema.Stars, pointings.Pointing, observations.Observation):
         text = inspect.cleandoc(record.__doc__ or "")
         lines += ["", f"## {record.__name__}", "", "```text", text, "```"]
     return "\n".join(lines) + "\n"
 
 
-def _request_keys() -> dict[str, tuple[str, str, str]]:
-    """Return the type, the limits or allowed values, and the default, as texts, of each key of a request by its path.
-
-    The parser runs on a sample request, and all its calls of functions that read a value are recorded. Keys that other
-    functions read, such as tables, are not included.
-    """
-    keys: dict[str, tuple[str, str, str]] = {}
-
-    def record_keys(name: str, reader: Callable[..., object]) -> Callable[..., object]:
-        arguments = inspect.signature(reader)
-
-        def record_and_read(*positional: object, **keywords: object) -> object:
-            bound = arguments.bind(*positional, **keywords).arguments
-            path = re.sub(r"\[0\]", "", str(bound["path"]))
-            legal = bound.get("legal") or ()
-            bounds = ", ".join(map(str, legal)) if legal else ""
-            if "lo" in bound and "hi" in bound:
-                bounds = f"{bound['lo']:g} to {bound['hi']:g}"
-            default = bound.get("default")
-            # The reading functions use NaN as the default of a number that has none.
-            default_text = "" if default is None or default != default else f"`{json.dumps(default)}`"
-            keys[path] = (_VALUE_KINDS[name], bounds, default_text)
-            return reader(*positional, **keywords)
-
-        return record_and_read
-
-    with ExitStack() as patched:
-        for module in (from_toml, observations, pointings, sky_notation):
-            for name in _VALUE_KINDS:
-                for alias in (name, f"_{name}"):
-                    defined = getattr(toml_values, name, None) or getattr(sky_notation, name)
-                    if getattr(module, alias, None) is defined:
-                        patched.enter_context(patch.object(module, alias, record_keys(name, defined)))
-        from_toml.from_table(_SAMPLE_REQUEST)
-    return keys
+def _describe_limits(key: Key) -> str:
+    """Return the smallest and largest number, or the allowed values, of a key of a request as text."""
+    if key.lo is not None and key.hi is not None:
+        return f"{key.lo:g} to {key.hi:g}"
+    return ", ".join(map(str, key.legal))
 
 
 def mission_page(mission: MissionConfiguration) -> str:

@@ -37,6 +37,7 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "request.md",
             "tables.md",
+            "limits.md",
             "mission.md",
             "effects.md",
             "accuracy.md",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.resources import files
@@ -14,7 +15,8 @@ _WILDCARDS = frozenset("*?[")
 
 
 @cache
-def _read_bounds() -> tuple[tuple[str, float, float, str], ...]:
+def read_bounds() -> tuple[tuple[str, float, float, str], ...]:
+    """Return the rows of bounds.csv: pattern of the names of parameters, lowest and highest value, and unit."""
     with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
         return tuple((r["pattern"], float(r["lo"]), float(r["hi"]), r["unit"]) for r in csv.DictReader(stream))
 
@@ -25,7 +27,7 @@ def _read_counts() -> tuple[str, ...]:
         return tuple(row["pattern"] for row in csv.DictReader(stream))
 
 
-def _matches(key: str, pattern: str) -> bool:
+def matches(key: str, pattern: str) -> bool:
     """Return True if the name of a parameter matches a pattern with *, ? or [...], as in fnmatch.
 
     Most patterns are a name, or end in a name after one *. They are compared directly, because compiling a regular
@@ -44,13 +46,13 @@ def bounds_of_parameter(key: str) -> tuple[tuple[float, float, str], ...]:
 
     The result is () if no pattern in bounds.csv matches the name `key`.
     """
-    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _read_bounds() if _matches(key, pattern))
+    return tuple((lo, hi, unit) for pattern, lo, hi, unit in read_bounds() if matches(key, pattern))
 
 
 @cache
 def is_count(key: str) -> bool:
     """Return True if the parameter with the name `key` counts something, so that it must be a whole number."""
-    return any(_matches(key, pattern) for pattern in _read_counts())
+    return any(matches(key, pattern) for pattern in _read_counts())
 
 
 def check_bounds(parameter: Parameter, key: str) -> None:
@@ -75,5 +77,7 @@ def check_bounds(parameter: Parameter, key: str) -> None:
         raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
     for lo, hi, unit in bounds_of_parameter(key):
         value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
-        if not lo <= value <= hi:
+        # The conversion of a value at a limit to the unit of the limit may be rounded.
+        tolerance = 0.0 if unit == parameter.unit else 1e-15
+        if not (lo <= value <= hi or any(math.isclose(value, limit, rel_tol=tolerance) for limit in (lo, hi))):
             raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)

@@ -50,7 +50,7 @@ COLUMNS = {
     WAVEFRONT: ("noll", "x_power", "y_power", "coefficient_nm"),
 }  # fmt: skip
 # Lowest and highest allowed value of each column of whole numbers, in any of the files.
-_INTEGER_BOUNDS = {
+INTEGER_BOUNDS = {
     "nx": (1, _MAX_PIXELS),
     "ny": (1, _MAX_PIXELS),
     "x": (0, _MAX_PIXELS),
@@ -63,6 +63,16 @@ _INTEGER_BOUNDS = {
     "noll": (4, 66),
     "x_power": (0, 10),
     "y_power": (0, 10),
+}
+# The same of columns of numbers that need not be whole.
+NUMBER_BOUNDS = {
+    "x_mm": (-1e4, 1e4),
+    "y_mm": (-1e4, 1e4),
+    "rotation_deg": (-360.0, 360.0),
+    "gain": (1e-3, 1e3),
+    "read_noise": (0.0, 1e4),
+    "full_well": (1.0, 1e8),
+    "coefficient_nm": (-1e4, 1e4),
 }
 # Largest number of characters of an entry of a table.
 _MAX_TEXT_LENGTH = 1000
@@ -93,25 +103,11 @@ class Row:
             raise BadInput(f"{self.location}: {column} is missing")
         return value
 
-    def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
+    def number(self, column: str) -> float:
         """Return the entry of a column as a finite number.
 
-        Parameters
-        ----------
-        column : str
-            Name of the column.
-        low, high : float, optional
-            Smallest and largest number that is allowed.
-
-        Returns
-        -------
-        float
-            The number.
-
-        Raises
-        ------
-        BadInput
-            If the text is blank or is not a finite number within the bounds. The message names the file and the line.
+        Raise BadInput if the text is blank or is not a finite number, or is outside the allowed range of this column.
+        The message names the file and the line.
         """
         text = self.text(column)
         try:
@@ -120,6 +116,7 @@ class Row:
             raise BadInput(f"{self.location}: {column} = {text!r} is not a number") from None
         if not math.isfinite(value):
             raise BadInput(f"{self.location}: {column} = {text} is not finite")
+        low, high = INTEGER_BOUNDS.get(column) or NUMBER_BOUNDS.get(column, (-math.inf, math.inf))
         if not low <= value <= high:
             raise BadInput(f"{self.location}: {column} = {text} is not between {low:g} and {high:g}")
         return value
@@ -129,7 +126,7 @@ class Row:
 
         Raise BadInput if the entry is not a whole number, or outside the allowed range of this column.
         """
-        value = self.number(column, *_INTEGER_BOUNDS[column])
+        value = self.number(column)
         if value % 1.0:
             raise BadInput(f"{self.location}: {column} = {value:g} is not a whole number")
         return int(value)
@@ -199,7 +196,7 @@ def _with_integers(row: Row) -> Row:
 
     The code that uses the tables later converts these entries with int(), which accepts only this form.
     """
-    integers = {column: str(row.integer(column)) for column in row.values if column in _INTEGER_BOUNDS}
+    integers = {column: str(row.integer(column)) for column in row.values if column in INTEGER_BOUNDS}
     return Row(row.location, {**row.values, **integers})
 
 
@@ -253,9 +250,8 @@ def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
             name = row.text("detector")
             raise BadInput(f"{row.location}: detector = {name!r}: a name must have letters, digits, _ and -")
         row.text("type")
-        for axis in ("x_mm", "y_mm"):
-            row.number(axis, -1e4, 1e4)
-        row.number("rotation_deg", -360.0, 360.0)
+        for column in ("x_mm", "y_mm", "rotation_deg"):
+            row.number(column)
     for first, second in find_overlaps([row.values for row in rows], pixel_mm):
         names = f"{rows[first].text('detector')} and {rows[second].text('detector')}"
         raise BadInput(f"{rows[second].location}: detectors {names} overlap")
@@ -327,10 +323,10 @@ def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
             raise BadInput(
                 f"{row.location}: amplifier = {row.text('amplifier')!r}: a name must have letters, digits, _ and -"
             )
-        row.number("gain", 1e-3, 1e3)
-        if not row.number("read_noise", 0.0, 1e4):
+        row.number("gain")
+        if not row.number("read_noise"):
             raise BadInput(f"{row.location}: read_noise = {row.text('read_noise')} is not positive")
-        row.number("full_well", 1.0, 1e8)
+        row.number("full_well")
         x, y, nx, ny = (row.integer(column) for column in ("x", "y", "nx", "ny"))
         if x + nx > size[0] or y + ny > size[1]:
             raise BadInput(f"{row.location}: reaches beyond the detector of {size[0]} x {size[1]} pixels")
@@ -350,5 +346,5 @@ def read_wavefront(folder: Path) -> list[Row]:
     """
     rows = read_rows(folder, WAVEFRONT)
     for row in rows:
-        row.number("coefficient_nm", -1e4, 1e4)
+        row.number("coefficient_nm")
     return rows

@@ -30,7 +30,7 @@ from truesky.randomness.rng import stream
 from truesky.request.files import DustMap
 
 # Largest A(V) that table `galaxies` can store, mag.
-_MAX_A_V = 40.0
+MAX_A_V = 40.0
 # A map is refused if the mean difference between neighbouring pixels in the other HEALPix ordering (RING or NESTED) is
 # below this fraction of the difference in its declared ordering.
 _SMOOTHNESS_RATIO = 0.5
@@ -205,12 +205,12 @@ def read(user_map: DustMap) -> Float32:
         raise BadInput(f"{where}: header says NSIDE = {cards['NSIDE']}, but {values.size} pixels mean NSIDE = {nside}")
     model = cosecant()
     to_a_v = model.r_v if user_map.quantity == "ebv" else 1.0
-    bad = ~((values >= 0.0) & (values * to_a_v <= _MAX_A_V))
+    bad = ~((values >= 0.0) & (values * to_a_v <= MAX_A_V))
     if bad.any():
         row = int(bad.argmax())
         raise BadInput(
             f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} bad rows): {user_map.quantity} must be from 0 "
-            f"to {_MAX_A_V / to_a_v:g} mag"
+            f"to {MAX_A_V / to_a_v:g} mag"
         )
     _refuse_other_ordering(where, values, ordering)
     ring = hp.reorder(values, n2r=True) if ordering == "NESTED" else values

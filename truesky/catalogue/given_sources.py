@@ -54,11 +54,11 @@ GALAXIES: Mapping[str, float | None] = {
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
 # Lowest and highest valid value of each property. The last four are properties of a whole galaxy, which replace those
 # of its bulge and disc.
-_GALAXY_BOUNDS = {
+GIVEN_GALAXY_BOUNDS = {
     **{name: GALAXY_BOUNDS[name] for name in (*_POSITION, *GALAXIES, "axis_ratio", "half_light_radius", "e1", "e2")},
     "sed": (0.0, 30.0),
 }
-_STAR_BOUNDS = {**{name: KEYS[name] for name in (*_POSITION, "teff", "a_v")}, "mag": GALAXY_BOUNDS["mag"]}
+GIVEN_STAR_BOUNDS = {**{name: KEYS[name] for name in (*_POSITION, "teff", "a_v")}, "mag": GALAXY_BOUNDS["mag"]}
 # Words that describe a mapping, for error messages: a property and the name of its column.
 _MAPPING = 'all columns with {{ file = "..", columns = {{ {} = "{}", .. }} }}'
 # Settings of the columns of galaxies.
@@ -277,7 +277,7 @@ def check_arrays(
 
 def _defaults_and_bounds(name: str) -> tuple[Mapping[str, float | None], Mapping[str, tuple[float, float]]]:
     """Return default values and bounds of the properties of a table, "galaxies" or "stars"."""
-    return (GALAXIES, _GALAXY_BOUNDS) if name == "galaxies" else (STARS, _STAR_BOUNDS)
+    return (GALAXIES, GIVEN_GALAXY_BOUNDS) if name == "galaxies" else (STARS, GIVEN_STAR_BOUNDS)
 
 
 def _parse(
@@ -365,7 +365,7 @@ def _check_titles(
     refuse_mistakes(messages)
 
 
-def find_columns(title: str, bounds: Container[str] = _GALAXY_BOUNDS) -> list[str]:
+def find_columns(title: str, bounds: Container[str] = GIVEN_GALAXY_BOUNDS) -> list[str]:
     """Return the properties that the title of a column can mean, such as half_light_radius for r_e, [] if unknown.
 
     `bounds` are the properties that are allowed, by default those of galaxies.

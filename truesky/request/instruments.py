@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from lake_schema.errors import BadInput, bad_input
 from lake_schema.tables.exposures import EUCLID_BANDS
 from lake_schema.texts import spelling
-from truesky.request.toml_values import known_name
+from truesky.request.toml_values import known_name, quote_value
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
@@ -316,4 +316,7 @@ def explain_override(name: str, value: object, units: Mapping[str, str]) -> tupl
             name, key = similar[0] + name.removeprefix(key), similar[0]
     number = value.get("value") if isinstance(value, dict) else value
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-    return problem, f'"{name}" = {{ value = {number if is_number else ".."}, unit = "{units.get(key, "..")}" }}'
+    return (
+        problem,
+        f'"{name}" = {{ value = {quote_value(number) if is_number else ".."}, unit = "{units.get(key, "..")}" }}',
+    )

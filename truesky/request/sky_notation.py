@@ -37,6 +37,8 @@ _SEXAGESIMAL = re.compile(
 _LARGE_RADIUS = 5.0
 # Midnight (UTC) at the start of MJD 0.
 _MJD_0 = datetime(1858, 11, 17, tzinfo=UTC)
+# The same as Julian date.
+_JD_OF_MJD_0 = 2_400_000.5
 
 
 def angle(value: object, path: str, axis: str, limits: tuple[float, float], ra: object = None) -> float:
@@ -140,8 +142,9 @@ def mjd(value: object, path: str) -> float:
         return checked_number(_mjd_of_date(value), path, *MJD_LIMITS)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise BadInput(f"{path} must be {_FORMS['mjd']}, got {quote_value(value)}")
-    if MJD_LIMITS[0] <= value - 2_400_000.5 <= MJD_LIMITS[1]:
-        raise BadInput(f"{path} = {value} is a Julian date: write the MJD {value - 2_400_000.5:.10g}")
+    # Compare before the subtraction, which fails for huge whole numbers.
+    if MJD_LIMITS[0] + _JD_OF_MJD_0 <= value <= MJD_LIMITS[1] + _JD_OF_MJD_0:
+        raise BadInput(f"{path} = {value} is a Julian date: write the MJD {value - _JD_OF_MJD_0:.10g}")
     return checked_number(value, path, *MJD_LIMITS)
 
 

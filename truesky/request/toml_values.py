@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, cast
 
-from lake_schema import arguments
+from lake_schema import arguments, errors
 from lake_schema.errors import BadInput, OutOfRange, bad_input
 from lake_schema.texts import spelling
 
@@ -52,6 +53,7 @@ _VALUES = {
     **{f"{filter}{mark}e": (band,) for mark in ("", "_") for filter, band in
        (("i", "euclid_vis"), ("y", "euclid_y"), ("j", "euclid_j"), ("h", "euclid_h"))},
 }  # fmt: skip
+quote_value = errors.quote_value
 # Number of decimals of an angle in a message, which replaces a text such as "17 arcmin".
 _ANGLE_DIGITS = 4
 _NO_PLACES: Mapping[str, str] = {}
@@ -444,7 +446,7 @@ def checked_number(value: object, path: str, lo: float, hi: float, unit: str = "
             arguments.refuse_angle(path, value, form, unit, _ANGLE_DIGITS)
         raise BadInput(f"{path} must be {_describe_range(lo, hi, unit)}, got {quote_value(value)}{hint}")
     # Compare before the conversion to float, which fails for huge whole numbers. TOML has no upper limit for them.
-    if not lo <= value <= hi or not math.isfinite(value):
+    if not lo <= value <= hi or not abs(value) <= sys.float_info.max:
         raise OutOfRange(path, quote_value(value), lo, hi, unit)
     return float(value)
 
@@ -494,13 +496,39 @@ def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None
     """
     if default is not None and not has_key(table, path):
         return default
-    integer_value = required_value(table, path, f"it must be a whole number from {lo} to {hi}")
-    if isinstance(integer_value, bool) or not isinstance(integer_value, int):
-        hint = _quotes_hint(integer_value, path, int)
-        raise BadInput(f"{path} must be a whole number from {lo} to {hi}, got {quote_value(integer_value)}{hint}")
-    if not lo <= integer_value <= hi:
-        raise OutOfRange(path, quote_value(integer_value), lo, hi)
-    return integer_value
+    return checked_integer(required_value(table, path, f"it must be a whole number from {lo} to {hi}"), path, lo, hi)
+
+
+def checked_integer(value: object, path: str, lo: int, hi: int) -> int:
+    """Check that a value is a whole number, and return it.
+
+    Parameters
+    ----------
+    value : object
+        Value in the request.
+    path : str
+        Path of the key, for error messages.
+    lo, hi : int
+        Smallest and largest number that is allowed.
+
+    Returns
+    -------
+    int
+        The number.
+
+    Raises
+    ------
+    BadInput
+        If the value is not a whole number; true, false and 2.0 are not whole numbers.
+    OutOfRange
+        If the number is outside its limits.
+    """
+    if isinstance(value, bool) or not isinstance(value, int):
+        hint = _quotes_hint(value, path, int)
+        raise BadInput(f"{path} must be a whole number from {lo} to {hi}, got {quote_value(value)}{hint}")
+    if not lo <= value <= hi:
+        raise OutOfRange(path, quote_value(value), lo, hi)
+    return value
 
 
 def boolean(table: Toml, path: str, default: bool) -> bool:
@@ -559,9 +587,3 @@ def integer_choice(table: Toml, path: str, legal: Sequence[int], default: int) -
     if isinstance(selected, bool) or not isinstance(selected, int) or selected not in legal:
         raise BadInput(f"{path} = {quote_value(selected)} is not one of {', '.join(map(str, legal))}")
     return selected
-
-
-def quote_value(value: object) -> str:
-    """Return repr(value) for an error message, cut to at most 60 characters."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -164,6 +164,7 @@ TABLES = {
     "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is not one of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
     "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: the pointing is 126."),
+    "a dark before the launch": ("ra,dec,mjd,image_type\n53.1,-27.8,58979,dark\n", "MJD 58979 is before the launch"),
     "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "is large enough: area.cone = { ra ="),
     "a line's detector": ("ra,dec,detectors\n53.1,-27.8,9-9\n", "no detector '9-9'"),
 }

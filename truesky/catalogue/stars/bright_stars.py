@@ -39,6 +39,8 @@ _TITLES = (
     ("BTmag", "BT"),
     ("VTmag", "VT"),
 )
+# Smallest and largest magnitude that a file may have; Sirius has -1.1, and the faintest star of the catalogue 16.
+MAGNITUDES = (-3.0, 20.0)
 _NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 _KIND, _LONGEST_LINE = "catalogue of stars", 1000
 
@@ -165,10 +167,17 @@ def _read(files: tuple[Path, ...]) -> dict[str, Array]:
 def _records(file: Path) -> tuple[Float, Float, Float]:
     """Read a file, and return positions (ra, dec, deg), shape (2, n), and B_T and V_T magnitudes (NaN if blank).
 
-    The observed position is used if there is no mean position. Raises BadInput if a position is not on the sky.
+    The observed position is used if there is no mean position. Raises BadInput if a position is not on the sky, or a
+    magnitude is out of range.
     """
     values = _read_fits(file) if file.suffix.lower() in (".fits", ".fit", ".fz") else _read_text(file)
     mean, observed = np.stack(values[:2]), np.stack(values[2:4])
+    for name, magnitudes in (("B_T", values[4]), ("V_T", values[5])):
+        is_wrong = ~np.isnan(magnitudes) & ~((magnitudes >= MAGNITUDES[0]) & (magnitudes <= MAGNITUDES[1]))
+        if is_wrong.any():
+            record = int(is_wrong.argmax())
+            allowed = f"must be from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} mag"
+            raise BadInput(f"{file}: {name} of record {record + 1} is {magnitudes[record]:g}, but {allowed}")
     place = np.where(np.isfinite(mean), mean, observed)
     bad = ~((place[0] >= 0.0) & (place[0] <= 360.0) & (np.abs(place[1]) <= 90.0))
     if bad.any():

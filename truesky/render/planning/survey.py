@@ -386,8 +386,10 @@ def _schedule_block(
             check_detectors((exposure.camera,), exposure.detectors, mission, "detectors")
             check_ramp(exposure.channel, exposure.camera, exposure.exposure_time_s, mission)
             channel = registry.CHANNELS[exposure.channel]
-            if not channel.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
-                check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
+            if not channel.on_ground and block.pointings:
+                check_launch(exposure.mjd, mission, "pointings")
+                if exposure.image_type in SKY_TYPES:
+                    check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
         return scheduled
     except BadInput as error:
         # A message that begins with a key of the observation continues its path.

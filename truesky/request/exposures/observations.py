@@ -22,6 +22,7 @@ from truesky.request.toml_values import (
     as_table,
     boolean,
     check_keys,
+    checked_integer,
     checked_number,
     integer,
     optional_number,
@@ -414,20 +415,17 @@ def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tupl
 
     `bounds` has the smallest and largest value of each number, and `names` their names for error messages. The list
     must be as long as `names`; if `names` is empty, it may be shorter than `bounds`. Raises BadInput if the value is
-    not such a list.
+    not such a list, and OutOfRange if a number is out of range.
     """
     values = table.get(path.rpartition(".")[2])
     if values is None:
         return ()
     if not isinstance(values, list) or not values or len(values) > len(bounds) or (names and len(values) != len(names)):
         raise BadInput(f"{path} = {quote_value(values)} is not [{', '.join(names) or 'whole numbers'}]")
-    numbers = []
-    for i, (value, (low, high)) in enumerate(zip(values, bounds, strict=False)):
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            name = f"{names[i]} = " if names else ""
-            raise BadInput(f"{path}: {name}{quote_value(value)} is not a whole number from {low} to {high}")
-        numbers.append(value)
-    return tuple(numbers)
+    return tuple(
+        checked_integer(value, f"{path}[{i}]{f' ({names[i]})' if names else ''}", low, high)
+        for i, (value, (low, high)) in enumerate(zip(values, bounds, strict=False))
+    )
 
 
 def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
@@ -534,6 +532,7 @@ def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, fl
     if not 1 <= len(dither) <= _MAX_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in dither):
         raise BadInput(f"{path} must be one of {', '.join(DITHERS)}, or 1 to {_MAX_DITHERS} offsets [x, y] in arcsec")
     steps = [
-        [checked_number(n, f"{path}[{i}]", -_MAX_OFFSET, _MAX_OFFSET) for n in step] for i, step in enumerate(dither)
+        [checked_number(n, f"{path}[{i}][{axis}]", -_MAX_OFFSET, _MAX_OFFSET, "arcsec") for axis, n in enumerate(step)]
+        for i, step in enumerate(dither)
     ]
     return tuple((x, y) for x, y in steps)

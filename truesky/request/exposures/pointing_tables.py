@@ -53,6 +53,18 @@ COLUMNS = (
     ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
     ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0"),
 )
+# Smallest and largest allowed number of each column of numbers.
+BOUNDS = {
+    "ra": sky_notation.RA_LIMITS,
+    "dec": sky_notation.DEC_LIMITS,
+    "position_angle": (-360.0, 360.0),
+    "mjd": sky_notation.MJD_LIMITS,
+    "exposure_time_s": (0.0, 1e6),
+    "sky": (0.0, 1e6),
+    "seeing": (0.01, 10.0),
+    "zero_point": (0.0, 50.0),
+    "grism_angle": (-360.0, 360.0),
+}
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
 # Names that other programs give to the columns, in lower case.
@@ -287,16 +299,16 @@ def _row_from_line(
             camera=row.get("camera") or EUCLID_CAMERAS.get(channel, ""),
             band=read(_band, row, channel, location),
             image_type=read(_image_type, row, image_type, location),
-            ra=read(_angle, row, "ra", sky_notation.RA_LIMITS, location),
-            dec=read(_angle, row, "dec", sky_notation.DEC_LIMITS, location),
-            position_angle=read(_number, row, "position_angle", -360.0, 360.0, location),
+            ra=read(_angle, row, "ra", location),
+            dec=read(_angle, row, "dec", location),
+            position_angle=read(_number, row, "position_angle", location),
             mjd=read(_mjd, row, location),
-            exposure_time_s=read(_number, row, "exposure_time_s", 0.0, 1e6, location),
-            sky=read(_number, row, "sky", 0.0, 1e6, location),
-            seeing=read(_number, row, "seeing", 0.01, 10.0, location) if channel == "EXT" else None,
-            zero_point=read(_number, row, "zero_point", 0.0, 50.0, location),
+            exposure_time_s=read(_number, row, "exposure_time_s", location),
+            sky=read(_number, row, "sky", location),
+            seeing=read(_number, row, "seeing", location) if channel == "EXT" else None,
+            zero_point=read(_number, row, "zero_point", location),
             psf=str(read(user_files.expand_path, row["psf"], path.parent)) if row.get("psf") else None,
-            grism_angle=read(_number, row, "grism_angle", -360.0, 360.0, location),
+            grism_angle=read(_number, row, "grism_angle", location),
             detectors=tuple(row.get("detectors", "").split()),
         )
     return replace(parsed, ra=parsed.ra % 360.0)
@@ -318,7 +330,7 @@ def _image_type(row: Mapping[str, str], default: str, location: str) -> str:
     return kind
 
 
-def _number(row: Mapping[str, str], name: str, lo: float, hi: float, location: str) -> float | None:
+def _number(row: Mapping[str, str], name: str, location: str) -> float | None:
     """Read a number from a field of a row; None if the field is empty. Raises BadInput if it is wrong."""
     if not row.get(name):
         return None
@@ -326,16 +338,17 @@ def _number(row: Mapping[str, str], name: str, lo: float, hi: float, location: s
         value = float(row[name])
     except ValueError:
         raise BadInput(f"{location}: {name} = {row[name]!r} is not a number") from None
+    lo, hi = BOUNDS[name]
     if not lo <= value <= hi:
         raise BadInput(f"{location}: {name} = {value} is outside {lo:g} to {hi:g}")
     return value
 
 
-def _angle(row: Mapping[str, str], axis: str, limits: tuple[float, float], location: str) -> float:
+def _angle(row: Mapping[str, str], axis: str, location: str) -> float:
     if not row[axis]:
         raise BadInput(f"{location}: {axis} is missing")
     ra = _as_number(row["ra"]) if axis == "dec" else None
-    return sky_notation.angle(_as_number(row[axis]), f"{location}: {axis}", axis, limits, ra)
+    return sky_notation.angle(_as_number(row[axis]), f"{location}: {axis}", axis, BOUNDS[axis], ra)
 
 
 def _mjd(row: Mapping[str, str], location: str) -> float | None:

@@ -102,6 +102,8 @@ def test_the_fits_form_says_the_same(tmp_path):
     [
         ([MEAN, record(bt=" 9.x00")], "record 2: '9.x00' is not a number .1 bad record"),
         ([MEAN, record(dec=" 92.23184345")], "record 2 lies at 2.3175, 92.2318"),
+        ([MEAN, record(bt="-1e300")], "B_T of record 2 is -1e.300, but must be from -3 to 20 mag"),
+        ([record(vt=" 1e999")], "V_T of record 1 is inf, but must be"),
         ([record(vt="   nan")], "record 1: 'nan' is not a number"),
         ([MEAN, MEAN[:100]], "Expected 32 columns"),
         (["a,b,c"], "records have 1 fields between bars, must have 32"),

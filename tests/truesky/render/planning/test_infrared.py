@@ -50,7 +50,7 @@ def test_invalid_lamps_are_refused():
     with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 is not visible in euclid_y"):
         flats(exposures=1, bands=["euclid_y"], lamps=[5])
     for lamps, message in (
-        ([6], "6 is not a whole number from 1 to 5"),
+        ([6], r"\[0\] = 6 is outside \[1, 5\]"),
         ([1, 1], "contains a lamp twice"),
         ([], "is not"),
     ):
@@ -185,10 +185,10 @@ MACC = r"observation\[0\]\.macc"
 @pytest.mark.parametrize(
     ("macc", "message"),
     [
-        ([0, 16, 4], rf"{MACC}: groups = 0 is not a whole number from 2 to 1000"),
-        ([4, 16, -1], rf"{MACC}: drops = -1 is not"),
-        ([4, 16.0, 4], rf"{MACC}: reads = 16.0 is not"),
-        ([4, True, 4], rf"{MACC}: reads = True is not"),
+        ([0, 16, 4], rf"{MACC}\[0\] \(groups\) = 0 is outside \[2, 1000\]"),
+        ([4, 16, -1], rf"{MACC}\[2\] \(drops\) = -1 is outside"),
+        ([4, 16.0, 4], rf"{MACC}\[1\] \(reads\) must be a whole number from 1 to 1000, got 16.0"),
+        ([4, True, 4], rf"{MACC}\[1\] \(reads\) must be a whole number from 1 to 1000, got True"),
         ([4, 16], rf"{MACC} = \[4, 16\] is not \[groups, reads, drops\]"),
         ("4,16,4", rf"{MACC} = '4,16,4' is not"),
         ([100, 30, 30], rf"{MACC} = \[100, 30, 30\] has 5970 frames, more than 4000"),
