@@ -163,7 +163,8 @@ def galaxy_fluxes(
     Raises
     ------
     BadInput
-        If there is no band, a name is unknown, or a value is missing. The message names the column and the source.
+        If there is no band, a name is unknown, a band is not inside 600 to 24000 A, or a value is missing. The message
+        names the band, or the column and the source.
     OutOfRange
         If a value is out of range.
 
@@ -354,7 +355,14 @@ def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
 def _load_passbands(bands: Sequence[str | Passband]) -> list[Passband]:
     if not bands:
         raise BadInput("passbands: at least one is required")
-    return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
+    curves = [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
+    for curve in curves:
+        # Wavelengths outside the grid would have indices of other wavelengths, or none.
+        if not passbands.GRID_FIRST <= curve.wavelength[0] <= curve.wavelength[-1] <= passbands.GRID_LAST:
+            ends = f"{curve.wavelength[0]:g} to {curve.wavelength[-1]:g} A"
+            allowed = f"must be inside {passbands.GRID_FIRST} to {passbands.GRID_LAST} A"
+            raise BadInput(f"passband {curve.name}: {ends}, {allowed}")
+    return curves
 
 
 def _source_kinds(table: pa.Table) -> Int:

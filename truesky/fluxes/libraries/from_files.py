@@ -176,7 +176,8 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     Raises
     ------
     BadInput
-        If the medium is unknown, the file cannot be read, or the curve is not valid or outside 600 to 24000 A.
+        If the medium is unknown, the file cannot be read, or the curve is not valid, is outside 600 to 24000 A, or is 0
+        at all whole angstroms.
     """
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
@@ -184,7 +185,9 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     wavelength, response = passbands.resample_to_grid(curve.wavelength, curve.value)
     if not len(wavelength):
         first, last = passbands.GRID_FIRST, passbands.GRID_LAST
-        raise BadInput(f"{path}: the passband is outside {first} .. {last} A")
+        raise BadInput(f"{path}: the passband is outside {first} .. {last} A, or between two whole angstroms")
+    if not response.any():
+        raise BadInput(f"{path}: the passband is 0 at all whole angstroms: it must be wider than 1 A")
     return Passband(name, wavelength, response, medium)
 
 

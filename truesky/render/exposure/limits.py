@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 from lake_schema.errors import BadInput
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import cost
@@ -14,6 +16,25 @@ from truesky.render.exposure.visible_sources import Light
 _MAX_BYTES = 2e9
 # CPU time that drawing the sources of one detector may take, s. An image that takes longer is probably a mistake.
 _MAX_SECONDS = 6 * 3600.0
+
+
+def refuse_too_many_pixels(aim: Aim) -> None:
+    """Check that the image of a detector fits into the memory of this machine, whatever its sources.
+
+    `aim` is the exposure and the detector. Raises BadInput if the predicted memory exceeds the installed memory.
+    """
+    detector, costs = aim.detector, aim.channel.cost
+    per_pixel = costs.sky_bytes_per_pixel if aim.sees_sky else costs.bytes_per_pixel
+    required, installed = 1e9 * costs.base_gb + per_pixel * detector.nx * detector.ny, _installed_bytes()
+    if required > installed:
+        raise BadInput(
+            f"exposure {aim.exposure.exposure_id}, detector {detector.name}: {detector.nx} x {detector.ny} pixels take "
+            f"{required / 1e9:.1f} GB, this machine has {installed / 1e9:.1f} GB: render it on a larger machine"
+        )
+
+
+def _installed_bytes() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def refuse_too_large(aim: Aim, light: Light) -> None:

@@ -79,6 +79,7 @@ def render(
         Raw image, truth maps and drawn sources. BadInput is raised by called functions, for example if the image would
         need too much memory or time.
     """
+    limits.refuse_too_many_pixels(aim)
     if drawings is not None:
         drawings.check((aim.exposure, aim.detector, variant.accuracy, seed))
     scene = replace(

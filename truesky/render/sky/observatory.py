@@ -88,8 +88,8 @@ class Site:
         Returns
         -------
         float array, broadcast shape of the arguments
-            Altitude in degrees, negative below the horizon. The error is 0.2 deg, because precession and nutation
-            since 2000 are neglected.
+            Altitude in degrees, negative below the horizon. The error is at most 0.2 deg until 2035, and 0.6 deg for
+            each century before or after 2000, because precession and nutation since 2000 are neglected.
         """
         hour, dec, latitude = self.hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
         sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)

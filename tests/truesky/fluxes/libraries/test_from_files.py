@@ -260,3 +260,13 @@ def test_no_word_needs_more_memory_than_its_file(tmp_path):
         from_files.read(path, "passband_ecsv")
     path.write_text(text.replace("datatype: float64", 'datatype: "float64"', 1))
     assert len(from_files.read(path, "passband_ecsv").value) == 21
+
+
+def test_a_passband_narrower_than_the_steps_is_refused(tmp_path):
+    """A curve that is 0 at all whole angstroms would give fluxes of NaN."""
+    path = tmp_path / "narrow"
+    path.write_text("5000 0\n5000.5 1\n5001 0\n")
+    with pytest.raises(BadInput, match=r"narrow: the passband is 0 at all whole angstroms: it must be wider than 1 A"):
+        from_files.passband(path, "own", "air")
+    path.write_text("5000 0\n5000.7 1\n5001.5 0\n")
+    assert from_files.passband(path, "own", "air").response[-1] > 0.0

@@ -1,5 +1,6 @@
 """A task has at least the memory that its forecast says, whatever the detector's size."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,11 +8,12 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
+from tests.truesky.render.fields import aimed, small
 from truesky.render.camera import detectors
 from truesky.render.camera.windows import Window
 from truesky.render.channels.registry import CHANNELS
 from truesky.render.drawing import cost
-from truesky.render.exposure import limits
+from truesky.render.exposure import limits, render
 from truesky.render.planning import detector_costs
 
 
@@ -48,3 +50,16 @@ def test_a_deep_field_is_drawn(camera, count, monkeypatch):
 
 def test_it_is_what_the_forecast_says():
     assert detector_costs.cost_model("EXT", True, ()).memory(9216 * 9232) == pytest.approx(4.19, abs=0.05)
+
+
+def test_a_detector_larger_than_the_memory_is_refused_before_it_is_drawn(monkeypatch):
+    """A detector of 32,000 x 32,000 pixels takes 59 GB."""
+    monkeypatch.setattr(limits, "_installed_bytes", lambda: 25e9, raising=False)
+    large = replace(small("vis", "3-4", 16), nx=32_000, ny=32_000)
+    with pytest.raises(BadInput, match=r"detector 3-4: 32000 x 32000 pixels take 58.9 GB, this machine has 25.0 GB"):
+        render.render(aimed(large, None, None), None, None, 1)
+    limits.refuse_too_many_pixels(aimed(replace(large, ny=16), None, None))
+
+
+def test_the_installed_memory_is_known():
+    assert limits._installed_bytes() > 5e8

@@ -30,6 +30,9 @@ _SHORTEST = 1e-2
 # If the expected number of tracks per exposure is at most this, `median_pixel` returns 0, so that no cosmic rays are
 # drawn unless the user switches them on.
 _NEGLIGIBLE = 1e-3
+# Number of tracks that are drawn together. A track of average length takes 1.1 kB, so that those of an exposure of
+# 1e6 s would take 27 GB.
+_TOGETHER = 1 << 18
 
 
 def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
@@ -101,8 +104,10 @@ def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Ge
     count = draw_event_count(expected, rng)
     if out.size:
         ny, nx = out.shape
-        _, column, row, charge = pixels_of_events(draw_events(count, ny, nx, quantiles, rng))
-        add_charge(out, row, column, charge)
+        for drawn in range(0, count, _TOGETHER):
+            events = draw_events(min(_TOGETHER, count - drawn), ny, nx, quantiles, rng)
+            _, column, row, charge = pixels_of_events(events)
+            add_charge(out, row, column, charge)
 
 
 @jit

@@ -132,6 +132,17 @@ def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
     np.testing.assert_array_equal(plain[:, 0], without + hit)
 
 
+def test_tracks_of_long_exposures_are_drawn_in_parts(monkeypatch):
+    """Memory does not grow with the exposure time, and no track is lost; all tracks have 7 electrons."""
+    together, draw = [], cosmic_rays.draw_events
+    monkeypatch.setattr(cosmic_rays, "draw_events", lambda count, *rest: together.append(count) or draw(count, *rest))
+    quantiles = np.array([[0.0, 0.01, 7.0], [1.0, 0.01, 7.0]])
+    image = cosmic_rays.draw_tracks((64, 64), 6e5, quantiles, np.random.default_rng(1))
+    assert max(together) <= 300_000
+    assert image.sum() == 7.0 * sum(together)
+    assert sum(together) == pytest.approx(6e5, rel=0.01)
+
+
 def test_too_many_are_refused():
     for wrong in (-1.0, np.nan, 1e12):
         with pytest.raises(OutOfRange, match="cosmic"):
