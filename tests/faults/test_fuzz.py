@@ -96,6 +96,10 @@ def test_mutations_are_reproducible():
         ("pointings", 865),
         ("pointings", 1436),
         ("Tycho-2", 17636),
+        ("cache, array", 28),
+        ("cache, array", 176),
+        ("receipt", 8),
+        ("head file", 1),
     ],
 )
 def test_inputs_that_once_failed_are_refused(name, number):
