@@ -239,6 +239,9 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if properties.is_file():
         lines = (line.partition("=") for line in user_files.read_text(properties, "request").splitlines())
         primary = {key.strip(): value.strip() for key, _, value in lines}.get("hats_primary_table_url", "")
+        if Path(primary).is_absolute() or ".." in Path(primary).parts or "\0" in primary:
+            # All files of a disc might be read.
+            raise BadInput(f"{properties}: hats_primary_table_url = {primary[:80]!r} is not a folder of the collection")
         folder = folder / primary
     data_folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
     all_files = sorted(path for path in data_folder.rglob("*") if path.is_file())

@@ -86,6 +86,15 @@ def cards_from_text(lines: str) -> tuple[Card, ...]:
     return tuple((card.keyword, card.value, card.comment) for card in map(fits.Card.fromstring, lines.splitlines()))
 
 
+def read_head_file(path: Path) -> tuple[Card, ...]:
+    """Return the cards of the first image in a head file, the text file with the true WCS of a FITS file.
+
+    Damaged is raised if the file is not a text of FITS cards.
+    """
+    with write.errors_as_damaged(path):
+        return cards_from_text(path.read_text("ascii").split("END\n")[0])
+
+
 def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:
     """Write images to one FITS file, which replaces `path` in one rename.
 

@@ -18,11 +18,14 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout
 from lake_schema.store.manifest import sync, write_json
 from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.store.provenance import digest
 from lake_schema.texts import spelling
 
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 # File in the folder of a request with the area of the sky that it covers. No table has this name.
 _AREA = "area.json"
+# Key in this file with the sha256 of the area.
+_DIGEST = "digest"
 
 
 def request_names(root: Folder) -> list[str]:
@@ -165,21 +168,26 @@ def write_area(root: Path, name: str, area: Mapping[str, Any]) -> None:
     """
     if read_area(root, name) != area:
         with layout.report_unwritable(root):
-            write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, area)
+            write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, {**area, _DIGEST: digest(area)})
 
 
 def read_area(root: Folder, name: str) -> dict[str, Any] | None:
     """Return the recorded area of a request, or None if the lake does not record it or is on object storage.
 
-    Damaged is raised if the file is not valid.
+    Areas without a digest, as older versions of truesky wrote them, count as not recorded. Damaged is raised if the
+    file is not valid, or has changed since it was written.
     """
     path = layout.requests_folder(root) / layout.check_name(name) / _AREA
     if not isinstance(path, Path) or not path.is_file():
         return None
     try:
         area = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise Damaged(f"{path}: {error}") from None
     if not isinstance(area, dict):
         raise Damaged(f"{path}: must contain an object")
+    if (seal := area.pop(_DIGEST, None)) is None:
+        return None
+    if digest(area) != seal:
+        raise Damaged(f"{path} has changed since it was written: its digest differs")
     return area

@@ -27,12 +27,14 @@ from lake_schema.errors import BadInput, LakeError, Superseded
 from lake_schema.ids import BLOCK_BITS, kind_from_id
 from lake_schema.store import hats_files, layout, manifest, parquet
 from lake_schema.store.plan import Json, Output, Plan, Task, TaskFunction, data_path
-from lake_schema.store.provenance import file_sha256, machine
+from lake_schema.store.provenance import digest, file_sha256, machine
 from lake_schema.store.validate import check_rows
 
 # Largest number of blocks of identifiers (order-8 HEALPix cells, each for one type of source) that the receipt (record)
 # of a partition lists. An order-3 cell, the largest partition, has 1024 blocks per type of source.
 _MAX_BLOCKS = 4096
+# Key of a receipt with the sha256 of its other entries.
+_DIGEST = "digest"
 # Number of receipts (records of finished partitions) that are read in parallel, because each read on a network file
 # system has a long delay.
 _READ_THREADS = 16
@@ -136,11 +138,11 @@ def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Js
 
 
 def write_receipt(stage: Path, receipt: Json) -> None:
-    """Write the receipt of a partition, a JSON record of its files with sizes and checksums.
+    """Write the receipt of a partition, a JSON record of its files with sizes and checksums, and its own digest.
 
     It is written into a folder next to `stage`, the folder in which the version is made.
     """
-    manifest.write_json(_receipt_path(stage, receipt["part"]), receipt)
+    manifest.write_json(_receipt_path(stage, receipt["part"]), {**receipt, _DIGEST: digest(receipt)})
 
 
 def _check_positions(rows: pa.Table, table: Table, task: Task) -> None:
@@ -237,12 +239,16 @@ def _flat_name(partition: str) -> str:
 
 
 def read_receipt(stage: Path, partition: str) -> dict[str, Any] | None:
-    """Return the receipt (record of the written files) of a partition, or None if it is missing or not valid JSON."""
+    """Return the receipt (record of the written files) of a partition, or None if it is missing or damaged.
+
+    The partition is then made again. The manifest takes the checksums and numbers of rows from the receipt.
+    """
     try:
         receipt: dict[str, Any] = json.loads(_receipt_path(stage, partition).read_bytes())
-    except (FileNotFoundError, ValueError):
+        is_whole = receipt.pop(_DIGEST) == digest(receipt)
+    except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    return receipt
+    return receipt if is_whole else None
 
 
 def is_done(stage: Path, task: Task) -> bool:

@@ -3,9 +3,11 @@
 A reader returns or raises a LakeError of one line (for several mistakes, one line each), within bounds of time and
 memory, and writes nothing. Mutations are numbered: the same number of a target is the same input, on any machine.
 
-    python -m tests.faults.fuzz [TARGET ...] [--runs 20000] [--first 0]
+    python -m tests.faults.fuzz [TARGET ...] [--runs 20000 | --total 1000000] [--first 0]
 
-prints what broke, and keeps the input of each in the folder of temporary files.
+prints a table of the targets, with the number of inputs that were refused and accepted, the violations, and the inputs
+per second. What broke is printed below its target, and its input is kept in the folder of temporary files. A run that
+was stopped goes on if --first is the number of mutations that each target has had.
 """
 
 import argparse
@@ -21,12 +23,13 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lake_schema.errors import BadInput, LakeError
-from tests.faults import fuzz_targets
+from tests.faults import fuzz_targets, lake_targets
 
 MOST_SECONDS, MOST_BYTES, MOST_CHARACTERS = 10.0, 512 << 20, 2000
 # Wall time after which a mutation's process is ended: one that waits takes no CPU time.
@@ -60,7 +63,7 @@ class Target:
     may_die: bool = False
 
 
-TARGETS = {name: Target(*rest) for name, rest in fuzz_targets.TARGETS.items()}
+TARGETS = {name: Target(*rest) for name, rest in (fuzz_targets.TARGETS | lake_targets.TARGETS).items()}
 
 
 # ------------------------------------------------------------------------------------------------ mutations
@@ -177,24 +180,24 @@ def _too_long(signum, frame):
 
 
 def judged(target, path):
-    """Return the fault of a reader for a file, or "" if the reader is correct."""
-    started = time.process_time()
+    """Return the fault of a reader for a file ("" if the reader is correct), and whether it refused the file."""
+    started, is_refused = time.process_time(), False
     signal.setitimer(signal.ITIMER_PROF, 5 * MOST_SECONDS)
     try:
         target.read(path)
     except LakeError as error:
-        said = str(error)
+        is_refused, said = True, str(error)
         mistakes = error.messages if isinstance(error, BadInput) else (said,)
         if len(said.splitlines()) > len(mistakes) or max(map(len, mistakes)) > MOST_CHARACTERS:
-            return f"says {len(said.splitlines())} lines, {len(said)} characters: {said[:200]!r}"
+            return f"says {len(said.splitlines())} lines, {len(said)} characters: {said[:200]!r}", True
     except BaseException as error:
         calls = [f"{call.filename}:{call.lineno}" for call in traceback.extract_tb(error.__traceback__)]
         ours = next((call for call in reversed(calls) if "site-packages" not in call), "")
-        return f"{type(error).__name__}: {str(error)[:150]} ({calls[-1]}; {ours})"
+        return f"{type(error).__name__}: {str(error)[:150]} ({calls[-1]}; {ours})", False
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
     seconds = time.process_time() - started
-    return f"takes {seconds:.1f} s" if seconds > MOST_SECONDS else ""
+    return f"takes {seconds:.1f} s" if seconds > MOST_SECONDS else "", is_refused
 
 
 def _child(target, seeds, folder, numbers, report):
@@ -208,20 +211,23 @@ def _child(target, seeds, folder, numbers, report):
         path.write_bytes(mutated(seeds, n))
         (folder / "number").write_text(str(n))
         signal.alarm(MOST_WAIT)
-        wrong = judged(target, path)
+        wrong, is_refused = judged(target, path)
         if not wrong and (peak := resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10) > base + MOST_BYTES:
             wrong, base = f"takes {(peak - base) >> 20} MB", peak
         there = sorted(p.name for p in (*(folder / "in").iterdir(), *(folder / "empty").iterdir()))
         if there != [path.name] and not wrong:
             wrong = f"leaves {there}"
-        if wrong:
-            report.write(json.dumps([n, wrong]) + "\n")
-            report.flush()
+        report.write(json.dumps([n, wrong, is_refused]) + "\n")
+        report.flush()
 
 
-def run(name, first, count, keep=None):
-    """Return (number, fault) of mutations that a target handles wrongly; inputs are kept in the folder `keep`."""
-    target = TARGETS[name]
+def run(name, first, count, keep=None, outcomes=None):
+    """Return (number, fault) of mutations that a target handles wrongly; inputs are kept in the folder `keep`.
+
+    The numbers of refused and of accepted inputs are added to the Counter `outcomes`. An input whose process died
+    counts as refused if the target may die.
+    """
+    target, outcomes = TARGETS[name], Counter() if outcomes is None else outcomes
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     try:
         (folder / "in").mkdir()
@@ -237,10 +243,13 @@ def run(name, first, count, keep=None):
             if not (child := os.fork()):
                 _in_child(target, seeds, folder, range(first, last))
             status = os.waitpid(child, 0)[1]
-            found += [tuple(json.loads(entry)) for entry in (folder / "report").read_text().splitlines()]
+            entries = [json.loads(entry) for entry in (folder / "report").read_text().splitlines()]
+            found += [(n, wrong) for n, wrong, _ in entries if wrong]
+            outcomes.update("refused" if is_refused else "accepted" for _, wrong, is_refused in entries if not wrong)
             first = last
             if status:
                 first = int((folder / "number").read_text()) + 1
+                outcomes["refused"] += target.may_die
                 if not target.may_die:
                     found.append((first - 1, f"its process died, status {status}"))
         for n, _ in found if keep else ():
@@ -268,17 +277,19 @@ def main(argv):
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("targets", nargs="*", default=list(TARGETS))
     parser.add_argument("--runs", type=int, default=20_000)
+    parser.add_argument("--total", type=int, help="number of inputs of all targets together, instead of --runs")
     parser.add_argument("--first", type=int, default=0)
     options = parser.parse_args(argv)
     keep, broken = Path(tempfile.mkdtemp(prefix="fuzz-found-")), 0
+    runs = -(-options.total // len(options.targets)) if options.total else options.runs
+    print(f"{'target':26} {'cases':>9} {'refused':>9} {'accepted':>9} {'violations':>10} {'cases/s':>8}")
     for name in options.targets:
-        started = time.monotonic()
-        found = run(name, options.first, options.runs, keep)
+        started, outcomes = time.monotonic(), Counter()
+        found = run(name, options.first, runs, keep, outcomes)
         broken += len(found)
-        print(
-            f"{name:24} {options.runs:7,} mutations {time.monotonic() - started:7.1f} s  {len(found)} broken",
-            flush=True,
-        )
+        counts = (runs, outcomes["refused"], outcomes["accepted"], len(found))
+        rate = runs / (time.monotonic() - started)
+        print(f"{name:26} {counts[0]:9,} {counts[1]:9,} {counts[2]:9,} {counts[3]:10,} {rate:8.1f}", flush=True)
         seen = set()
         for n, what in found:
             if (kind := re.sub(r"\d+", "9", what)[:160]) not in seen:

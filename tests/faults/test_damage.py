@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from hypothesis import strategies as st
 
 from lake_schema.errors import Damaged
 from lake_schema.fits.images import Image, read_images, write_images
-from lake_schema.store import publish, read
+from lake_schema.store import layout, manifest, publish, read, request_links, stage
 from lake_schema.store.plan import Output
 from tests.faults import promise
+from tests.faults.lake_targets import AREA
 from tests.universe import plain_plan, plain_work, toy_plan, toy_rows, toy_work
+from truesky.numerics import cache
 
 FLIPS = [pytest.param(60, id="short"), pytest.param(2000, id="long", marks=pytest.mark.nightly)]
 
@@ -82,6 +85,94 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
             refused += 1
         path.write_bytes(whole)
     assert refused > 0.6 * flips
+
+
+# ------------------------------------------------------------------------------------------------ every file of a lake
+
+# Files up to this size (bytes) are tested with every flipped bit, larger ones with one flipped bit of every byte.
+SMALL = 8192
+
+
+class CompleteLake:
+    """A lake with every kind of file that has a checksum, and a reader for each of them.
+
+    A reader returns what the file says. With a flipped bit it must return the same, or refuse the file: it raises
+    Damaged, or returns None for a receipt or an entry of the cache, which are then made again.
+    """
+
+    def __init__(self, root):
+        self.root, self.readers = root, {}
+        publish.make_version(root, toy_plan(cells=((1607, 30), (1608, 20))), toy_work)
+        publish.make_version(root, plain_plan(parts=1), image_work, name="mine")
+        for name in ("toy", "plain"):
+            self._add_version(read.version(root, name))
+        self._add_stage(plain_plan(2, 1))
+        request_links.write_area(root, "mine", AREA)
+        self.readers[root / "names" / "mine" / "area.json"] = lambda: request_links.read_area(root, "mine")
+        self._add_cache(root / "cache" / "arrays-0")
+        self.good = {path: reader() for path, reader in self.readers.items()}
+
+    def _add_version(self, version):
+        for entry in version.manifest["files"]:
+            path = version.folder / entry["path"]
+            self.readers[path] = lambda entry=entry: manifest.check_contents(version.folder, entry).read_bytes()
+        for part in version.partitions:
+            self.readers[version.partition_path(part)] = lambda part=part: version.rows(partitions=[part])
+        self.readers[version.folder / "manifest.json"] = lambda: dict(manifest.load(version.folder, version.table))
+
+    def _add_stage(self, plan):
+        folder = layout.stage_folder(self.root, "plain", plan.key)
+        folder.mkdir()
+        for task in plan.tasks:
+            stage.run_task(self.root, plan.key, plan.table, plan.facts, image_work, task)
+            path = stage.receipts_folder(folder) / f"{task.name}.json"
+            self.readers[path] = lambda task=task: stage.read_receipt(folder, task.name)
+
+    def _add_cache(self, folder):
+        folder.mkdir(parents=True)
+        cache._store({"one": np.arange(50.0), "two": np.ones((3, 4), np.int16)}, folder)
+        cache.store_checksums(folder, ["one.npy", "two.npy"])
+        shutil.copytree(folder, self.root / "copy")
+
+        def entry():
+            """Read the entry; the cache removes a damaged one."""
+            found = cache._load(folder)
+            found = found and {name: array.tolist() for name, array in found.items()}
+            if not folder.exists():
+                shutil.copytree(self.root / "copy", folder)
+            return found
+
+        self.readers |= {path: entry for path in folder.iterdir()}
+
+    def flips(self, few):
+        """Yield (path, bit): `few` bits of each file, or all bits that are tested if it is None."""
+        rng = np.random.default_rng(8)
+        for path in sorted(self.readers):
+            size = path.stat().st_size
+            bits = range(8 * size) if size <= SMALL else (8 * at + at % 8 for at in range(size))
+            yield from ((path, int(bit)) for bit in (bits if few is None else rng.choice(8 * size, few, replace=False)))
+
+    def is_harmless(self, path, bit):
+        """Return True if a file with a flipped bit is refused, or says the same as before."""
+        whole = path.read_bytes()
+        flipped(path, bit)
+        try:
+            found = self.readers[path]()
+        except Damaged:
+            found = None
+        path.write_bytes(whole)
+        return found is None or found == self.good[path]
+
+
+@pytest.mark.parametrize("few", [pytest.param(2, id="few"), pytest.param(None, id="all", marks=pytest.mark.nightly)])
+def test_a_flipped_bit_of_any_file_is_refused_or_says_nothing(lake, few):
+    """The test of all bits prints the number of its cases and the time with `-s`."""
+    complete, started = CompleteLake(lake), time.monotonic()
+    assert len(complete.readers) > 15
+    flips = list(complete.flips(few))
+    for path, bit in flips:
+        assert complete.is_harmless(path, bit), (path.relative_to(lake), bit)
+    print(f"{len(flips):,} cases in {time.monotonic() - started:.0f} s")
 
 
 @pytest.mark.parametrize("kind", ["rows", "image"])

@@ -5,6 +5,7 @@ Catalogues cover whole HEALPix cells, so that they contain sources outside the a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -52,7 +53,7 @@ def _condition_of_request(root: Folder, name: str) -> str:
     try:
         values = request_links.read_area(root, name)
         return _failure(_UNKNOWN) if values is None else condition(_area(values))
-    except (Damaged, TypeError, ValueError, KeyError) as error:
+    except (Damaged, TypeError, ValueError, KeyError, OverflowError) as error:
         return _failure(f"in_area: the area of request {name} cannot be read: {error}")
 
 
@@ -61,10 +62,18 @@ def _failure(message: str) -> str:
 
 
 def _area(values: dict[str, Any]) -> Area:
-    tuples = {name: tuple(tuple(map(float, place)) for place in values[name]) for name in ("vertices", "patches")}
-    box = None if values["box"] is None else tuple(map(float, values["box"]))
-    centre = {name: float(values[name]) for name in ("ra", "dec", "radius")}
+    tuples = {name: tuple(tuple(map(_number, place)) for place in values[name]) for name in ("vertices", "patches")}
+    box = None if values["box"] is None else tuple(map(_number, values["box"]))
+    centre = {name: _number(values[name]) for name in ("ra", "dec", "radius")}
     return Area(**tuples, **centre, box=box, wide=bool(values["wide"]))  # type: ignore[arg-type]
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        # In SQL, it would be the name of a column.
+        raise ValueError(f"{number} is not a finite number")
+    return number
 
 
 def condition(area: Area) -> str:

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
+from tokenize import TokenError
 from types import SimpleNamespace
 from typing import Any
 
@@ -262,7 +263,7 @@ def _load(folder: Path) -> dict[str, Array] | None:
         return None
     try:
         return {name.removesuffix(_ARRAY): _map(folder / name) for name in checksums}
-    except (ValueError, EOFError, FileNotFoundError) as error:
+    except (ValueError, EOFError, FileNotFoundError, TokenError, OverflowError) as error:
         # Another process may have removed the folder in the meantime.
         discard(folder, str(error))
         return None

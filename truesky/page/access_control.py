@@ -6,14 +6,25 @@ token, and it cannot change the headers Host, Origin and Sec-Fetch-Site, which t
 
 from __future__ import annotations
 
+import asyncio
 import hmac
+import logging
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
-from aiohttp import web
+from aiohttp import http_exceptions, web
+
+from lake_schema.errors import BadInput
 
 MAX_BODY_BYTES = 256 << 10
+# Longest time in seconds in which a client must send the body of a request.
+BODY_TIMEOUT = 30.0
+# Settings of aiohttp for each connection. A connection without a complete header of a request is closed after the
+# first time. After an answer, the rest of the request's body is read for the second time, so that the client gets the
+# answer. Bodies are not decompressed, because a short one may contain gigabytes, and the page sends none.
+CONNECTION_SETTINGS = {"keepalive_timeout": 75.0, "lingering_time": 2.0, "auto_decompress": False}
 _TOKEN_BYTES = 24
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -110,6 +121,31 @@ class AccessRules:
             except web.HTTPException as error:
                 response = web.Response(status=error.status, text=f"{error.reason}\n")
         return response
+
+
+@asynccontextmanager
+async def limit_body() -> AsyncIterator[None]:
+    """Limit the time in which an `async with` block may read the body of a request.
+
+    The client gets the status 408 if it has not sent the body after 30 s. BadInput is raised if the body breaks the
+    rules of HTTP.
+    """
+    try:
+        async with asyncio.timeout(BODY_TIMEOUT):
+            yield
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
+    except web.RequestPayloadError:
+        raise BadInput("the body of the request does not follow the rules of HTTP") from None
+
+
+def is_no_client_error(record: logging.LogRecord) -> bool:
+    """Return False for messages of aiohttp about requests that break the rules of HTTP.
+
+    Anyone can send such requests, and each message would print a traceback. The client gets the reason.
+    """
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, http_exceptions.HttpProcessingError | web.RequestPayloadError)
 
 
 async def add_security_headers(request: web.Request, response: web.StreamResponse) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 from aiohttp import web
 
@@ -82,7 +84,7 @@ async def send_stream(
     first = await anext(stream, b"")
     response = web.StreamResponse(headers={"Content-Type": content_type})
     if file_name is not None:
-        response.headers["Content-Disposition"] = f'attachment; filename="{file_name}"'
+        response.headers["Content-Disposition"] = f"attachment; {_name_parameter(file_name)}"
     await response.prepare(request)
     try:
         await _write_piece(request, response, first)
@@ -96,6 +98,17 @@ async def send_stream(
         return response
     await response.write_eof()
     return response
+
+
+def _name_parameter(file_name: str) -> str:
+    """Return the parameter of the HTTP header Content-Disposition for the name of a file.
+
+    The name of an image in a lake may contain any character. A quote would end the name, and a new line the header, so
+    such names are percent-encoded (RFC 6266).
+    """
+    if re.fullmatch(r"[A-Za-z0-9_.+-]+", file_name):
+        return f'filename="{file_name}"'
+    return f"filename*=UTF-8''{quote(file_name, safe='')}"
 
 
 async def _write_piece(request: web.Request, response: web.StreamResponse, piece: bytes) -> None:

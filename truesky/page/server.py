@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,15 @@ from aiohttp import web
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput, LakeError
 from truesky.page import answers, downloads, sky_maps
-from truesky.page.access_control import MAX_BODY_BYTES, TAP_PATH, AccessRules, add_security_headers
+from truesky.page.access_control import (
+    CONNECTION_SETTINGS,
+    MAX_BODY_BYTES,
+    TAP_PATH,
+    AccessRules,
+    add_security_headers,
+    is_no_client_error,
+    limit_body,
+)
 from truesky.page.lake_session import Busy, Closed, LakeSession
 from truesky.page.tap import service
 
@@ -48,7 +57,12 @@ class Server:
 
     def application(self) -> web.Application:
         """Return the aiohttp application with all addresses of the page and of the TAP service."""
-        app = web.Application(middlewares=[self.access.middleware, _errors_to_json], client_max_size=MAX_BODY_BYTES)
+        logging.getLogger("aiohttp.server").addFilter(is_no_client_error)
+        app = web.Application(
+            middlewares=[self.access.middleware, _errors_to_json],
+            client_max_size=MAX_BODY_BYTES,
+            handler_args=CONNECTION_SETTINGS,
+        )
         app.on_response_prepare.append(add_security_headers)
         app.on_startup.append(self._start_warm_up)
         app.on_cleanup.append(self._close)
@@ -152,7 +166,10 @@ async def _errors_to_json(
 
 
 async def _read_json(request: web.Request) -> dict[str, Any]:
+    async with limit_body():
+        await request.read()
     try:
+        # The body is in memory now.
         content = json.loads(await request.text())
         # JSON may contain lone surrogates as escape sequences, but they cannot be encoded again.
         json.dumps(content, ensure_ascii=False).encode()

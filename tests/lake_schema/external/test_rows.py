@@ -29,3 +29,11 @@ def test_titles_of_any_length_are_refused(tmp_path):
     path.write_text("ra," + "x" * 70_000 + "\n1,2\n")
     with pytest.raises(BadInput, match="titles that are too long"):
         rows(path)
+
+
+@pytest.mark.parametrize("primary", ["/", "../other", "a/../..", "x\0"])
+def test_the_catalogue_of_a_collection_is_a_folder_in_it(tmp_path, primary):
+    """Otherwise all files of a disc might be read."""
+    (tmp_path / "collection.properties").write_text(f"hats_primary_table_url = {primary}\n")
+    with pytest.raises(BadInput, match="is not a folder of the collection"):
+        external_rows._files_of_folder(tmp_path)

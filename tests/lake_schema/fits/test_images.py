@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import external, tables, write
-from lake_schema.fits.images import Image, cards_to_text, read_images, write_images
+from lake_schema.fits.images import Image, cards_to_text, read_head_file, read_images, write_images
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from tests.universe import rows_of
@@ -366,3 +366,11 @@ def test_bytes_are_on_the_disc_before_the_file_has_its_name(tmp_path, monkeypatc
     write_images(tmp_path / "a.fits", [Image(science(), CARDS)])
     assert done[:2] == ["fsync", "replace"]
     assert (tmp_path / "a.fits").stat().st_mode & 0o777 == 0o666 & ~write._umask()
+
+
+@pytest.mark.parametrize("text", [b"CRVAL1  = 1\xb2\n", b"CTYPE2  = 'RA--\n", b"CRVAL1  = 1" + b" " * 80])
+def test_a_head_file_that_is_not_cards_is_damaged(tmp_path, text):
+    path = tmp_path / "x.head"
+    path.write_bytes(text)
+    with pytest.raises(Damaged, match=r"x\.head"):
+        read_head_file(path)

@@ -8,6 +8,7 @@ import pytest
 
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import publish, request_links
+from lake_schema.store.provenance import digest
 from tests.universe import plain_plan, plain_work
 from truesky.explore import requested_area
 from truesky.explore.explorer import Explorer
@@ -78,13 +79,23 @@ def test_different_areas_need_the_name_of_the_request(lake):
         assert explorer.sql("SELECT in_area(5.0, -30.0) AS b").iloc[0].tolist() == [True]
 
 
+def sealed(values):
+    return json.dumps({**values, "digest": digest(values)})
+
+
 def test_an_unknown_or_damaged_area_is_an_error_of_the_query_only(lake):
     publish.make_version(lake, plain_plan(), plain_work, name="a")
     with Explorer(lake) as explorer:
         assert explorer.sql("SELECT count(*) AS n FROM plain").n[0] > 0
         with pytest.raises(BadInput, match="does not record the area"):
             explorer.sql("SELECT in_area(0.0, -30.0)")
-    for text, reason in (("{", "cannot be read"), ("[]", "must contain an object"), ("{}", "cannot be read")):
+    written = {"box": None, "vertices": [], "patches": [], "ra": 10**400, "dec": 0.0, "radius": 1.0, "wide": False}
+    texts = {
+        "{": "cannot be read", "[]": "must contain an object", "{}": "does not record", "[" * 100_000: "cannot be read",
+        '{"digest": "0"}': "has changed since it was written", sealed({}): "cannot be read",
+        sealed(written): "too large", sealed({**written, "ra": "inf"}): "is not a finite number",
+    }  # fmt: skip
+    for text, reason in texts.items():
         (lake / "names" / "a" / "area.json").write_text(text)
         with Explorer(lake) as explorer, pytest.raises(BadInput, match=reason):
             explorer.sql("SELECT in_area(0.0, -30.0)")

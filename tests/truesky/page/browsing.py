@@ -27,6 +27,8 @@ DRAWN = {
     "images": "document.getElementById('image-legend').textContent.includes('electron')",
     "runs": "document.querySelectorAll('#runs-content h2').length > 2",
 }
+# The security policy stops what markup of a stranger would run or load. The page must not even try.
+VIOLATED = "addEventListener('securitypolicyviolation', (event) => console.error(`policy: ${event.blockedURI}`))"
 # State of the page, which is stored in its address.
 HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
 
@@ -51,7 +53,9 @@ def tab_of(browser, page, address="/", refused=None, **context):
     """
     faults = []
     opened = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **context})
+    opened.add_init_script(VIOLATED)
     tab = opened.new_page()
+    tab.on("dialog", lambda dialog: faults.append(f"dialog {dialog.message}"))
     tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
     tab.on("pageerror", lambda error: faults.append(str(error)))
 

@@ -118,8 +118,14 @@ let telling = 0;
 /** Describe what a table omits, for example "500 of 12 288 cells"; null if it is complete. */
 export const cut = (shown, all, what) => (shown < all ? `${number(shown)} of ${number(all)} ${what}` : null);
 
-/** The name of a table in a query, in quotes if it is not a plain SQL identifier. */
-export const sqlName = (name) => name.split(".").map((part) => (/^[a-z_][a-z0-9_]*$/.test(part) ? part : `"${part}"`)).join(".");
+/** The name of a column in a query, in quotes. */
+export const sqlQuoted = (name) => `"${name.replaceAll('"', '""')}"`;
+
+/** The name of a column in a query, in quotes if it is not a plain SQL identifier. */
+export const sqlWord = (name) => (/^[a-z_][a-z0-9_]*$/.test(name) ? name : sqlQuoted(name));
+
+/** The name of a table in a query, which may follow the name of its request and a dot. */
+export const sqlName = (name) => name.split(".").map(sqlWord).join(".");
 
 /** A query as Python code. */
 export const python = (sql) => `from truesky.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify(sql)}, into="astropy")\n`;

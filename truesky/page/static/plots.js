@@ -57,7 +57,7 @@ function usual() {
 }
 
 function facts(expression) {
-  const name = expression.replace(/^"(.*)"$/, "$1");
+  const name = /^"(.*)"$/s.test(expression) ? expression.slice(1, -1).replaceAll('""', '"') : expression;
   const found = columnsOf(source).find((column) => column.name === name);
   return found ?? { name, unit: expression.startsWith("mag_ab(") ? "mag" : "", meaning: "" };
 }

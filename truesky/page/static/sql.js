@@ -82,7 +82,7 @@ async function run() {
 /** Plot the first two columns of numbers against each other. */
 async function plot() {
   if (!ran) await run();
-  const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => `"${c.name}"`);
+  const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => api.sqlQuoted(c.name));
   if (!numbers.length) return api.say("The result has no numeric column.", true);
   const text = query().trim().replace(/;$/, "");
   usePlot(`(${text}\n) AS result`, numbers.length > 1 ? [[numbers[0]], [numbers[1]], [numbers[0], numbers[1]]] : [[numbers[0]]]);

@@ -13,10 +13,11 @@ export function sources() {
 export function suggested(rows) {
   if (rows.startsWith("galaxies")) {
     const flux = rows.includes("galaxy_fluxes") ? columnsOf(rows).find((c) => c.name.startsWith("f_nu_")) : null;
-    return flux ? [["z_obs"], [`mag_ab(${flux.name})`], ["color_gr_01"], [`mag_ab(${flux.name})`, "color_gr_01"]]
+    const mag = flux && `mag_ab(${api.sqlWord(flux.name)})`;
+    return flux ? [["z_obs"], [mag], ["color_gr_01"], [mag, "color_gr_01"]]
       : [["z_obs"], ["mag_r01"], ["color_gr_01"], ["log_stellar_mass"], ["z_obs", "mag_r01"], ["abs_mag_r01", "color_gr_01"]];
   }
-  const numbers = columnsOf(rows).filter((c) => /int|float|double/.test(c.type) && !/^list|(^|_)id$|^_healpix/.test(`${c.type}`) && !/(^|_)id$|^_healpix/.test(c.name)).map((c) => `"${c.name}"`);
+  const numbers = columnsOf(rows).filter((c) => /int|float|double/.test(c.type) && !/^list|(^|_)id$|^_healpix/.test(`${c.type}`) && !/(^|_)id$|^_healpix/.test(c.name)).map((c) => api.sqlQuoted(c.name));
   return [...numbers.slice(0, 4).map((name) => [name]), ...(numbers.length > 1 ? [numbers.slice(0, 2)] : [])];
 }
 

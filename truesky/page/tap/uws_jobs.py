@@ -17,6 +17,7 @@ from aiohttp import web
 from lake_schema.errors import BadInput
 from truesky.explore import votables
 from truesky.page import downloads
+from truesky.page.access_control import limit_body
 from truesky.page.lake_session import iterate_in_thread
 from truesky.page.tap import descriptions
 from truesky.page.tap.queries import RETENTION, Job, Jobs
@@ -35,7 +36,8 @@ async def read_parameters(request: web.Request) -> dict[str, str]:
     values = {name.upper(): value for name, value in request.query.items()}
     if request.method == "POST":
         try:
-            form = await request.post()
+            async with limit_body():
+                form = await request.post()
         except (ValueError, LookupError) as error:
             raise BadInput(f"the form of the request cannot be read: {error}") from None
         for name, value in form.items():

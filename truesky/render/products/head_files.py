@@ -41,13 +41,14 @@ def write(texts: Iterable[str], path: Path) -> None:
 
 
 def first_cards(path: Path) -> tuple[Card, ...]:
-    """Return the WCS cards of the first image in the head file of a FITS file `path`, or () without a head file."""
+    """Return the WCS cards of the first image in the head file of a FITS file `path`, or () without a head file.
+
+    Damaged is raised if the head file is not a text of FITS cards.
+    """
     head_file = path.with_suffix(".head")
     if not head_file.is_file():
         return ()
-    return tuple(
-        card for card in images.cards_from_text(head_file.read_text("ascii").split("END\n")[0]) if is_wcs(card[0])
-    )
+    return tuple(card for card in images.read_head_file(head_file) if is_wcs(card[0]))
 
 
 def is_wcs(keyword: str) -> bool:

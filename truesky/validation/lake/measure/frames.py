@@ -311,8 +311,7 @@ def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
     cards = header if "CTYPE1" in header else first
     head_file = path.with_suffix(".head")
     if (_UNCERTAIN_POINTING in header or _UNCERTAIN_POINTING in first) and head_file.is_file():
-        lines = head_file.read_text("ascii").split("END\n")[0]
-        cards = {key: value for key, value, _ in images.cards_from_text(lines)}
+        cards = {key: value for key, value, _ in images.read_head_file(head_file)}
     wcs_cards = {key: value for key, value in cards.items() if _WCS_KEYWORD.fullmatch(key)}
     all_cards = {**first, **header}
     names = ("DSEC1", "CSEC1") if "DSEC1" in all_cards else ("DATASEC", "CCDSEC")
