@@ -47,6 +47,8 @@ _SECURE_LOCAL_SETTINGS = {
     "spark.driver.bindAddress": "127.0.0.1",
     "spark.driver.host": "127.0.0.1",
     "spark.authenticate": "true",
+    # Workers must not import modules from the folder in which the user is: its files may come from others.
+    "spark.executorEnv.PYTHONSAFEPATH": "1",
 }
 
 

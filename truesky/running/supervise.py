@@ -26,6 +26,7 @@ from truesky.numerics import activity
 from truesky.running import display
 from truesky.running.display import Display
 
+_ROOT = Path(__file__).resolve().parents[2]
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Time between two updates of the display, s.
 _INTERVAL = 0.25
@@ -70,7 +71,10 @@ def _supervise(name: str, words: Sequence[str], resume: str) -> int:
         columns = str(shutil.get_terminal_size().columns)
         # As in spark-env.sh, numerical libraries use one thread per process, because Spark starts one worker per core.
         defaults = {"COLUMNS": columns, "OMP_NUM_THREADS": "1"}
-        environment = {**defaults, **os.environ, activity.SETTING: folder}
+        # The child process must not import modules from the folder in which the user is: others may have made it.
+        search_path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(_ROOT)]))
+        safe = {"PYTHONSAFEPATH": "1", "PYTHONPATH": search_path}
+        environment = {**defaults, **os.environ, **safe, activity.SETTING: folder}
         # A separate process group lets this process end all processes of the run, and keeps Ctrl-C from them.
         with subprocess.Popen(
             [sys.executable, *words],

@@ -18,21 +18,24 @@ LISTS = Table(
 FLUXES = fluxes("galaxy", ["euclid_vis"])
 
 
-@pytest.fixture(scope="package")
-def explored(tmp_path_factory):
-    """A lake of galaxies with fluxes and one plain table."""
-    root = tmp_path_factory.mktemp("explored") / "lake"
+def make_lake(root, num_galaxies):
+    """Make a lake of galaxies with fluxes, one plain table and one table of lists, and return its folder."""
     root.mkdir()
     part = Task(layout.cell_file(5, 1607), {})
-    galaxies = rows_of(GALAXIES, ROWS, seed=3)
+    galaxies = rows_of(GALAXIES, num_galaxies, seed=3)
     shared = {name: galaxies[name] for name in ("id", "ra", "dec", "_healpix_29")}
-    flux = FLUXES.build({**shared, "f_nu_euclid_vis": galaxies["bulge_fraction"], "integrated": [False] * ROWS})
+    flux = FLUXES.build({**shared, "f_nu_euclid_vis": galaxies["bulge_fraction"], "integrated": [False] * num_galaxies})
     for table, rows in ((GALAXIES, galaxies), (FLUXES, flux)):
         publish.make_version(root, Plan(table, {}, (part,)), lambda lake, facts, rows=rows: Output(rows))
     publish.make_version(root, plain_plan(), plain_work)
     lists = LISTS.build({"id": [1, 2], "stars": [[1.0, 2.0], [3.0]]})
     publish.make_version(root, Plan(LISTS, {}, (Task("0.parquet", {}),)), lambda lake, facts: Output(lists))
     return root
+
+
+@pytest.fixture(scope="package")
+def explored(tmp_path_factory):
+    return make_lake(tmp_path_factory.mktemp("explored") / "lake", ROWS)
 
 
 @pytest.fixture(scope="package")

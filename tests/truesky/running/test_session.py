@@ -1,5 +1,6 @@
 """The Spark session: one, and it reads a lake's files as every other reader does."""
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,6 +41,10 @@ def test_nobody_else_can_reach_it(spark):
     assert any("truesky.running.spark_workers" in p.cmdline() for p in processes)
     conf = spark.sparkContext.getConf()
     assert (conf.get("spark.authenticate"), conf.get("spark.ui.enabled")) == ("true", "false")
+
+
+def test_workers_import_nothing_from_the_current_folder(spark):
+    assert spark.sparkContext.parallelize([0], 1).map(lambda _: sys.flags.safe_path).collect() == [True]
 
 
 def test_there_is_one_session(spark):

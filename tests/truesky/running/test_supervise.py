@@ -134,6 +134,14 @@ def test_the_output_and_the_status_of_a_run_are_passed_on():
     assert (done.returncode, done.stdout, done.stderr) == (7, "a\nb", "é\n")
 
 
+def test_a_run_imports_nothing_from_the_current_folder(tmp_path, monkeypatch):
+    """Users may call truesky in a folder that they have downloaded."""
+    (tmp_path / "strange.py").touch()
+    monkeypatch.chdir(tmp_path)
+    done = finished("import importlib.util, truesky; print(importlib.util.find_spec('strange'))")
+    assert (done.returncode, done.stdout) == (0, "None\n")
+
+
 def test_a_run_that_is_killed_says_so():
     done = finished("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     assert done.returncode == 1
