@@ -105,7 +105,7 @@ SUBJECTS = (
             _given("bulge_fraction"),
             _given("position_angle", "deg"),
             _given("kappa", usual=(-0.2, 0.4)),
-            Quantity("reduced_shear", 0.0, MAX_SHEAR, usual=(0.0, 0.4)),
+            Quantity("reduced_shear", -MAX_SHEAR, MAX_SHEAR, usual=(-0.4, 0.4)),
             Quantity("electrons", 1e-6, 1e12, "", FINITE, (1e2, 1e9), log=True),
         ),
         "GalSim: Fourier transforms of the profile, PSF and pixel",
@@ -119,13 +119,13 @@ SUBJECTS = (
             _column("a_v", usual=(0.0, 3.0)),
             _given("ebv", "mag", usual=(0.0, 0.5)),
             _column("mag_r01"),
-            _given("kappa", usual=(-0.2, 0.4)),
+            _given("kappa", beyond=FINITE, usual=(-0.2, 0.4)),
             _column("frac_1"),
             _WAVELENGTH,
         ),
         "the template, redshifted and dimmed by dust_extinction in double precision",
-        1e-6,
-        "of the flux",
+        1.0,
+        "of the documented error",
     ),
     Subject(
         "galaxy of high redshift in a passband of one sample",
@@ -150,7 +150,7 @@ SUBJECTS = (
         "emission line",
         (
             Quantity("velocity_dispersion", lines.SIGMA_MIN, lines.SIGMA_MAX, "km s-1", FINITE, log=True),
-            _column("z_obs", beyond=FINITE),
+            _column("z_obs", beyond=IMPOSSIBLE),
             _column("flux_halpha", log=True, tiny=1e-30, beyond=FINITE),
         ),
         "SciPy: ndtr at the edges of the bins",
@@ -214,8 +214,8 @@ SUBJECTS = (
             Quantity("wavelength", 3000.0, 11000.0, "A", IMPOSSIBLE),
         ),
         "GalSim: VonKarman",
-        1e-4,
-        "of the FWHM",
+        1.0,
+        "of the documented error",
     ),
     Subject(
         "detector that is read out",
@@ -246,3 +246,22 @@ def value_between(quantity, share, usual):
         return float(lo + (hi - lo) * share) if share < 1.0 else float(hi)
     low = lo or quantity.tiny
     return float(low * np.exp(share * np.log(hi / low)))
+
+
+def range_of(quantity):
+    """Return the limits of a quantity in words."""
+    return f"{quantity.lo:.4g} to {quantity.hi:.4g} {quantity.unit}".strip()
+
+
+def quantity_rows():
+    """Return the rows of the table of quantities in docs/promises.md."""
+    return [
+        f"| {subject.name} | {one.label} | {range_of(one)} | {one.beyond} |"
+        for subject in SUBJECTS
+        for one in subject.quantities
+    ]
+
+
+def reference_row(subject, seen):
+    """Return the row of a subject in the table of references in docs/promises.md, with the largest error seen."""
+    return f"| {subject.name} | {subject.compared_with} | {seen:.2g} {subject.unit} | {subject.error:.2g} |"

@@ -53,7 +53,9 @@ def is_near_caustic(kappa, shear):
     found = []
     for rounding in (-1e-6, 1e-6):
         determinant = (1.0 - kappa) ** 2 * (1.0 - shear**2) * (1.0 + rounding)
-        found.append(determinant < lensing.settings().caustic or kappa >= 1.0 or shear * (1 + rounding) > MAX_SHEAR)
+        found.append(
+            determinant < lensing.settings().caustic or kappa >= 1.0 or abs(shear) * (1.0 + rounding) > MAX_SHEAR
+        )
     return found[0] if found[0] == found[1] else None
 
 
@@ -169,7 +171,8 @@ def galaxy_in_one_sample(values):
     scale *= wavelength**2 / units.LIGHT_ANGSTROM_S / (1.0 - values["kappa"]) ** 2
     expected = scale * np.interp(wavelength / (1.0 + z), rest, total)
     dimmed = expected * 10.0 ** (-0.4 * values["a_v"] * milky_way(wavelength))
-    return relative(got, dimmed, max(DARK * scale * total.max(), 1e-37))
+    error = relative(got, dimmed, max(DARK * scale * total.max(), 1e-37))
+    return error / max(1e-6, 2e-7 * values["a_v"] * milky_way(wavelength))
 
 
 def distant_galaxy_in_one_sample(values):
@@ -258,7 +261,9 @@ def position_on_the_sky(values):
     found = float(sky.separation(ra, dec, *np.degrees([lon, lat])))
     expected = np.degrees(angular_separation(turned, np.radians(dec), lon, lat))
     assert 0.0 <= moved[0][0] < 360.0
-    return max(np.degrees(apart), abs(found - expected), distance_to_cell(ra, dec, order, cell))
+    # A right ascension of many turns has fewer digits.
+    error = max(np.degrees(apart), abs(found - expected), distance_to_cell(ra, dec, order, cell))
+    return max(error - np.spacing(abs(ra)), 0.0)
 
 
 def distance_to_cell(ra, dec, order, cell):
@@ -294,7 +299,9 @@ def pixel_of_a_detector(values):
     turned = np.radians(math.fmod(ra, 360.0)), np.radians(dec)
     expected = offset(*turned, angle, np.arctan(scale * np.hypot(x, y)))
     apart = sky.separation(lon, lat, *np.degrees(expected))
-    return max(back.max(), np.radians(apart).max() / scale)
+    # A right ascension of many turns has fewer digits.
+    rounding = np.radians(np.spacing(abs(ra))) / scale
+    return max(back.max(), np.radians(apart).max() / scale) - 2.0 * rounding
 
 
 def airmass_of_young(altitude):
@@ -344,7 +351,7 @@ def seeing_through_air(values):
     theirs = galsim.VonKarman(lam=wavelength / 10.0, r0=fried, L0=outer)
     middle, half = (theirs.xValue(r, 0.0) for r in (0.0, 0.5 * wide))
     slope = (theirs.xValue(0.501 * wide, 0.0) - theirs.xValue(0.499 * wide, 0.0)) / (0.002 * middle)
-    return abs((half / middle - 0.5) / slope)
+    return abs((half / middle - 0.5) / slope) / (2e-5 if fried < 0.03 * outer else 1e-3)
 
 
 # ------------------------------------------------------------------------------------------------ readout

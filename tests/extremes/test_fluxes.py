@@ -230,7 +230,7 @@ def test_a_band_outside_the_grid_is_refused(library, kind, wavelength):
     """A negative index on the grid would give the flux at its other end."""
     outside = Passband("outside", np.array([wavelength]), np.array([0.3]), "vacuum")
     row = galaxies(kind=kind, frac_1=1.0, frac_2=0.0, ebv_1=0.0, sed_1=7, mag_r01=27.0)
-    with pytest.raises(BadInput, match="passband outside: .* must be inside 600 to 24000 A"):
+    with pytest.raises(BadInput, match=r"passband outside: .* must be inside 600 to 24000 A"):
         band_fluxes.galaxy_fluxes(row, [outside], library)
 
 
