@@ -51,7 +51,7 @@ def tables_of_request(root: Folder, name: str) -> list[str]:
 
     The result is [] if there is no such request.
     """
-    folder = layout.requests_folder(root) / layout.check_name(name)
+    folder = layout.request_folder(root, name)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
@@ -165,7 +165,7 @@ def write_area(root: Path, name: str, area: Mapping[str, Any]) -> None:
     """
     if read_area(root, name) != area:
         with layout.report_unwritable(root):
-            write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, area)
+            write_json(layout.request_folder(root, name) / _AREA, area)
 
 
 def read_area(root: Folder, name: str) -> dict[str, Any] | None:
@@ -173,7 +173,7 @@ def read_area(root: Folder, name: str) -> dict[str, Any] | None:
 
     Damaged is raised if the file is not valid.
     """
-    path = layout.requests_folder(root) / layout.check_name(name) / _AREA
+    path = layout.request_folder(root, name) / _AREA
     if not isinstance(path, Path) or not path.is_file():
         return None
     try:
