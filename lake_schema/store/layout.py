@@ -277,6 +277,14 @@ def requests_folder(root: Below) -> Below:
     return check_inside(root, root / _NAMES)
 
 
+def request_folder(root: Below, request: str) -> Below:
+    """Return the folder with the links of a request (named set of settings), which need not exist.
+
+    BadInput is raised if the name is not valid, or if the folder is a link that leads out of the lake.
+    """
+    return check_inside(root, requests_folder(root) / check_name(request))
+
+
 def request_link(root: Below, request: str, table_name: str) -> Below:
     """Return the path of the symbolic link from a request to its version of a table.
 
@@ -294,7 +302,7 @@ def request_link(root: Below, request: str, table_name: str) -> Below:
     Path or ObjectPath
         The link, which need not exist.
     """
-    return requests_folder(root) / check_name(request) / check_name(table_name)
+    return request_folder(root, request) / check_name(table_name)
 
 
 def table_names(root: Folder) -> list[str]:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from lake_schema.errors import Superseded
+from lake_schema.errors import BadInput, Superseded
 
 # Time to wait for the lock of a table, in s. Other processes hold it only while they rename a few folders or links.
 TABLE_TIMEOUT = 10.0
@@ -41,9 +41,13 @@ def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
     ------
     Superseded
         If another process still holds the lock after `timeout`.
+    BadInput
+        If the path is a symbolic link, which could lead out of the lake.
     """
     deadline = time.monotonic() + timeout
     while True:
+        if path.is_symlink():
+            raise BadInput(f"{path} is a symbolic link, and a lock must not be one: remove it")
         with path.open("a") as stream:
             if _try_lock(path, stream.fileno()):
                 yield

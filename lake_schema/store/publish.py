@@ -40,6 +40,7 @@ from lake_schema.store.stage import (
     is_done,
     missing_tasks,
     receipts_folder,
+    refuse_links,
     run_task,
     write_partition,
 )
@@ -130,6 +131,7 @@ def make_version(
                 _refuse_damaged(target, table)
             else:
                 stage = layout.stage_folder(root, table, key)
+                refuse_links(stage)
                 stage.mkdir(exist_ok=True)
                 _finish_stage(stage, plan, _run_tasks(root, plan, task_function, mapper, name))
             _publish(root, plan, base, name)

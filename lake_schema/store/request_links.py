@@ -54,7 +54,7 @@ def tables_of_request(root: Folder, name: str) -> list[str]:
 
     The result is [] if there is no such request.
     """
-    folder = layout.requests_folder(root) / layout.check_name(name)
+    folder = layout.request_folder(root, name)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
@@ -168,7 +168,7 @@ def write_area(root: Path, name: str, area: Mapping[str, Any]) -> None:
     """
     if read_area(root, name) != area:
         with layout.report_unwritable(root):
-            write_json(layout.requests_folder(root) / layout.check_name(name) / _AREA, {**area, _DIGEST: digest(area)})
+            write_json(layout.request_folder(root, name) / _AREA, {**area, _DIGEST: digest(area)})
 
 
 def read_area(root: Folder, name: str) -> dict[str, Any] | None:
@@ -177,7 +177,7 @@ def read_area(root: Folder, name: str) -> dict[str, Any] | None:
     Areas without a digest, as older versions of truesky wrote them, count as not recorded. Damaged is raised if the
     file is not valid, or has changed since it was written.
     """
-    path = layout.requests_folder(root) / layout.check_name(name) / _AREA
+    path = layout.request_folder(root, name) / _AREA
     if not isinstance(path, Path) or not path.is_file():
         return None
     try:

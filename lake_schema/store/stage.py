@@ -230,6 +230,17 @@ def receipts_folder(stage: Path) -> Path:
     return stage.with_name(stage.name.replace(".stage-", ".receipts-"))
 
 
+def refuse_links(stage: Path) -> None:
+    """Raise BadInput if the folder of an unfinished version, or that of its receipts, is or contains a symbolic link.
+
+    truesky makes no such links. One in a lake of somebody else could lead out of the lake, where files would be written
+    and removed.
+    """
+    for folder in (stage, receipts_folder(stage)):
+        if link := next((path for path in (folder, *folder.rglob("*")) if path.is_symlink()), None):
+            raise BadInput(f"{link} is a symbolic link, and an unfinished version must not have one: remove it")
+
+
 def _receipt_path(stage: Path, partition: str) -> Path:
     return receipts_folder(stage) / f"{_flat_name(partition)}.json"
 
