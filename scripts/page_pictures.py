@@ -22,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 LAKE = ROOT / "out" / "demo" / "lake"
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
-_TOKEN = "a-token-of-the-pictures"
+_TOKEN = "a-token-of-the-pictures"  # noqa: S105  (of the server that this program starts on 127.0.0.1)
 # Size of the browser window, pixels.
 _SIZE = {"width": 1400, "height": 860}
 # Longest time that `wait_until` waits, s.

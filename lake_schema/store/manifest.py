@@ -34,6 +34,8 @@ _ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
 # Largest number of values in a manifest. An image has about 35, so that this is sufficient for 900,000 images. A value
 # takes up to 72 bytes of memory, an empty list for example.
 _MAX_VALUES = 1 << 25
+# Checksums are parts of paths of temporary copies, so other texts could lead to files outside.
+_SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
@@ -148,6 +150,8 @@ def _is_manifest(facts: Any) -> bool:
 
 def _is_entry(entry: Any) -> bool:
     if not _has_types(entry, _ENTRY_TYPES) or type(entry.get("rows", 0)) is not int:
+        return False
+    if not _SHA256.fullmatch(entry["sha256"]):
         return False
     path = entry["path"]
     if path.endswith(".parquet") or "blocks" in entry:

@@ -233,8 +233,8 @@ def receipts_folder(stage: Path) -> Path:
 def refuse_links(stage: Path) -> None:
     """Raise BadInput if the folder of an unfinished version, or that of its receipts, is or contains a symbolic link.
 
-    truesky makes no such links. One in a lake of somebody else could lead out of the lake, where files would be written
-    and removed.
+    truesky makes no such links. A link in the lake of a stranger could lead out of the lake, and files would be
+    written and removed there.
     """
     for folder in (stage, receipts_folder(stage)):
         if link := next((path for path in (folder, *folder.rglob("*")) if path.is_symlink()), None):

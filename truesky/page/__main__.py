@@ -22,7 +22,7 @@ from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
 
 _GIGABYTE = 1e9
-_LOCAL_NAMES, _ALL_INTERFACES = ("127.0.0.1", "localhost"), ("", "0.0.0.0")
+_LOCAL_NAMES, _ALL_INTERFACES = ("127.0.0.1", "localhost"), ("", "0.0.0.0")  # noqa: S104  (refused without --token and --called)
 # A token that a user may choose: 16 to 256 characters that need no escaping in addresses and cookies.
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]{16,256}")
 _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")

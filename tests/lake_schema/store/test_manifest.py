@@ -135,7 +135,13 @@ def test_many_files_in_a_manifest_are_all_checked(published):
         manifest.load(published, "plain")
 
 
-@pytest.mark.parametrize("entry", [{"path": "/etc/passwd"}, {"path": "dataset/../../x"}, {"blocks": "AAAA"}])
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"path": "/etc/passwd"}, {"path": "dataset/../../x"}, {"blocks": "AAAA"}, {"sha256": "/etc"},
+        {"sha256": "../" * 20 + "etc"}, {"sha256": ""}, {"sha256": "A" * 64},
+    ],
+)  # fmt: skip
 def test_a_wrong_entry_of_a_file_is_damaged(published, entry):
     rewrite(published, lambda facts: facts["files"][1].update(entry))
     with pytest.raises(Damaged, match="not a valid manifest"):

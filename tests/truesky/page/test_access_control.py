@@ -107,6 +107,19 @@ def test_every_response_has_security_headers(page, path, cookie):
     assert {name: headers[name] for name in expected} == expected
 
 
+def test_no_other_site_may_read_an_answer(page):
+    """No answer allows it (CORS), neither of the page nor of TAP, and browsers keep answers from other sites."""
+    tap = f"/tap/{page.gate.tap_token}"
+    for path in ("/", "/api/lake", "/nothing", f"{tap}/availability", f"{tap}/sync", f"{tap}/nothing"):
+        _, headers, _ = page.ask(path)
+        assert [name for name in headers if name.lower().startswith("access-control-")] == []
+        assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        # A browser asks with OPTIONS before it sends another method or another content type.
+        status, headers, _ = page.ask(path, method="OPTIONS", Origin="http://evil.example")
+        assert status == 403
+        assert [name for name in headers if name.lower().startswith("access-control-")] == []
+
+
 def test_downloads_have_security_headers(page):
     status, headers, _ = page.of_lake("export?format=csv&sql=SELECT+1+AS+a")
     assert status == 200

@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import os
 import socket
 import threading
 from contextlib import asynccontextmanager
@@ -220,6 +221,19 @@ def test_results_have_a_bound(monkeypatch, bounds, words):
         await jobs.close()
 
     asyncio.run(run())
+
+
+def test_results_are_private():
+    """Other users of the machine cannot read the folder of the results, whatever the user's mask allows."""
+    previous = os.umask(0)
+    try:
+        jobs = Jobs(None)
+    finally:
+        os.umask(previous)
+    folder = jobs.file(jobs.add({}, 1.0)).parent
+    assert folder.stat().st_mode & 0o777 == 0o700
+    asyncio.run(jobs.close())
+    assert not folder.exists()
 
 
 def test_an_aborted_job_leaves_nothing():
