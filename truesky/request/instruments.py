@@ -316,7 +316,5 @@ def explain_override(name: str, value: object, units: Mapping[str, str]) -> tupl
             name, key = similar[0] + name.removeprefix(key), similar[0]
     number = value.get("value") if isinstance(value, dict) else value
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-    return (
-        problem,
-        f'"{name}" = {{ value = {quote_value(number) if is_number else ".."}, unit = "{units.get(key, "..")}" }}',
-    )
+    text = quote_value(number) if is_number else ".."
+    return problem, f'"{name}" = {{ value = {text}, unit = "{units.get(key, "..")}" }}'
