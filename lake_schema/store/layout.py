@@ -515,9 +515,15 @@ def report_unwritable(root: Path) -> Iterator[None]:
     root : Path
         Folder of the lake, which the message names.
 
-    Notes
-    -----
-    Errors that concern files outside the lake are not changed.
+    Yields
+    ------
+    None
+        Nothing.
+
+    Raises
+    ------
+    BadInput
+        If the body raises such an error for a file of the lake. Errors that concern other files are not changed.
     """
     try:
         yield
