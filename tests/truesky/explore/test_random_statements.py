@@ -18,7 +18,7 @@ from truesky.explore.explorer import Explorer
 STATEMENTS, MANY_STATEMENTS = 240, 10_000
 # The state of the session is compared after this number of statements.
 BLOCK = 40
-# Longest CPU time (s) in which the guard decides about a statement.
+# Longest CPU time (s) in which a statement is checked, by the guard and by this test.
 MOST_SECONDS = 2.0
 
 
