@@ -282,7 +282,8 @@ def distance_to_cell(ra, dec, order, cell):
 
 def pixel_of_a_detector(values):
     ra, dec = values["right_ascension"], values["declination"]
-    overrides = {f"vis.fpa.n{axis}": (np.rint(values[n]) if np.isfinite(values[n]) else values[n], "pix")
+    # Only values within the limits are rounded: 0.6 columns would be one column.
+    overrides = {f"vis.fpa.n{axis}": (np.rint(values[n]) if 1.0 <= values[n] <= 65536.0 else values[n], "pix")
                  for axis, n in (("x", "columns"), ("y", "rows"))}  # fmt: skip
     sky.check_positions(ra, dec)
     mission = resolve(overrides=overrides)

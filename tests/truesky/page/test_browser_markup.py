@@ -6,6 +6,7 @@ a-z, 0-9, _ and -. All other texts of a lake may contain anything.
 
 import json
 import re
+import time
 from dataclasses import replace
 from urllib.parse import quote, urlencode
 from xml.etree import ElementTree
@@ -150,8 +151,17 @@ def test_the_lake_the_sky_and_the_runs(tab, stranger):
     until(tab, f"{bands}.length > 1")
     assert f"depth in {BAND}" in tab.evaluate(bands)
     for table in (f"coverage of {BAND}", "stars"):
-        tab.select_option("#sky-table", table)
-        until(tab, f"document.getElementById('sky-legend').textContent.includes({json.dumps(table.split(' of ')[-1])})")
+        legend = f"document.getElementById('sky-legend').textContent.includes({json.dumps(table.split(' of ')[-1])})"
+        # On a busy machine, a query may end at its time limit; then a user selects the table again.
+        for _ in range(5):
+            tab.select_option("#sky-table", "galaxies")
+            tab.select_option("#sky-table", table)
+            ended = time.monotonic() + 60.0
+            while not tab.evaluate(legend) and time.monotonic() < ended:
+                time.sleep(0.05)
+            if tab.evaluate(legend):
+                break
+        until(tab, legend)
     tab.select_option("#sky-footprints", "exposures")
     tab.select_option("#sky-footprints", "products")
     until(tab, "document.getElementById('sky-states').textContent.includes('observed')")
