@@ -165,8 +165,9 @@ def survives(user, process, kinds, number, seconds):
     # On a busy machine, every answer takes longer.
     assert user.longest < MOST_SECONDS + 5.0 * usual
     user.works()
-    until(lambda: process.files() <= before[1])
-    until(lambda: process.threads() <= before[0])
+    # The server may have started another worker for queries meanwhile; a leak would have one file per connection.
+    until(lambda: process.files() <= before[1] + 8)
+    until(lambda: process.threads() <= before[0] + 4)
 
 
 def test_other_users_are_served_during_an_attack(page):
