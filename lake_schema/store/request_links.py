@@ -182,12 +182,14 @@ def read_area(root: Folder, name: str) -> dict[str, Any] | None:
         return None
     try:
         area = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(area, dict):
+            raise Damaged(f"{path}: must contain an object")
+        seal = area.pop(_DIGEST, None)
+        has_changed = seal is not None and digest(area) != seal
     except (ValueError, RecursionError) as error:
         raise Damaged(f"{path}: {error}") from None
-    if not isinstance(area, dict):
-        raise Damaged(f"{path}: must contain an object")
-    if (seal := area.pop(_DIGEST, None)) is None:
+    if seal is None:
         return None
-    if digest(area) != seal:
+    if has_changed:
         raise Damaged(f"{path} has changed since it was written: its digest differs")
     return area

@@ -103,6 +103,14 @@ def test_an_unknown_or_damaged_area_is_an_error_of_the_query_only(lake):
         request_links.read_area(lake, "a") if (lake / "names/a/area.json").write_text("[") else None
 
 
+@pytest.mark.parametrize("text", ['{"digest": "0", "wide": NaN}', '{"digest": "0", "ra": Infinity}', "3"])
+def test_an_area_with_values_that_json_does_not_have_is_damaged(lake, text):
+    recorded(lake, "a", AREAS["wide"])
+    (lake / "names" / "a" / "area.json").write_text(text)
+    with pytest.raises(Damaged, match=r"area\.json"):
+        request_links.read_area(lake, "a")
+
+
 def test_an_area_is_not_a_table(lake):
     recorded(lake, "a", AREAS["wide"])
     assert request_links.tables_of_request(lake, "a") == ["plain"]
