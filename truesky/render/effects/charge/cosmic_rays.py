@@ -9,6 +9,7 @@ approximation, it is added after the trails of all other charge are computed, an
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -104,8 +105,8 @@ def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Ge
     count = draw_event_count(expected, rng)
     if out.size:
         ny, nx = out.shape
-        for drawn in range(0, count, _TOGETHER):
-            events = draw_events(min(_TOGETHER, count - drawn), ny, nx, quantiles, rng)
+        for batch in batches(count):
+            events = draw_events(batch, ny, nx, quantiles, rng)
             _, column, row, charge = pixels_of_events(events)
             add_charge(out, row, column, charge)
 
@@ -136,6 +137,12 @@ def draw_event_count(expected: float, rng: np.random.Generator) -> int:
     if not 0.0 <= expected <= 1e8:
         raise OutOfRange("cosmic rays", expected, 0.0, 1e8)
     return int(rng.poisson(expected))
+
+
+def batches(count: int) -> Iterator[int]:
+    """Yield the sizes of the groups in which `count` tracks are drawn, to limit the memory that they take."""
+    for drawn in range(0, count, _TOGETHER):
+        yield min(_TOGETHER, count - drawn)
 
 
 def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Generator) -> tuple[Any, ...]:

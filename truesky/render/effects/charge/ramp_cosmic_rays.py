@@ -65,7 +65,19 @@ def apply(
     if count == 0 or frame.size == 0:
         return np.array(frame, dtype=float)
     out = ramp.with_planes(frame, 3)
-    ny, nx = frame.shape
+    for batch in cosmic_rays.batches(count):
+        _add_tracks(out, batch, thickness, electrons, scatter, rng)
+    return out
+
+
+def _add_tracks(
+    planes: Frame, count: int, thickness: float, electrons: float, scatter: float, rng: np.random.Generator
+) -> None:
+    """Draw `count` tracks, and add their charge and times to the planes 1 and 2, in place.
+
+    `planes` is a float array of shape (3, ny, nx). The other parameters are those of `apply`.
+    """
+    ny, nx = planes.shape[1:]
     angle, x, y = 2.0 * np.pi * rng.random(count), nx * rng.random(count), ny * rng.random(count)
     # `longer` is a random number in (0, 1] for each track: the fraction of all tracks that are longer than it.
     longer, logarithm = 1.0 - rng.random(count), rng.normal(0.0, scatter, count)
@@ -75,9 +87,8 @@ def apply(
     # A track of length 0 still crosses one pixel: `pixels_of_events` needs a length above 0.
     events = (x, y, np.cos(angle), np.sin(angle), np.maximum(length, 1e-9), charge)
     event, columns, rows, pixel_charge = cosmic_rays.pixels_of_events(events)
-    cosmic_rays.add_charge(out[1], rows, columns, pixel_charge)
-    out[2][rows % ny, columns % nx] = moment[event]
-    return out
+    cosmic_rays.add_charge(planes[1], rows, columns, pixel_charge)
+    planes[2][rows % ny, columns % nx] = moment[event]
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float]:

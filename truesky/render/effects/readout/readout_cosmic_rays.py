@@ -59,16 +59,17 @@ def apply_readout(
         part = quadrant[:, prescan : prescan + columns]
         if not rows or not part.size:
             continue
-        event, column, row, charge = cosmic_rays.pixels_of_events(
-            cosmic_rays.draw_events(count, rows, columns, quantiles, rng)
-        )
-        # Number of rows that were read before the cosmic ray arrived. Its charge is read that many rows later than its
-        # pixel.
-        rows_read = rng.integers(0, quadrant.shape[0], count)
-        column, row = column % part.shape[1], row % rows
-        packet = row + rows_read[event]
-        read = packet < len(part)
-        _deposit(part, column[read], packet[read], row[read], charge[read], silicon)
+        for batch in cosmic_rays.batches(count):
+            event, column, row, charge = cosmic_rays.pixels_of_events(
+                cosmic_rays.draw_events(batch, rows, columns, quantiles, rng)
+            )
+            # Number of rows that were read before the cosmic ray arrived. Its charge is read that many rows later than
+            # its pixel.
+            rows_read = rng.integers(0, quadrant.shape[0], batch)
+            column, row = column % part.shape[1], row % rows
+            packet = row + rows_read[event]
+            read = packet < len(part)
+            _deposit(part, column[read], packet[read], row[read], charge[read], silicon)
     return out
 
 

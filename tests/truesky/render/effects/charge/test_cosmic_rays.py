@@ -10,7 +10,7 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import CAMERAS
 from tests.truesky.render.effects.readout.test_charge_transfer import every_transfer
 from truesky.render.camera import detectors
-from truesky.render.effects.charge import cosmic_rays
+from truesky.render.effects.charge import cosmic_rays, ramp_cosmic_rays
 from truesky.render.effects.readout import charge_transfer, readout_cosmic_rays
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Scene
@@ -132,15 +132,33 @@ def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
     np.testing.assert_array_equal(plain[:, 0], without + hit)
 
 
-def test_tracks_of_long_exposures_are_drawn_in_parts(monkeypatch):
-    """Memory does not grow with the exposure time, and no track is lost; all tracks have 7 electrons."""
-    together, draw = [], cosmic_rays.draw_events
-    monkeypatch.setattr(cosmic_rays, "draw_events", lambda count, *rest: together.append(count) or draw(count, *rest))
-    quantiles = np.array([[0.0, 0.01, 7.0], [1.0, 0.01, 7.0]])
-    image = cosmic_rays.draw_tracks((64, 64), 6e5, quantiles, np.random.default_rng(1))
-    assert max(together) <= 300_000
-    assert image.sum() == 7.0 * sum(together)
-    assert sum(together) == pytest.approx(6e5, rel=0.01)
+def apply_to_exposure(expected, rng):
+    return cosmic_rays.draw_tracks((64, 64), expected, QUANTILES, rng)
+
+
+def apply_to_ramp(expected, rng):
+    return ramp_cosmic_rays.apply(np.zeros((64, 64)), expected, 0.1, 70.0, 0.1, rng)[1]
+
+
+def apply_to_readout(expected, rng):
+    # With 63 rows of overscan, most of the charge is read; the rest arrives after its pixel was read.
+    return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, 1, 0, 64, None, rng)
+
+
+QUANTILES = np.array([[0.0, 0.01, 7.0], [1.0, 0.01, 7.0]])
+
+
+@pytest.mark.parametrize("apply", [apply_to_exposure, apply_to_ramp, apply_to_readout])
+def test_tracks_of_long_exposures_are_drawn_in_parts(monkeypatch, apply):
+    """Memory does not grow with the exposure time, and no track is lost."""
+    drawn, find_pixels = [], cosmic_rays.pixels_of_events
+    monkeypatch.setattr(cosmic_rays, "pixels_of_events", lambda events: drawn.append(events) or find_pixels(events))
+    image = apply(6e5, np.random.default_rng(1))
+    counts = [len(events[0]) for events in drawn]
+    assert max(counts) <= 300_000
+    assert sum(counts) == pytest.approx(6e5, rel=0.01)
+    # Float32 holds these whole numbers without rounding.
+    assert image.sum(dtype=float) == sum(events[-1].sum() for events in drawn)
 
 
 def test_too_many_are_refused():
