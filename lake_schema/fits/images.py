@@ -188,6 +188,7 @@ def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
     with write.errors_as_damaged(path):
         # Turn RuntimeWarnings into errors: astropy emits them if damaged scaling keywords make values overflow.
         warnings.simplefilter("error", RuntimeWarning)
+        write.check_headers(path)
         with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
             write.check_size(path, hdus, max_bytes)
         with fits.open(path, memmap=False, checksum=True, disable_image_compression=True) as hdus:

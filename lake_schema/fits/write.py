@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from lake_schema.errors import BadInput, Damaged, LakeError
+from lake_schema.fits import headers
 
 if TYPE_CHECKING:
     # Imported in the functions that use it, because its import takes half a second.
@@ -116,6 +117,15 @@ def errors_as_damaged(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         raise Damaged(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def check_headers(path: Path) -> None:
+    """Check the headers of a file that truesky wrote; raise Damaged if astropy could not read it in bounded time."""
+    with path.open("rb") as stream:
+        try:
+            headers.check(str(path), stream)
+        except BadInput as error:
+            raise Damaged(str(error)) from None
 
 
 def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lake_schema.errors import BadInput, LakeError
-from tests.faults import fuzz_targets, lake_targets
+from tests.faults import frame_targets, fuzz_targets, lake_targets
 
 MOST_SECONDS, MOST_BYTES, MOST_CHARACTERS = 10.0, 512 << 20, 2000
 # Wall time after which a mutation's process is ended: one that waits takes no CPU time.
@@ -63,7 +63,10 @@ class Target:
     may_die: bool = False
 
 
-TARGETS = {name: Target(*rest) for name, rest in (fuzz_targets.TARGETS | lake_targets.TARGETS).items()}
+TARGETS = {
+    name: Target(*rest)
+    for name, rest in (fuzz_targets.TARGETS | lake_targets.TARGETS | frame_targets.TARGETS).items()
+}
 
 
 # ------------------------------------------------------------------------------------------------ mutations

@@ -101,6 +101,10 @@ def test_mutations_are_reproducible():
         ("cache, array", 176),
         ("receipt", 8),
         ("head file", 1),
+        ("area of a request", 37),
+        ("master, sealed", 115),
+        ("image, sealed", 228),
+        ("calibrated image, sealed", 116),
     ],
 )
 def test_inputs_that_once_failed_are_refused(name, number):

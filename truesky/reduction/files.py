@@ -225,8 +225,11 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     mean, uncertainty, count = (np.asarray(unit.data) for unit in units[1:])
     for plane in (mean, uncertainty, count):
         _refuse_other_shape(path, plane.shape, shape)
+    seconds = header.get("EXPTIME")
+    if not isinstance(seconds, int | float) or not 0.0 <= seconds < np.inf:
+        raise BadInput(f"{user_files.format_path(path)}: EXPTIME = {seconds} must be a number of seconds from 0")
     vignetted = bool(header.get("VIGNETTE", False))
-    return CombinedFrame(mean, uncertainty, count, vignetted), float(header["EXPTIME"])
+    return CombinedFrame(mean, uncertainty, count, vignetted), float(seconds)
 
 
 def _refuse_other_shape(path: Path, shape: tuple[int, ...], expected: tuple[int, int]) -> None:
@@ -377,5 +380,8 @@ def read_image(path: Path) -> ImageFile:
             f"{user_files.format_path(path)}: is not a calibrated image: truesky reduce LAKE --out FOLDER makes them"
         )
     image, weight, flags = (np.asarray(unit.data) for unit in units[1:4])
-    astrometry.from_cards(units[0].cards)
+    try:
+        astrometry.from_cards(units[0].cards)
+    except BadInput as error:
+        raise BadInput(f"{user_files.format_path(path)}: {error}") from None
     return ImageFile(ReducedImage(image, weight, flags), units[0].cards)

@@ -165,6 +165,14 @@ def test_size_is_checked_from_the_header(tmp_path):
         read_images(path)
 
 
+def test_a_number_of_axes_up_to_which_astropy_would_count_is_refused(tmp_path):
+    path = tmp_path / "a.fits"
+    write_images(path, [Image(science())])
+    path.write_bytes(path.read_bytes().replace(b"NAXIS   =                    2", b"NAXIS   =           4294967296"))
+    with pytest.raises(Damaged, match=r"a\.fits: has 4294967296 axes"):
+        read_images(path)
+
+
 @pytest.mark.parametrize(
     "card",
     [

@@ -192,6 +192,9 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
     cards = tuple((k, "12" if k == "SEED" else v, c) for k, v, c in units[0].cards)
     images.write_images(other / "VIS_3-4_dark.fits", [images.Image(None, cards), *units[1:]])
     assert "SEED = 12, the frame has 7" in refused("--masters", str(other))
+    cards = tuple((k, "long" if k == "EXPTIME" else v, c) for k, v, c in units[0].cards)
+    images.write_images(other / "VIS_3-4_dark.fits", [images.Image(None, cards), *units[1:]])
+    assert "VIS_3-4_dark.fits: EXPTIME = long must be a number of seconds" in refused("--masters", str(other))
     shutil.copy(made / "masters" / "VIS_3-4_bias.fits", other / "VIS_3-4_dark.fits")
     assert "is not a master dark" in refused("--masters", str(other))
 

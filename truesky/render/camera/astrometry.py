@@ -8,7 +8,7 @@ pixel centres.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +25,9 @@ from truesky.render.camera.pointing import ARCSEC
 if TYPE_CHECKING:
     # Imported in the functions that use it, because its import takes a second.
     from astropy.wcs import WCS, Sip
+
+# Largest degree of a distortion in the SIP convention.
+_MAX_ORDER = 9
 
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
@@ -246,31 +249,44 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
     Raises
     ------
     BadInput
-        If a necessary card is missing. The message names its keyword.
+        If a necessary card is missing; the message names its keyword. Also if a value is wrong.
     """
-    from astropy.wcs import WCS, Sip
-
     values = {keyword: value for keyword, value, _ in header}
     try:
-        system = WCS(naxis=2)
-        system.wcs.ctype = [values["CTYPE1"], values["CTYPE2"]]
-        system.wcs.cunit = [values["CUNIT1"], values["CUNIT2"]]
-        system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
-        system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
-        system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
-        system.wcs.lonpole = values["LONPOLE"]
-        system.wcs.radesys = values["RADESYS"]
-        if str(values["CTYPE1"]).endswith("-SIP"):
-            system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
-        if str(values["CTYPE1"]).endswith("-TPV"):
-            system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
-            system.sip = Sip(*tpv.to_sip(values), None, None, _crpix(system))
+        return _system(values)
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None
+    except Exception as error:
+        # astropy raises many types of exceptions for wrong values.
+        raise BadInput(f"the WCS of the header cannot be used: {' '.join(str(error).split())[:300]}") from None
+
+
+def _system(values: Mapping[str, Any]) -> WCS:
+    from astropy.wcs import WCS, Sip
+
+    system = WCS(naxis=2)
+    system.wcs.ctype = [values["CTYPE1"], values["CTYPE2"]]
+    system.wcs.cunit = [values["CUNIT1"], values["CUNIT2"]]
+    system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
+    system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
+    system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
+    system.wcs.lonpole = values["LONPOLE"]
+    system.wcs.radesys = values["RADESYS"]
+    if str(values["CTYPE1"]).endswith("-SIP"):
+        system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
+    if str(values["CTYPE1"]).endswith("-TPV"):
+        system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
+        system.sip = Sip(*tpv.to_sip(values), None, None, _crpix(system))
     system.wcs.set()
+    for keyword in ("crval", "crpix", "cd"):
+        if not np.isfinite(getattr(system.wcs, keyword)).all():
+            raise ValueError(f"{keyword.upper()} is not finite")
     return system
 
 
-def _coefficients(values: dict[str, Any], name: str) -> Float:
-    side = int(values[f"{name}_ORDER"]) + 1
-    return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])
+def _coefficients(values: Mapping[str, Any], name: str) -> Float:
+    order = int(values[f"{name}_ORDER"])
+    if not 0 <= order <= _MAX_ORDER:
+        raise ValueError(f"{name}_ORDER = {order} must be from 0 to {_MAX_ORDER}")
+    powers = range(order + 1)
+    return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in powers] for p in powers])

@@ -261,6 +261,20 @@ def test_a_header_without_a_world_is_refused():
         astrometry.from_cards((("EXPTIME", 1.0, ""),))
 
 
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [("CRVAL1", "east"), ("CRPIX2", np.nan), ("CUNIT1", "parsecs"), ("CD1_1", 0.0), ("A_ORDER", 10**9)],
+)
+def test_a_header_with_a_wrong_value_is_refused(keyword, value):
+    system = wcs(detector("vis", "3-4", MISSION), 10.0, -30.0, 0.0)
+    cards = [(key, value if key == keyword else old, "") for key, old, _ in astrometry.cards(system)]
+    if keyword == "CD1_1":
+        cards = [(key, 0.0 if key == "CD1_2" else old, "") for key, old, _ in cards]
+    assert keyword in [key for key, _, _ in cards]
+    with pytest.raises(BadInput, match="WCS of the header cannot be used"):
+        astrometry.from_cards(cards)
+
+
 @given(SKY, STRAIGHT)
 def test_footprints(pointing, d):
     system = wcs(d, *boresight_for(d, *pointing))
