@@ -1,12 +1,12 @@
-# make demo | pilot | test | test-oldest | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a
-# second time. test-oldest has an environment of its own, .venv-oldest.
+# make demo | pilot | test | test-oldest | check | bench | bench-compare | docs | clean -- each installs what it is missing into
+# .venv, and nothing a second time. test-oldest has an environment of its own, .venv-oldest.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo pilot test test-oldest check bench docs clean spark FORCE
+.PHONY: help demo pilot test test-oldest check bench bench-compare docs clean spark FORCE
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -32,6 +32,7 @@ help:
 	@echo 'make test-oldest  fast tests with the lowest versions that pyproject.toml allows'
 	@echo 'make check        style, spelling, types, who may import whom, plain English'
 	@echo 'make bench        all benchmarks'
+	@echo 'make bench-compare BASE=COMMIT   CPU times of this working copy relative to a commit'
 	@echo 'make docs         the documentation as a site in out/site, its notebooks run on the lake of make demo'
 	@echo 'make clean        remove what was computed (.venv, .venv-oldest and the cache stay)'
 
@@ -53,7 +54,13 @@ check: .venv/installed-test
 	@$(RUN) ruff check . && ruff format --check . && codespell && mypy && lint-imports --no-cache && python -m scripts.plain_words --check
 
 bench: .venv/installed-bench spark
-	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; python -m "benchmarks.$${name%.py}"; done
+	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; \
+	    [ "$$name" = compare.py ] || python -m "benchmarks.$${name%.py}"; done
+
+# For example, make bench-compare BASE=origin/main SUBJECTS="vis lsst"
+bench-compare: .venv/installed-bench spark
+	@$(RUN) python -m benchmarks.compare $(or $(BASE),$(error give a commit: make bench-compare BASE=origin/main)) \
+	    $(if $(SUBJECTS),--subjects $(SUBJECTS))
 
 docs: .venv/installed-test demo
 	@$(RUN) python -m scripts.make_docs --notebooks

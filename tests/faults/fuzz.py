@@ -64,8 +64,7 @@ class Target:
 
 
 TARGETS = {
-    name: Target(*rest)
-    for name, rest in (fuzz_targets.TARGETS | lake_targets.TARGETS | frame_targets.TARGETS).items()
+    name: Target(*rest) for name, rest in (fuzz_targets.TARGETS | lake_targets.TARGETS | frame_targets.TARGETS).items()
 }
 
 

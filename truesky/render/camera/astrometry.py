@@ -266,7 +266,10 @@ def _system(values: Mapping[str, Any]) -> WCS:
 
     system = WCS(naxis=2)
     system.wcs.ctype = [values["CTYPE1"], values["CTYPE2"]]
-    system.wcs.cunit = [values["CUNIT1"], values["CUNIT2"]]
+    for keyword in ("CUNIT1", "CUNIT2"):
+        if values[keyword] != "deg":
+            raise ValueError(f"{keyword} = {values[keyword]!r} must be 'deg'")
+    system.wcs.cunit = ["deg", "deg"]
     system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
     system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
     system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]

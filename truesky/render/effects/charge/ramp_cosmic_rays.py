@@ -75,7 +75,7 @@ def _add_tracks(
 ) -> None:
     """Draw `count` tracks, and add their charge and times to the planes 1 and 2, in place.
 
-    `planes` is a float array of shape (3, ny, nx). The other parameters are those of `apply`.
+    `planes` is a float array of shape (3, ny, nx). See `apply` for the other parameters.
     """
     ny, nx = planes.shape[1:]
     angle, x, y = 2.0 * np.pi * rng.random(count), nx * rng.random(count), ny * rng.random(count)

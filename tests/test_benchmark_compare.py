@@ -1,0 +1,42 @@
+"""A working copy is compared with a commit: with itself, the ratio is near 1; the checkout is removed."""
+
+import json
+import subprocess
+
+import pytest
+
+from benchmarks import _subjects, compare
+
+ROOT = compare.ROOT
+
+
+def worktrees():
+    listed = ["git", "-C", str(ROOT), "worktree", "list"]
+    return subprocess.run(listed, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize(
+    "subjects", [["fluxes"], pytest.param(list(_subjects.SUBJECTS), marks=pytest.mark.nightly)], ids=["fluxes", "all"]
+)
+def test_the_ratios(tmp_path, subjects):
+    file, before = tmp_path / "figures.json", worktrees()
+    assert compare.main(["HEAD", "--quick", "--json", str(file), "--subjects", *subjects]) == 0
+    assert worktrees() == before
+    figures = json.loads(file.read_text())
+    for subject in subjects:
+        assert figures[f"{subject}_ratio"] == pytest.approx(figures[f"{subject}_s"] / figures[f"{subject}_base_s"])
+        assert figures[f"{subject}_ratio_min"] <= figures[f"{subject}_ratio"] <= figures[f"{subject}_ratio_max"]
+
+
+def test_the_base_is_imported_from_its_commit(tmp_path):
+    """A change of the base's package is seen by the process of the base, but not by that of this working copy."""
+    with compare.checkout("HEAD") as base:
+        (base / "truesky" / "__init__.py").write_text("raise SystemExit(7)")
+        with pytest.raises(SystemExit, match="ended with status"):
+            compare.compare("fluxes", base, 1, True)
+    assert not base.exists()
+
+
+def test_an_unknown_commit_is_refused():
+    with pytest.raises(SystemExit, match="commit no-such-commit: "):
+        compare.main(["no-such-commit"])
