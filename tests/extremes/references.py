@@ -172,7 +172,9 @@ def galaxy_in_one_sample(values):
     expected = scale * np.interp(wavelength / (1.0 + z), rest, total)
     dimmed = expected * 10.0 ** (-0.4 * values["a_v"] * milky_way(wavelength))
     error = relative(got, dimmed, max(DARK * scale * total.max(), 1e-37))
-    return error / max(1e-6, 2e-7 * values["a_v"] * milky_way(wavelength))
+    own = [np.interp(wavelength / (1.0 + z), rest, extinction.laws(rest)[k]) for k in law]
+    magnitudes = values["ebv"] * max(own) + values["a_v"] * milky_way(wavelength)
+    return error / max(1e-6, 2e-7 * magnitudes)
 
 
 def distant_galaxy_in_one_sample(values):

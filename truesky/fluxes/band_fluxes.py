@@ -171,8 +171,8 @@ def galaxy_fluxes(
     Notes
     -----
     The relative error is at most `accuracy.flux`, compared with `band_fluxes` of `galaxy_spectra`
-    (benchmarks/fluxes.py). It is 1e-6 at best. In a narrow band that the Milky Way dims by more than 5 mag,
-    it is 2e-7 per magnitude, because exponents have single precision.
+    (benchmarks/fluxes.py). It is 1e-6 at best. In a narrow band that dust of the galaxy and of the Milky
+    Way dims by more than 5 mag, it is 2e-7 per magnitude, because exponents have single precision.
     """
     curves = _load_passbands(bands)
     settings = [choice.setting for choice in errors_measured.choose(curves, accuracy, library)]
