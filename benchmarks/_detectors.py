@@ -22,6 +22,7 @@ from truesky.fluxes import compute_fluxes
 from truesky.numerics import cache
 from truesky.render import plan_exposures, render_exposures
 from truesky.render.effects.effect import Effect
+from truesky.render.previous_exposures import ChargeMaps
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
@@ -73,13 +74,21 @@ def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
     dict
         Description of the rendering task, an argument of `render_exposures.render_task`.
     """
+    return plan_tasks(root, request)[number]
+
+
+def plan_tasks(root: Path, request: Request) -> list[Json]:
+    """Plan the exposures of a request, and return the descriptions of all rendering tasks, longest first.
+
+    `root` is the folder of a lake with the catalogues and fluxes of the request.
+    """
     for step in plan_exposures.steps(root, request):
         publish.make_version(root, step.plan, step.run_task)
     step = render_exposures.steps(root, request)[0]
-    return {**step.plan.facts, **step.plan.tasks[number].facts}
+    return [{**step.plan.facts, **task.facts} for task in step.plan.tasks]
 
 
-def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
+def measure_render(root: Path, facts: Json, folder: Path, charge_maps: ChargeMaps | None = None) -> tuple[float, float]:
     """Measure the rendering of a detector image, from reading the catalogues to writing the files.
 
     Parameters
@@ -90,6 +99,8 @@ def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]
         Description of the rendering task, as `plan_detector` returns it.
     folder : Path
         Folder in which the image files are written; existing files are replaced.
+    charge_maps : ChargeMaps, optional
+        Memory for charge maps of earlier exposures. By default none are kept.
 
     Returns
     -------
@@ -100,7 +111,7 @@ def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]
     """
     reset_peak_memory()
     started = time.process_time()
-    output = render_exposures.render_task(root, facts)
+    output = render_exposures.render_task(root, facts, charge_maps)
     for path, write in output.files.items():
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ An option also times an exposure of 16 detectors by Spark.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,9 @@ from pathlib import Path
 
 from benchmarks import _detectors as one_detector
 from benchmarks import report
-from benchmarks._detectors import FIELD_RADIUS, ROOT, measure_render, plan_detector
+from benchmarks._detectors import FIELD_RADIUS, ROOT, measure_render, plan_detector, plan_tasks
 from truesky.render.channels import nisp_p
+from truesky.render.previous_exposures import DEFAULT_LIMIT_MB, ChargeMaps
 from truesky.request.accuracy import preset
 from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
@@ -26,13 +28,25 @@ RESULTS = ROOT / "benchmarks" / "results" / "nisp_p.json"
 # Pattern of the names of the cache folders that contain PSF images.
 _PLANES = "nisp*_psf-*"
 _RAMP = nisp_p.SKY[nisp_p.SKY.index(nisp_p.persistence.EFFECT) + 1 :]
+# Offsets of four dithers, arcsec to the east and to the north, and seconds between their starts.
+_DITHERS, _DITHER_S = ((0.0, 0.0), (50.0, -30.0), (100.0, 20.0), (60.0, 100.0)), 1080.0
+# Channels and bands of a dither, and seconds from its start.
+_SEQUENCE = (
+    ("NISP-S", "nisp_red", 0.0),
+    ("NISP-P", "euclid_j", 620.0),
+    ("NISP-P", "euclid_y", 754.0),
+    ("NISP-P", "euclid_h", 888.0),
+)
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed (target 5)",
     "survey_warm_s": "the same, PSF planes from the cache (target 2.5)",
     "draft_s": "the same at draft accuracy with the effects that it selects (target 1)",
     "ramp_s": "part of survey_warm_s: effects from cosmic rays to the converter",
     "peak_gb": "peak memory of the process (target 1.2)",
-    "third_s": "as survey_warm_s, third exposure of a dither with persistence of the first two",
+    "third_s": "as survey_warm_s, third exposure of a dither with persistence of the first two, alone",
+    "after_15_alone_s": "as survey_warm_s, after four NISP-S and eleven NISP-P exposures, whose charge maps it draws",
+    "after_15_s": "the same in order of time: the map of the last of the fifteen is drawn, the others are in memory",
+    "after_15_gb": "peak memory of the process in order of time",
     "exposure_s": "wall, 16 detectors by the Spark job on 2 cores (target 30)",
 }
 
@@ -70,6 +84,54 @@ mjd = {60905.0 + number * 134.0 / 86400.0!r}
     return text
 
 
+def sequence_text(quick: bool) -> str:
+    """Return a request for sixteen exposures of the field of requests/demo.toml: NISP-S, J, Y and H in four dithers.
+
+    If `quick` is True, only bright sources are simulated.
+    """
+    text = one_detector.request_head(quick).split("[products]")[0]
+    for dither, (east, north) in enumerate(_DITHERS):
+        for channel, band, seconds in _SEQUENCE:
+            text += f"""
+[[pointing]]
+channel = "{channel}"
+camera = "nisp"
+band = "{band}"
+ra = {53.117 + east / 3600.0 / math.cos(math.radians(27.808))!r}
+dec = {-27.808 + north / 3600.0!r}
+centre_on = "DET22"
+detectors = ["DET22"]
+mjd = {60905.0 + (_DITHER_S * dither + seconds) / 86400.0!r}
+"""
+    return text
+
+
+def measure_sequence(folder: Path, root: Path, sequence: Request) -> dict[str, float]:
+    """Measure the last exposure of a sequence, alone and in order of time.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder in which the image files are written.
+    root : Path
+        Folder of the lake, with the catalogues and fluxes of the request.
+    sequence : Request
+        Request for the exposures.
+
+    Returns
+    -------
+    dict of str to float
+        `after_15_alone_s`, `after_15_s` and `after_15_gb`.
+    """
+    charge_maps = ChargeMaps(DEFAULT_LIMIT_MB)
+    tasks = {facts["exposure_id"]: facts for facts in plan_tasks(root, with_all_effects(sequence))}
+    previous, last = (tasks[number] for number in sorted(tasks)[-2:])
+    alone, _ = measure_render(root, last, folder)
+    measure_render(root, previous, folder, charge_maps)
+    seconds, peak = measure_render(root, last, folder, charge_maps)
+    return {"after_15_alone_s": alone, "after_15_s": seconds, "after_15_gb": peak}
+
+
 def with_all_effects(request: Request) -> Request:
     """Return a copy of a request that switches on all optional effects of NISP-P science images.
 
@@ -96,11 +158,11 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
     dict of str to float
         Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
-    file = folder / "three.toml"
-    file.write_text(request_text(quick, exposures=3), encoding="utf-8")
-    three_exposures = parse(file)
+    three_exposures, sequence = (
+        _parse_text(folder, text) for text in (request_text(quick, exposures=3), sequence_text(quick))
+    )
     last_exposure = replace(three_exposures, pointings=three_exposures.pointings[-1:])
-    root = one_detector.make_lake(folder, three_exposures)
+    root = one_detector.make_lake(folder, sequence)
     full_task = plan_detector(root, with_all_effects(last_exposure))
     measure_render(root, full_task, folder)  # Untimed: compiles functions and fills the caches.
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
@@ -115,7 +177,13 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
     out["draft_s"] = min(measure_render(root, draft, folder)[0] for _ in range(repeats + 1))
     last_task = plan_detector(root, with_all_effects(three_exposures), -1)
     out["third_s"] = min(measure_render(root, last_task, folder)[0] for _ in range(repeats + 1))
-    return out
+    return out | measure_sequence(folder, root, sequence)
+
+
+def _parse_text(folder: Path, text: str) -> Request:
+    file = folder / "request.toml"
+    file.write_text(text, encoding="utf-8")
+    return parse(file)
 
 
 def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:

@@ -20,6 +20,7 @@ from truesky.render.drawing.stored_drawing import DrawingStore
 from truesky.render.exposure import render
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.exposure.rendered_detector import RenderedDetector
+from truesky.render.previous_exposures import ChargeMaps
 from truesky.render.products import fits_files, truth_table
 
 if TYPE_CHECKING:
@@ -32,9 +33,10 @@ _MAX_LISTED = 8
 
 @dataclass(slots=True)
 class _Shared:
-    """Inputs and drawings that an image without and with additional sources shares."""
+    """Inputs, drawings and charge maps that an image without and with additional sources shares."""
 
     drawings: DrawingStore
+    charge_maps: ChargeMaps
     inputs: tuple[Aim, Rows, Variant] | None = None
 
 
@@ -66,7 +68,7 @@ class LakeFrame:
             raise no_image(root, exposure, detector, ((part["exposure_id"], part["detector"]) for part in facts))
         self._root, self._facts = root, {**version.manifest["facts"], **parts[0]}
         self._extra: Any = None
-        self._shared = _Shared(DrawingStore(added.is_added))
+        self._shared = _Shared(DrawingStore(added.is_added), ChargeMaps.from_environment())
         self._rendered: RenderedDetector | None = None
         self._has_maps = False
 
@@ -101,7 +103,7 @@ class LakeFrame:
         if self._rendered is None or (with_maps and not self._has_maps):
             request = self._facts["request"]
             if self._shared.inputs is None:
-                self._shared.inputs = detector_inputs.load_inputs(self._root, self._facts)
+                self._shared.inputs = detector_inputs.load_inputs(self._root, self._facts, self._shared.charge_maps)
             aim, rows, variant = self._shared.inputs
             # The file of a PSF is read again for each image.
             detector_inputs.check_psf_files(aim.exposure, rows.previous_exposures, self._facts)

@@ -16,14 +16,14 @@ from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.inputs import galaxy_library_from_facts, passband_from_facts, stellar_library_from_facts
 from truesky.render.camera import detectors
-from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamp_sizes
-from truesky.render.exposure import board_neighbours, persistence, visible_sources, visible_spectra
+from truesky.render.exposure import board_neighbours, visible_sources, visible_spectra
 from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows, Variant
 from truesky.render.planning import exposure_chunks, variants
+from truesky.render.previous_exposures import ChargeMaps, find_previous_exposures, moving_bodies
 from truesky.render.psf import from_file
-from truesky.render.sources import catalogue_rows, ephemerides, galaxy_stamps, solar_system
+from truesky.render.sources import catalogue_rows, galaxy_stamps
 from truesky.render.sources.catalogue_rows import LENSES
 from truesky.render.sources.disc_structure import DiscStructure
 from truesky.render.sources.solar_system import Population
@@ -54,7 +54,7 @@ def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfigurat
     return Aim.from_exposure(exposed, detector, band, request["seed"], request["readout"]), variant, mission
 
 
-def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
+def load_inputs(lake: Folder, facts: Json, charge_maps: ChargeMaps | None = None) -> tuple[Aim, Rows, Variant]:
     """Read everything that is needed to render one detector of an exposure.
 
     Parameters
@@ -64,6 +64,8 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
     facts : dict
         Recorded inputs of the image: `request` (its settings), `inputs` (version of each input table), `exposure_id`,
         `detector`, and checksums of user files.
+    charge_maps : ChargeMaps, optional
+        Memory for the charge maps of earlier exposures. By default none are kept.
 
     Returns
     -------
@@ -84,14 +86,11 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
     number = facts["exposure_id"]
     in_detector = (pc.field("exposure_id") == number) & (pc.field("detector") == facts["detector"])
     (task,) = exposure_chunks.rows(inputs["tasks"], [number], where=in_detector).to_pylist()
-    previous_exposures = find_previous_exposures(lake, inputs, exposed, task, mission, request["seed"])
+    previous_exposures = find_previous_exposures(
+        lake, facts, exposed, task["detector"], mission, charge_maps or ChargeMaps()
+    )
     check_psf_files(exposed, previous_exposures, facts)
-    bodies = solar_system.empty_population if request.get("bodies") == "none" else None
-    if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
-        for file, sha256 in facts.get("bodies", {}).items():
-            if file_sha256(Path(file)) != sha256:
-                raise BadInput(f"{file}: has changed since the rendering began")
-            bodies = ephemerides.read(Path(file), sha256).on_day
+    bodies = moving_bodies(exposed, facts)
     rows = _read_rows(lake, inputs, aim, task, variant, bodies, previous_exposures, request["seed"])
     return aim, _with_structure(rows, request, facts.get("stamps", {})), variant
 
@@ -183,100 +182,3 @@ def _read_rows(
         previous_exposures=previous_exposures,
         neighbours=board_neighbours.bright_stars(inputs, aim, variant),
     )
-
-
-def find_previous_exposures(
-    lake: Folder,
-    inputs: Mapping[str, read.Version],
-    exposed: ExposureRow,
-    task: Json,
-    mission: MissionConfiguration,
-    seed: int,
-) -> tuple[PreviousExposure | PreviousSky, ...]:
-    """Find the earlier exposures that leave persistence in a detector.
-
-    Parameters
-    ----------
-    lake : Folder
-        Lake (folder of stored tables).
-    inputs : mapping of str to Version
-        Stored versions of the tables from which images are made, by table name.
-    exposed : ExposureRow
-        Exposure to be rendered.
-    task : dict
-        Row of the table `tasks` for the detector to be rendered.
-    mission : MissionConfiguration
-        Mission parameters of the request.
-    seed : int
-        Seed of the request, used for random tilts of filters and grisms.
-
-    Returns
-    -------
-    tuple of PreviousExposure or PreviousSky
-        The exposures in order of time: with their bright sources, or only with their sky level if truesky cannot render
-        them. It is empty if the channel has no persistence.
-    """
-    if registry.CHANNELS[exposed.channel].persistence_effect is None:
-        return ()
-    mission_for = variants.mission_lookup(mission)
-    start_mjd = exposed.mjd - persistence.window_days(exposed.camera, mission_for(exposed.settings))
-    in_window = (pc.field("mjd") >= start_mjd) & (pc.field("mjd") <= exposed.mjd)
-    same_camera = pc.field("camera") == exposed.camera
-    candidates = exposure_chunks.rows(
-        inputs["exposures"], dates=(start_mjd, exposed.mjd), where=in_window & same_camera
-    ).to_pylist()
-    rows = {row.exposure_id: row for row in map(ExposureRow.from_row, candidates)}
-    in_detector = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
-    tasks = exposure_chunks.rows(inputs["tasks"], rows, where=in_detector).to_pylist()
-    previous_tasks = persistence.previous_tasks(tasks, rows, mission_for)[exposed.exposure_id, task["detector"]]
-    pairs = [(rows[previous_task["exposure_id"]], previous_task) for previous_task in previous_tasks]
-    pairs_with_sources = [pair for pair in pairs if persistence.is_drawn(pair[0])]
-    bright_by_exposure = {
-        previous.exposure.exposure_id: previous
-        for previous in _load_bright_sources(lake, inputs, exposed, pairs_with_sources, mission_for, seed)
-    }
-    return tuple(bright_by_exposure.get(row.exposure_id, PreviousSky(row)) for row, _ in pairs)
-
-
-def _load_bright_sources(
-    lake: Folder,
-    inputs: Mapping[str, read.Version],
-    exposed: ExposureRow,
-    pairs: Sequence[tuple[ExposureRow, Json]],
-    mission_of: Callable[[str | None], MissionConfiguration],
-    seed: int,
-) -> list[PreviousExposure]:
-    """Read the sources of earlier exposures that are bright enough to leave persistence in exposure `exposed`.
-
-    `pairs` has each earlier exposure, and its row of the table `tasks` for the same detector. The result has one item
-    per pair, in the same order. `mission_of` returns the mission parameters of an exposure, given its column `settings`
-    (JSON of changed parameters, or None).
-    """
-    if not pairs:
-        return []
-    fluxes = inputs["galaxy_fluxes"].manifest["facts"]
-    aims, galaxies, stars = [], [], []
-    for previous, task in pairs:
-        mission = mission_of(previous.settings)
-        detector = detectors.detector(previous.camera, task["detector"], mission)
-        aim = Aim.from_exposure(previous, detector, passband_from_facts(lake, fluxes, previous.band), seed)
-        min_flux = persistence.min_flux(exposed, previous, persistence.brightest_column_fraction(aim, mission))
-        spectral_reach = visible_spectra.margin_arcsec(previous, detector, mission, aim.band, seed)
-        extra_reach = max(spectral_reach - aim.channel.margin(detector.section, mission), 0.0)
-        # Read the columns of spectra for exposures through a grism only. In other images, sources with persistence are
-        # assumed to have flat f_nu.
-        is_dispersed = aim.channel.dispersion is not None
-        shapes = visible_sources.GALAXY_COLUMNS if is_dispersed else visible_sources.SHAPE_COLUMNS
-        galaxies.append(catalogue_rows.BrightQuery(task, shapes, previous.band, min_flux, extra_reach))
-        stars.append(replace(galaxies[-1], columns=visible_sources.STAR_COLUMNS))
-        aims.append((aim, mission))
-    library, stellar = (
-        galaxy_library_from_facts(lake, fluxes),
-        stellar_library_from_facts(lake, inputs["star_fluxes"].manifest["facts"]),
-    )
-    of_galaxies = catalogue_rows.read_bright(inputs["galaxies"], inputs["galaxy_fluxes"], galaxies)
-    of_stars = catalogue_rows.read_bright(inputs["stars"], inputs["star_fluxes"], stars)
-    return [
-        PreviousExposure(aim, Rows(*galaxy_rows, *star_rows, galaxy_library=library, stellar_library=stellar), mission)
-        for (aim, mission), galaxy_rows, star_rows in zip(aims, of_galaxies, of_stars, strict=True)
-    ]

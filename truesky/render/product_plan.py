@@ -18,6 +18,7 @@ from lake_schema.store.plan import Json, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import PRODUCTS
+from truesky.render.channels.image_types import shared_settings
 from truesky.render.exposure import persistence
 from truesky.render.planning import exposure_chunks, preconditions, variants
 from truesky.render.planning.exposure_chunks import RenderSelection
@@ -35,6 +36,7 @@ from truesky.render.psf import from_file
 from truesky.render.sources.catalogue_rows import LENSES
 from truesky.request import structure
 from truesky.request.schema import IMAGE_OPTIONS, Request
+from truesky.running.task_chains import Link, LinkFunction
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +169,35 @@ class RenderInputs:
             return part_name(task) in self.published_keys and all(file.is_file() for file in files)
 
         return [task for task in self.selection.tasks if part_name(task) in requested or can_reuse(task)]
+
+    def chain_links(self) -> LinkFunction:
+        """Return the function that gives the place of a task of the table `products` in a chain.
+
+        A chain contains the exposures of a detector in order of time, as long as each one has persistence of earlier
+        ones. The tasks are those of `products`, and the chains those of `selection.tasks`.
+        """
+        rows = {row.exposure_id: row for row in map(ExposureRow.from_row, self.exposures.to_pylist())}
+        places: dict[tuple[int, str], tuple[int, float]] = {}
+        starts: dict[tuple[Any, ...], int] = {}
+        for task in sorted(self.selection.tasks, key=lambda task: _time_order(rows[task["exposure_id"]])):
+            row, place = rows[task["exposure_id"]], (task["exposure_id"], task["detector"])
+            sequence = row.camera, shared_settings(row.settings), task["detector"]
+            if sequence not in starts or not self.previous_tasks.get(place):
+                # Exposures without persistence also begin a chain, in which they are alone.
+                starts[sequence] = row.exposure_id
+            places[place] = starts[sequence], task["seconds"]
+
+        def link(task: Task) -> Link:
+            number, detector = task.facts["exposure_id"], task.facts["detector"]
+            start, seconds = places[number, detector]
+            return Link((start, detector), _time_order(rows[number]), seconds)
+
+        return link
+
+
+def _time_order(exposure: ExposureRow) -> tuple[float, int]:
+    """Return the date and the number of an exposure, by which exposures are sorted."""
+    return exposure.mjd, exposure.exposure_id
 
 
 def _versions(lake: Path, request: Request) -> dict[str, read.Version]:

@@ -1,6 +1,7 @@
 """Render the planned exposures: spark-submit jobs/render/render_exposures.py --lake LAKE --request REQUEST."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,6 +16,7 @@ from truesky.render import detector_inputs, product_plan
 from truesky.render.channels import registry
 from truesky.render.exposure import render
 from truesky.render.planning import preconditions
+from truesky.render.previous_exposures import ChargeMaps
 from truesky.render.product_plan import RenderInputs
 from truesky.render.products import exposure_files, fits_files, truth_table
 from truesky.render.products.sidecar_files import psf_file, spectra_file, truth_file
@@ -28,7 +30,9 @@ from truesky.running.submitted_job import Job, Step
 def steps(lake: Path, request: Request) -> list[Step]:
     """Return the steps of this job: render the detectors, collect the tables of true positions, write exposure files.
 
-    Detectors with the longest estimated time are rendered first. Files with all detectors of an exposure are written
+    Exposures of a detector that leave persistence in one another are rendered one after the other, if possible by the
+    same worker, which keeps their charge maps. Otherwise, detectors with the longest estimated time are rendered first.
+    Files with all detectors of an exposure are written
     only if the request asks for them. Images of detectors that are not requested now are kept if their inputs have not
     changed. Raises BadInput if the plan or the catalogues do not fit the request.
     """
@@ -39,7 +43,12 @@ def steps(lake: Path, request: Request) -> list[Step]:
         Task(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.tasks
     )
     steps = [
-        Step(plan, render_task, unit="detector"),
+        Step(
+            plan,
+            partial(render_task, charge_maps=ChargeMaps.from_environment()),
+            unit="detector",
+            link_of=inputs.chain_links(),
+        ),
         Step(Plan(RENDERED_TRUTH, {"products": plan.key}, truth_parts), read_truth),
     ]
     dispersed = _dispersed_exposures(inputs.selection.exposures)
@@ -87,15 +96,16 @@ def _dispersed_exposures(exposures: pa.Table) -> set[int]:
     return numbers
 
 
-def render_task(lake: Path, facts: Json) -> Output:
+def render_task(lake: Path, facts: Json, charge_maps: ChargeMaps | None = None) -> Output:
     """Render one detector of an exposure.
 
-    `facts` are the recorded inputs of the image (see `detector_inputs.load_inputs`). The result has the rows of the
-    table `products`, and the functions that write the files: image, truth maps, tables of drawn sources and PSF.
+    `facts` are the recorded inputs of the image (see `detector_inputs.load_inputs`). `charge_maps` keeps the charge
+    maps of earlier exposures for other tasks of the same plan. The result has the rows of the table `products`, and the
+    functions that write the files: image, truth maps, tables of drawn sources and PSF.
     """
     request = facts["request"]
     with memory_reuse.retain_freed_memory():
-        aim, source_rows, variant = detector_inputs.load_inputs(lake, facts)
+        aim, source_rows, variant = detector_inputs.load_inputs(lake, facts, charge_maps)
         noise, truth = request["noise_seed"], request["truth"]
         with activity.report(f"detector {aim.detector.name}, exposure {aim.exposure.exposure_id}"):
             rendered = render.render(aim, source_rows, variant, request["seed"], truth, noise_seed=noise)

@@ -28,6 +28,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, TypeVar
@@ -44,7 +45,8 @@ from truesky.command_line.simulation import add_job_arguments
 from truesky.request import checks, universe
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
-from truesky.running import progress
+from truesky.running import progress, task_chains
+from truesky.running.task_chains import LinkFunction
 from truesky.running.task_metrics import WithMetrics
 
 if TYPE_CHECKING:
@@ -70,6 +72,9 @@ class Step:
         Word for a task in the progress bar.
     on_published : callable, optional
         Function that is called with the version of the table after it has been published.
+    link_of : callable, optional
+        Function that returns the place of a task in a chain of tasks, which one worker runs one after the other because
+        they share data in its memory.
     """
 
     plan: Plan
@@ -77,6 +82,7 @@ class Step:
     on_driver: bool = False
     unit: str = "part"
     on_published: Callable[[read.Version], None] | None = None
+    link_of: LinkFunction | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +270,7 @@ def _run_step(job: Job, step: Step, root: Path, request: Request, verbose: bool,
             outcome = (
                 map(run_with_metrics, tasks)
                 if step.on_driver
-                else _spark_map(run_with_metrics, tasks, job.name, verbose)
+                else _spark_map(run_with_metrics, tasks, job.name, verbose, step.link_of)
             )
             for result in outcome:
                 results.append(result)
@@ -381,8 +387,16 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
 # ------------------------------------------------------------------------------------ execution of tasks with Spark
 
 
-def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: str, verbose: bool) -> Iterable[Json]:
+def _spark_map(
+    function: Callable[[Task], Json],
+    tasks: Sequence[Task],
+    name: str,
+    verbose: bool,
+    link_of: LinkFunction | None = None,
+) -> Iterable[Json]:
     """Run a function for each task in Spark workers, and return the results.
+
+    `link_of` returns the place of a task in a chain of tasks that one worker runs one after the other.
 
     If a worker process ends unexpectedly, Spark gives up all tasks. The list of tasks is then divided into halves,
     which are run separately, until the task that kills its worker is alone. The result of this task contains an error.
@@ -404,14 +418,18 @@ def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: st
         raise LakeError(f"Spark did not start: {' '.join(str(error).split())[:300]}") from None
     try:
         with quietly():
-            return _collect(spark, function, tasks)
+            return _collect(spark, function, tasks, link_of)
     except (Py4JError, PySparkException, OSError):
         if not is_alive(spark):
             raise LakeError(f"Spark has ended; {_RESUME_HINT}") from None
         if len(tasks) == 1:
             return [{"part": tasks[0].name, "error": "its worker ended unexpectedly"}]
     half = len(tasks) // 2
-    return [r for half_tasks in (tasks[:half], tasks[half:]) for r in _spark_map(function, half_tasks, name, verbose)]
+    return [
+        result
+        for half_tasks in (tasks[:half], tasks[half:])
+        for result in _spark_map(function, half_tasks, name, verbose, link_of)
+    ]
 
 
 def map_in_workers(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -461,13 +479,18 @@ def _silence_logging() -> Iterator[None]:
         logging.disable(previous_level)
 
 
-def _collect(spark: SparkSession, function: Callable[[Task], Json], tasks: Sequence[Task]) -> list[Json]:
+def _collect(
+    spark: SparkSession,
+    function: Callable[[Task], Json],
+    tasks: Sequence[Task],
+    link_of: LinkFunction | None = None,
+) -> list[Json]:
     max_attempts = _max_attempts(spark)
 
-    def run(partition: Iterable[Task]) -> Iterator[Json]:
+    def run(partition: Iterable[list[Task]]) -> Iterator[Json]:
         from pyspark import TaskContext
 
-        for task in partition:
+        for task in chain.from_iterable(partition):
             result = function(task)
             context = TaskContext.get()
             last = context is None or context.attemptNumber() >= max_attempts - 1
@@ -481,8 +504,10 @@ def _collect(spark: SparkSession, function: Callable[[Task], Json], tasks: Seque
             }
         _freeze_garbage()
 
-    # Give each Spark task one task as its data. A list of all tasks in the function would be unpickled by every worker.
-    results: list[Json] = spark.sparkContext.parallelize(tasks, len(tasks)).mapPartitions(run).collect()
+    # Give each Spark task its list as its data. A list of all tasks in the function would be unpickled by every worker.
+    context = spark.sparkContext
+    partitions = task_chains.divide(tasks, link_of, context.defaultParallelism)
+    results: list[Json] = context.parallelize(partitions, len(partitions)).mapPartitions(run).collect()
     return results
 
 

@@ -224,7 +224,7 @@ def test_a_failed_detector_does_not_end_the_run(lake, monkeypatch, tmp_path, cap
         patch.setattr(
             render_exposures,
             "render_task",
-            lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts),
+            lambda root, facts, **_: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts),
         )
         with pytest.raises(TasksFailed, match=rf"1 of 2 tasks failed: {part}: ValueError: no light"):
             submitted_job.run(render_exposures.JOB, lake, wanted())
@@ -239,7 +239,9 @@ def test_a_failed_detector_does_not_end_the_run(lake, monkeypatch, tmp_path, cap
     assert len(stage.missing_tasks(layout.stage_folder(lake, "products", step.plan.key), step.plan)) == 1
     # The next run makes only failed detectors, which are then no longer listed as failures.
     made = []
-    monkeypatch.setattr(render_exposures, "render_task", lambda root, facts: made.append(facts) or WORK(root, facts))
+    monkeypatch.setattr(
+        render_exposures, "render_task", lambda root, facts, **_: made.append(facts) or WORK(root, facts)
+    )
     submitted_job.run(render_exposures.JOB, lake, wanted())
     assert [facts["detector"] for facts in made] == ["R22_S11"]
     assert archive.failures(lake).num_rows == 0

@@ -228,7 +228,7 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     """One of a thousand tasks kills its worker; all others are made, in runs of many tasks each."""
     runs = []
 
-    def collect(spark, function, parts):
+    def collect(spark, function, parts, link_of):
         runs.append(len(parts))
         if any(part.name == "700" for part in parts):
             raise Py4JNetworkError("the worker is gone")
@@ -254,6 +254,7 @@ def test_a_worker_s_modules_are_left_out_of_its_collections_once(monkeypatch):
     spark = SimpleNamespace(
         sparkContext=SimpleNamespace(
             master="local[2]",
+            defaultParallelism=2,
             parallelize=lambda parts, n: SimpleNamespace(
                 mapPartitions=lambda run: SimpleNamespace(collect=lambda: [one for p in parts for one in run([p])])
             ),

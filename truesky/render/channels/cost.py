@@ -28,7 +28,10 @@ class Cost:
     file_bytes_per_pixel : float
         Bytes of the file per pixel that is read out, including prescan and overscan.
     redraw_s : float
-        Seconds to draw an earlier image of the sky again, because it leaves persistence; 0 without persistence.
+        Seconds to draw the charge map of an image of the sky, because it leaves persistence; 0 without persistence. The
+        map is drawn once for all later images of a detector.
+    release_s : float
+        Seconds to compute the charge that is released in an image because of one earlier image; 0 without persistence.
     lamp_s : float
         Additional seconds per million pixels if a calibration lamp illuminates the detector. The charge of each frame
         of a ramp is then drawn separately.
@@ -46,5 +49,6 @@ class Cost:
     sky_bytes_per_pixel: float
     file_bytes_per_pixel: float
     redraw_s: float = 0.0
+    release_s: float = 0.0
     lamp_s: float = 0.0
     most_sources: float = math.inf

@@ -106,6 +106,7 @@ COST = Cost(
     sky_bytes_per_pixel=160.0,
     file_bytes_per_pixel=3.0,
     redraw_s=0.36,
+    release_s=0.03,
     lamp_s=1.2,
 )
 

@@ -164,6 +164,7 @@ COST = Cost(
     sky_bytes_per_pixel=240.0,
     file_bytes_per_pixel=3.0,
     redraw_s=0.8,
+    release_s=0.03,
     lamp_s=6.5,
     most_sources=5600.0,
 )

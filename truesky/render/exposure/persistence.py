@@ -1,13 +1,14 @@
 """Compute the persistence of a detector: charge that was trapped in earlier exposures and is released in a later one.
 
-Each earlier exposure is drawn again from the catalogue without noise. No exposure needs the image of another, so
-exposures can be simulated in any order: persistence depends only on the planned exposures and the catalogue. An earlier
-exposure is drawn with its sky, its lamp, and the stars and galaxies that leave noticeable charge, dispersed if it had a
-grism. An exposure that cannot be simulated contributes only its mean sky.
+The charge map of an earlier exposure, its expected electrons, is drawn again from the catalogue. No exposure needs the
+image of another, so exposures can be simulated in any order: persistence depends only on the planned exposures and the
+catalogue. The charge map depends only on the earlier exposure and the detector. The same map is therefore used for all
+later exposures. It contains sky and lamp, and the stars, galaxies, lensed arcs and moving bodies that leave noticeable
+charge, dispersed if the exposure had a grism. An exposure that cannot be simulated contributes only its mean sky.
 
-Cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn. For example, a pixel that was hit by a
-cosmic ray of 2300 electrons lacks 10 electrons of persistence after 134 s. Sources are selected as if their spectra
-were flat. A source may therefore be omitted although one of its emission lines leaves noticeable charge.
+Cosmic rays of earlier exposures are not drawn. For example, a pixel that was hit by a cosmic ray of 2300 electrons
+lacks 10 electrons of persistence after 134 s. Sources are selected as if their spectra were flat. A source may
+therefore be omitted although one of its emission lines leaves noticeable charge.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -28,16 +30,16 @@ from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim, electron_rate
 from truesky.render.channels.image_types import shared_settings
 from truesky.render.dispersing import draw as dispersing
-from truesky.render.drawing import stamp_sizes, stamps
+from truesky.render.drawing import stamps
 from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.charge import ramp
 from truesky.render.effects.charge.persistence import PersistenceModel, variation_of_scene
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.exposure import scene_factory, sky_through_grism, visible_sources
 from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows, Variant
+from truesky.render.exposure.visible_sources import visible_light
 from truesky.render.exposure.visible_spectra import visible_spectra
 from truesky.render.psf.model import Psf
-from truesky.render.sources import solar_system
 
 # Seconds per day.
 _DAY_S = 86400.0
@@ -47,18 +49,12 @@ _TIME_TOLERANCE_S = 1e-3
 # Image types without light of the sky. An earlier exposure of these types that cannot be simulated causes no
 # persistence.
 _STARLESS = ("bias", "dark", "flat", "charge_injection", "persistence")
-# Smallest number of electrons with which a point source in an earlier exposure is drawn, if the later exposure begins
-# _REFERENCE_S seconds after the earlier one. The limit is proportional to this delay. A star at the limit leaves 0.8
-# electrons of persistence in a pixel. In an example with two earlier exposures, at most 1.2 electrons in a pixel are
-# missing.
-_MIN_ELECTRONS = 400.0
-# Electrons per pixel that replace the noise of a pixel when sources of an earlier exposure are drawn: light that is
-# small compared with them is neglected. The number is for a delay of _REFERENCE_S seconds and is proportional to the
-# delay.
-_NEGLECTED_ELECTRONS = 300.0
-# Delay from the start of an earlier exposure to the start of the later one for which _MIN_ELECTRONS and
-# _NEGLECTED_ELECTRONS are given, s.
-_REFERENCE_S = 134.0
+# Smallest number of electrons with which a point source in an earlier exposure is drawn, per second of exposure time.
+# The limit is proportional to the exposure time, because the next exposure cannot begin sooner than that.
+_MIN_RATE = 2.3
+# Electrons per pixel and second of exposure time that replace the noise of a pixel when sources of an earlier exposure
+# are drawn: light that is small compared with them is neglected.
+_NEGLECTED_RATE = 1.7
 # Assumed fraction of a point source's flux in its brightest column in a direct image. A spectrum whose brightest column
 # has the same electrons is assumed to leave the same persistence.
 _COLUMN_FRACTION = 0.5
@@ -201,34 +197,24 @@ def brightest_column_fraction(aim: Aim, mission: MissionConfiguration) -> float:
     return largest
 
 
-def min_flux(exposure: ExposureRow, previous: ExposureRow, column: float = _COLUMN_FRACTION) -> float:
-    """Return the flux of the faintest source in an earlier exposure that is drawn because it leaves persistence.
+def min_flux(previous: ExposureRow, column: float = _COLUMN_FRACTION) -> float:
+    """Return the flux of the faintest source of an earlier exposure that is drawn in its charge map.
 
     Parameters
     ----------
-    exposure, previous : ExposureRow
-        Later and earlier exposure.
+    previous : ExposureRow
+        Earlier exposure.
     column : float, optional
         Result of `brightest_column_fraction` for the earlier exposure. The default is that of a direct image.
 
     Returns
     -------
     float
-        f_nu in microjansky; infinite if the earlier exposure has no light of the sky. `delay` raises BadInput if
-        `previous` does not begin before `exposure`.
+        f_nu in microjansky; infinite if the earlier exposure has no light of the sky.
     """
     if not registry.CHANNELS[previous.channel].sees_sky(previous.image_type):
         return float("inf")
-    min_electrons = _MIN_ELECTRONS * _COLUMN_FRACTION / column
-    return min_electrons * _age_factor(exposure, previous) / (electron_rate(previous) * previous.exposure_time_s)
-
-
-def _age_factor(exposure: ExposureRow, previous: ExposureRow) -> float:
-    """Return the delay between the starts of two exposures, in units of _REFERENCE_S.
-
-    The electrons that may be neglected in the earlier exposure are proportional to this delay.
-    """
-    return delay(exposure, previous) / _REFERENCE_S
+    return _MIN_RATE * _COLUMN_FRACTION / column / electron_rate(previous)
 
 
 def total_charge(
@@ -259,30 +245,50 @@ def total_charge(
     variation = variation_of_scene(scene, stream(seed, aim.exposure.camera, aim.detector.name, _VARIATION_STREAM))
     total = np.zeros((aim.detector.ny, aim.detector.nx))
     for previous in previous_exposures:
-        charge = _draw_charge(previous, variant, _age_factor(aim.exposure, previous.exposure), seed)
+        charge = _mean_charge(previous.exposure) if isinstance(previous, PreviousSky) else previous.charge()
         times = delay(aim.exposure, previous.exposure), aim.exposure.exposure_time_s, previous.exposure.exposure_time_s
         total += model.released_charge(charge, *times, variation)
     return total
 
 
-def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age_factor: float, seed: int) -> Frame:
-    """Return the expected electrons in each pixel of an earlier exposure, or one number if only its mean sky is known.
+def _mean_charge(exposure: ExposureRow) -> Frame:
+    """Return the electrons per pixel, as one number, of an exposure of which only the mean sky is known."""
+    return np.asarray((exposure.image_type not in _STARLESS) * exposure.sky * exposure.exposure_time_s)
 
-    `age_factor` is the delay from the start of this exposure to the start of the later one, divided by _REFERENCE_S.
-    The electrons are those collected in the exposure time, which in a ramp begins with the first group of reads. The
-    parameters of traps refer to these electrons. As an approximation, charge collected before this group is not
-    counted, although it also fills traps.
+
+def draw_charge_map(aim: Aim, rows: Rows, variant: Variant, seed: int, fraction: float = 1.0) -> Float32:
+    """Draw the expected electrons of an exposure from which the persistence in later exposures is computed.
+
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows of the sources that leave noticeable charge: at least those above `min_flux`.
+    variant : Variant
+        Mission database, accuracy, and forced effects of this exposure.
+    seed : int
+        Seed of the request, from which moving bodies and the position errors of wheels are drawn.
+    fraction : float, optional
+        Factor by which the limits of neglected light are multiplied. It is 1 except in tests, which compare the map
+        with a more complete one.
+
+    Returns
+    -------
+    float32 array, shape (ny, nx)
+        Electrons collected in the exposure time.
+
+    Notes
+    -----
+    In a ramp, the exposure time begins with the first group of reads. The parameters of traps refer to the electrons
+    collected since then. As an approximation, charge collected before this group is not counted, although it also fills
+    traps.
     """
-    if isinstance(previous, PreviousSky):
-        shines = previous.exposure.image_type not in _STARLESS
-        return np.asarray(shines * previous.exposure.sky * previous.exposure.exposure_time_s)
-    aim = previous.aim
-    variant = variant if previous.mission is None else replace(variant, mission=previous.mission)
     scene = sky_through_grism.with_sky_change(scene_factory.from_aim(aim, variant), aim, seed)
     if aim.channel.dispersion is not None and aim.sees_sky:
-        frame = _draw_spectra(aim, previous.rows, scene, age_factor, seed)
+        frame = _draw_spectra(aim, rows, scene, seed, fraction)
     else:
-        frame = _draw_sources(aim, previous.rows, scene, age_factor)
+        frame, scene = _draw_sources(aim, rows, scene, seed, fraction)
     for effect in aim.effects:
         if effect is aim.channel.persistence_effect:
             break
@@ -290,19 +296,18 @@ def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age
         # light, such as the sky. Fixed patterns of the detector are omitted, because they do not consist of light.
         if not effect.fixed and effect.is_applied(scene) and effect.contribution(scene) > _MIN_LIGHT:
             frame = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(0))
-    return frame
+    return frame.astype(np.float32)
 
 
-def _draw_spectra(aim: Aim, rows: Rows, scene: Scene, age_factor: float, seed: int) -> Frame:
+def _draw_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int, fraction: float) -> Frame:
     """Return the expected electrons [ny, nx] of the slitless spectra of sources that leave noticeable persistence.
 
-    `age_factor` is the delay from the start of this exposure to the start of the later one, divided by _REFERENCE_S.
-    The electrons below which light is neglected are proportional to it.
+    The limits of neglected light are multiplied by `fraction`.
     """
-    light = visible_spectra(aim, replace(rows, bodies=solar_system.empty_population), scene, seed)
+    light = visible_spectra(aim, rows, scene, seed)
     assert light.dispersed is not None
     assert light.psf is not None
-    min_electrons = _MIN_ELECTRONS * _COLUMN_FRACTION * age_factor
+    min_electrons = fraction * _MIN_RATE * _COLUMN_FRACTION * aim.exposure.exposure_time_s
     # The limits `faint` and `edge` are fractions of the pixel noise. Here they are in electrons, because 1 electron is
     # passed to `draw` as the noise.
     settings = replace(light.dispersed.settings, faint=min_electrons, edge=_EDGE_FRACTION * min_electrons)
@@ -310,23 +315,24 @@ def _draw_spectra(aim: Aim, rows: Rows, scene: Scene, age_factor: float, seed: i
     return dispersing.draw(light.sources, dispersed, light.psf, (aim.detector.ny, aim.detector.nx), 1.0)
 
 
-def _draw_sources(aim: Aim, rows: Rows, scene: Scene, age_factor: float) -> Frame:
-    detector, rows = aim.detector, visible_sources.rows_at_exposure(rows, aim, scene.mission)
-    column = f"f_nu_{aim.exposure.band}"
-    pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
-    galaxies, stars = (visible_sources.row_fluxes(*pair, column) * aim.electrons_per_microjansky for pair in pairs)
-    if not aim.sees_sky or not len(galaxies) + len(stars):
-        return np.zeros((detector.ny, detector.nx))
-    noise = _NEGLECTED_ELECTRONS * age_factor
+def _draw_sources(aim: Aim, rows: Rows, scene: Scene, seed: int, fraction: float) -> tuple[Frame, Scene]:
+    """Return the expected electrons [ny, nx] of sources in a direct image, and the scene with its bright sources.
+
+    The limits of neglected light are multiplied by `fraction`.
+    """
+    detector = aim.detector
+    if not aim.sees_sky:
+        return np.zeros((detector.ny, detector.nx)), scene
     # Two wavelengths in the passband at which the PSF is computed are enough. With one wavelength, the brightest pixels
     # would have an error of 2 %, and their persistence one of 1.5 electrons. The number of positions on the detector at
     # which the PSF is computed is not reduced: with one position, the errors would be 5 % and 3 electrons.
     settings = replace(settings_for(scene.accuracy), colours=2)
-    brightest = max(galaxies.max(initial=0.0), stars.max(initial=0.0))
-    psf = _simplify_psf(visible_sources.exposure_psf(aim, scene, settings), brightest)
-    sources, sizes = visible_sources.select_sources(rows, (galaxies, stars), aim, psf, noise, settings)
-    neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
-    return stamps.draw(sources, sizes, psf, detector.nx, detector.ny, neglected=neglected)
+    psf = visible_sources.exposure_psf(aim, scene, settings)
+    light = visible_light(aim, rows, scene, seed, psf, fraction * _NEGLECTED_RATE * aim.exposure.exposure_time_s)
+    assert light.psf is not None
+    psf = _simplify_psf(light.psf, float(light.sources.electrons.max(initial=0.0)))
+    frame = stamps.draw(light.sources, light.sizes, psf, detector.nx, detector.ny, neglected=light.neglected)
+    return frame, light.scene
 
 
 def _simplify_psf(psf: Psf, brightest: float) -> Psf:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.libraries.templates import Library
 from truesky.render.camera.detectors import Detector
-from truesky.render.channels.aim import Aim
 from truesky.render.sources.disc_structure import DiscStructure
 from truesky.render.sources.galaxy_stamps import GalaxyStamps
 from truesky.render.sources.solar_system import Population
@@ -84,19 +83,14 @@ class NeighbourDetector:
 
 @dataclass(frozen=True, slots=True)
 class PreviousExposure:
-    """Earlier exposure of the same detector, with its bright sources (`rows`), which leave persistence.
+    """Earlier exposure of the same detector, whose charge leaves persistence.
 
-    `mission` is the mission database (parameters of telescopes and cameras) for this exposure. None means the mission
-    database of the later exposure.
+    `charge` is a function without arguments that returns the expected electrons, float32[ny, nx], of this exposure. It
+    draws them when it is called, unless they are in memory.
     """
 
-    aim: Aim
-    rows: Rows
-    mission: MissionConfiguration | None = None
-
-    @property
-    def exposure(self) -> ExposureRow:
-        return self.aim.exposure
+    exposure: ExposureRow
+    charge: Callable[[], Float32]
 
 
 @dataclass(frozen=True, slots=True)

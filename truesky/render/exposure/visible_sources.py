@@ -156,7 +156,9 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
     )
 
 
-def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int, psf: Psf | None = None) -> Light:
+def visible_light(
+    aim: Aim, rows: Rows, scene: Scene, seed: int, psf: Psf | None = None, noise: float | None = None
+) -> Light:
     """Select all sources with light on a detector in a direct image, and choose the PSF and the stamp sizes.
 
     Parameters
@@ -171,6 +173,9 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int, psf: Psf | None
         Seed of the request, from which moving bodies are drawn.
     psf : Psf, optional
         PSF of the detector, if `exposure_psf` has computed it before.
+    noise : float, optional
+        Electrons rms per pixel, compared with which small light is neglected. By default the noise of a pixel in
+        `scene`.
 
     Returns
     -------
@@ -185,14 +190,16 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int, psf: Psf | None
     galaxies, stars = (
         row_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs
     )
-    settings, noise = settings_for(scene.accuracy), scene.pixel_noise
+    settings, noise = settings_for(scene.accuracy), scene.pixel_noise if noise is None else noise
     psf = psf or exposure_psf(aim, scene, settings)
     if psf.planes is not None:
         psf = replace(psf, planes=replace(psf.planes, origin=(aim.drawn.column, aim.drawn.row)))
     sources, sizes = select_sources(rows, (galaxies, stars), aim, psf, noise, settings)
     moving_lights = Lights()
     if aim.channel.draws_moving_bodies:
-        sources, sizes, moving_lights = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
+        sources, sizes, moving_lights = _with_moving(
+            (sources, sizes), aim, rows, scene.mission, psf, (noise, settings), seed
+        )
     if aim.channel.has_scattered_light:
         catalogue_lights = bright_lights.catalogue_lights((rows.galaxies, galaxies), (rows.stars, stars), aim)
         scene = replace(scene, lights=catalogue_lights.concatenate(moving_lights))
@@ -486,23 +493,29 @@ def _arcs(
 
 
 def _with_moving(
-    fixed: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
+    fixed: tuple[Sources, Int],
+    aim: Aim,
+    rows: Rows,
+    mission: MissionConfiguration,
+    psf: Psf,
+    noise_and_settings: tuple[float, Settings],
+    seed: int,
 ) -> tuple[Sources, Int, Lights]:
     """Add the bodies of the Solar System to the sources at rest `fixed` (sources, sizes of stamps).
+
+    `noise_and_settings` are the noise of a pixel, electrons rms, and the limits for neglected light.
 
     Returns the sources, with moving bodies at the end, since they have the largest identifiers; the sizes of their
     stamps in pixels; and bright bodies on and around the detector, which cause scattered light.
     """
-    (sources, sizes), drawn = fixed, aim.drawn
+    (sources, sizes), drawn, (noise, settings) = fixed, aim.drawn, noise_and_settings
     reach = (aim.half_diagonal + stamp_sizes.reach(aim.detector.pixel_scale)) / 3600.0
-    bodies = solar_system.trailed_sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    bodies = solar_system.trailed_sources(aim, mission, seed, reach, sources.shapes, rows.bodies)
     bodies = replace(bodies, column=bodies.column - drawn.column, row=bodies.row - drawn.row)
     length = stamp_sizes.piece_length(bodies.trail_length)
-    body_sizes = stamp_sizes.stamp_sizes(
-        bodies.electrons, bodies.shape, bodies.shapes, psf, scene.pixel_noise, settings, length
-    )
+    body_sizes = stamp_sizes.stamp_sizes(bodies.electrons, bodies.shape, bodies.shapes, psf, noise, settings, length)
     body_reach = stamp_sizes.visible_sides(
-        bodies.electrons, body_sizes, bodies.shape, None, psf, scene.pixel_noise, bodies.trail_length
+        bodies.electrons, body_sizes, bodies.shape, None, psf, noise, bodies.trail_length
     )
     on_detector = selection.overlaps_frame(bodies.column, bodies.row, body_reach, drawn.nx, drawn.ny) & (
         bodies.electrons > 0

@@ -133,7 +133,7 @@ def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> floa
 def add_persistence_cost(
     rows: pa.Table, exposures: pa.Table, candidates: Iterable[Exposure], mission: MissionConfiguration
 ) -> pa.Table:
-    """Add to estimated CPU times the time needed to draw the earlier exposures that leave persistence in an image.
+    """Add to estimated CPU times the time needed for earlier exposures that leave persistence in an image.
 
     Parameters
     ----------
@@ -154,27 +154,33 @@ def add_persistence_cost(
 
     Notes
     -----
-    Each earlier exposure of a camera is counted for all its detectors, even if it was requested only for some.
+    A worker that renders a detector in order of time draws the charge map of each exposure once. This time is counted
+    for the first later exposure. A shorter time is counted for each pair of an exposure and an earlier one, for the
+    charge that is released. Each earlier exposure of a camera is counted for all its detectors, even if it was
+    requested only for some.
     """
     if not (cameras := _cameras_with_persistence(exposures)):
         return rows
-    redraw_cost: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
+    redraw_us: dict[str, dict[float, int]] = {camera: {} for camera in cameras}
     for candidate in candidates:
-        channel = registry.CHANNELS[candidate.channel]
-        # Store the CPU times by date, so that repetitions of an exposure (same camera and date) count only once.
-        if candidate.camera in cameras and channel.sees_sky(candidate.image_type):
-            redraw_cost[candidate.camera][candidate.mjd] = channel.cost.redraw_s
+        if candidate.camera in cameras:
+            channel = registry.CHANNELS[candidate.channel]
+            # Store the CPU times by date, so that repetitions of an exposure (same camera and date) count only once.
+            redraw_us[candidate.camera][candidate.mjd] = round(
+                1e6 * channel.cost.redraw_s * channel.sees_sky(candidate.image_type)
+            )
     extra_seconds = {}
-    # Sum integer microseconds: the rounding of sums of floats would depend on how exposures are divided into
-    # partitions.
-    for camera, cost_by_mjd in redraw_cost.items():
+    for camera, us_by_mjd in redraw_us.items():
         days = persistence.window_days(camera, mission)
-        start_mjds = np.array(sorted(cost_by_mjd))
-        total = np.cumsum([0, *(round(1e6 * cost_by_mjd[mjd]) for mjd in start_mjds.tolist())])
+        start_mjds = np.array(sorted(us_by_mjd))
         for row in exposures.select(["exposure_id", "camera", "channel", "mjd"]).to_pylist():
-            if row["camera"] == camera and registry.CHANNELS[row["channel"]].persistence_effect is not None:
-                first, last = np.searchsorted(start_mjds, (row["mjd"] - days, row["mjd"]))
-                extra_seconds[row["exposure_id"]] = 1e-6 * float(total[last] - total[first])
+            cost, effect = registry.CHANNELS[row["channel"]].cost, registry.CHANNELS[row["channel"]].persistence_effect
+            if row["camera"] == camera and effect is not None:
+                first, last = map(int, np.searchsorted(start_mjds, (row["mjd"] - days, row["mjd"])))
+                # Sum integer microseconds: the rounding of sums of floats would depend on how exposures are divided
+                # into partitions. The maps of exposures before the last one have been drawn for that one.
+                drawing_us = us_by_mjd[float(start_mjds[last - 1])] if last > first else 0
+                extra_seconds[row["exposure_id"]] = 1e-6 * (drawing_us + (last - first) * round(1e6 * cost.release_s))
     task_seconds = [extra_seconds.get(number, 0.0) for number in rows["exposure_id"].to_pylist()]
     column = rows.schema.get_field_index("seconds")
     seconds = pa.array(rows["seconds"].to_numpy() + np.array(task_seconds), rows.schema.field(column).type)

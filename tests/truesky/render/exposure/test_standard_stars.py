@@ -94,11 +94,13 @@ def test_other_images_have_none_and_other_targets_are_refused():
 def test_they_leave_persistence():
     """Where they were, with no star of the catalogue about."""
     row = exposed("Vega", mjd=infrared.MJD - 134 / 86400, exposure_id=9)
-    before = PreviousExposure(Aim.from_exposure(fields.exposure(**row), DETECTOR), Rows(*tables(row)))
+    aim, variant = Aim.from_exposure(fields.exposure(**row), DETECTOR), Variant(MISSION, SURVEY, {})
+    rows = Rows(*tables(row))
+    before = PreviousExposure(aim.exposure, lambda: persistence.draw_charge_map(aim, rows, variant, infrared.SEED))
     now = Aim.from_exposure(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, found, *_: infrared.psf_of(d, "euclid_y"))
-        left = persistence.total_charge(now, (before,), Variant(MISSION, SURVEY, {}), infrared.SEED)
+        left = persistence.total_charge(now, (before,), variant, infrared.SEED)
     x, y = np.rint(PLACES).astype(int).T
     assert (left[y, x] > 20.0).all()
     assert np.median(left) < 1.5

@@ -180,9 +180,12 @@ def test_the_forecast_of_a_dry_run_as_json(tmp_path, capsys):
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
     own = registry.CHANNELS[channel]
-    assert min(getattr(own.cost, name) for name in own.cost.__slots__ if name not in ("redraw_s", "lamp_s")) > 0.0
+    assert (
+        min(getattr(own.cost, name) for name in own.cost.__slots__ if name not in ("redraw_s", "release_s", "lamp_s"))
+        > 0.0
+    )
     assert (own.cost.lamp_s > 0.0) == bool(own.ramp_name)
-    assert (own.cost.redraw_s > 0.0) == (own.persistence_effect is not None)
+    assert (own.cost.redraw_s > own.cost.release_s > 0.0) == (own.persistence_effect is not None)
 
 
 def test_every_channel_can_be_planned():

@@ -54,8 +54,8 @@ def test_unplanned_detectors_are_refused(plan, wanted, said):
         places(plan, **wanted)
 
 
-def test_redrawing_for_persistence_adds_time(tmp_path, monkeypatch):
-    """NISP redraws images of the sky in the persistence window, but not frames without sky; VIS redraws nothing."""
+def test_persistence_adds_time(tmp_path, monkeypatch):
+    """NISP draws the map of the last image of the sky, and adds all those in the persistence window; VIS has none."""
     blocks = [
         {"channels": ["VIS", "NISP-P", "NISP-S"], "fields": 1, "mjd": 60400.0, "short": False, "flat": False},
         {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
@@ -66,19 +66,24 @@ def test_redrawing_for_persistence_adds_time(tmp_path, monkeypatch):
         _, alone = planned(tmp_path, observation=blocks)
     without = {(row["exposure_id"], row["detector"]): row["seconds"] for row in alone.to_pylist()}
     every, days = exposures.to_pylist(), resolve().value("nisp.persistence.window", "d")
-    added = {}
+    added, drawn = {}, 0.0
     for row in rows.to_pylist():
         (own,) = (one for one in every if one["exposure_id"] == row["exposure_id"])
         before = [
-            registry.CHANNELS[one["channel"]].cost.redraw_s
-            for one in every
-            if own["camera"] == one["camera"] == "nisp"
-            and own["mjd"] - days <= one["mjd"] < own["mjd"]
-            and one["image_type"] == "science"
-        ]
+            one for one in every
+            if own["camera"] == one["camera"] == "nisp" and own["mjd"] - days <= one["mjd"] < own["mjd"]
+        ]  # fmt: skip
+        last = max(before, key=lambda one: one["mjd"], default={"image_type": "none"})
+        drawing = registry.CHANNELS[last["channel"]].cost.redraw_s if last["image_type"] == "science" else 0.0
         more = row["seconds"] - without[row["exposure_id"], row["detector"]]
-        assert more == pytest.approx(sum(before), abs=1e-6)
+        cost = registry.CHANNELS[own["channel"]].cost
+        assert more == pytest.approx(drawing + len(before) * cost.release_s, abs=1e-6)
         added[own["channel"], row["exposure_id"]] = more
+        drawn += drawing
     assert len({round(more, 3) for more in added.values()}) > 10
     assert max(more for (channel, _), more in added.items() if channel == "VIS") == 0.0
     assert rows["seconds"].to_pylist() == sorted(rows["seconds"].to_pylist(), reverse=True)
+    # In a sequence, the map of an image is drawn once per detector.
+    science = [one for one in every if one["camera"] == "nisp" and one["image_type"] == "science"]
+    once = sum(registry.CHANNELS[one["channel"]].cost.redraw_s for one in science)
+    assert 0.8 * once < drawn / (len(rows) / len(every)) <= once

@@ -86,7 +86,7 @@ class PersistenceModel:
 
     def released_charge(
         self,
-        charge: Frame,
+        charge: Frame | Float32,
         delay: float,
         seconds: float,
         earlier_seconds: float | None = None,
@@ -121,7 +121,7 @@ class PersistenceModel:
         -----
         The effect of an exposure length other than the nominal one is computed with the power law of the median pixel.
         """
-        filling = np.clip(charge, 0.0, self.full_well)
+        filling = np.clip(np.asarray(charge, dtype=float), 0.0, self.full_well)
         scale = self.time_scaling(delay, seconds, earlier_seconds)
         if variation is not None:
             filling = np.ascontiguousarray(np.broadcast_to(filling, variation.p2.shape), dtype=float)
