@@ -6,9 +6,9 @@ tasks of a list in their order. Results never depend on the division: a task mak
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 
 from lake_schema.store.plan import Task
 
@@ -54,9 +54,9 @@ def divide(tasks: Sequence[Task], link_of: LinkFunction | None, workers: int) ->
     Returns
     -------
     list of list of Task
-        Without chains, one list per task, in the given order. Otherwise a list contains a chain, or consecutive tasks
-        of a chain that would take longer than a quarter of the time that all tasks take on all workers. Such a chain is
-        cut into lists of about equal times. The lists with the longest times are first.
+        Without chains, one list per task, in the given order. Otherwise a list has a chain, or consecutive tasks of a
+        chain that is cut, so that no list of several tasks takes longer than a quarter of the time that all tasks take
+        on all workers. The lists with the longest times are first.
     """
     if link_of is None:
         return [[task] for task in tasks]
@@ -76,12 +76,13 @@ def divide(tasks: Sequence[Task], link_of: LinkFunction | None, workers: int) ->
 
 
 def _cut(chain: Sequence[tuple[Link, Task]], longest: float) -> list[list[tuple[Link, Task]]]:
-    """Cut a chain into lists of about equal estimated times, of which most take at most `longest` seconds."""
-    ends = list(accumulate(link.seconds for link, _ in chain))
-    count = min(len(chain), max(1, round(ends[-1] / longest + 0.5))) if longest > 0.0 else 1
-    pieces: dict[int, list[tuple[Link, Task]]] = {}
-    for pair, end in zip(chain, ends, strict=True):
-        # The middle of the task's time selects the list.
-        middle = end - 0.5 * pair[0].seconds
-        pieces.setdefault(min(int(count * middle / ends[-1]), count - 1), []).append(pair)
-    return list(pieces.values())
+    """Cut a chain into lists that take at most `longest` seconds each, or have one task."""
+    pieces: list[list[tuple[Link, Task]]] = []
+    used = math.inf
+    for link, task in chain:
+        if used + link.seconds > longest:
+            pieces.append([])
+            used = 0.0
+        pieces[-1].append((link, task))
+        used += link.seconds
+    return pieces

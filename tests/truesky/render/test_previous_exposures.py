@@ -42,14 +42,14 @@ def test_a_map_is_drawn_once():
 
 
 def test_the_earliest_maps_are_removed_first():
-    """Exposures in order of time, each with up to three earlier ones: each map is drawn once in memory for three."""
-    maps = Drawings(3)
+    """Exposures in order of time, each with three earlier ones: each map is drawn once, even in memory for two."""
+    maps = Drawings(2)
     for now in range(8):
         for number in range(max(now - 3, 0), now):
             maps.get(number)
     assert maps.drawn == [(number, "DET22") for number in range(7)]
-    # In memory for two, only the earliest of the three is drawn each time.
-    maps = Drawings(2)
+    # In memory for one, the latest map is kept, and two are drawn each time.
+    maps = Drawings(1)
     for now in range(3, 8):
         for number in range(now - 3, now):
             maps.get(number)

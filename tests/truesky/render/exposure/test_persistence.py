@@ -100,7 +100,7 @@ def test_persistence_of_faint_sources_is_negligible():
     rng = np.random.default_rng(1)
     count = 150
     x, y = rng.uniform(0, 96, (2, count))
-    mags = rng.uniform(15.0, 24.0, count)
+    mags = rng.uniform(15.0, 26.0, count)
     for before in (134.0, 1100.0):
         row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND)
         whole = infrared.rendered(mags, x, y, mjd=row["mjd"])
@@ -117,7 +117,7 @@ def test_persistence_of_faint_sources_is_negligible():
 def dither(count, draw):
     """Return `count` exposures, 134 s apart, of 150 stars that move by two pixels from one to the next."""
     rng = np.random.default_rng(4)
-    x, y, mags = rng.uniform(0, 70, 150), rng.uniform(0, 96, 150), rng.uniform(15.0, 24.0, 150)
+    x, y, mags = rng.uniform(0, 70, 150), rng.uniform(0, 96, 150), rng.uniform(15.0, 26.0, 150)
     return [draw(134.0 * (n + 1), mags, x + 2.0 * n, y) for n in range(count)]
 
 
@@ -210,7 +210,7 @@ def spectrum_before(seconds, mags, x, y):
 
 @pytest.mark.parametrize("before", [700.0, pytest.param(3000.0, marks=pytest.mark.nightly)])
 def test_traces_leave_what_whole_spectra_leave(before):
-    """All orders of all sources against those of the bright ones alone: 1 e- in any pixel, of 30 and more."""
+    """All orders of all sources against those of the bright ones alone: 1.2 e- in any pixel, of 30 and more."""
     rng = np.random.default_rng(2)
     count = 250
     x, y, mags = rng.uniform(-1200.0, 1800.0, count), rng.uniform(0, 96, count), rng.uniform(12.0, 23.0, count)
@@ -221,7 +221,7 @@ def test_traces_leave_what_whole_spectra_leave(before):
     even = TRAPS.released_charge(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME, spectroscopic.TIME)[0]
     print("left at most", expected.max() - even, "missed at most", np.abs(found - expected).max())
     assert expected.max() > even + 5.0
-    assert np.abs(found - expected).max() < 1.0
+    assert np.abs(found - expected).max() < 1.2
     np.testing.assert_array_equal(
         found, persistence.total_charge(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
     )
