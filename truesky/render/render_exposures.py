@@ -99,9 +99,21 @@ def _dispersed_exposures(exposures: pa.Table) -> set[int]:
 def render_task(lake: Path, facts: Json, charge_maps: ChargeMaps | None = None) -> Output:
     """Render one detector of an exposure.
 
-    `facts` are the recorded inputs of the image (see `detector_inputs.load_inputs`). `charge_maps` keeps the charge
-    maps of earlier exposures for other tasks of the same plan. The result has the rows of the table `products`, and the
-    functions that write the files: image, truth maps, tables of drawn sources and PSF.
+    Parameters
+    ----------
+    lake : Path
+        Lake (folder of stored tables).
+    facts : dict
+        Recorded inputs of the image (see `detector_inputs.load_inputs`).
+    charge_maps : ChargeMaps, optional
+        Memory in which the charge maps of earlier exposures are kept for other tasks of the same plan. By default none
+        are kept.
+
+    Returns
+    -------
+    Output
+        Rows of the table `products`, and the functions that write the files: image, truth maps, tables of drawn sources
+        and PSF.
     """
     request = facts["request"]
     with memory_reuse.retain_freed_memory():

@@ -159,3 +159,15 @@ def is_alive(spark: SparkSession) -> bool:
         return java_context is not None and not java_context.sc().isStopped()
     except (Py4JError, OSError, LookupError):
         return False
+
+
+def max_attempts(spark: SparkSession) -> int:
+    """Return the largest number of times that Spark runs a failing task.
+
+    It is F for the master local[N,F], 1 for local[N], and otherwise the setting spark.task.maxFailures (default 4).
+    """
+    master = str(spark.sparkContext.master)
+    local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
+    if local:
+        return int(local[1] or 1)
+    return int(spark.conf.get("spark.task.maxFailures", "4") or 4)

@@ -485,7 +485,9 @@ def _collect(
     tasks: Sequence[Task],
     link_of: LinkFunction | None = None,
 ) -> list[Json]:
-    max_attempts = _max_attempts(spark)
+    from truesky.running.session import max_attempts
+
+    attempts = max_attempts(spark)
 
     def run(partition: Iterable[list[Task]]) -> Iterator[Json]:
         from pyspark import TaskContext
@@ -493,7 +495,7 @@ def _collect(
         for task in chain.from_iterable(partition):
             result = function(task)
             context = TaskContext.get()
-            last = context is None or context.attemptNumber() >= max_attempts - 1
+            last = context is None or context.attemptNumber() >= attempts - 1
             if "error" in result and not result.get("final") and not last:
                 raise RuntimeError(result["error"])
             attempt = 1 if context is None else context.attemptNumber() + 1
@@ -519,15 +521,3 @@ def _freeze_garbage() -> None:
     """
     gc.collect()
     gc.freeze()
-
-
-def _max_attempts(spark: SparkSession) -> int:
-    """Return the largest number of times that Spark runs a failing task.
-
-    It is F for the master local[N,F], 1 for local[N], and otherwise the setting spark.task.maxFailures (default 4).
-    """
-    master = str(spark.sparkContext.master)
-    local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
-    if local:
-        return int(local[1] or 1)
-    return int(spark.conf.get("spark.task.maxFailures", "4") or 4)

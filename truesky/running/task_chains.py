@@ -15,6 +15,9 @@ from lake_schema.store.plan import Task
 # Number of lists per worker process into which the tasks are at least divided, if there are enough tasks, so that all
 # workers end at about the same time.
 _LISTS_PER_WORKER = 4
+# Longest estimated time of a list of several tasks, s. It limits what a lost worker leaves unfinished, and divides the
+# tasks for a cluster whose workers start after the driver.
+_LONGEST_S = 1800.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +58,8 @@ def divide(tasks: Sequence[Task], link_of: LinkFunction | None, workers: int) ->
     -------
     list of list of Task
         Without chains, one list per task, in the given order. Otherwise a list has a chain, or consecutive tasks of a
-        chain that is cut, so that no list of several tasks takes longer than a quarter of the time that all tasks take
-        on all workers. The lists with the longest times are first.
+        chain that is cut, so that no list of several tasks takes longer than half an hour, or than a quarter of the
+        time that all tasks take on all workers. The lists with the longest times are first.
     """
     if link_of is None:
         return [[task] for task in tasks]
@@ -65,7 +68,7 @@ def divide(tasks: Sequence[Task], link_of: LinkFunction | None, workers: int) ->
         link = link_of(task)
         chains.setdefault(link.chain, []).append((link, task))
     total = sum(link.seconds for chain in chains.values() for link, _ in chain)
-    longest = total / (_LISTS_PER_WORKER * max(workers, 1))
+    longest = min(total / (_LISTS_PER_WORKER * max(workers, 1)), _LONGEST_S)
     pieces = [
         piece
         for chain in chains.values()

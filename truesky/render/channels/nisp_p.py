@@ -94,8 +94,10 @@ def _psf(
 # Costs of an image (CPU seconds, memory) on the reference machine. The times were measured in runs of the requests
 # nisp_spectra and slitless with two workers (see nisp_s.py): 3.4 s at draft accuracy without earlier images, and at
 # survey accuracy 5.4 to 5.9 s after one NISP-S image, 10.4 to 11.8 s after four of them and nine to eleven NISP-P
-# images. redraw_s is the cost to draw an earlier image again, for its persistence. A single process that has drawn
-# before needs 1.5 s for 1.2e4 sources and 1.2 GB.
+# images, which were then drawn again for each image. A single process that has drawn before needs 1.5 s for 1.2e4
+# sources and 1.2 GB. redraw_s is the cost to draw the charge map of an image, once for all later images, and release_s
+# the cost of the charge that one earlier image releases. An AMD EPYC with other load took 0.92 to 1.07 s and 0.038 s
+# (2.2 to 2.6 s for the map of a NISP-S image), when it took 17.0 to 20.2 s for an image with a forecast of 12.9 s.
 COST = Cost(
     frame_s=0.05,
     sky_s=2.6,
@@ -105,7 +107,7 @@ COST = Cost(
     bytes_per_pixel=120.0,
     sky_bytes_per_pixel=160.0,
     file_bytes_per_pixel=3.0,
-    redraw_s=0.36,
+    redraw_s=0.7,
     release_s=0.03,
     lamp_s=1.2,
 )

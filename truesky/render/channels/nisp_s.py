@@ -153,7 +153,7 @@ def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, pos
 # 25 s. Both contained 1.6e4 spectra: three times the 5.6e3 sources on the detector with H < 24, because the spectra of
 # sources up to 10 arcmin around it fall on it. The spectra of fainter sources are not noticeable. With eight truth maps
 # (images of the true signals), Spark tasks use 1.6 to 2.3 GB; darks and flats with four maps use 1.4 to 1.8 GB.
-# nisp_p.py explains redraw_s, the cost to draw an earlier image for its persistence.
+# nisp_p.py explains redraw_s and release_s, the costs of the persistence of an earlier image.
 COST = Cost(
     frame_s=0.05,
     sky_s=0.5,
@@ -163,7 +163,7 @@ COST = Cost(
     bytes_per_pixel=190.0,
     sky_bytes_per_pixel=240.0,
     file_bytes_per_pixel=3.0,
-    redraw_s=0.8,
+    redraw_s=1.6,
     release_s=0.03,
     lamp_s=6.5,
     most_sources=5600.0,

@@ -38,6 +38,8 @@ _STARS_S = 2e-8
 # Measured in runs of the demo: workers needed 2.13 and 1.67 GB for a VIS and an LSST detector, new processes 1.68 and
 # 1.24 GB.
 _KEPT_GB = 0.5
+# Memory in GB of the charge maps that a worker keeps for persistence: those of 18 exposures in two hours.
+_CHARGE_MAPS_GB = 0.3
 # Bytes per pixel that an image with 32 bits takes in addition to one with 16 bits.
 _WIDE_BYTES = 2.0
 
@@ -165,6 +167,7 @@ def cost_model(
     written_bytes = registry.CHANNELS[channel].with_readout(files.readout).readout.file_bytes_per_pixel
     effect_names = [effect.name for effect in applied]
     has_lamp = calibration_lamp.EFFECT.name in effect_names
+    has_persistence = registry.CHANNELS[channel].persistence_effect is not None
     map_seconds = sum(
         cost for name in maps for effect_name, cost in _FILLED_S.get(name, {}).items() if effect_name in effect_names
     )
@@ -176,7 +179,7 @@ def cost_model(
         + map_seconds,
         galaxy_s=sees_sky * channel_cost.galaxy_s * accuracy_factor,
         star_s=sees_sky * channel_cost.star_s * accuracy_factor * (1 + ("stars" in maps)),
-        start_gb=channel_cost.base_gb + _KEPT_GB,
+        start_gb=channel_cost.base_gb + _KEPT_GB + _CHARGE_MAPS_GB * has_persistence,
         pixel_gb=1e-9 * ((channel_cost.sky_bytes_per_pixel if sees_sky else channel_cost.bytes_per_pixel) + map_bytes),
         start_bytes=_HEADER_BYTES * (images + len(maps)),
         pixel_bytes=map_bytes + images * (written_bytes or 0),
