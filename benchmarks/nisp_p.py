@@ -126,10 +126,10 @@ def measure_sequence(folder: Path, root: Path, sequence: Request) -> dict[str, f
     charge_maps = ChargeMaps(DEFAULT_LIMIT_MB)
     tasks = {facts["exposure_id"]: facts for facts in plan_tasks(root, with_all_effects(sequence))}
     previous, last = (tasks[number] for number in sorted(tasks)[-2:])
-    alone, _ = measure_render(root, last, folder)
+    single_s, _ = measure_render(root, last, folder)
     measure_render(root, previous, folder, charge_maps)
     seconds, peak = measure_render(root, last, folder, charge_maps)
-    return {"after_15_alone_s": alone, "after_15_s": seconds, "after_15_gb": peak}
+    return {"after_15_alone_s": single_s, "after_15_s": seconds, "after_15_gb": peak}
 
 
 def with_all_effects(request: Request) -> Request:

@@ -174,7 +174,7 @@ class RenderInputs:
         """Return the function that gives the place of a task of the table `products` in a chain.
 
         A chain contains the exposures of a detector in order of time, as long as each one has persistence of earlier
-        ones. The tasks are those of `products`, and the chains those of `selection.tasks`.
+        ones. The tasks of `products` must be among `selection.tasks`.
         """
         rows = {row.exposure_id: row for row in map(ExposureRow.from_row, self.exposures.to_pylist())}
         places: dict[tuple[int, str], tuple[int, float]] = {}

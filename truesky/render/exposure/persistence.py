@@ -50,7 +50,9 @@ _TIME_TOLERANCE_S = 1e-3
 # persistence.
 _STARLESS = ("bias", "dark", "flat", "charge_injection", "persistence")
 # Smallest number of electrons with which a point source in an earlier exposure is drawn, per second of exposure time.
-# The limit is proportional to the exposure time, because the next exposure cannot begin sooner than that.
+# The limit is proportional to the exposure time, because the next exposure cannot begin sooner than that. A NISP-P
+# image after 15 exposures (four dithers of NISP-S and three bands) lacks at most 0.84 electrons in a pixel, compared
+# with limits that are twenty times lower.
 _MIN_RATE = 2.3
 # Electrons per pixel and second of exposure time that replace the noise of a pixel when sources of an earlier exposure
 # are drawn: light that is small compared with them is neglected.
@@ -280,6 +282,9 @@ def draw_charge_map(aim: Aim, rows: Rows, variant: Variant, seed: int, fraction:
 
     Notes
     -----
+    Persistence that is computed from these maps lacks less than 1 electron in a pixel after 15 exposures, compared with
+    maps whose limits of neglected light are twenty times lower.
+
     In a ramp, the exposure time begins with the first group of reads. The parameters of traps refer to the electrons
     collected since then. As an approximation, charge collected before this group is not counted, although it also fills
     traps.

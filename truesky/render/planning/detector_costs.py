@@ -38,7 +38,7 @@ _STARS_S = 2e-8
 # Measured in runs of the demo: workers needed 2.13 and 1.67 GB for a VIS and an LSST detector, new processes 1.68 and
 # 1.24 GB.
 _KEPT_GB = 0.5
-# Memory in GB of the charge maps that a worker keeps for persistence: those of 18 exposures in two hours.
+# Memory in GB of the charge maps of 18 exposures in two hours, which a worker keeps for persistence.
 _CHARGE_MAPS_GB = 0.3
 # Bytes per pixel that an image with 32 bits takes in addition to one with 16 bits.
 _WIDE_BYTES = 2.0
