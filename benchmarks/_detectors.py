@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Json
@@ -22,10 +22,13 @@ from truesky.fluxes import compute_fluxes
 from truesky.numerics import cache
 from truesky.render import plan_exposures, render_exposures
 from truesky.render.effects.effect import Effect
-from truesky.render.previous_exposures import ChargeMaps
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
+
+if TYPE_CHECKING:
+    # `benchmarks.compare` runs this module with earlier versions of the package, some of which lack the class.
+    from truesky.render.previous_exposures import ChargeMaps
 
 ROOT = Path(__file__).resolve().parents[1]
 # Radius (deg) around the centre of an exposure of Euclid that contains all sources on its detectors.
@@ -67,7 +70,7 @@ def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
     request : Request
         Request with at least one exposure.
     number : int, optional
-        Index of the detector image in the plan; negative values count from the end.
+        Index of the detector image in order of exposures; negative values count from the end.
 
     Returns
     -------
@@ -78,14 +81,15 @@ def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
 
 
 def plan_tasks(root: Path, request: Request) -> list[Json]:
-    """Plan the exposures of a request, and return the descriptions of all rendering tasks, longest first.
+    """Plan the exposures of a request, and return the descriptions of all rendering tasks, in order of exposures.
 
     `root` is the folder of a lake with the catalogues and fluxes of the request.
     """
     for step in plan_exposures.steps(root, request):
         publish.make_version(root, step.plan, step.run_task)
     step = render_exposures.steps(root, request)[0]
-    return [{**step.plan.facts, **task.facts} for task in step.plan.tasks]
+    tasks = sorted(step.plan.tasks, key=lambda task: (task.facts["exposure_id"], task.facts["detector"]))
+    return [{**step.plan.facts, **task.facts} for task in tasks]
 
 
 def measure_render(root: Path, facts: Json, folder: Path, charge_maps: ChargeMaps | None = None) -> tuple[float, float]:
@@ -111,7 +115,8 @@ def measure_render(root: Path, facts: Json, folder: Path, charge_maps: ChargeMap
     """
     reset_peak_memory()
     started = time.process_time()
-    output = render_exposures.render_task(root, facts, charge_maps)
+    memory = {} if charge_maps is None else {"charge_maps": charge_maps}
+    output = render_exposures.render_task(root, facts, **memory)
     for path, write in output.files.items():
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)

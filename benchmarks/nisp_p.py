@@ -19,7 +19,6 @@ from benchmarks import _detectors as one_detector
 from benchmarks import report
 from benchmarks._detectors import FIELD_RADIUS, ROOT, measure_render, plan_detector, plan_tasks
 from truesky.render.channels import nisp_p
-from truesky.render.previous_exposures import DEFAULT_LIMIT_MB, ChargeMaps
 from truesky.request.accuracy import preset
 from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
@@ -123,9 +122,10 @@ def measure_sequence(folder: Path, root: Path, sequence: Request) -> dict[str, f
     dict of str to float
         `after_15_alone_s`, `after_15_s` and `after_15_gb`.
     """
+    from truesky.render.previous_exposures import DEFAULT_LIMIT_MB, ChargeMaps
+
     charge_maps = ChargeMaps(DEFAULT_LIMIT_MB)
-    tasks = {facts["exposure_id"]: facts for facts in plan_tasks(root, with_all_effects(sequence))}
-    previous, last = (tasks[number] for number in sorted(tasks)[-2:])
+    previous, last = plan_tasks(root, with_all_effects(sequence))[-2:]
     single_s, _ = measure_render(root, last, folder)
     measure_render(root, previous, folder, charge_maps)
     seconds, peak = measure_render(root, last, folder, charge_maps)
@@ -159,7 +159,7 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
         Measured values by name; a name ends with the unit of the value, such as `_s` or `_gb`.
     """
     three_exposures, sequence = (
-        _parse_text(folder, text) for text in (request_text(quick, exposures=3), sequence_text(quick))
+        parse_text(folder, text) for text in (request_text(quick, exposures=3), sequence_text(quick))
     )
     last_exposure = replace(three_exposures, pointings=three_exposures.pointings[-1:])
     root = one_detector.make_lake(folder, sequence)
@@ -180,7 +180,8 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
     return out | measure_sequence(folder, root, sequence)
 
 
-def _parse_text(folder: Path, text: str) -> Request:
+def parse_text(folder: Path, text: str) -> Request:
+    """Return the request of a TOML text, which is written to a file in a folder."""
     file = folder / "request.toml"
     file.write_text(text, encoding="utf-8")
     return parse(file)
