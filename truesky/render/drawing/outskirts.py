@@ -15,28 +15,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import scipy
 
-from lake_schema.arrays import Array, Float, Int
+from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from truesky.numerics import matrices
-from truesky.numerics.compiling import jit
 from truesky.render.drawing import psf_on_nodes
+from truesky.render.drawing.kernels import outer_light
 from truesky.render.drawing.kernels.frame import BULGE, BULGE_FORM, DISK, DISK_FORM, POWER
+from truesky.render.drawing.kernels.outer_light import STEP
 from truesky.render.psf.model import Psf
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import Forms, Shapes
 from truesky.render.sources.selection import FARTHEST
 
 # Measured CPU time of drawing the light outside the stamp of one galaxy that exceeds the largest stamp, s per pixel of
-# the detector (2.5 GHz, one core).
-FRAME_S = 6e-8
+# the detector (2.5 GHz, one core). An edge-on disc takes up to four times longer.
+FRAME_S = 8e-9
 # Measured CPU time of removing aliased light from the stamp of one galaxy that exceeds the largest stamp, s per pixel
 # of the stamp (2.5 GHz, one core).
-STAMP_S = 4e-7
+STAMP_S = 1e-7
 # Light of a large galaxy is noticeable in a pixel above this fraction of the rms noise of the pixel. The limit is lower
 # than the 10 % for effects of the detector, since the light extends smoothly over many pixels.
 _NOTICED = 1e-2
@@ -58,24 +58,22 @@ _RINGS = 64
 # of the ring (1 for the eight stamps next to the galaxy's stamp), times the largest deviation from uniform light in
 # electrons per pixel, is below this value.
 _UNEVEN = 0.05
+# Smallest spacing of the grid between whose nodes the light of pixels outside a stamp is interpolated, pixels.
+_FINEST_STEP = 2
 # Smallest spacing of the grid on which the light of a ring of periodic copies of a galaxy is computed, pixels.
 _FINEST = 4
 # Largest spacing of the grid on which the light of a ring of periodic copies of a galaxy is computed, as a fraction of
 # the side of the galaxy's stamp.
 _COARSEST = 1.0 / 16.0
-# Spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the width (minor
-# axis) that the galaxy's ellipse has at the distance of the ring.
+# Largest spacing of a grid on which the light of a galaxy is computed, as a fraction of the width (minor axis) that the
+# galaxy's ellipse has at the distance of the grid.
 _SPACING_FRACTION = 0.2
-# Largest spacing of the grid on which the light of a ring of periodic copies is computed, as a fraction of the smallest
-# apparent scale of the disc. Unlike the width of an ellipse, the thickness of an edge-on disc does not grow with the
+# Largest spacing of a grid on which the light of a galaxy is computed, as a fraction of the smallest apparent scale of
+# the disc. Unlike the width of an ellipse, the thickness of an edge-on disc does not grow with the
 # distance.
 _DISC_FRACTION = 0.25
 # Number of nodes along the major axis, and along the minor axis, of the table of an inclined disc's light.
 _NODES = 76
-# Spacing of the nodes in the table of an inclined disc's light. Nodes are equally spaced in t = arsinh(u), where u is
-# the distance from the middle along the major axis in scale lengths. Along the minor axis, the distance is first
-# divided by the factor w of `surface_disk`, about the axis ratio.
-_STEP = 1.0 / 16.0
 # Number of points along each line of sight through a galaxy's disc at which its light is summed up.
 _POINTS = 512
 # Largest distance from the major axis, in the plane of a galaxy's disc, up to which its light is integrated, in scale
@@ -86,10 +84,6 @@ _HEIGHTS = 20.0
 # Smallest value of a disc's light in its table (fraction of the flux per squared scale length). Smaller values are
 # replaced by it, because the table contains logarithms.
 _DARK = 1e-40
-# Light of a disc is neglected where an estimate of it is below this, electrons per pixel. The estimate is exp(-u) times
-# the electrons of the disc per squared scale length, where u is the distance along the major axis in scale lengths. It
-# is too large for a face-on disc, but about ten times too small far out along the major axis of an edge-on disc.
-_NEGLIGIBLE = 1e-4
 # Smallest axis ratio (minor / major) of any bulge or disc; some bulges have it.
 _THINNEST = 0.02
 # Number of directions from the middle of a galaxy over which its light outside a square is averaged.
@@ -154,7 +148,8 @@ def from_galaxy(
 
     Notes
     -----
-    The error next to the stamp is 1e-3 of the light there. For bulges thinner than 1 : 50 it is a few per cent along
+    The error next to the stamp is 1e-3 of the light there. Interpolation between the nodes of a grid adds at most about
+    1e-4 of the light plus 1e-4 electrons per pixel. For bulges thinner than 1 : 50 it is a few per cent along
     the major axis.
     """
     light = galaxy_shapes.real_space_profile(shape, form)[0].copy()
@@ -170,13 +165,15 @@ def from_galaxy(
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), max(map(abs, region)))
     cells = psf_on_nodes.change_by_psf(psf, weights, block)
-    first_x, first_y = (int(np.floor(start / block)) - 1 for start in (region[0], region[2]))
-    end_x, end_y = (int(np.ceil(end / block)) + 2 for end in (region[1], region[3]))
+    # Number of nodes before the region: cubic interpolation of its first pixels needs values farther out.
+    extra = 2 * _BLOCK // block + 1
+    first_x, first_y = (int(np.floor(start / block)) - extra for start in (region[0], region[2]))
+    end_x, end_y = (int(np.ceil(end / block)) + extra + 2 for end in (region[1], region[3]))
     # Nodes around the region from which the PSF moves light into it.
     margin = len(cells) // 2
     unblurred = np.zeros((end_y - first_y + 2 * margin, end_x - first_x + 2 * margin))
     x, y = float((margin - first_x) * block), float((margin - first_y) * block)
-    _sample(light, disk, wide, x, y, float(block), unblurred)
+    outer_light.sample(light, disk, wide, x, y, float(block), unblurred)
     blurred = psf_on_nodes.convolve_inside(unblurred, cells)
     return Outskirts(light, disk, wide, blurred, block, (first_x, first_y))
 
@@ -206,7 +203,7 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
     """
     cosine, sine = (float(f(np.radians(inclination))) for f in (np.cos, np.sin))
     wide = float(np.hypot(cosine, DISK_SCALE_HEIGHT))
-    along = np.sinh(_STEP * np.abs(np.arange(-1, _NODES - 1)))
+    along = np.sinh(STEP * np.abs(np.arange(-1, _NODES - 1)))
     u, v = along[:, None, None], wide * along[None, :, None]
     # First and last point of the part of each line of sight that lies inside the disc.
     thick = _HEIGHTS * DISK_SCALE_HEIGHT
@@ -248,18 +245,57 @@ def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
     x, y : float
         Position of the galaxy in the stamp, pixels.
     """
-    size = len(stamp)
-    x_first, y_first = (galaxy.block * node for node in galaxy.first)
-    aliased, blurred, pixels = (
-        distant_image_light(galaxy, size, x, y),
-        _spline(galaxy.blurred, galaxy.block),
-        np.arange(size),
-    )
-    for up in (-size, 0, size):
-        for right in (-size, 0, size):
-            if up or right:
-                aliased += blurred(pixels - y - up - y_first, pixels - x - right - x_first)
-    _remove_aliased(galaxy.light, galaxy.disk, galaxy.across, aliased, x, y, stamp)
+    size, half = len(stamp), 0.5 * len(stamp)
+    shifts = [(right * size, up * size) for up in (-1, 0, 1) for right in (-1, 0, 1) if up or right]
+    region = (-x, size - 1.0 - x, -y, size - 1.0 - y)
+    # The nearest copy is at least as far from the stamp as the galaxy is from the stamp's border.
+    nodes = _nodes(galaxy, np.array(shifts, float), region, half, (0.0, 0.0, 0.0, 0.0))
+    distant = distant_image_light(galaxy, size, x, y)
+    outer_light.subtract_copies(*_light_arguments(galaxy), *nodes, -x, -y, distant, stamp)
+
+
+def _light_arguments(galaxy: Outskirts) -> tuple[Float, Float, float, Float, int, tuple[int, int]]:
+    """Return the attributes of a galaxy that the compiled functions of `kernels.outer_light` take first."""
+    return galaxy.light, galaxy.disk, galaxy.across, galaxy.blurred, galaxy.block, galaxy.first
+
+
+def _nodes(
+    galaxy: Outskirts,
+    copies: Float,
+    region: tuple[float, float, float, float],
+    nearest: float,
+    hole: tuple[float, float, float, float],
+) -> tuple[Float, int, tuple[int, int], Float, Bool]:
+    """Evaluate the light of a galaxy at the nodes of a grid, between which the light of pixels is interpolated.
+
+    Parameters
+    ----------
+    galaxy : Outskirts
+        Light of the galaxy.
+    copies : float array, shape (m, 2)
+        Columns and rows of the galaxy or of its periodic copies, pixels from the middle of the galaxy.
+    region : (float, float, float, float)
+        First and last column, and first and last row, of the pixels, from the middle of the galaxy.
+    nearest : float
+        Smallest distance of a pixel from the middle of a copy, pixels. It limits the spacing of the nodes.
+    hole : (float, float, float, float)
+        Columns and rows like `region`, between which no light is needed. The pixels can be closer than `nearest` there.
+
+    Returns
+    -------
+    tuple
+        `copies`, spacing of the nodes, first column and row of the nodes, light at the nodes, and mask of the cells
+        whose pixels are evaluated directly; these are arguments of the functions of `kernels.outer_light`.
+    """
+    wide = _SPACING_FRACTION * slimness(galaxy.light, galaxy.across) * nearest
+    limit = min(wide, _DISC_FRACTION * _disc_scale(galaxy.light, galaxy.across), galaxy.block)
+    step = 2 ** int(np.log2(max(limit, _FINEST_STEP)))
+    first_x, first_y = (int(np.floor(start / step)) - 1 for start in (region[0], region[2]))
+    end_x, end_y = (int(np.floor(end / step)) + 3 for end in (region[1], region[3]))
+    nodes = np.empty((end_y - first_y, end_x - first_x))
+    direct = np.empty((nodes.shape[0] - 3, nodes.shape[1] - 3), bool)
+    outer_light.sample_copies(*_light_arguments(galaxy), copies, step, (first_x, first_y), hole, nodes, direct)
+    return copies, step, (first_x, first_y), nodes, direct
 
 
 def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Float:
@@ -300,7 +336,7 @@ def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Flo
         ring_light = np.zeros(ring_sum.shape)
         for up in range(-ring, ring + 1):
             for right in range(-ring, ring + 1) if abs(up) == ring else (-ring, ring):
-                _sample(
+                outer_light.sample(
                     galaxy.light, galaxy.disk, galaxy.across, x + right * size, y + up * size, float(step), ring_light
                 )
         ring_sum += ring_light
@@ -373,11 +409,21 @@ def add(
     int
         Light that was added on read rows, in the integers of the frame.
     """
-    added = _add_galaxy(
-        galaxy.light, galaxy.disk, galaxy.across, galaxy.blurred, galaxy.block, galaxy.first,
-        frame, column, row, hole, unread_rows, unit,
-    )  # fmt: skip
-    return int(added)
+    (ny, nx), (hole_x, hole_y, size) = frame.shape, hole
+    region = (-column, nx - 1.0 - column, -row, ny - 1.0 - row)
+    stamp = (hole_x - column, hole_x + size - 1.0 - column, hole_y - row, hole_y + size - 1.0 - row)
+    nodes = _nodes(galaxy, np.zeros((1, 2)), region, _nearest_distance(region, stamp), stamp)
+    return int(outer_light.add_galaxy(*_light_arguments(galaxy), *nodes, column, row, frame, hole, unread_rows, unit))
+
+
+def _nearest_distance(region: tuple[float, float, float, float], hole: tuple[float, float, float, float]) -> float:
+    """Return a lower limit of the distance in pixels from the middle of a galaxy to a pixel of a region outside a hole.
+
+    `region` and `hole` are the first and last column, and the first and last row, from the middle of the galaxy.
+    """
+    in_hole = min(-hole[0], hole[1], -hole[2], hole[3])
+    outside = max(region[0], -region[1], region[2], -region[3])
+    return max(in_hole, outside, 0.0)
 
 
 def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, min_radius: float) -> Float:
@@ -461,134 +507,3 @@ def _log_bulge_total(n: float) -> float:
     The light in the bulge's middle is 1. The exponent is p = 1 / (2 n), where n is the Sersic index.
     """
     return float(np.log(2 * np.pi * n) + scipy.special.gammaln(2 * n))
-
-
-@jit
-def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
-    """Return the electrons of a galaxy in a pixel at (x, y) pixels from its middle, without the effect of the PSF.
-
-    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light) and `across` (factor of the
-    coordinate along the disc's minor axis) are attributes of `Outskirts`.
-    """
-    out = 0.0
-    if light[BULGE] > 0.0:
-        u = light[BULGE_FORM] * x + light[BULGE_FORM + 1] * y
-        v = light[BULGE_FORM + 2] * x + light[BULGE_FORM + 3] * y
-        out += light[BULGE] * np.exp(-np.exp(light[POWER] * np.log(u * u + v * v + 1e-300)))
-    if light[DISK] > 0.0:
-        u = abs(light[DISK_FORM] * x + light[DISK_FORM + 1] * y)
-        if light[DISK] * np.exp(-u) > _NEGLIGIBLE:
-            v = abs(light[DISK_FORM + 2] * x + light[DISK_FORM + 3] * y) / across
-            out += light[DISK] * _from_table(disk, np.log(u + np.sqrt(u * u + 1.0)), np.log(v + np.sqrt(v * v + 1.0)))
-    return out
-
-
-@jit
-def _from_table(disk: Float, u: float, v: float) -> Any:
-    """Return the light of a disc from the table `disk` of its logarithm, by cubic interpolation; 0 beyond the table.
-
-    The nodes of the table are equally spaced in `u` and `v`, both at least 0: sinh u is the distance from the middle
-    along the major axis in scale lengths, and sinh v that along the minor axis divided by the factor `across` of
-    `Outskirts`. The result is for flux 1, per squared scale length.
-    """
-    # Coordinate 0 is at node 1 of the table, since cubic interpolation needs a node (node 0) on the other side of it.
-    a, b = u / _STEP + 1.0, v / _STEP + 1.0
-    i, j = int(a), int(b)
-    if i + 2 >= len(disk) or j + 2 >= len(disk):
-        return 0.0
-    a, b = a - i, b - j
-    total = 0.0
-    for r in range(4):
-        line = disk[i - 1 + r]
-        row_sum = 0.0
-        for c in range(4):
-            row_sum += _cubic(b, c) * line[j - 1 + c]
-        total += _cubic(a, r) * row_sum
-    return np.exp(total)
-
-
-@jit
-def _cubic(part: float, node: int) -> Any:
-    """Return the weight of `node`, 0 to 3, for cubic interpolation between four values at even spacing.
-
-    The interpolated position is the fraction `part`, 0 to 1, of the way from node 1 to node 2.
-    """
-    if node == 0:
-        return -part * (part - 1.0) * (part - 2.0) / 6.0
-    if node == 1:
-        return (part + 1.0) * (part - 1.0) * (part - 2.0) / 2.0
-    if node == 2:
-        return -(part + 1.0) * part * (part - 2.0) / 2.0
-    return (part + 1.0) * part * (part - 1.0) / 6.0
-
-
-@jit
-def _bilinear(nodes: Float, x: float, y: float) -> Any:
-    """Return a value at (x, y) by linear interpolation between `nodes` [y, x] at integer coordinates; 0 beyond them."""
-    i, j = int(np.floor(y)), int(np.floor(x))
-    if i < 0 or j < 0 or i + 1 >= nodes.shape[0] or j + 1 >= nodes.shape[1]:
-        return 0.0
-    up, right = y - i, x - j
-    low = (1.0 - right) * nodes[i, j] + right * nodes[i, j + 1]
-    return (1.0 - up) * low + up * ((1.0 - right) * nodes[i + 1, j] + right * nodes[i + 1, j + 1])
-
-
-@jit
-def _pixel_light(
-    light: Float, disk: Float, across: float, blurred: Float, block: int, first: tuple[int, int], x: float, y: float
-) -> Any:
-    """Return the electrons of a galaxy in a pixel at (x, y) pixels from its middle, with the effect of the PSF.
-
-    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light), `across` (factor of its minor
-    axis), `blurred` (change of the light by the PSF at the nodes of a grid), `block` (spacing of the nodes, pixels) and
-    `first` (position of the first node) are attributes of `Outskirts`. A negative result is replaced by 0.
-    """
-    blur_light = _bilinear(blurred, x / block - first[0], y / block - first[1])
-    return max(_light(light, disk, across, x, y) + blur_light, 0.0)
-
-
-@jit
-def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: float, out: Float) -> None:
-    """Add the light of a galaxy to the nodes `out` of a grid, electrons per pixel at each node.
-
-    The nodes are `step` pixels apart, and `out[0, 0]` is at (0, 0). The middle of the galaxy is at (x, y), pixels.
-    `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light) and `across` (factor of its minor
-    axis) are attributes of `Outskirts`. The effect of the PSF is not included.
-    """
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[r, c] += _light(light, disk, across, step * c - x, step * r - y)
-
-
-@jit
-def _remove_aliased(light: Float, disk: Float, across: float, aliased: Float, x: float, y: float, stamp: Any) -> None:
-    size = stamp.shape[0]
-    for r in range(size):
-        for c in range(size):
-            excess = aliased[r, c]
-            for up in (-size, 0, size):
-                for right in (-size, 0, size):
-                    if up != 0 or right != 0:
-                        excess += _light(light, disk, across, c - x - right, r - y - up)
-            stamp[r, c] -= excess
-
-
-@jit
-def _add_galaxy(
-    light: Float, disk: Float, across: float, blurred: Float, block: int, first: tuple[int, int], frame: Int,
-    x: float, y: float, hole: tuple[int, int, int], unread_rows: tuple[int, int], unit: float,
-) -> Any:  # fmt: skip
-    ny, nx = frame.shape
-    hole_x, hole_y, size = hole
-    total = np.int64(0)
-    for r in range(ny):
-        inside = hole_y <= r < hole_y + size
-        read = not unread_rows[0] <= r < unread_rows[1]
-        for c in range(nx):
-            if inside and hole_x <= c < hole_x + size:
-                continue
-            units = np.int64(np.rint(_pixel_light(light, disk, across, blurred, block, first, c - x, r - y) * unit))
-            frame[r, c] += units
-            if read:
-                total += units
-    return total
