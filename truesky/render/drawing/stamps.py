@@ -22,6 +22,7 @@ import scipy
 
 from lake_schema.arrays import Array, Bool, Float, Int
 from truesky.render.drawing import arcs, far_light, outskirts, stamp_sizes, transfer, wings
+from truesky.render.drawing.drawn_units import DrawnUnits
 from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.kernels.frame import BULGE, DISK, accumulate, aliased_light, subtract_aliased, to_electrons
 from truesky.render.drawing.stamp_sizes import BRIGHT, ROUNDING, SIZES
@@ -89,30 +90,6 @@ def draw(
     """
     drawn = draw_in_units(sources, sizes, psf, (nx, ny), progress, neglected, tally)
     return np.asarray(to_electrons(drawn.frame, drawn.unit, drawn.layer, wings.BLOCK, wings.MARGIN))
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnUnits:
-    """Light of sources on a frame (image of the detector) in integers, so that sums do not depend on the order.
-
-    Attributes
-    ----------
-    frame : int64 array, shape (ny, nx)
-        Light of the stamps.
-    layer : float array
-        Light beyond the stamps on blocks of pixels, as in `wings.wings`: multiples of 1 / `unit`.
-    unit : float
-        Factor from electrons to the integers of the frame.
-    """
-
-    frame: Int
-    layer: Float
-    unit: float
-
-    def electrons_with(self, other: DrawnUnits) -> Float:
-        """Return the electrons [ny, nx] of these sources and of others, which have the same unit."""
-        frame, layer = self.frame + other.frame, self.layer + other.layer
-        return np.asarray(to_electrons(frame, self.unit, layer, wings.BLOCK, wings.MARGIN))
 
 
 def draw_in_units(

@@ -10,7 +10,8 @@ import numpy as np
 
 from lake_schema.arrays import Bool, Float, Int
 from truesky.render.drawing import stamps
-from truesky.render.drawing.stamps import DrawnUnits, Tally
+from truesky.render.drawing.drawn_units import DrawnUnits
+from truesky.render.drawing.stamps import Tally
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 

@@ -20,7 +20,8 @@ from lake_schema.tables.exposures import ExposureRow
 from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels.aim import Aim, electron_rate
-from truesky.render.drawing import stamp_sizes, stamps
+from truesky.render.drawing import stamp_sizes, stamps, wings
+from truesky.render.drawing.drawn_units import DrawnUnits
 from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.charge import bleeding
 from truesky.render.effects.readout import detector_crosstalk
@@ -170,20 +171,54 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
         settings = settings_for(variant.accuracy)
         sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, min_electrons, settings)
         neighbour_scene = scene_factory.from_aim(neighbour_aim, variant)
-        frame = stamps.draw(sources, sizes, psf, neighbour_aim.detector.nx, neighbour_aim.detector.ny)
-        planes = split_amplifiers(_bled_electrons(frame, neighbour_scene), neighbour_scene)
-        pixel_indices = np.argwhere(planes > _NEGLECTED * min_electrons)
+        drawn = stamps.draw_in_units(sources, sizes, psf, (neighbour_aim.detector.nx, neighbour_aim.detector.ny))
+        rows_columns, charge = _charged_pixels(drawn, neighbour_scene, _NEGLECTED * min_electrons)
+        # Find where the pixels are read: split a frame that contains the number of each pixel. A search for them is
+        # fastest in a mask.
+        numbers, mask = (np.zeros(drawn.frame.shape, dtype) for dtype in (np.int32, bool))
+        numbers[rows_columns], mask[rows_columns] = np.arange(len(charge)), True
+        planes = split_amplifiers(numbers, neighbour_scene)
+        flat_indices = np.flatnonzero(split_amplifiers(mask, neighbour_scene))
+        pixel_indices = np.column_stack(np.unravel_index(flat_indices, planes.shape))
         # A detector of another type may have more pixels than this detector. They are read when this detector reads no
         # pixel, so they are removed.
         pixel_indices = pixel_indices[(pixel_indices < shape).all(axis=1)]
         pixels.append(np.asarray(np.ravel_multi_index(tuple(pixel_indices.T), shape), np.int64))
-        electrons.append(planes[tuple(pixel_indices.T)])
+        electrons.append(charge[planes[tuple(pixel_indices.T)]])
     unique_pixels, inverse = np.unique(np.concatenate(pixels), return_inverse=True)
     if not len(unique_pixels):
         return None
     return NeighbourCharge(
         unique_pixels, np.asarray(np.bincount(inverse, np.concatenate(electrons), len(unique_pixels)), float)
     )
+
+
+def _charged_pixels(drawn: DrawnUnits, scene: Scene, threshold: float) -> tuple[tuple[Int, Int], Float]:
+    """Return rows and columns, and electrons after bleeding, of the pixels with more than `threshold` electrons.
+
+    `drawn` is the light of the stars on the detector of `scene`. Charge bleeds along columns only, and few columns have
+    stars that are bright enough, so that only these columns are computed.
+    """
+    rows, columns, electrons = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
+    for first, past in _bright_columns(drawn, threshold):
+        charge = _bled_electrons(drawn.electrons_of_columns(first, past), scene)
+        row, column = np.nonzero(charge > threshold)
+        rows.append(row)
+        columns.append(column + first)
+        electrons.append(charge[row, column])
+    return (np.concatenate(rows), np.concatenate(columns)), np.concatenate(electrons)
+
+
+def _bright_columns(drawn: DrawnUnits, threshold: float) -> list[tuple[int, int]]:
+    """Return (first, last + 1) of groups of columns that contain all pixels with more than `threshold` electrons.
+
+    The groups begin at the borders of the blocks in which the light beyond stamps is stored. `drawn` is the light of
+    the stars on the detector.
+    """
+    nx = drawn.frame.shape[1]
+    blocks = np.unique(np.flatnonzero(drawn.max_of_columns() > threshold) // wings.BLOCK)
+    groups = np.split(blocks, np.flatnonzero(np.diff(blocks) > 1) + 1) if len(blocks) else []
+    return [(int(group[0]) * wings.BLOCK, min((int(group[-1]) + 1) * wings.BLOCK, nx)) for group in groups]
 
 
 def _bled_electrons(frame: Frame, scene: Scene) -> Frame:

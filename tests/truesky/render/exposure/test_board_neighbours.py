@@ -116,6 +116,30 @@ def test_an_image_with_an_additional_star_has_the_same_crosstalk_if_it_is_kept(c
         assert empty.psf.intra_pixel != alone.psf.intra_pixel
 
 
+@pytest.mark.parametrize("camera", PAIRS)
+def test_charge_of_the_columns_with_bright_stars_is_that_of_whole_frames(camera, monkeypatch):
+    """A star that bleeds, stars at the border and at a corner, and one that is too faint to be noticed."""
+    places = [(60.3, 40.8), (200.0, 180.0), (2.0, 120.5), (SIDE - 1.4, SIDE - 2.3), (130.0, 90.0)]
+    others, mission = (beside(camera, places, [8e6, 4e6, 2e6, 3e6, 3e3]),), stronger(camera)
+    drawn_columns = []
+
+    def record(drawn, threshold):
+        drawn_columns.append(groups := bright_columns(drawn, threshold))
+        return groups
+
+    bright_columns = board_neighbours._bright_columns
+    monkeypatch.setattr(board_neighbours, "_bright_columns", record)
+    few = rendered(camera, others, mission).scene.neighbour_charge
+    monkeypatch.setattr(board_neighbours, "_bright_columns", lambda drawn, threshold: [(0, SIDE)])
+    whole = rendered(camera, others, mission).scene.neighbour_charge
+    assert len(few.pixel) > 200
+    np.testing.assert_array_equal(few.pixel, whole.pixel)
+    np.testing.assert_array_equal(few.electrons, whole.electrons)
+    ((*groups,),) = drawn_columns
+    assert len(groups) > 1
+    assert sum(past - first for first, past in groups) < 0.9 * SIDE
+
+
 def test_the_order_of_the_rows_changes_nothing():
     mission, places, light = stronger("decam"), [(60.3, 40.8), (62.0, 44.0), (200.0, 180.0)], [3e6, 8e5, 4e6]
     here, there = (
