@@ -7,7 +7,7 @@ pixels. An effect too small to be noticed in the image is omitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,9 @@ class Effect:
     systematic : callable, optional
         Function of a `Scene` that returns the part of the contribution that does not average out in a mean over many
         frames or pixels, in electrons. By default the whole contribution does not average out.
+    in_place : bool
+        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. Effects that change
+        few pixels have it, because a copy of all pixels takes longer than their change.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Effect:
     random_stream: str = ""
     cost: float = 0.0
     systematic: Callable[[Scene], float] | None = None
+    in_place: bool = False
 
     def margin(self, scene: Scene) -> float:
         """Return the size of the effect divided by the noticeable change. Above 1 the effect is needed.
@@ -97,6 +101,15 @@ def zero_contribution(scene: Scene) -> float:
     pixels.
     """
     return 0.0
+
+
+def copy_frame(frame: Frame, out: Frame | None) -> Frame:
+    """Return a copy of a frame as float64 numbers: a new array, or `out`, which may be the frame itself."""
+    if out is None:
+        return np.array(frame, dtype=float, order="C")
+    if out is not frame:
+        out[...] = frame
+    return out
 
 
 def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Frame:
@@ -185,6 +198,7 @@ def apply_all(
     scene: Scene,
     stream: Callable[[Effect], np.random.Generator],
     callback: Callable[[str, Frame, Frame], None] | None = None,
+    recorded: Container[str] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
     """Apply the effects of a channel (an instrument mode), one after the other, if they are noticeable or forced.
 
@@ -201,6 +215,8 @@ def apply_all(
         one effect off does not change the random numbers of the others.
     callback : callable, optional
         Function (name, previous frame, new frame), called after each applied effect.
+    recorded : container of str, optional
+        Names of the effects after which `callback` is called. By default all.
 
     Returns
     -------
@@ -214,11 +230,17 @@ def apply_all(
     BadInput
         If `scene.forced` switches off an effect that is not optional.
     """
-    decisions = decide(effects, scene)
+    decisions, is_new = decide(effects, scene), False
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
-            previous, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
-            if callback is not None:
+            is_recorded = callback is not None and (recorded is None or effect.name in recorded)
+            # The frame of the caller must not change, nor a frame that the callback compares with the next one.
+            reusable = effect.in_place and is_new and not is_recorded
+            reusable = reusable and frame.dtype == np.float64 and frame.flags.c_contiguous
+            options = {"out": frame} if reusable else {}
+            previous, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect), **options)
+            is_new = is_new or not np.may_share_memory(previous, frame)
+            if callback is not None and is_recorded:
                 callback(effect.name, previous, frame)
             # Free the previous frame before the next effect allocates a new one, to reduce the peak memory.
             del previous

@@ -69,6 +69,12 @@ def available_maps(truth: Sequence[str], effects: Sequence[str] | None, sees_sky
     return [name for name in truth if effects is None or name in available]
 
 
+def recorded_effects(truth: Sequence[str]) -> set[str]:
+    """Return the names of the effects that `map_recorder` needs for the requested truth maps `truth`."""
+    names = {effect for effect, name in _MAP_OF_EFFECT.items() if name in truth}
+    return names | ({"bleeding", "ramp"} if "saturation" in truth else set())
+
+
 def map_recorder(
     maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> Callable[[str, Frame, Frame], None]:

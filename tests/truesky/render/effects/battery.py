@@ -222,10 +222,10 @@ CUT = ("quadrants", "amplifiers")
 SHAPES = ((4, 6), (1, 1), (1, 9), (9, 1), (12, 10))
 
 
-def call(case, frame, off=False, seed=7):
+def call(case, frame, off=False, seed=7, **options):
     arguments = case.off if off else case.on
     arguments = arguments(frame.shape) if callable(arguments) else arguments
-    return case.apply(frame, *arguments, rng=np.random.default_rng(seed))
+    return case.apply(frame, *arguments, rng=np.random.default_rng(seed), **options)
 
 
 def shapes_of(name):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.truesky.render.effects.battery import CASES, CUT, SHAPES, call, frame_of, shapes_of
+from tests.truesky.render.effects.battery import CASES, CUT, EFFECTS, SHAPES, call, frame_of, shapes_of
 from truesky.render import effects
 from truesky.render.channels import ground, nisp_p, vis
 from truesky.render.effects.light import intra_pixel
@@ -44,6 +44,21 @@ def test_no_effect_is_forgotten():
     assert found == {case.apply for case in CASES.values()}
     assert intra_pixel.EFFECT.apply.__module__ == "truesky.render.psf.pixel_response"
     assert {e.apply for kind in (vis, nisp_p, ground) for effects in kind.EFFECTS.values() for e in effects} <= found
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if EFFECTS[case.name.split(":")[0]].in_place])
+@pytest.mark.parametrize("off", [False, True])
+def test_effects_in_place_have_the_same_result(name, off):
+    case = CASES[name]
+    assert case.off is not None
+    shape = (4, 20, 30) if case.planes else (20, 30)
+    frame = np.floor(np.random.default_rng(2).exponential(3e4, shape))
+    expected, other = call(case, frame, off), np.empty(shape)
+    assert call(case, frame, off, out=other) is other
+    changed = frame.copy()
+    assert call(case, changed, off, out=changed) is changed
+    np.testing.assert_array_equal(other, expected)
+    np.testing.assert_array_equal(changed, expected)
 
 
 @named

@@ -9,8 +9,10 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from truesky.randomness.rng import stream
 from truesky.render.channels import ground, nisp_p, nisp_s, registry, vis
-from truesky.render.effects.effect import apply_all, decide
+from truesky.render.effects.effect import Effect, apply_all, decide
 from truesky.render.effects.scene import Scene
+from truesky.render.exposure import truth_maps
+from truesky.render.exposure.truth_maps import BYTES_PER_PIXEL
 from truesky.request import schema
 
 SCENE = Scene(resolve(), "vis", 560.0, 0.25, 1e4)
@@ -117,6 +119,56 @@ def test_a_frame_becomes_adu():
     assert image.mean() == pytest.approx(expected, abs=0.1)
     noise = np.sqrt(190.0 + 4.4**2) / 3.48
     assert image.std() == pytest.approx(np.hypot(noise, 12**-0.5), rel=0.02)
+
+
+def test_frames_that_are_needed_later_are_not_changed():
+    """Effects that work in place change neither the caller's frame nor a frame that is recorded."""
+    first, second, third = (
+        Effect(name, lambda frame, number, rng, out=None: np.add(frame, number, out=out), lambda scene, n=n: (n,),
+               lambda scene: 1.0, optional=False, in_place=True)
+        for n, name in enumerate("abc", 1)
+    )  # fmt: skip
+    frame, seen = np.zeros((3, 4)), []
+
+    def record(name, before, after):
+        seen.append((name, before.copy(), after.copy(), before is after))
+
+    for recorded, expected in ((("b",), ["b"]), (None, ["a", "b", "c"]), ((), [])):
+        seen.clear()
+        found, _ = apply_all(frame, (first, second, third), SCENE, lambda effect: stream(1, 7), record, recorded)
+        assert (frame == 0.0).all()
+        assert (found == 6.0).all()
+        assert [name for name, *_ in seen] == expected
+        for name, before, after, same in seen:
+            assert not same
+            assert (after - before == "abc".index(name) + 1).all()
+
+
+def test_effects_work_in_place_if_nothing_is_recorded():
+    arrays = []
+
+    def add(frame, rng, out=None):
+        arrays.append((frame, out))
+        return frame + 1.0 if out is None else np.add(frame, 1.0, out=out)
+
+    effect = Effect("a", add, lambda scene: (), lambda scene: 1.0, optional=False, in_place=True)
+    apply_all(
+        np.zeros((3, 4)), (effect, effect, replace(effect, in_place=False), effect), SCENE, lambda e: stream(1, 7)
+    )
+    assert [out is None for _, out in arrays] == [True, False, True, False]
+    assert all(out is None or out is frame for frame, out in arrays)
+
+
+@pytest.mark.parametrize("name", BYTES_PER_PIXEL)
+def test_effects_of_truth_maps_are_recorded(name):
+    """The recorder uses frames of the effects that are listed for a map, and of no other effects."""
+    recorded, record = truth_maps.recorded_effects([name]), truth_maps.map_recorder({}, SCENE, [name], None)
+    for effect in schema.EFFECTS:
+        if effect in recorded:
+            with pytest.raises((AttributeError, TypeError, BadInput, KeyError)):
+                record(effect, None, None)
+        else:
+            record(effect, None, None)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -15,7 +15,7 @@ import numpy as np
 from lake_schema.arrays import Bool
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 
 # Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
@@ -23,7 +23,9 @@ from truesky.render.effects.scene import Frame, Scene
 Segments = Sequence[tuple[int, int, bool]]
 
 
-def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None) -> Frame:
+def apply(
+    frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
     """Limit every pixel to its full well and move the excess charge along its column.
 
     Parameters
@@ -37,6 +39,8 @@ def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Gene
         register is above).
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -48,10 +52,10 @@ def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Gene
     OutOfRange
         If `capacity` is less than 1, infinite or NaN, or if a segment is outside the frame.
     """
-    return bleed(frame, capacity, segments)[0]
+    return bleed(frame, capacity, segments, out)[0]
 
 
-def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, float]:
+def bleed(frame: Frame, capacity: float, segments: Segments, out: Frame | None = None) -> tuple[Frame, float]:
     """Move charge above the full well along its column, and count the charge that leaves the detector.
 
     Parameters
@@ -63,6 +67,8 @@ def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, flo
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
         register is above). Rows outside all segments are unchanged.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -82,7 +88,7 @@ def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, flo
     for first, past, _ in segments:
         if not 0 <= first <= past <= len(frame):
             raise OutOfRange("rows of a column", first if first < 0 else past, 0, len(frame))
-    out = np.array(frame, dtype=np.float64, order="C")
+    out = copy_frame(frame, out)
     highest = out.max(axis=0, initial=0.0)
     if highest.max(initial=0.0) <= capacity:
         return out, 0.0
@@ -156,4 +162,6 @@ def _contribution(scene: Scene) -> float:
     return max(scene.brightest_electrons - full_well(scene), 0.0)
 
 
-EFFECT = Effect("bleeding", apply, lambda scene: (full_well(scene), scene.column_segments), _contribution, cost=5e-3)
+EFFECT = Effect(
+    "bleeding", apply, lambda scene: (full_well(scene), scene.column_segments), _contribution, cost=5e-3, in_place=True
+)

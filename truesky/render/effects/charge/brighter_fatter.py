@@ -23,7 +23,7 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 
 # A border between two pixels is displaced by the charge of this number of pixels on each side of it, and of pixels up
@@ -42,7 +42,14 @@ MAX_CROSSING = 0.2
 
 
 def apply(
-    frame: Frame, shift: float, softening: float, capacity: float, threshold: float, gap: int, rng: np.random.Generator
+    frame: Frame,
+    shift: float,
+    softening: float,
+    capacity: float,
+    threshold: float,
+    gap: int,
+    rng: np.random.Generator,
+    out: Frame | None = None,
 ) -> Frame:
     """Move charge between neighbouring pixels in proportion to the charge around their common border.
 
@@ -64,6 +71,8 @@ def apply(
         Number of drained rows between the two halves of the detector, 0 or more.
     rng : numpy.random.Generator
         Random generator, used to round the moved charge to whole electrons without bias.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -81,7 +90,7 @@ def apply(
     ):  # fmt: skip
         if not low <= value <= high:
             raise OutOfRange(name, value, low, high)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
     # Use single precision: it is exact for whole electrons below 2^24, and the moved charge has a relative error of
@@ -263,4 +272,4 @@ def _contribution(scene: Scene) -> float:
     return 1.5 * shift * peak**2
 
 
-EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=1e-2)
+EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=1e-2, in_place=True)

@@ -17,7 +17,7 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.camera import amplifiers
-from truesky.render.effects.effect import Effect, zero_contribution
+from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 # Square centimetres per square micrometre.
@@ -36,7 +36,7 @@ _NEGLIGIBLE = 1e-3
 _TOGETHER = 1 << 18
 
 
-def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator, out: Frame | None = None) -> Frame:
     """Draw the cosmic rays of an exposure, and add their charge to a frame.
 
     Parameters
@@ -50,6 +50,8 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
         rows, the logarithms of length and charge are interpolated linearly.
     rng : numpy.random.Generator
         Random generator of the tracks.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -61,7 +63,7 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
     OutOfRange
         If `expected` is outside its limits or NaN.
     """
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     _add_tracks(out, expected, quantiles, rng)
     return out
 
@@ -329,4 +331,5 @@ EFFECT = Effect(
     lambda scene: median_pixel(scene, _expected_events(scene)),
     cost=4e-3,
     systematic=zero_contribution,
+    in_place=True,
 )

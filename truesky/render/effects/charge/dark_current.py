@@ -13,7 +13,7 @@ from truesky.render.camera import windows
 from truesky.render.camera.windows import DetectorPart
 from truesky.render.effects import pixel_random
 from truesky.render.effects.charge import poisson
-from truesky.render.effects.effect import Effect, map_pixels
+from truesky.render.effects.effect import Effect, copy_frame, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
 # Upper limit on the mean dark electrons of a hot pixel in an exposure, far above every full well. Only very warm
@@ -81,7 +81,12 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
 
 
 def apply_hot(
-    frame: Frame, fraction: float, electrons: float, rng: np.random.Generator, part: DetectorPart | None = None
+    frame: Frame,
+    fraction: float,
+    electrons: float,
+    rng: np.random.Generator,
+    part: DetectorPart | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Add electrons to randomly chosen hot pixels, which are the same in every exposure.
 
@@ -97,6 +102,8 @@ def apply_hot(
         Random generator of the detector, in the same state in every exposure, so that the hot pixels are the same.
     part : DetectorPart, optional
         Part of the detector that the frame shows. By default the frame is the whole detector.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -116,7 +123,7 @@ def apply_hot(
         raise OutOfRange("fraction of hot pixels", fraction, 0.0, 1.0)
     if not 0.0 <= electrons < 1e12:
         raise OutOfRange("hot electrons", electrons, 0.0, 1e12)
-    part, out = part or windows.whole(frame.shape), np.array(frame, dtype=float)
+    part, out = part or windows.whole(frame.shape), copy_frame(frame, out)
     size = part.nx * part.ny
     count = int(rng.binomial(size, fraction))
     is_inside, rows, columns = part.find_pixels(*np.divmod(rng.integers(0, max(size, 1), count), max(part.nx, 1)))
@@ -149,4 +156,5 @@ HOT = Effect(
     lambda scene: _hot_parameters(scene)[1] * (_hot_parameters(scene)[0] > 0),
     fixed=True,
     cost=2e-3,
+    in_place=True,
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
 # Number of samples along each side of a pixel, to compute the part of the pixel that a ghost covers.
@@ -44,7 +44,7 @@ class Pupil(NamedTuple):
 
 def apply(
     frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
-    rng: np.random.Generator | None = None,
+    rng: np.random.Generator | None = None, out: Frame | None = None,
 ) -> Frame:  # fmt: skip
     """Add the ghost of every star in `lights` to a frame, also of stars outside the frame.
 
@@ -62,6 +62,8 @@ def apply(
         Shape of a ghost.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -80,7 +82,7 @@ def apply(
     ):  # fmt: skip
         if not lowest <= value <= highest:
             raise OutOfRange(name, value, lowest, highest)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     if ratio == 0.0 or out.size == 0 or not len(lights.electrons):
         return out
     stamp = _pupil_image(radius, hole, np.array(arms, float).reshape(-1, 4), width)
@@ -218,7 +220,7 @@ def _mean_contribution(scene: Scene, plate: str = "ghost") -> float:
     return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
 
 
-EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, systematic=_mean_contribution)
+EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, systematic=_mean_contribution, in_place=True)
 FILTER = Effect(
     "filter_ghosts",
     apply,
@@ -226,4 +228,5 @@ FILTER = Effect(
     partial(_contribution, plate="filter_ghost"),
     cost=4.5e-3,
     systematic=partial(_mean_contribution, plate="filter_ghost"),
+    in_place=True,
 )

@@ -14,7 +14,7 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
 # Distance between nodes of the grid on which halos are computed, in units of the halo's scale length. Linear
@@ -25,7 +25,14 @@ _NODE_SPACING = 1.0 / 16.0
 _MAX_STEP = 256
 
 
-def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.random.Generator | None = None) -> Frame:
+def apply(
+    frame: Frame,
+    lights: Lights,
+    fraction: float,
+    scale: float,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
+) -> Frame:
     """Add the halo of every star in `lights` to a frame, also of stars outside the frame.
 
     Parameters
@@ -40,6 +47,8 @@ def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.r
         Scale length of the halo in pixels, 1 to 1e6.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -55,7 +64,7 @@ def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.r
         raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)
     if not 1.0 <= scale <= 1e6:
         raise OutOfRange("straylight scale", scale, 1.0, 1e6)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     if fraction == 0.0 or out.size == 0 or not len(lights.electrons):
         return out
     step = int(np.clip(scale * _NODE_SPACING, 1, _MAX_STEP))
@@ -113,4 +122,4 @@ def _contribution(scene: Scene) -> float:
     return fraction * float(scene.lights.electrons.sum()) / (2.0 * np.pi * scale**2)
 
 
-EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=5e-3)
+EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=5e-3, in_place=True)

@@ -50,7 +50,12 @@ _SWEEPS = (
 
 
 def apply_parallel(
-    frame: Frame, silicon: Traps, sweeps: Sweeps, rows: int, rng: np.random.Generator | None = None
+    frame: Frame,
+    silicon: Traps,
+    sweeps: Sweeps,
+    rows: int,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Shift charge down the columns to the serial register, over traps that capture and release electrons.
 
@@ -66,17 +71,24 @@ def apply_parallel(
         Number of rows that are pixels of the detector; the others are overscan. Larger numbers mean all rows.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
     float array, shape of `frame`
         Electrons of each pixel after the transfer. Charge that is still trapped after the last row is lost.
     """
-    return traps.shift_charge(frame, silicon, sweeps, -2, min(rows, frame.shape[-2]))[0]
+    return traps.shift_charge(frame, silicon, sweeps, -2, min(rows, frame.shape[-2]), out)[0]
 
 
 def apply_serial(
-    frame: Frame, silicon: Traps, sweeps: Sweeps, columns: int, rng: np.random.Generator | None = None
+    frame: Frame,
+    silicon: Traps,
+    sweeps: Sweeps,
+    columns: int,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Shift charge along the serial register to the amplifier, over traps that capture and release electrons.
 
@@ -93,13 +105,15 @@ def apply_serial(
         columns.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
     float array, shape of `frame`
         Electrons of each pixel after the transfer. Charge that is still trapped after the last column is lost.
     """
-    return traps.shift_charge(frame, silicon, sweeps, -1, min(columns, frame.shape[-1]))[0]
+    return traps.shift_charge(frame, silicon, sweeps, -1, min(columns, frame.shape[-1]), out)[0]
 
 
 def choose_sweeps(accuracy: Accuracy, traps_passed: float) -> Sweeps:
@@ -343,6 +357,7 @@ PARALLEL = Effect(
     lambda scene: _max_loss(_scene_before_readout(scene), "parallel", scene.half_rows),
     cost=0.044,
     systematic=lambda scene: _systematic_loss(_scene_before_readout(scene), "parallel", scene.half_rows),
+    in_place=True,
 )
 SERIAL = Effect(
     "serial_cti",
@@ -351,6 +366,7 @@ SERIAL = Effect(
     lambda scene: _max_loss(scene, "serial", _register_columns(scene)),
     cost=0.032,
     systematic=lambda scene: _systematic_loss(scene, "serial", _register_columns(scene)),
+    in_place=True,
 )
 PARALLEL_LOSS = Effect(
     "parallel_loss",

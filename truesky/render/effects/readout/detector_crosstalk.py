@@ -9,12 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from lake_schema.errors import OutOfRange
-from truesky.render.effects.effect import Effect, zero_contribution
+from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 
 
 def apply(
-    frame: Frame, neighbour_charge: NeighbourCharge | None, coefficient: float, rng: np.random.Generator | None = None
+    frame: Frame,
+    neighbour_charge: NeighbourCharge | None,
+    coefficient: float,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Add the crosstalk from the other detectors on the same readout board to a frame.
 
@@ -29,6 +33,8 @@ def apply(
         Share of the signal of one detector that appears in another, -1 to 1.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -42,7 +48,7 @@ def apply(
     """
     if not abs(coefficient) <= 1.0:
         raise OutOfRange("crosstalk between detectors", coefficient, -1.0, 1.0)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     if neighbour_charge is not None:
         # numpy adds only one value to an element whose index occurs several times in such a sum. This is no danger
         # here, because each pixel occurs only once in `neighbour_charge.pixel`.
@@ -73,4 +79,5 @@ EFFECT = Effect(
     _contribution,
     cost=2e-3,
     systematic=zero_contribution,
+    in_place=True,
 )

@@ -40,6 +40,7 @@ import numpy.typing as npt
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.effects.effect import copy_frame
 from truesky.render.effects.readout import trap_levels
 
 # Number of columns that are copied together to a contiguous array, because the packets of a column are far apart in
@@ -158,7 +159,7 @@ class Sweeps:
 
 
 def shift_charge(
-    frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None
+    frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None, out: Float | None = None
 ) -> tuple[Float, float]:
     """Shift the charge of all columns or rows of a frame over traps to the output.
 
@@ -174,6 +175,8 @@ def shift_charge(
         Axis of the transfer: -2 along columns, -1 along rows.
     pixels : int, optional
         Number of packets of a line that start in a pixel, by default all. Later packets (overscan) pass all pixels.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -189,7 +192,7 @@ def shift_charge(
     """
     if axis not in (-1, -2):
         raise OutOfRange("axis of transfer", axis, -2, -1)
-    out = np.array(frame, dtype=np.float64, order="C")
+    out = copy_frame(frame, out)
     n = out.shape[axis]
     physical = n if pixels is None else pixels
     if not 0 <= physical <= n:
