@@ -35,6 +35,7 @@ Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -208,16 +209,12 @@ def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
     share = np.repeat(photons / _WAVES, _WAVES)
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     out = LONG * np.arange(int(reach / LONG) + 2)
-    # Spikes without blur are computed up to twice the distance from the axis that the result has, since the blur moves
-    # light from outside into it.
-    across = STEP * np.arange(2 * round(WIDE / STEP))
     lines = []
     for _, width, length in edges.bars:
         height = share * (width * length * cycles) ** 2 / edges.area
         along = np.sinc(width * cycles * out[:, None]) ** 2 * height
-        lines.append(
-            _blur_lines(np.sinc(length * cycles[:, None] * across) ** 2, edges.blur / edges.pixel_scale, along)
-        )
+        across = _blurred_profiles(cycles.tobytes(), float(length), edges.blur / edges.pixel_scale)
+        lines.append(matrices.matmul(along, across))
     return np.stack(lines)
 
 
@@ -265,17 +262,25 @@ def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
     )
 
 
-def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
-    """Return a table [i, j] of the light of a spike, blurred across the spike by a Gaussian and by the pixel.
+@lru_cache(maxsize=32)
+def _blurred_profiles(cycles: bytes, length: float, blur: float) -> Float:
+    """Return profiles [w, j] across the spike of a bar at w wavelengths, blurred by a Gaussian and by the pixel.
 
-    i is the index along the spike, and j counts steps of STEP pixels from its axis. `along` [i, w] is the light on the
-    axis at each of w wavelengths. `lines` [w, j] are the profiles across the spike before the blur, 1 on the axis.
-    `blur` is the rms of the Gaussian in pixels. The table extends to WIDE pixels from the axis.
+    All bright stars of an exposure have the same profiles. j counts steps of STEP pixels from the axis of the spike, up
+    to WIDE pixels. Before the blur, the light on the axis is 1. `cycles` [w] are the float64 numbers of pixel scales
+    per wavelength in 1/mm, as bytes. `length` is the length of the bar in mm, and `blur` the rms of the Gaussian in
+    pixels.
     """
+    # Profiles without blur are computed up to twice the distance from the axis that the result has, since the blur
+    # moves light from outside into it.
+    across = STEP * np.arange(2 * round(WIDE / STEP))
+    lines = np.sinc(length * np.frombuffer(cycles)[:, None] * across) ** 2
     symmetric = np.concatenate([lines[:, :0:-1], lines], axis=1)
     passed = np.fft.rfft(symmetric, axis=1) * _blur_transfer(symmetric.shape[1], blur)
     smooth = np.fft.irfft(passed, symmetric.shape[1], axis=1)[:, lines.shape[1] - 1 :]
-    return np.asarray(matrices.matmul(along, np.maximum(smooth[:, : round(WIDE / STEP) + 2], 0.0)))
+    profiles: Float = np.maximum(smooth[:, : round(WIDE / STEP) + 2], 0.0)
+    profiles.flags.writeable = False
+    return profiles
 
 
 def _blur_transfer(count: int, blur: float) -> Float:

@@ -95,6 +95,21 @@ def test_a_spike_is_the_pupil_s_transform(bar):
     assert (ours * radius**2).mean() == pytest.approx((theirs * radius**2).mean(), rel=0.05)
 
 
+def test_spikes_of_several_stars_are_those_of_each_star_alone():
+    """Stars share the profiles across the spikes, but not those of a pupil with another blur, scale or passband."""
+    own = of_pupil()
+    others = [own, *(replace(own, **{key: 1.5 * getattr(own, key)}) for key in ("blur", "pixel_scale", "wavelength"))]
+    red = np.arange(len(EQUAL)) / np.arange(len(EQUAL)).sum()
+    cases = [(edges, photons, reach) for edges in others for photons in (EQUAL, red) for reach in (300.0, 2000.0)]
+    spikes._blurred_profiles.cache_clear()
+    together = [spikes.spike_light(*case) for case in cases]
+    assert spikes._blurred_profiles.cache_info().misses < spikes._blurred_profiles.cache_info().hits
+    for case, expected in zip(cases, together, strict=True):
+        spikes._blurred_profiles.cache_clear()
+        np.testing.assert_array_equal(spikes.spike_light(*case), expected)
+    assert len({table.tobytes() for table in together}) == len(cases)
+
+
 def test_wings_are_those_of_the_mission_database(vis):
     """The azimuthal mean of the embedded pupil at 1" agrees with the database.
 
