@@ -10,6 +10,7 @@ import asyncio
 import hmac
 import logging
 import secrets
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -25,6 +26,9 @@ BODY_TIMEOUT = 30.0
 # first time. After an answer, the rest of the request's body is read for the second time, so that the client gets the
 # answer. Bodies are not decompressed, because a short one may contain gigabytes, and the page sends none.
 CONNECTION_SETTINGS = {"keepalive_timeout": 75.0, "lingering_time": 2.0, "auto_decompress": False}
+# Size of the buffer in which the system receives the bytes of a connection (Linux doubles it). The server therefore
+# reads small pieces, so that a client that sends without end keeps little of its time and memory from other users.
+_RECEIVED_BYTES = 16 << 10
 _TOKEN_BYTES = 24
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -45,6 +49,16 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 def new_token() -> str:
     """Return a new random token of 192 bits as 32 characters that need no escaping in addresses."""
     return secrets.token_urlsafe(_TOKEN_BYTES)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that accepts connections, with a small receive buffer for each; port 0 selects a free port.
+
+    OSError is raised if the port is in use.
+    """
+    server_socket = socket.create_server((host, port))
+    server_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED_BYTES)
+    return server_socket
 
 
 @dataclass(frozen=True, slots=True)

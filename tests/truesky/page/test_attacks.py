@@ -161,6 +161,7 @@ def survives(user, process, kinds, number, seconds):
     finally:
         over.set()
         attack.join(PATIENCE)
+    print(f"longest answer {user.longest:.1f} s, {(largest - size) / number / 1e6:.2f} MB per connection")
     assert largest - size < number * MOST_BYTES
     # On a busy machine, every answer takes longer.
     assert user.longest < MOST_SECONDS + 5.0 * usual
