@@ -16,7 +16,7 @@ from lake_schema import command
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.command_line import commands
-from truesky.page.access_control import AccessRules, listen, new_token
+from truesky.page.access_control import AccessRules, new_token, open_socket
 from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
 
@@ -53,7 +53,7 @@ def run_command(options: argparse.Namespace) -> int:
         return LakeSession(root, options.name, options.memory * _GIGABYTE, options.timeout)
 
     # Open the socket before the address is printed: the port is known only then, because port 0 selects a free port.
-    server_socket = listen(options.host, options.port)
+    server_socket = open_socket(options.host, options.port)
     port = int(server_socket.getsockname()[1])
     access = AccessRules(host_names, port, options.token or new_token())
     server = Server(open_lake, access)

@@ -27,7 +27,7 @@ BODY_TIMEOUT = 30.0
 # answer. Bodies are not decompressed, because a short one may contain gigabytes, and the page sends none.
 CONNECTION_SETTINGS = {"keepalive_timeout": 75.0, "lingering_time": 2.0, "auto_decompress": False}
 # Size of the buffer in which the system receives the bytes of a connection (Linux doubles it). The server therefore
-# reads small pieces, so that a client that sends without end keeps little of its time and memory from other users.
+# reads small pieces in turn, so that other users need not wait while a client sends without end.
 _RECEIVED_BYTES = 16 << 10
 _TOKEN_BYTES = 24
 _CONTENT_POLICY = (
@@ -51,7 +51,7 @@ def new_token() -> str:
     return secrets.token_urlsafe(_TOKEN_BYTES)
 
 
-def listen(host: str, port: int) -> socket.socket:
+def open_socket(host: str, port: int) -> socket.socket:
     """Return a socket that accepts connections, with a small receive buffer for each; port 0 selects a free port.
 
     OSError is raised if the port is in use.

@@ -28,7 +28,7 @@ from lake_schema.tables.tasks import TASKS
 from tests.truesky.page.browsing import at, tab_of
 from tests.universe import plain_plan, plain_work, rows_of
 from tests.waiting import PATIENCE
-from truesky.page.access_control import AccessRules, listen
+from truesky.page.access_control import AccessRules, open_socket
 from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
 from truesky.render.camera import astrometry
@@ -205,7 +205,7 @@ class Page:
 @contextlib.contextmanager
 def serving(root):
     """Serve a lake within the context."""
-    listening = listen("127.0.0.1", 0)
+    listening = open_socket("127.0.0.1", 0)
     gate = AccessRules(("127.0.0.1", "localhost"), listening.getsockname()[1], TOKEN)
     server = Server(lambda: LakeSession(root, memory=1e9, timeout=PATIENCE), gate)
     loop, ready = asyncio.new_event_loop(), threading.Event()
