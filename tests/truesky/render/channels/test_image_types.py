@@ -181,10 +181,10 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
         found = {}
 
         def watched(effect):
-            def apply(frame, *parameters, rng):
+            def apply(frame, *parameters, rng, **out):
                 state = rng.bit_generator.state
                 found[effect.name] = (*state["state"]["key"].tolist(), *state["state"]["counter"].tolist())
-                return effect.apply(frame, *parameters, rng=rng)
+                return effect.apply(frame, *parameters, rng=rng, **out)
 
             return replace(effect, apply=apply)
 
