@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import BadInput
-from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Frame, Scene
+from truesky.render.effects.scene import Frame, Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +68,18 @@ class Effect:
     def margin(self, scene: Scene) -> float:
         """Return the size of the effect divided by the noticeable change. Above 1 the effect is needed.
 
-        The noticeable change of a single pixel is `NOTICEABLE` = 0.1 times its noise. The part of the effect that does
-        not average out is compared with 0.1 times the noise of the mean of `STACK_SIZE` = 1024 pixels. The larger of
-        the two ratios is returned. Without noise the result is infinite, or 0 for an effect of size 0.
+        The noticeable change of a single pixel is 0.1 times its noise. The part of the effect that does not average out
+        is compared with 0.1 times the noise of the mean of 1024 pixels. Both limits are larger if the request allows
+        larger errors (`Scene.noticeable_electrons`, `Scene.noticeable_mean_electrons`). The larger of the two ratios is
+        returned. Without noise the result is infinite, or 0 for an effect of size 0.
         """
         change = float(self.contribution(scene))
         systematic = change if self.systematic is None else float(self.systematic(scene))
-        change = max(change, math.sqrt(STACK_SIZE) * systematic)
-        noise = NOTICEABLE * scene.pixel_noise
+        limit, mean_limit = scene.noticeable_electrons, scene.noticeable_mean_electrons
         # Without noise, any change above 0 is noticeable.
-        return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
+        if limit == 0.0:
+            return math.inf if max(change, systematic) > 0.0 else 0.0
+        return max(change / limit, systematic / mean_limit)
 
     def is_needed(self, scene: Scene) -> bool:
         """Return True if the effect is not optional or is noticeable.

@@ -5,6 +5,7 @@ Examples are the exposure time, the sky background, bright sources, and the para
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -24,10 +25,11 @@ from truesky.request.accuracy import SURVEY, Accuracy
 Frame = Float
 
 # A detector effect is applied if the largest change of a pixel that it causes exceeds this fraction of the pixel's
-# noise (rms).
+# noise (rms), or the larger fraction that the request allows as an error (`Scene.noticeable_fraction`).
 NOTICEABLE = 0.1
 # The part of a detector effect that repeats in every image or every pixel does not average out. It is compared with the
-# noise of the mean of this number of values, such as 32 x 32 pixels of sky or one pixel in 1024 images.
+# noise of the mean of this number of values, such as 32 x 32 pixels of sky or one pixel in 1024 images. The limit is
+# higher with an accuracy coarser than `survey` (`Scene.noticeable_mean_electrons`).
 STACK_SIZE = 1024
 
 # Boltzmann's constant, eV / K (CODATA 2018).
@@ -328,6 +330,29 @@ class Scene:
         # Behind a grism the sky background varies over the detector: add its mean difference from a uniform background.
         dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
         return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
+
+    @property
+    def noticeable_fraction(self) -> float:
+        """Smallest change of a pixel that is taken into account, as a fraction of `pixel_noise`.
+
+        It is `NOTICEABLE`, or the error of the background that the request allows if this is larger.
+        """
+        return max(NOTICEABLE, self.accuracy.background)
+
+    @property
+    def noticeable_electrons(self) -> float:
+        """Smallest change of a pixel that is taken into account, in electrons."""
+        return self.noticeable_fraction * self.pixel_noise
+
+    @property
+    def noticeable_mean_electrons(self) -> float:
+        """Smallest change in electrons per pixel that is taken into account if it does not average out.
+
+        At the accuracy `survey` and finer ones, it is `NOTICEABLE` times the noise of the mean of `STACK_SIZE` pixels.
+        It increases in proportion to the error of the background that the request allows.
+        """
+        of_survey = NOTICEABLE * self.pixel_noise / math.sqrt(STACK_SIZE)
+        return of_survey * max(self.accuracy.background / SURVEY.background, 1.0)
 
     @property
     def reading_noise(self) -> float:

@@ -25,7 +25,7 @@ from truesky.render.drawing.drawn_units import DrawnUnits
 from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.charge import bleeding
 from truesky.render.effects.readout import detector_crosstalk
-from truesky.render.effects.scene import NOTICEABLE, Frame, NeighbourCharge, Scene
+from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 from truesky.render.exposure import scene_factory, visible_sources
 from truesky.render.exposure.records import NeighbourDetector, Rows, Variant
 from truesky.render.exposure.visible_sources import Light
@@ -72,17 +72,15 @@ def is_noticeable(aim: Aim, variant: Variant) -> bool:
     """Return True if crosstalk from other detectors on the readout board must be simulated for a detector.
 
     `aim` is the exposure and the detector, and `variant` contains the parameters of the simulation. Crosstalk is
-    simulated if a pixel at the full well on another detector would change a pixel by more than a tenth of its noise. A
-    request can also switch crosstalk on or off. It is never simulated if no light of the sky reaches the detector, as
-    in a dark image.
+    simulated if a pixel at the full well on another detector would change a pixel noticeably: by a tenth of its noise,
+    or more if the request allows larger errors. A request can also switch crosstalk on or off. It is never simulated if
+    no light of the sky reaches the detector, as in a dark image.
     """
     if _EFFECT not in aim.effects or not aim.sees_sky:
         return False
     scene = scene_factory.from_aim(aim, variant)
     max_electrons = abs(detector_crosstalk.coefficient(scene)) * bleeding.full_well(scene)
-    return bool(
-        max_electrons > 0.0 and variant.forced.get(_EFFECT.name, max_electrons > NOTICEABLE * scene.pixel_noise)
-    )
+    return bool(max_electrons > 0.0 and variant.forced.get(_EFFECT.name, max_electrons > scene.noticeable_electrons))
 
 
 def detector_circle(exposure: ExposureRow, detector: Detector) -> dict[str, float]:
@@ -133,10 +131,10 @@ def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant)
 def _noticeable_electrons(scene: Scene) -> float:
     """Return how many electrons in a pixel of another detector cause just noticeable crosstalk in this detector.
 
-    Crosstalk is noticeable above a tenth of the noise of a pixel. `scene` contains the properties of this detector and
+    Crosstalk is noticeable above `scene.noticeable_electrons`. `scene` contains the properties of this detector and
     its exposure. The crosstalk coefficient must not be 0.
     """
-    return NOTICEABLE * scene.pixel_noise / abs(detector_crosstalk.coefficient(scene))
+    return scene.noticeable_electrons / abs(detector_crosstalk.coefficient(scene))
 
 
 def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> NeighbourCharge | None:

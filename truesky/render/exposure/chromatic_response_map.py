@@ -16,7 +16,7 @@ from truesky.render.dispersing import draw as dispersing
 from truesky.render.drawing import stamp_sizes, stamps
 from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.light import chromatic_response
-from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
+from truesky.render.effects.scene import Frame, Scene
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.psf.model import Psf, reduce_colours
@@ -65,13 +65,11 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
     change = chromatic_response.colour_changes(
         sources.electrons * peak_fraction, source_colours, components, chromatic_response.map_strength(scene)
     )
-    is_chosen = visible_sources.touches_frame(sources, light.sizes, aim.drawn) & (
-        change > NOTICEABLE * scene.pixel_noise
-    )
+    is_chosen = visible_sources.touches_frame(sources, light.sizes, aim.drawn) & (change > scene.noticeable_electrons)
     if not is_chosen.any():
         return scene
     chosen, shares, change = sources.take(is_chosen), sources.photons[is_chosen], change[is_chosen]
-    settings = replace(settings_for(scene.accuracy), edge=NOTICEABLE, aliased=_PART, floor=_PART)
+    settings = replace(settings_for(scene.accuracy), edge=scene.noticeable_fraction, aliased=_PART, floor=_PART)
     noise = scene.pixel_noise
     sizes = stamp_sizes.stamp_sizes(change / peak_fraction, chosen.shape, chosen.shapes, psf, noise, settings)
     # Images of sources that are drawn from pictures, or that move, must not be cut. Their stamps (square images around
@@ -128,13 +126,14 @@ def with_dispersed_light(
     f = chromatic_response.component_spectra(scene.section, dispersed.orders[0].wavelength, aim.band, scene.mission)
     largest = float(np.hypot(*(f * np.array(chromatic_response.map_strength(scene))).T).max())
     change = tally.peak.max(axis=1) * _peak_fraction(psf, of_rows=True) * largest
-    (indices,) = np.nonzero(change > NOTICEABLE * scene.pixel_noise)
+    (indices,) = np.nonzero(change > scene.noticeable_electrons)
     if not len(indices):
         return scene
     chosen, shape = light.sources.take(indices), (aim.detector.ny, aim.detector.nx)
     # Light may be neglected if the chromatic response changes it by less than half of a noticeable change, which is a
     # tenth of a pixel's noise.
-    settings = replace(dispersed.settings, edge=0.5 * NOTICEABLE / largest, faint=0.5 * NOTICEABLE / largest)
+    limit = 0.5 * scene.noticeable_fraction / largest
+    settings = replace(dispersed.settings, edge=limit, faint=limit)
 
     def draw(weight: Float) -> Frame:
         """Return the image of the chosen spectra; `weight` has a factor for the photons of each wavelength."""

@@ -14,6 +14,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.exposure import truth_maps
 from truesky.render.exposure.truth_maps import BYTES_PER_PIXEL
 from truesky.request import schema
+from truesky.request.accuracy import PRESETS
 
 SCENE = Scene(resolve(), "vis", 560.0, 0.25, 1e4)
 NAMES = ["background", "poisson", "dark_current", "bleeding", "read_noise", "adc"]
@@ -184,6 +185,21 @@ def test_numbers_are_the_effects_own(seed):
     np.testing.assert_array_equal(without, again)
     other, _ = run(SOME[:5], frame, forced={"dark_current": False}, seed=seed + 10)
     assert (other != without).any()
+
+
+def test_margins_follow_the_accuracy():
+    """Limits of `survey` and finer accuracies are equal; half of the noise may be wrong in a quicklook."""
+    (dark,) = (e for e in ground.SKY if e.name == "dark_current")
+    (counted,) = (e for e in ground.SKY if e.name == "poisson")
+    survey, draft, quick, reference = (replace(SCENE, accuracy=PRESETS[name]) for name in (
+        "survey", "draft", "quicklook", "reference",
+    ))  # fmt: skip
+    for effect in (dark, counted):
+        assert effect.margin(survey) == effect.margin(reference)
+    assert dark.margin(survey) == pytest.approx(5.0 * dark.margin(draft))
+    assert dark.margin(survey) == pytest.approx(25.0 * dark.margin(quick))
+    assert counted.margin(survey) == counted.margin(draft)
+    assert counted.margin(survey) == pytest.approx(5.0 * counted.margin(quick))
 
 
 def test_what_a_request_forces_is_recorded():

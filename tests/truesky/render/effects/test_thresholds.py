@@ -17,6 +17,7 @@ from truesky.render.channels import vis
 from truesky.render.effects.charge import cosmic_rays
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Lights, NeighbourCharge, Scene
+from truesky.request.accuracy import DRAFT, QUICKLOOK, SURVEY
 
 MISSION = resolve()
 DETECTOR = detectors.detector("vis", "1-1", MISSION)
@@ -208,6 +209,31 @@ def test_all_effects_that_are_left_out_are_not_noticeable_together(mag):
     # Nor in the mean of the sky: what is left out of every pixel is seen there.
     biased = NOTICEABLE * one.scene.pixel_noise / np.sqrt(STACK_SIZE)
     assert abs(change.mean()) < biased + 5.0 * change.std() / np.sqrt(change.size), left_out
+
+
+def test_a_quicklook_leaves_out_no_more_than_the_error_that_it_allows():
+    """The image with the effects that a survey applies is the reference; a draft applies the same ones.
+
+    Sample of 256 x 256 pixels with 16 stars; significance 6e-7 of the mean (5 standard errors).
+    """
+    x, y = nominal.lattice(256, 64)
+    one = nominal.rendered(small("vis", "2-5", 256), np.linspace(18.0, 26.0, len(x)), x, y, seconds=450.0)
+    # Before it is rounded.
+    effects = [effect for effect in vis.SKY if effect.name != "adc"]
+
+    def read(allowed):
+        light, of_one = one.noise_free.astype(float), replace(one.scene, accuracy=allowed)
+        frame, decisions = apply_all(light, effects, of_one, lambda e: rng.stream(1, e.name))
+        return frame, {decision.name for decision in decisions if decision.applied}
+
+    (quick, few), (_, drafted), (fine, needed) = (read(each) for each in (QUICKLOOK, DRAFT, SURVEY))
+    assert needed - few == {"pixel_area", "dark_current", "read_noise"}
+    assert needed == drafted
+    noise, change = one.scene.pixel_noise, fine - quick
+    assert 0.1 * noise < np.sqrt(np.mean(change**2)) < QUICKLOOK.background * noise
+    # What repeats in every pixel may be 25 times as large as in a survey, because 25 times the background may be wrong.
+    biased = QUICKLOOK.background / SURVEY.background * NOTICEABLE * noise / np.sqrt(STACK_SIZE)
+    assert abs(change.mean()) < biased + 5.0 * change.std() / np.sqrt(change.size)
 
 
 @pytest.mark.parametrize("seconds", [1.0, 100.0, 565.0])

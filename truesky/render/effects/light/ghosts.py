@@ -14,7 +14,7 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect, copy_frame
-from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
+from truesky.render.effects.scene import Frame, Lights, Scene
 
 # Number of samples along each side of a pixel, to compute the part of the pixel that a ghost covers.
 _SUBSAMPLES = 4
@@ -179,7 +179,7 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
 
 
 def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
-    """Return the stars whose ghost, summed over its area, exceeds a tenth of the noise of the same area.
+    """Return the stars whose ghost, summed over its area, is noticeable compared with the noise of the same area.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Light
     """
     area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
     lights = scene.lights
-    bright = ratio * lights.electrons > NOTICEABLE * scene.pixel_noise * np.sqrt(area)
+    bright = ratio * lights.electrons > scene.noticeable_electrons * np.sqrt(area)
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright])
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect, copy_frame
-from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
+from truesky.render.effects.scene import Frame, Lights, Scene
 
 # Distance between nodes of the grid on which halos are computed, in units of the halo's scale length. Linear
 # interpolation between the nodes has a relative error of at most 3e-3.
@@ -110,10 +110,10 @@ def _halo_parameters(scene: Scene) -> tuple[float, float]:
 def _parameters(scene: Scene) -> tuple[Any, ...]:
     fraction, scale = _halo_parameters(scene)
     lights = scene.lights
-    # Omit halos whose peak is at most a thousandth of the noticeable change, which is 0.1 times the noise of a pixel.
-    # Even a thousand of them at the same place are not noticeable.
+    # Omit halos whose peak is at most a thousandth of the noticeable change. Even a thousand of them at the same place
+    # are not noticeable.
     height = fraction * lights.electrons / (2.0 * np.pi * scale**2)
-    bright = height > 1e-3 * NOTICEABLE * scene.pixel_noise
+    bright = height > 1e-3 * scene.noticeable_electrons
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright]), fraction, scale
 
 

@@ -18,8 +18,8 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.readout import traps
 from truesky.render.effects.readout.traps import Sweeps, Traps
-from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
-from truesky.request.accuracy import DRAFT, Accuracy
+from truesky.render.effects.scene import Frame, Scene
+from truesky.request.accuracy import Accuracy
 
 # Highest allowed fraction of a charge packet that one transfer from pixel to pixel leaves behind. OutOfRange is raised
 # above it. All detectors in use have a lower fraction.
@@ -298,7 +298,7 @@ def _max_loss(scene: Scene, direction: str, transfers: int) -> float:
     change of a pixel times (change of sources / accepted error). The effect then counts as too small to be applied.
     """
     lost, excess = _loss_and_excess(scene, direction, transfers)
-    return lost if excess > 1.0 else min(lost, excess * NOTICEABLE * scene.pixel_noise)
+    return lost if excess > 1.0 else min(lost, excess * scene.noticeable_electrons)
 
 
 def _systematic_loss(scene: Scene, direction: str, transfers: int) -> float:
@@ -327,14 +327,9 @@ def _loss_and_excess(scene: Scene, direction: str, transfers: int) -> tuple[floa
 def _accuracy_excess(accuracy: Accuracy, traps_passed: float) -> float:
     """Return the largest change of a source by traps (flux, position or shape) divided by the accepted error.
 
-    `traps_passed` is the number of traps on the longest path to the amplifier. The accepted errors are the values of
-    `accuracy`, or the values of the accuracy preset "draft" if these are smaller.
-    The coarser preset "quicklook" therefore omits no effect that "draft" includes.
+    `traps_passed` is the number of traps on the longest path to the amplifier, and `accuracy` has the accepted errors.
     """
-    flux, shift, shape = (
-        min(accuracy.flux, DRAFT.flux), min(accuracy.position, DRAFT.position), min(accuracy.shape, DRAFT.shape)
-    )  # fmt: skip
-    return traps_passed / _END_OF_LIFE * max(_FLUX / flux, _SHIFT / shift, _SHAPE / shape)
+    return traps_passed / _END_OF_LIFE * max(_FLUX / accuracy.flux, _SHIFT / accuracy.position, _SHAPE / accuracy.shape)
 
 
 def _scene_before_readout(scene: Scene) -> Scene:
