@@ -201,6 +201,7 @@ def apply_all(
     stream: Callable[[Effect], np.random.Generator],
     callback: Callable[[str, Frame, Frame], None] | None = None,
     recorded: Container[str] | None = None,
+    reuse_frame: bool = False,
 ) -> tuple[Frame, tuple[Decision, ...]]:
     """Apply the effects of a channel (an instrument mode), one after the other, if they are noticeable or forced.
 
@@ -219,6 +220,8 @@ def apply_all(
         Function (name, previous frame, new frame), called after each applied effect.
     recorded : container of str, optional
         Names of the effects after which `callback` is called. By default all.
+    reuse_frame : bool, optional
+        True to allow that the input frame is changed.
 
     Returns
     -------
@@ -232,11 +235,12 @@ def apply_all(
     BadInput
         If `scene.forced` switches off an effect that is not optional.
     """
-    decisions, is_new = decide(effects, scene), False
+    decisions, is_new = decide(effects, scene), reuse_frame
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
             is_recorded = callback is not None and (recorded is None or effect.name in recorded)
-            # The frame of the caller must not change, nor a frame that the callback compares with the next one.
+            # The frame of the caller must not change (unless it allows this), nor a frame that the callback compares
+            # with the next one.
             reusable = effect.in_place and is_new and not is_recorded
             reusable = reusable and frame.dtype == np.float64 and frame.flags.c_contiguous
             options = {"out": frame} if reusable else {}

@@ -228,7 +228,7 @@ def _apply_effects(
     mode = aim.channel.readout
     record_truth = truth_maps.map_recorder(drawn.maps, scene, truth, mode)
     final_frame, decisions = apply_all(
-        frame.pop(), aim.effects, scene, stream, record_truth, truth_maps.recorded_effects(truth)
+        frame.pop(), aim.effects, scene, stream, record_truth, truth_maps.recorded_effects(truth), reuse_frame=True
     )
     if "traps" in truth and trap_pumping.EFFECT in aim.effects:
         drawn.maps["traps"] = trap_pumping.trap_map(scene, stream(trap_pumping.EFFECT))

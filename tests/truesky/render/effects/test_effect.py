@@ -202,6 +202,23 @@ def test_margins_follow_the_accuracy():
     assert counted.margin(survey) == pytest.approx(5.0 * counted.margin(quick))
 
 
+def test_a_frame_is_changed_only_if_the_caller_allows_it():
+    rays = [replace(e, apply=lambda frame, rng, out=None: _add_one(frame, out), parameters=lambda scene: ())
+            for e in vis.SKY if e.name == "cosmic_rays"]  # fmt: skip
+    scene = replace(SCENE, forced={"cosmic_rays": True})
+    for reuse in (False, True):
+        frame = np.zeros((4, 4))
+        found, _ = apply_all(frame, rays, scene, lambda e: None, reuse_frame=reuse)
+        assert (found == 1.0).all()
+        assert (found is frame) == reuse
+        assert frame.any() == reuse
+
+
+def _add_one(frame, out):
+    out = np.empty_like(frame) if out is None else out
+    return np.add(frame, 1.0, out=out)
+
+
 def test_what_a_request_forces_is_recorded():
     decisions = {d.name: d for d in decide(SOME, replace(SCENE, forced={"poisson": False, "dark_current": True}))}
     assert not decisions["poisson"].applied
