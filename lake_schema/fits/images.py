@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -250,25 +251,36 @@ def _is_empty_primary(hdu: Any) -> bool:
 
 
 def _add_cards(hdu: Any, image: Image) -> Any:
-    from astropy.io import fits
-    from astropy.utils.exceptions import AstropyUserWarning
-
     for keyword, value, comment in image.cards:
-        if keyword.upper() in STRUCTURE:
-            raise BadInput(f"FITS card {keyword} is set by the writer")
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", AstropyUserWarning)
-                card = fits.Card(keyword, value, comment)
-                # Format the card only to check it: astropy warns if it must cut a long comment, and the filter above
-                # turns the warning into an error.
-                str(card)
-        except (ValueError, AstropyUserWarning) as error:
-            raise BadInput(f"FITS card {keyword}: {' '.join(str(error).split())}") from None
-        hdu.header.append(card, end=True)
+        # The header may change its cards, so it gets a copy.
+        hdu.header.append(copy(_header_card(keyword, value, comment, repr(value))), end=True)
     if image.name:
         hdu.header["EXTNAME"] = image.name
     return hdu
+
+
+@lru_cache(maxsize=4096, typed=True)
+def _header_card(keyword: str, value: Any, comment: str, value_text: str) -> fits.Card:
+    """Return a header card of astropy, which contains its formatted text.
+
+    Cards are cached as in `_card_line`, because astropy reads its settings several times for each card that is new. The
+    caller must not change the card. BadInput is raised if FITS cannot store it.
+    """
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyUserWarning
+
+    if keyword.upper() in STRUCTURE:
+        raise BadInput(f"FITS card {keyword} is set by the writer")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AstropyUserWarning)
+            card = fits.Card(keyword, value, comment)
+            # Format the card, also to check it: astropy warns if it must cut a long comment, and the filter above turns
+            # the warning into an error.
+            str(card)
+    except (ValueError, AstropyUserWarning) as error:
+        raise BadInput(f"FITS card {keyword}: {' '.join(str(error).split())}") from None
+    return card
 
 
 def _check_array(data: Array) -> Array:
