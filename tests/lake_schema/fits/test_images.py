@@ -84,6 +84,27 @@ def test_cards_that_are_equal_are_written_each_as_it_is():
     assert len(set(lines)) == 6
 
 
+def test_cards_of_many_images_are_written_as_if_each_were_the_first(tmp_path):
+    """Cards are kept from image to image, with values that Python counts as equal; headers must not change them."""
+    values = (0.0, -0.0, 1, 1.0, True, "1", "a" * 100)
+    units = [Image(None, tuple((f"K{number}", value, "of many") for number, value in enumerate(values, start)), "U")
+             for start in (0, 0, 1)]  # fmt: skip
+    written = []
+    for name in ("a", "b"):
+        write_images(tmp_path / name, units)
+        written.append((tmp_path / name).read_bytes())
+        with astropy_fits.open(tmp_path / name, mode="update") as stored:
+            stored[1].header["K0"] = 5.0
+    assert written[0] == written[1]
+    expected = astropy_fits.HDUList([(astropy_fits.ImageHDU if i else astropy_fits.PrimaryHDU)() for i in range(3)])
+    for hdu, unit in zip(expected, units, strict=True):
+        for card in unit.cards:
+            hdu.header.append(astropy_fits.Card(*card), end=True)
+        hdu.header["EXTNAME"] = "U"
+    write.write_atomically(tmp_path / "c", expected)
+    assert (tmp_path / "c").read_bytes() == written[0]
+
+
 def test_packed_images_are_small_sound_and_the_same_every_time(tmp_path):
     noise = np.rint(np.random.default_rng(1).normal(2000.0, 3.0, (200, 300))).astype(np.uint16)
     for name in ("a", "b"):

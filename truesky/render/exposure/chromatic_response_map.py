@@ -34,7 +34,7 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
     """Add images of the sources, in which photons are weighted by wavelength, to the scene of a direct image.
 
     From them the chromatic response is computed: the dependence of each pixel's efficiency on wavelength. Only sources
-    whose colour changes a pixel by more than a tenth of its noise are drawn.
+    whose colour changes a pixel noticeably are drawn.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def with_dispersed_light(
 
     Notes
     -----
-    The light that is neglected at the edges of stamps changes a pixel by at most a tenth of its noise.
+    The light that is neglected at the edges of stamps changes a pixel by less than a noticeable amount.
     """
     dispersed, psf = light.dispersed, light.psf
     if _is_inactive(scene, aim) or psf is None or dispersed is None or not len(light.sources):
@@ -130,8 +130,7 @@ def with_dispersed_light(
     if not len(indices):
         return scene
     chosen, shape = light.sources.take(indices), (aim.detector.ny, aim.detector.nx)
-    # Light may be neglected if the chromatic response changes it by less than half of a noticeable change, which is a
-    # tenth of a pixel's noise.
+    # Light may be neglected if the chromatic response changes it by less than half of a noticeable change.
     limit = 0.5 * scene.noticeable_fraction / largest
     settings = replace(dispersed.settings, edge=limit, faint=limit)
 
