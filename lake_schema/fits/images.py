@@ -263,8 +263,8 @@ def _add_cards(hdu: Any, image: Image) -> Any:
 def _header_card(keyword: str, value: Any, comment: str, value_text: str) -> fits.Card:
     """Return a header card of astropy, which contains its formatted text.
 
-    Cards are cached as in `_card_line`, because astropy reads its settings several times for each card that is new. The
-    caller must not change the card. BadInput is raised if FITS cannot store it.
+    Cards are cached as in `_card_line`, because astropy reads its settings several times for each new card. Copy the
+    result before changing it. BadInput is raised if FITS cannot store the card.
     """
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyUserWarning

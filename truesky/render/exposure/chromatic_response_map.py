@@ -95,7 +95,7 @@ def with_dispersed_light(
     """Add spectra of the sources, in which photons are weighted by wavelength, to the scene of a slitless image.
 
     From them the chromatic response is computed: the dependence of each pixel's efficiency on wavelength. Only sources
-    whose brightest column changes a pixel by more than a tenth of its noise are drawn.
+    whose brightest column changes a pixel noticeably are drawn.
 
     Parameters
     ----------
