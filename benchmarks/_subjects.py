@@ -65,12 +65,12 @@ def _nisp_p_chain(folder: Path, quick: bool) -> Work:
     return work
 
 
-def _nisp_s(folder: Path, quick: bool) -> Work:
+def _nisp_s(folder: Path, quick: bool, selection: int = 0) -> Work:
     from benchmarks import _detectors, nisp_s
     from truesky.request.from_toml import parse
 
     file = folder / "request.toml"
-    file.write_text(nisp_s.request_text(quick), encoding="utf-8")
+    file.write_text(nisp_s.request_text(quick, selection=selection), encoding="utf-8")
     plain = parse(file)
     root = _detectors.make_lake(folder, plain)
     facts = _detectors.plan_detector(root, nisp_s.with_all_effects(plain))
@@ -115,6 +115,7 @@ SUBJECTS: Mapping[str, Callable[[Path, bool], Work]] = {
     "nisp_p": _nisp_p,
     "nisp_p_chain": _nisp_p_chain,
     "nisp_s": _nisp_s,
+    "nisp_s_flux_limits": partial(_nisp_s, selection=1),
     **{name: partial(_ground, camera=name) for name in ("lsst", "decam", "gpc1", "jpcam")},
     "fluxes": _fluxes,
     "catalogue": _catalogue,
@@ -125,7 +126,8 @@ NOTES = {
     "vis_quicklook": "the same at quicklook accuracy",
     "nisp_p": "a NISP-P detector with all effects",
     "nisp_p_chain": "the same after fifteen exposures of the detector, in order of time",
-    "nisp_s": "a NISP-S detector with all effects",
+    "nisp_s": "a NISP-S detector with all effects and the default selection of sources",
+    "nisp_s_flux_limits": "the same with sources above flux limits only",
     "lsst": "a detector of LSSTCam with all effects; decam, gpc1 and jpcam are the same for other cameras",
     "fluxes": f"{_GALAXIES:,} galaxies in 22 bands from tables",
     "catalogue": "halos and galaxies of a sixteenth of an order-5 cell",
