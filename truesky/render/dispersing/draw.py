@@ -8,7 +8,7 @@ trail of a moving source is drawn in pieces, each on a separate stamp.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.arrays import Float, Float32, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
 from truesky.render.camera.traces import Trace
 from truesky.render.dispersing import images, kernels, large_galaxies, spreading
 from truesky.render.dispersing.images import Planes, Sampling
@@ -47,6 +47,10 @@ _STEEPEST = 0.15
 # fraction of the source's largest side, the order is drawn from the image on the largest stamp. The image of the source
 # is then computed only once.
 _SHARED_FRACTION = 0.6
+# Factor by which upper limits of a source's electrons are increased, because spectra are normalised in single precision.
+_ROUNDING = 1.001
+# Electrons that a source of unit brightness may have at a wavelength without a weight (see `DispersedSources.weights`).
+_UNLIMITED = 1e30
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +167,16 @@ class DispersedSources:
         Orders of one grism; all must have the same w wavelengths.
     settings : Settings
         Limits for the light that is not drawn, and sampling of the images of sources.
+    weights : float array, shape (w,), optional
+        Weights of the wavelengths for which the sum of weights times spectrum is at most 1 for every source. No spectrum
+        may be negative. The spectra of sources of which nothing can be drawn are then not computed. Without weights,
+        all spectra are computed.
     """
 
     spectra: Spectra
     orders: tuple[Order, ...]
     settings: Settings
+    weights: Float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +189,7 @@ class Tally:
         Electrons that were drawn on the frame (image of the detector).
     expected : float array, shape (n, orders)
         Electrons of the whole order, on and outside the frame. If the response is negative, their absolute values are
-        counted.
+        counted. 0 for sources whose spectra were not computed (see `DispersedSources.weights`).
     peak : float array, shape (n, orders)
         Electrons (absolute values) in the brightest column of the order, summed over its rows; 0 if the order was not
         drawn.
@@ -264,8 +273,9 @@ def draw(
         pieces, psf, sizes, settings, (slope, straight), shape, {} if planes_cache is None else planes_cache
     )
     piece_tally = Tally.empty(len(pieces), len(orders))
-    for start in range(0, len(pieces), _BATCH_SOURCES):
-        batch = np.arange(start, min(start + _BATCH_SOURCES, len(pieces)))
+    drawable = _find_drawable(source_images, parent, plans, dispersed.weights, shape)
+    for start in range(0, len(drawable), _BATCH_SOURCES):
+        batch = drawable[start : start + _BATCH_SOURCES]
         spectra = dispersed.spectra(parent[batch])
         order_batches = [_OrderBatch.from_spectra(source_images, batch, spectra, plan, shape) for plan in plans]
         for column, part in enumerate(order_batches):
@@ -281,6 +291,52 @@ def draw(
     # Frames have integer pixels (FIXED_POINT per electron). Their sum is exact, so the result is the same whether each
     # order has its own frame or not.
     return sum(frames[1:], frames[0]) / FIXED_POINT
+
+
+def _find_drawable(
+    source_images: _SourceImages,
+    parent: Int,
+    plans: Sequence[_OrderPlan],
+    weights: Float | None,
+    shape: tuple[int, int],
+) -> Int:
+    """Return the indices of the sources of which some order may be drawn, without computing spectra.
+
+    Parameters
+    ----------
+    source_images : _SourceImages
+        Positions, electrons and stamps of the sources. A moving source is given in several pieces.
+    parent : int array, shape (p,)
+        Index of the whole source to which each of the p pieces belongs. If one piece may be drawn, all pieces of its
+        source are returned, because the electrons of the whole source are counted.
+    plans : sequence of _OrderPlan
+        Spectral orders.
+    weights : float array, shape (w,), or None
+        Weights of `DispersedSources`. If None, all sources may be drawn.
+    shape : (int, int)
+        Number of rows and of columns of the detector.
+
+    Returns
+    -------
+    int array
+        Indices in ascending order.
+
+    Notes
+    -----
+    The electrons of an order are at most those of a source whose light is all at the wavelength with the largest ratio
+    of response and weight. A spectrum with more electrons has a larger stamp, so that a source whose largest possible
+    spectrum is not drawn is certainly not drawn.
+    """
+    if weights is None:
+        return np.arange(len(parent))
+    everything, may_be_drawn = np.arange(len(parent)), np.zeros(len(parent), bool)
+    electrons = source_images.sources.electrons
+    for plan in plans:
+        size = np.abs(plan.order.response)
+        ratio = np.divide(size, weights, out=np.where(size > 0.0, _UNLIMITED, 0.0), where=weights > 0.0)
+        largest = electrons * (_ROUNDING * ratio.max(initial=0.0))
+        may_be_drawn |= source_images.sizes_on_frame(everything, plan, (largest, largest), shape)[0] > 0
+    return np.flatnonzero(np.bincount(parent, may_be_drawn, parent.max(initial=-1) + 1)[parent] > 0)
 
 
 def _slope(trace: Trace) -> float:
@@ -365,35 +421,13 @@ class _OrderBatch:
     def from_spectra(
         cls, source_images: _SourceImages, batch: Int, spectra: Float32, plan: _OrderPlan, shape: tuple[int, int]
     ) -> _OrderBatch:
-        order, (ny, nx), count = plan.order, shape, len(batch)
-        column, row = source_images.sources.column[batch], source_images.sources.row[batch]
-        peak, expected = np.empty(count), np.empty(count)
+        peak, expected = np.empty(len(batch)), np.empty(len(batch))
         window = max(round(plan.angstrom_per_pixel), 1)
         kernels.measure_peak_and_total(
-            spectra, source_images.sources.electrons[batch], order.response, window, peak, expected
+            spectra, source_images.sources.electrons[batch], plan.order.response, window, peak, expected
         )
-        along, across = (part.T for part in order.trace.polynomials(column, row))
-        t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
-        x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
-        limit = source_images.sizes.limit * (
-            1.0 if order.trace.order == 1 else source_images.settings.faint / source_images.settings.edge
-        )
-        sizes = source_images.sizes.size(batch, peak, expected)
-        left_edge, right_edge = column + x.min(axis=1), column + x.max(axis=1)
-        low_edge, high_edge = row + y.min(axis=1), row + y.max(axis=1)
-        off_frame = (
-            (right_edge + sizes < 0) | (left_edge - sizes > nx) | (high_edge + sizes < 0) | (low_edge - sizes > ny)
-        )
-        across_step, along_step = np.diff(y, axis=1), np.diff(x, axis=1)
-        straight = (np.abs(across_step - source_images.slope * along_step) <= _STRAIGHT * np.abs(along_step)).all(
-            axis=1
-        )
-        straight &= (along_step > 0.0).all(axis=1) | (along_step < 0.0).all(axis=1)
-        not_drawn = off_frame | (peak < limit) | (peak <= 0.0)
-        return cls(
-            np.ascontiguousarray(along), np.ascontiguousarray(across), np.where(not_drawn, 0, sizes),
-            np.where(straight, plan.tile, 0), expected, peak,
-        )  # fmt: skip
+        sizes, along, across, straight = source_images.sizes_on_frame(batch, plan, (peak, expected), shape)
+        return cls(along, across, sizes, np.where(straight, plan.tile, 0), expected, peak)
 
 
 class _SourceImages:
@@ -417,6 +451,50 @@ class _SourceImages:
         ]
         self.weights = np.stack(node_weights, axis=1)
         self._planes = planes_cache
+
+    def sizes_on_frame(
+        self, batch: Int, plan: _OrderPlan, light: tuple[Float, Float], shape: tuple[int, int]
+    ) -> tuple[Int, Float, Float, Bool]:
+        """Choose the stamps (square images of sources) of one spectral order of k sources.
+
+        Parameters
+        ----------
+        batch : int array, shape (k,)
+            Indices of the sources.
+        plan : _OrderPlan
+            The order.
+        light : (float array, float array), each of shape (k,)
+            Electrons of each spectrum in its brightest column, and in all columns.
+        shape : (int, int)
+            Number of rows and of columns of the detector.
+
+        Returns
+        -------
+        sizes : int array, shape (k,)
+            Sides of the stamps, pixels; 0 if the order is too faint to be drawn or not on the detector.
+        along, across : float array, shape (k, i)
+            Coefficients of the trace, as in `_OrderBatch`.
+        straight : bool array, shape (k,)
+            True if the trace is straight.
+        """
+        (ny, nx), (peak, expected), order = shape, light, plan.order
+        column, row = self.sources.column[batch], self.sources.row[batch]
+        along, across = (part.T for part in order.trace.polynomials(column, row))
+        t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
+        x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
+        limit = self.sizes.limit * (1.0 if order.trace.order == 1 else self.settings.faint / self.settings.edge)
+        sizes = self.sizes.size(batch, peak, expected)
+        left_edge, right_edge = column + x.min(axis=1), column + x.max(axis=1)
+        low_edge, high_edge = row + y.min(axis=1), row + y.max(axis=1)
+        off_frame = (
+            (right_edge + sizes < 0) | (left_edge - sizes > nx) | (high_edge + sizes < 0) | (low_edge - sizes > ny)
+        )
+        across_step, along_step = np.diff(y, axis=1), np.diff(x, axis=1)
+        straight = (np.abs(across_step - self.slope * along_step) <= _STRAIGHT * np.abs(along_step)).all(axis=1)
+        straight &= (along_step > 0.0).all(axis=1) | (along_step < 0.0).all(axis=1)
+        not_drawn = off_frame | (peak < limit) | (peak <= 0.0)
+        sizes = np.where(not_drawn, 0, sizes)
+        return sizes, np.ascontiguousarray(along), np.ascontiguousarray(across), straight
 
     def stamp_sampling(self, size: int, smooth: bool = False) -> Sampling:
         """Return the sampling of stamps (square images of sources) with a side of `size` pixels.

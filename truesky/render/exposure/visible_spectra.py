@@ -90,7 +90,7 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     nodes = images.nodes(order_traces[0].first, order_traces[0].last, settings.nodes)
     psf = dispersion.psf(aim.detector, nodes, mission, settings.positions)
     zeros = np.zeros(len(sources))
-    dispersed = DispersedSources(source_spectra, grism_orders, settings)
+    dispersed = DispersedSources(source_spectra, grism_orders, settings, band.response * band.wavelength)
     return Light(
         sources,
         zeros.astype(np.int64),
