@@ -61,7 +61,8 @@ _TABLE_HEADER = """\
 # Settings of drawing spectra. allowed: the error of a pixel, of its noise, that they are for.
 #
 # edge, faint: of a sky pixel's noise; min_size: pixels; along, across: samples a pixel; block: A that share a PSF;
-# nodes: wavelengths of the PSF; positions: of the PSF on a detector, one of euclid.DEGREES.
+# nodes: wavelengths of the PSF; positions: of the PSF on a detector, one of euclid.DEGREES; separable: light of the
+# brightest column, of a pixel's noise, below which an order is a product of two profiles.
 # Then by python -m benchmarks.nisp_s --settings, the largest errors of {chosen} galaxies and stars of
 # H_E = {bright:g} to {faint:g} that the settings were chosen on, and (_held) of {held} others, each in a first order
 # at a tilt of 0, 4 or -4 deg: background: of a pixel, of its own noise; flux: of a line in {wide} x {high} pixels;

@@ -18,9 +18,9 @@ import numpy as np
 
 from lake_schema.arrays import Bool, Float, Float32, Int
 from truesky.render.camera.traces import Trace
-from truesky.render.dispersing import images, kernels, large_galaxies, spreading
+from truesky.render.dispersing import images, kernels, large_galaxies, separable, spreading
 from truesky.render.dispersing.images import Planes, Sampling
-from truesky.render.dispersing.stamp_sizes import LARGE_GALAXY_SIZES, Sizes
+from truesky.render.dispersing.stamp_sizes import LARGE_GALAXY_SIZES, LARGEST, Sizes
 from truesky.render.drawing import stamps, transfer
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.psf.model import Psf
@@ -47,8 +47,12 @@ _STEEPEST = 0.15
 # fraction of the source's largest side, the order is drawn from the image on the largest stamp. The image of the source
 # is then computed only once.
 _SHARED_FRACTION = 0.6
-# Factor by which upper limits of a source's electrons are increased, because spectra are normalised in single precision.
+# Factor by which upper limits of a source's electrons are increased, because of the rounding of spectra in single
+# precision.
 _ROUNDING = 1.001
+# A faint order is drawn as a product of two profiles (separable.py) only if the slope of its trace differs from that of
+# the images by at most this, in rows per column.
+_SEPARABLE_SLOPE = 0.3
 # Electrons that a source of unit brightness may have at a wavelength without a weight (see `DispersedSources.weights`).
 _UNLIMITED = 1e30
 
@@ -103,6 +107,9 @@ class Settings:
         Number of wavelengths at which the PSF is computed; it is interpolated between them.
     positions : int
         Number of positions on a detector at which the PSF is computed: 1, 4, 9 or 25 (keys of `euclid.DEGREES`).
+    separable : float
+        A spectral order is drawn as a product of a profile along and a profile across the trace (separable.py) if all
+        light in its brightest column is below this limit. With 0 no order is.
     """
 
     edge: float = 0.003
@@ -113,6 +120,7 @@ class Settings:
     block: float = 110.0
     nodes: int = 4
     positions: int = 9
+    separable: float = 0.0
 
 
 # File with one row of settings (attributes of `Settings`) per accuracy. The column `allowed` is the error of the
@@ -142,7 +150,7 @@ def read_settings() -> list[dict[str, float]]:
 
 def settings_from_row(row: dict[str, float]) -> Settings:
     """Return the settings in a row of `read_settings`. KeyError is raised if a column is missing."""
-    values: dict[str, Any] = {name: row[name] for name in ("edge", "faint", "block")}
+    values: dict[str, Any] = {name: row[name] for name in ("edge", "faint", "block", "separable")}
     values |= {name: int(row[name]) for name in ("min_size", "along", "across", "nodes", "positions")}
     return Settings(**values)
 
@@ -168,9 +176,9 @@ class DispersedSources:
     settings : Settings
         Limits for the light that is not drawn, and sampling of the images of sources.
     weights : float array, shape (w,), optional
-        Weights of the wavelengths for which the sum of weights times spectrum is at most 1 for every source. No spectrum
-        may be negative. The spectra of sources of which nothing can be drawn are then not computed. Without weights,
-        all spectra are computed.
+        Weights of the wavelengths for which the sum of weights times spectrum is at most 1 for every source. No
+        spectrum may be negative. The spectra of sources of which nothing can be drawn are then not computed. Without
+        weights, all spectra are computed.
     """
 
     spectra: Spectra
@@ -408,6 +416,8 @@ class _OrderBatch:
         are counted.
     peak : float array, shape (k,)
         Electrons (absolute values) in the brightest column of the order, summed over its rows.
+    separable : bool array, shape (k,)
+        True if the order is drawn as a product of two profiles.
     """
 
     along: Float
@@ -416,6 +426,7 @@ class _OrderBatch:
     tiles: Int
     expected: Float
     peak: Float
+    separable: Bool
 
     @classmethod
     def from_spectra(
@@ -426,8 +437,12 @@ class _OrderBatch:
         kernels.measure_peak_and_total(
             spectra, source_images.sources.electrons[batch], plan.order.response, window, peak, expected
         )
-        sizes, along, across, straight = source_images.sizes_on_frame(batch, plan, (peak, expected), shape)
-        return cls(along, across, sizes, np.where(straight, plan.tile, 0), expected, peak)
+        sizes, along, across, slope = source_images.sizes_on_frame(batch, plan, (peak, expected), shape)
+        limit = source_images.sizes.limit * source_images.settings.separable / source_images.settings.edge
+        is_separable = (peak < limit) & (sizes > 0) & (sizes <= LARGEST) & (slope <= _SEPARABLE_SLOPE)
+        is_separable &= source_images.unextended[batch] & (plan.angstrom_per_pixel >= separable.BIN)
+        tiles = np.where(slope <= _STRAIGHT, plan.tile, 0)
+        return cls(along, across, sizes, tiles, expected, peak, is_separable)
 
 
 class _SourceImages:
@@ -451,10 +466,12 @@ class _SourceImages:
         ]
         self.weights = np.stack(node_weights, axis=1)
         self._planes = planes_cache
+        # Sources without a given image or a trail, in coordinates in which traces are rows.
+        self.unextended = self.straight & (sizes.extra_pixels == 0.0)
 
     def sizes_on_frame(
         self, batch: Int, plan: _OrderPlan, light: tuple[Float, Float], shape: tuple[int, int]
-    ) -> tuple[Int, Float, Float, Bool]:
+    ) -> tuple[Int, Float, Float, Float]:
         """Choose the stamps (square images of sources) of one spectral order of k sources.
 
         Parameters
@@ -474,8 +491,9 @@ class _SourceImages:
             Sides of the stamps, pixels; 0 if the order is too faint to be drawn or not on the detector.
         along, across : float array, shape (k, i)
             Coefficients of the trace, as in `_OrderBatch`.
-        straight : bool array, shape (k,)
-            True if the trace is straight.
+        slope : float array, shape (k,)
+            Limit, of `_STRAIGHT` and `_SEPARABLE_SLOPE`, that the difference of the trace's slope from the slope of the
+            images does not exceed, rows per column. It is infinite if the difference is larger or the trace turns back.
         """
         (ny, nx), (peak, expected), order = shape, light, plan.order
         column, row = self.sources.column[batch], self.sources.row[batch]
@@ -490,11 +508,14 @@ class _SourceImages:
             (right_edge + sizes < 0) | (left_edge - sizes > nx) | (high_edge + sizes < 0) | (low_edge - sizes > ny)
         )
         across_step, along_step = np.diff(y, axis=1), np.diff(x, axis=1)
-        straight = (np.abs(across_step - self.slope * along_step) <= _STRAIGHT * np.abs(along_step)).all(axis=1)
-        straight &= (along_step > 0.0).all(axis=1) | (along_step < 0.0).all(axis=1)
+        one_way = (along_step > 0.0).all(axis=1) | (along_step < 0.0).all(axis=1)
+        difference = np.abs(across_step - self.slope * along_step)
+        straight = (difference <= _STRAIGHT * np.abs(along_step)).all(axis=1)
+        moderate = (difference <= _SEPARABLE_SLOPE * np.abs(along_step)).all(axis=1)
+        slope = np.where(one_way & straight, _STRAIGHT, np.where(one_way & moderate, _SEPARABLE_SLOPE, np.inf))
         not_drawn = off_frame | (peak < limit) | (peak <= 0.0)
         sizes = np.where(not_drawn, 0, sizes)
-        return sizes, np.ascontiguousarray(along), np.ascontiguousarray(across), straight
+        return sizes, np.ascontiguousarray(along), np.ascontiguousarray(across), slope
 
     def stamp_sampling(self, size: int, smooth: bool = False) -> Sampling:
         """Return the sampling of stamps (square images of sources) with a side of `size` pixels.
@@ -512,11 +533,20 @@ class _SourceImages:
         wavelengths of the PSF. `sampling` contains the side n of an image in pixels, and its samples per pixel along
         and across the trace.
         """
-        if sampling not in self._planes:
-            self._planes[sampling] = images.planes(self.psf, sampling)
-        stamp_planes = self._planes[sampling]
+        stamp_planes = self._stamp_planes(sampling)
         transforms = [images.spread_transform(stamp_planes, self.sources, i) for i in batch.tolist()]
         return images.coefficients(stamp_planes, self.weights[batch], self.profiles.take(batch), transforms)
+
+    def profiles_of_images(self, batch: Int, sampling: Sampling) -> tuple[Float32, Float32]:
+        """Return the profiles along and across the trace of the sources with the indices `batch` (see separable.py)."""
+        return separable.profiles_of_images(
+            self._stamp_planes(sampling), self.weights[batch], self.profiles.take(batch)
+        )
+
+    def _stamp_planes(self, sampling: Sampling) -> Planes:
+        if sampling not in self._planes:
+            self._planes[sampling] = images.planes(self.psf, sampling)
+        return self._planes[sampling]
 
     def batch_size(self, sampling: Sampling) -> int:
         """Return for how many sources, at least 1, images with this sampling may be in memory at a time."""
@@ -542,6 +572,9 @@ def _add_orders(
     largest = sizes.max(axis=0)
     sizes = np.where((sizes > 0) & (sizes >= _SHARED_FRACTION * largest), largest, sizes)
     tally.sizes[batch] = np.maximum(tally.sizes[batch], largest)
+    is_product = np.stack([part.separable for _, part in orders]) & (sizes <= LARGEST)
+    _add_products(source_images, batch, spectra, orders, np.where(is_product, sizes, 0), order_frames, tally)
+    sizes = np.where(is_product, 0, sizes)
     for size in np.unique(sizes[sizes > 0]).tolist():
         sampling = source_images.stamp_sampling(size)
         smooth = source_images.stamp_sampling(size, smooth=True) if size >= LARGE_GALAXY_SIZES[0] else None
@@ -563,3 +596,26 @@ def _add_orders(
                             smooth_image, light, plan.share, path, plan.t, place, smooth, order_frames[m]
                         )
                     tally.electrons[i, m] = fallen
+
+
+def _add_products(
+    source_images: _SourceImages, batch: Int, spectra: Float32, orders: list[tuple[_OrderPlan, _OrderBatch]],
+    sizes: Int, order_frames: list[Int], tally: Tally,
+) -> None:  # fmt: skip
+    """Draw faint spectral orders as products of two profiles, as `_add_orders` draws the others.
+
+    `sizes` [orders, k] are the sides of the stamps, pixels; 0 for orders that are not drawn here.
+    """
+    for size in np.unique(sizes[sizes > 0]).tolist():
+        sampling = source_images.stamp_sampling(size)
+        (indices,) = np.nonzero((sizes == size).any(axis=0))
+        profiles = source_images.profiles_of_images(batch[indices], sampling)
+        for k, along_profile, across_profile in zip(indices.tolist(), *profiles, strict=True):
+            i = int(batch[k])
+            for m in np.flatnonzero(sizes[:, k] == size).tolist():
+                plan, part = orders[m]
+                tally.electrons[i, m] = separable.draw_product(
+                    along_profile, across_profile, spectra[k], float(source_images.sources.electrons[i]),
+                    plan.order.response, plan.share, part.along[k], part.across[k], plan.t, source_images.places[i],
+                    sampling.shear, sampling.shape, FIXED_POINT, order_frames[m],
+                )  # fmt: skip

@@ -329,7 +329,8 @@ def spread_transform(stamp_planes: Planes, sources: Sources, i: int) -> Array | 
 
 
 @lru_cache(maxsize=1)
-def _sersic() -> Float32:
+def sersic_table() -> Float32:
+    """Return the Fourier transforms of Sersic profiles, one row per Sersic index, from `sersic.table`."""
     return sersic.table()
 
 
@@ -367,7 +368,7 @@ def coefficients(stamp_planes: Planes, weights: Float, profiles: Profiles, trans
         profiles.bulge,
         profiles.disk,
         profiles.thick,
-        _sersic(),
+        sersic_table(),
         profiles.row,
         profiles.row_weights,
         zones,

@@ -140,18 +140,29 @@ def add_samples(
                 for v in range(len(line)):
                     line[v] += weight * image_line[v]
             aside = shear * (corner[0] + first_column + i - (first + m) / ox)
-            _add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, first_column + i])
+            add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, first_column + i])
 
 
 @jit
-def _add_line(
+def add_line(
     line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
 ) -> None:
     """Add one column of a source's image to a column of the detector.
 
-    `out` [h] are the pixels of the detector's column from the row `low` on. The array `line` contains the spline
-    coefficients of the image's column, `oy` for each of n rows. The middle of `line` is placed at the fractional row
-    `row` of the detector. The arrays `wrapped` and `fine` are scratch memory.
+    Parameters
+    ----------
+    line : float32 array, shape (n oy,)
+        Spline coefficients of the column of the image. Its middle is placed at the row `row` of the detector.
+    row : float
+        Fractional row of the detector.
+    n, oy : int
+        Rows of the image, and coefficients per row.
+    low : int
+        Row of the detector at which `out` begins.
+    wrapped, fine : float32 array, shape (n oy + oy + 4,) and (n oy,)
+        Scratch memory.
+    out : float32 array, shape (h,)
+        Pixels of the detector's column, changed in place.
     """
     tall, begin = len(line), int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
@@ -392,7 +403,7 @@ def add_lines(
     ends = _slope(path, 0), _slope(path, _NODES - 2)
     for c in range(out.shape[1]):
         row, _, _ = _interpolate_path(path, float(corner[0] + c), ends)
-        _add_line(lines[corner[0] + c - low], row, n, oy, corner[1], wrapped, fine, out[:, c])
+        add_line(lines[corner[0] + c - low], row, n, oy, corner[1], wrapped, fine, out[:, c])
 
 
 @jit

@@ -1,0 +1,225 @@
+"""Draw faint slitless spectra as products of a profile along and a profile across the trace.
+
+The image I(u, v) of a source, with u along and v across the trace, is replaced by the product of its sums over v and
+over u. The light of a continuum that changes slowly along the trace is then the same, and so is the light of a line in
+every column and in every row. Only the shape of a line within a few pixels differs. This is not noticeable in a
+spectrum whose brightest column is well below the noise of a pixel. The sums are one-dimensional Fourier transforms, and
+therefore fast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+
+from lake_schema.arrays import Array, Float, Float32, Int
+from truesky.numerics.compiling import jit
+from truesky.render.dispersing import images, kernels
+from truesky.render.dispersing.images import Planes, Profiles
+from truesky.render.dispersing.kernels import add_to_trace
+from truesky.render.dispersing.spreading import add_line, add_piece
+
+# Width of the bins in which the light of a spectrum is summed, in wavelengths; at most a pixel (see `draw._OrderPlan`).
+# The light of a wavelength is divided between the two nearest bins, which conserves its mean position.
+BIN = 4
+# Number of samples along the trace that are drawn with the same PSF.
+_SAMPLES = 16
+
+
+def profiles_of_images(stamp_planes: Planes, weights: Float, profiles: Profiles) -> tuple[Float32, Float32]:
+    """Return the sums of the images of m sources, across and along the trace.
+
+    Parameters
+    ----------
+    stamp_planes : Planes
+        Fourier transforms of the PSF's p basis images, for stamps (square images of sources) of one size.
+    weights : float array, shape (m, b, p)
+        Weights of the p basis images in the PSF of each source, at each of b wavelengths.
+    profiles : Profiles
+        Bulge and disc profiles of the sources.
+
+    Returns
+    -------
+    along : float32 array, shape (m, b, s_a, n)
+        Sums across the trace as coefficients of the spline along it: for each of the s_a places of a sample in a pixel,
+        one coefficient for each of the n pixels.
+    across : float32 array, shape (m, b, n s_c)
+        Sums along the trace as coefficients of the spline across it, divided by the light inside the stamp.
+    """
+    n, s_along, s_across = stamp_planes.sampling.shape
+    half = n * s_along // 2 + 1
+    planes = stamp_planes.planes
+    swapped = profiles.bulge[:, ::-1], profiles.disk[:, ::-1], profiles.thick[:, ::-1]
+    along_transform = _line_transforms(planes[:, :half, 0], np.abs(stamp_planes.ku[:half]), weights, profiles, swapped)
+    matrices = profiles.bulge, profiles.disk, profiles.thick
+    across_transform = _line_transforms(planes[:, 0, :], stamp_planes.kv, weights, profiles, matrices)
+    along = scipy.fft.irfft(along_transform, n * s_along) * np.float32(1.0 / s_across)
+    # Both sums have the light inside the stamp, which is less than 1. The product must have it once, so the sum of
+    # `across` is normalised. The first element of a transform is the sum of all coefficients.
+    across = scipy.fft.irfft(across_transform, n * s_across) * (s_across / across_transform[..., :1].real)
+    by_phase = along.reshape(*along.shape[:2], n, s_along).swapaxes(2, 3)
+    return np.ascontiguousarray(by_phase), np.asarray(across)
+
+
+def _line_transforms(
+    planes: Array, k: Float32, weights: Float, profiles: Profiles, matrices: tuple[Float, Float, Float]
+) -> Array:
+    """Return the Fourier transforms [m, b, columns] of the images of m sources at frequencies on one axis.
+
+    `planes` [p, columns] are the transforms of the PSF's basis images at the frequencies `k`, radian per pixel. The
+    `matrices` are the attributes `bulge`, `disk` and `thick` of the profiles, whose second axis is that of `k`.
+    """
+    out = np.empty((*weights.shape[:2], 1, len(k)), np.complex64)
+    kernels.zones(
+        np.ascontiguousarray(planes[:, None]), weights.astype(np.float32), np.zeros(1, np.float32),
+        np.ascontiguousarray(k), profiles.body, profiles.fraction, *map(np.ascontiguousarray, matrices),
+        images.sersic_table(), profiles.row, profiles.row_weights, out,
+    )  # fmt: skip
+    return out[:, :, 0]
+
+
+@jit
+def draw_product(
+    along_profile: Float32, across_profile: Float32, spectrum: Float32, factor: float, response: Float, share: Float,
+    along: Float, across: Float, times: tuple[float, float], start: tuple[float, float], shear: float,
+    shape: tuple[int, int, int], unit: float, frame: Int,
+) -> float:  # fmt: skip
+    """Draw one spectral order of a source on the image of a detector (frame), as a product of two profiles.
+
+    Parameters
+    ----------
+    along_profile : float32 array, shape (b, s_a, n)
+        Profile of the source along the trace at b wavelengths, from `profiles_of_images`.
+    across_profile : float32 array, shape (b, n s_c)
+        Profile of the source across the trace.
+    spectrum : float32 array, shape (w,)
+        Spectrum of the source.
+    factor : float
+        Factor by which the spectrum is multiplied.
+    response : float array, shape (w,)
+        Electrons per unit of `spectrum` times `factor`, by wavelength.
+    share : float array, shape (w, b)
+        Weights that interpolate the PSF at each of the spectrum's w wavelengths from the PSFs at b wavelengths.
+    along, across : float array, shape (i,)
+        Coefficients of t^i of the displacement from the undispersed image in columns (`along`) and in rows, pixels.
+    times : (float, float)
+        Value of t at the first wavelength, and step of t from one wavelength to the next.
+    start : (float, float)
+        Column and row of the undispersed image, 0-based pixels.
+    shear : float
+        Slope of the images' rows relative to the detector's rows, in rows per column.
+    shape : (int, int, int)
+        Side n of the stamp in pixels, and samples per pixel, along (s_a) and across the trace (s_c).
+    unit : float
+        Integers of the frame per electron.
+    frame : int array, shape (ny, nx)
+        Frame in integers, changed in place.
+
+    Returns
+    -------
+    float
+        Electrons that were added to the frame; 0 if the spectrum does not touch it.
+
+    Notes
+    -----
+    In each column, the profile across the trace is placed at the mean row, and has the PSF of the mean wavelength, of
+    the light in this column.
+    """
+    n, ox, oy = shape
+    ny, nx = frame.shape
+    count = len(response)
+    bins = (count - 1) // BIN + 2
+    electrons = np.zeros(bins)
+    for k in range(bins - 1):
+        low, high = 0.0, 0.0
+        for i in range(min(BIN, count - k * BIN)):
+            light = factor * np.float64(spectrum[k * BIN + i]) * response[k * BIN + i]
+            high += light * i
+            low += light
+        electrons[k + 1] += high / BIN
+        electrons[k] += low - high / BIN
+    # Weights with which the light, its row relative to the sheared coordinates and its wavelength are summed.
+    moments = np.ones((3, bins))
+    left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
+    for k in range(bins):
+        t = times[0] + times[1] * BIN * k
+        x, y = along[len(along) - 1], across[len(across) - 1]
+        for j in range(len(along) - 2, -1, -1):
+            x = x * t + along[j]
+        for j in range(len(across) - 2, -1, -1):
+            y = y * t + across[j]
+        left, right = min(left, start[0] + x), max(right, start[0] + x)
+        moments[1, k], moments[2, k] = start[1] + y - shear * (start[0] + x), BIN * k
+        bottom, top = min(bottom, moments[1, k]), max(top, moments[1, k])
+    first = int(np.floor(ox * left)) - 3
+    trace = np.zeros((3, int(np.ceil(ox * right)) + 4 - first))
+    add_to_trace(electrons, along, (times[0], times[1] * BIN), start[0], ox, moments, first, trace)
+    begin = max(int(np.floor(left)) - n // 2 - 2, 0)
+    width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin
+    if width <= 0:
+        return 0.0
+    ends = shear * begin, shear * (begin + width - 1)
+    low_row = max(int(np.floor(bottom + min(ends[0], ends[1]))) - n // 2 - 1, 0)
+    height = min(int(np.ceil(top + max(ends[0], ends[1]))) + n // 2 + 2, ny) - low_row
+    if height <= 0:
+        return 0.0
+    columns = np.zeros((3, width))
+    _sum_columns(along_profile, trace, first, share, ox, begin, columns)
+    piece = np.zeros((height, width), np.float32)
+    line = np.empty(n * oy, np.float32)
+    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
+    for c in range(width):
+        light = columns[0, c]
+        if light == 0.0:
+            continue
+        row = min(max(columns[1, c] / light, bottom), top) + shear * (begin + c)
+        number = int(min(max(columns[2, c] / light, 0.0), count - 1.0))
+        line[:] = np.float32(0.0)
+        for b in range(len(across_profile)):
+            weight, profile = np.float32(light * share[number, b]), across_profile[b]
+            for v in range(len(line)):
+                line[v] += weight * profile[v]
+        add_line(line, row, n, oy, low_row, wrapped, fine, piece[:, c])
+    return add_piece(piece, (begin, low_row), unit, frame)
+
+
+@jit
+def _sum_columns(
+    along_profile: Float32, trace: Float, first: int, share: Float, ox: int, begin: int, columns: Float
+) -> None:
+    """Convolve the light along a trace with the profile of a source along it, and add the result to `columns` [3, w].
+
+    `trace` [3, m] are the light, the light times its row and the light times its wavelength index, in m samples along
+    the trace from the sample `first` on. There are `ox` samples per pixel. `columns` are the same sums for columns of
+    the detector from the column `begin` on. The profile [b, ox, n] at b wavelengths is interpolated with the weights
+    `share` [w, b].
+    """
+    nodes, _, n = along_profile.shape
+    width, samples = columns.shape[1], trace.shape[1]
+    mixed = np.empty((ox, n))
+    for group in range(0, samples, _SAMPLES):
+        light, number = 0.0, 0.0
+        for m in range(group, min(group + _SAMPLES, samples)):
+            light += trace[0, m]
+            number += trace[2, m]
+        if light == 0.0:
+            continue
+        index = int(min(max(number / light, 0.0), len(share) - 1.0))
+        mixed[:] = 0.0
+        for b in range(nodes):
+            for phase in range(ox):
+                for i in range(n):
+                    mixed[phase, i] += share[index, b] * along_profile[b, phase, i]
+        for m in range(group, min(group + _SAMPLES, samples)):
+            phase = (-(first + m)) % ox
+            left = (first + m + phase) // ox - n // 2 - begin
+            w0, w1, w2 = trace[0, m], trace[1, m], trace[2, m]
+            start, stop = max(0, -left), min(n, width - left)
+            if start >= stop:
+                continue
+            profile = mixed[phase, start:stop]
+            c0, c1, c2 = columns[0, left + start :], columns[1, left + start :], columns[2, left + start :]
+            for i in range(len(profile)):
+                c0[i] += w0 * profile[i]
+                c1[i] += w1 * profile[i]
+                c2[i] += w2 * profile[i]
