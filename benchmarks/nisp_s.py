@@ -3,8 +3,8 @@
 The time is from the catalogue to the file, in one process with one thread, which has rendered before. The image shows
 the field of requests/demo.toml through grism RGS000. Most times are of an image with all spectral orders of all sources
 with H_E < 23 or an H alpha flux above 1e-16 erg s-1 cm-2. Figures whose names begin with "default" are of an image with
-the default selection: all sources whose light is noticeable, about four times as many. "cold" times are without images
-of the PSF in the cache, "warm" times with them. An option also times a whole exposure by Spark.
+the default selection: all sources whose light is noticeable, 38,956 instead of 10,940. Times called "cold" are without
+images of the PSF in the cache, times called "warm" with them. An option also times a whole exposure by Spark.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def draw_product(
         electrons[k] += low - high / BIN
     # Weights with which the light, its row relative to the sheared coordinates and its wavelength are summed.
     moments = np.ones((3, bins))
-    left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
+    x_min, x_max, bottom, top = np.inf, -np.inf, np.inf, -np.inf
     for k in range(bins):
         t = times[0] + times[1] * BIN * k
         x, y = along[len(along) - 1], across[len(across) - 1]
@@ -148,14 +148,14 @@ def draw_product(
             x = x * t + along[j]
         for j in range(len(across) - 2, -1, -1):
             y = y * t + across[j]
-        left, right = min(left, start[0] + x), max(right, start[0] + x)
+        x_min, x_max = min(x_min, start[0] + x), max(x_max, start[0] + x)
         moments[1, k], moments[2, k] = start[1] + y - shear * (start[0] + x), BIN * k
         bottom, top = min(bottom, moments[1, k]), max(top, moments[1, k])
-    first = int(np.floor(ox * left)) - 3
-    trace = np.zeros((3, int(np.ceil(ox * right)) + 4 - first))
+    first = int(np.floor(ox * x_min)) - 3
+    trace = np.zeros((3, int(np.ceil(ox * x_max)) + 4 - first))
     add_to_trace(electrons, along, (times[0], times[1] * BIN), start[0], ox, moments, first, trace)
-    begin = max(int(np.floor(left)) - n // 2 - 2, 0)
-    width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin
+    begin = max(int(np.floor(x_min)) - n // 2 - 2, 0)
+    width = min(int(np.ceil(x_max)) + n // 2 + 3, nx) - begin
     if width <= 0:
         return 0.0
     ends = shear * begin, shear * (begin + width - 1)
@@ -212,13 +212,17 @@ def _sum_columns(
                     mixed[phase, i] += share[index, b] * along_profile[b, phase, i]
         for m in range(group, min(group + _SAMPLES, samples)):
             phase = (-(first + m)) % ox
-            left = (first + m + phase) // ox - n // 2 - begin
+            first_column = (first + m + phase) // ox - n // 2 - begin
             w0, w1, w2 = trace[0, m], trace[1, m], trace[2, m]
-            start, stop = max(0, -left), min(n, width - left)
+            start, stop = max(0, -first_column), min(n, width - first_column)
             if start >= stop:
                 continue
             profile = mixed[phase, start:stop]
-            c0, c1, c2 = columns[0, left + start :], columns[1, left + start :], columns[2, left + start :]
+            c0, c1, c2 = (
+                columns[0, first_column + start :],
+                columns[1, first_column + start :],
+                columns[2, first_column + start :],
+            )
             for i in range(len(profile)):
                 c0[i] += w0 * profile[i]
                 c1[i] += w1 * profile[i]
