@@ -69,10 +69,11 @@ def _line_transforms(
     `planes` [p, columns] are the transforms of the PSF's basis images at the frequencies `k`, radian per pixel. The
     `matrices` are the attributes `bulge`, `disk` and `thick` of the profiles, whose second axis is that of `k`.
     """
+    bulge, disk, thick = (np.ascontiguousarray(matrix) for matrix in matrices)
     out = np.empty((*weights.shape[:2], 1, len(k)), np.complex64)
     kernels.zones(
         np.ascontiguousarray(planes[:, None]), weights.astype(np.float32), np.zeros(1, np.float32),
-        np.ascontiguousarray(k), profiles.body, profiles.fraction, *map(np.ascontiguousarray, matrices),
+        np.ascontiguousarray(k), profiles.body, profiles.fraction, bulge, disk, thick,
         images.sersic_table(), profiles.row, profiles.row_weights, out,
     )  # fmt: skip
     return out[:, :, 0]
