@@ -95,6 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("compare", __doc__ or "", other_arguments)
     repeats = 1 if options.quick else extra_options.repeats
+    if repeats < 1:
+        extra_parser.error("--repeats must be at least 1")
     figures: dict[str, float] = {}
     with checkout(extra_options.base) as base:
         for subject in extra_options.subjects:

@@ -1,6 +1,8 @@
-"""A working copy is compared with a commit: with itself, the ratio is near 1; the checkout is removed."""
+"""A working copy is compared with a commit; the checkout is removed."""
 
+import contextlib
 import json
+import os
 import subprocess
 
 import pytest
@@ -32,9 +34,21 @@ def test_the_base_is_imported_from_its_commit(tmp_path):
     """A change of the base's package is seen by the process of the base, but not by that of this working copy."""
     with compare.checkout("HEAD") as base:
         (base / "truesky" / "__init__.py").write_text("raise SystemExit(7)")
-        with pytest.raises(SystemExit, match="ended with status"):
+        with pytest.raises(SystemExit, match="ended with status 7"):
             compare.compare("fluxes", base, 1, True)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with _subjects.start("fluxes", True, environment, ROOT) as process:
+            assert _subjects.ask(process) > 0.0
+            process.communicate()
     assert not base.exists()
+
+
+def test_ratios_are_new_times_by_old_times(monkeypatch):
+    monkeypatch.setattr(_subjects, "alternate", lambda processes, repeats: [[2.0, 4.0, 9.0], [1.0, 1.0, 3.0]])
+    monkeypatch.setattr(_subjects, "start", lambda *arguments: contextlib.nullcontext())
+    assert compare.compare("fluxes", ROOT, 3, True) == {
+        "fluxes_ratio": 3.0, "fluxes_ratio_min": 2.0, "fluxes_ratio_max": 4.0, "fluxes_base_s": 1.0, "fluxes_s": 4.0,
+    }  # fmt: skip
 
 
 def test_an_unknown_commit_is_refused():

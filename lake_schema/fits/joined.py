@@ -65,11 +65,10 @@ def join(
 def _joined_hdus(
     files: Sequence[tuple[str, Path]], cards: Sequence[Card], common_keywords: set[str], kept_keywords: set[str]
 ) -> Iterator[Any]:
-    from astropy.io import fits
 
     yield images.primary_hdu(Image(None, tuple(cards)))
     for name, file in files:
-        with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+        with write.open_written(file) as hdus:
             first_hdu = hdus[0]
             for hdu in hdus:
                 if write.is_compressed(hdu):
@@ -124,9 +123,8 @@ def _first_cards(file: Path) -> dict[str, Card]:
     This is usually the primary header. If it has structural cards only and the first image is compressed, it is the
     header of the first image.
     """
-    from astropy.io import fits
 
-    with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+    with write.open_written(file) as hdus:
         skip_primary = len(hdus) > 1 and write.is_compressed(hdus[1]) and not _cards_except(hdus[0], set())
         return {card[0]: card for card in _cards_except(hdus[int(skip_primary)], set())}
 

@@ -128,6 +128,20 @@ def check_headers(path: Path) -> None:
             raise Damaged(str(error)) from None
 
 
+@contextmanager
+def open_written(path: Path) -> Iterator[fits.HDUList]:
+    """Open a FITS file that truesky wrote for the body of a `with` statement, with compressed images as tables.
+
+    Damaged is raised in place of any error of astropy, and if the headers are wrong.
+    """
+    from astropy.io import fits
+
+    with errors_as_damaged(path):
+        check_headers(path)
+        with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+            yield hdus
+
+
 def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:
     """Check that the data size in the headers of a FITS file exceeds neither the file nor a limit.
 

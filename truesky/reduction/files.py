@@ -226,7 +226,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     for plane in (mean, uncertainty, count):
         _refuse_other_shape(path, plane.shape, shape)
     seconds = header.get("EXPTIME")
-    if not isinstance(seconds, int | float) or not 0.0 <= seconds < np.inf:
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0.0 <= seconds < np.inf:
         raise BadInput(f"{user_files.format_path(path)}: EXPTIME = {seconds} must be a number of seconds from 0")
     vignetted = bool(header.get("VIGNETTE", False))
     return CombinedFrame(mean, uncertainty, count, vignetted), float(seconds)
@@ -372,7 +372,8 @@ def read_image(path: Path) -> ImageFile:
     Raises
     ------
     BadInput
-        If the file does not exist, its extensions do not begin with SCI, WHT and FLG, or its WCS is incomplete.
+        If the file does not exist, its extensions do not begin with SCI, WHT and FLG, or its WCS is incomplete or
+        wrong.
     """
     units = read_images(user_files.check_file(path, "calibrated image"))
     if [unit.name for unit in units[1:4]] != ["SCI", "WHT", "FLG"]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from lake_schema import sky
 from lake_schema.arrays import Float
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, LakeError
 from truesky.numerics import matrices
 from truesky.render.camera import distortion, pointing, tpv
 from truesky.render.camera.detectors import Detector
@@ -256,6 +256,8 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
         return _system(values)
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None
+    except (LakeError, MemoryError):
+        raise
     except Exception as error:
         # astropy raises many types of exceptions for wrong values.
         raise BadInput(f"the WCS of the header cannot be used: {' '.join(str(error).split())[:300]}") from None
@@ -281,9 +283,9 @@ def _system(values: Mapping[str, Any]) -> WCS:
         system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
         system.sip = Sip(*tpv.to_sip(values), None, None, _crpix(system))
     system.wcs.set()
-    for keyword in ("crval", "crpix", "cd"):
-        if not np.isfinite(getattr(system.wcs, keyword)).all():
-            raise ValueError(f"{keyword.upper()} is not finite")
+    for attribute, keywords in (("crval", "CRVAL1, CRVAL2"), ("crpix", "CRPIX1, CRPIX2"), ("cd", "CD1_1 to CD2_2")):
+        if not np.isfinite(getattr(system.wcs, attribute)).all():
+            raise ValueError(f"{keywords} must be finite")
     return system
 
 

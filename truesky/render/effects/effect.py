@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import BadInput
-from truesky.render.effects.scene import Frame, Scene
+from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +70,14 @@ class Effect:
 
         The noticeable change of a single pixel is 0.1 times its noise. The part of the effect that does not average out
         is compared with 0.1 times the noise of the mean of 1024 pixels. Both limits are larger if the request allows
-        larger errors (`Scene.noticeable_electrons`, `Scene.noticeable_mean_electrons`). The larger of the two ratios is
-        returned. Without noise the result is infinite, or 0 for an effect of size 0.
+        larger errors (`Scene.noticeable_electrons`, `Scene.noticeable_mean_electrons`), except for effects that average
+        out completely: they are noise, and an image with too little noise would look deeper than it is. The larger of
+        the two ratios is returned. Without noise the result is infinite, or 0 for an effect of size 0.
         """
         change = float(self.contribution(scene))
         systematic = change if self.systematic is None else float(self.systematic(scene))
-        limit, mean_limit = scene.noticeable_electrons, scene.noticeable_mean_electrons
+        limit = scene.noticeable_electrons if systematic > 0.0 else NOTICEABLE * scene.pixel_noise
+        mean_limit = scene.noticeable_mean_electrons
         # Without noise, any change above 0 is noticeable.
         if limit == 0.0:
             return math.inf if max(change, systematic) > 0.0 else 0.0

@@ -141,7 +141,7 @@ def apply_to_ramp(expected, rng):
 
 
 def apply_to_readout(expected, rng):
-    # With 63 rows of overscan, most of the charge is read; the rest arrives after its pixel was read.
+    # With one row of pixels and 63 rows of overscan, all charge is read.
     return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, 1, 0, 64, None, rng)
 
 
