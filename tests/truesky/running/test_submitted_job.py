@@ -18,7 +18,7 @@ from lake_schema.store import layout, locks, publish, read, request_links, stage
 from lake_schema.store.plan import Plan, Task
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
-from truesky.running import submitted_job
+from truesky.running import submitted_job, task_chains
 from truesky.running.submitted_job import Job, Step
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -228,7 +228,11 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     """One of a thousand tasks kills its worker; all others are made, in runs of many tasks each."""
     runs = []
 
-    def collect(spark, function, parts, link_of):
+    def link_of(part):
+        return task_chains.Link("chain", (float(part.name), 0), 1.0)
+
+    def collect(spark, function, parts, given):
+        assert given is link_of
         runs.append(len(parts))
         if any(part.name == "700" for part in parts):
             raise Py4JNetworkError("the worker is gone")
@@ -238,7 +242,7 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     monkeypatch.setattr("truesky.running.session.is_alive", lambda spark: True)
     monkeypatch.setattr(submitted_job, "_collect", collect)
     parts = [Task(f"{i:03}", {}) for i in range(1000)]
-    results = submitted_job._spark_map(dict, parts, "toy", verbose=True)
+    results = submitted_job._spark_map(dict, parts, "toy", True, link_of)
     assert [result["part"] for result in results] == [part.name for part in parts]
     assert [result for result in results if "error" in result] == [
         {"part": "700", "error": "its worker ended unexpectedly"}
@@ -246,22 +250,45 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     assert len(runs) <= 2 * 10 + 1
 
 
+def fake_spark(made):
+    """Return a session that runs tasks at once, and adds the lists of task names that it got to `made`."""
+
+    def parallelize(lists, number):
+        assert number == len(lists)
+        made.extend([part.name for part in parts] for parts in lists)
+        return SimpleNamespace(
+            mapPartitions=lambda run: SimpleNamespace(collect=lambda: [one for p in lists for one in run([p])])
+        )
+
+    context = SimpleNamespace(master="local[2]", defaultParallelism=1, parallelize=parallelize)
+    return SimpleNamespace(sparkContext=context)
+
+
+def test_tasks_of_a_chain_run_one_after_the_other():
+    """In order of the chain, in one list if it is short compared with all tasks."""
+    chains = {"a2": ("a", 2.0), "b1": ("b", 1.0), "a1": ("a", 1.0), **{f"c{n}": (f"c{n}", 0.0) for n in range(20)}}
+    parts, made = [Task(name, {}) for name in chains], []
+
+    def link_of(part):
+        chain, order = chains[part.name]
+        return task_chains.Link(chain, (order, 0), 1.0)
+
+    found = submitted_job._collect(fake_spark(made), lambda part: {"part": part.name}, parts, link_of)
+    assert sorted(one["part"] for one in found) == sorted(chains)
+    assert made[0] == ["a1", "a2"]
+    assert [len(names) for names in made] == [2] + [1] * 21
+    made.clear()
+    submitted_job._collect(fake_spark(made), lambda part: {"part": part.name}, parts)
+    assert made == [[name] for name in chains]
+
+
 def test_a_worker_s_modules_are_left_out_of_its_collections_once(monkeypatch):
     """After its first task."""
     done = []
     monkeypatch.setattr(submitted_job.gc, "freeze", lambda: done.append("frozen"))
     submitted_job._freeze_garbage.cache_clear()
-    spark = SimpleNamespace(
-        sparkContext=SimpleNamespace(
-            master="local[2]",
-            defaultParallelism=2,
-            parallelize=lambda parts, n: SimpleNamespace(
-                mapPartitions=lambda run: SimpleNamespace(collect=lambda: [one for p in parts for one in run([p])])
-            ),
-        )
-    )
     parts = [Task(name, {}) for name in "abc"]
-    found = submitted_job._collect(spark, lambda part: done.append(part.name) or {"part": part.name}, parts)
+    found = submitted_job._collect(fake_spark([]), lambda part: done.append(part.name) or {"part": part.name}, parts)
     submitted_job._freeze_garbage.cache_clear()
     assert [one["part"] for one in found] == ["a", "b", "c"]
     assert done == ["a", "frozen", "b", "c"]
