@@ -110,7 +110,7 @@ def test_every_module_has_a_layer():
 
 def test_only_the_fits_package_uses_astropy_fits():
     assert {path for path, (touches, _, _) in facts().items() if touches} == {
-        f"lake_schema/fits/{name}.py" for name in ("external", "images", "joined", "ldac", "psfex", "tables", "write")
+        f"lake_schema/fits/{name}.py" for name in ("external", "images", "ldac", "psfex", "tables", "write")
     }
 
 

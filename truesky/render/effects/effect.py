@@ -76,7 +76,8 @@ class Effect:
         """
         change = float(self.contribution(scene))
         systematic = change if self.systematic is None else float(self.systematic(scene))
-        limit = scene.noticeable_electrons if systematic > 0.0 else NOTICEABLE * scene.pixel_noise
+        is_noise = self.systematic is zero_contribution
+        limit = NOTICEABLE * scene.pixel_noise if is_noise else scene.noticeable_electrons
         mean_limit = scene.noticeable_mean_electrons
         # Without noise, any change above 0 is noticeable.
         if limit == 0.0:
