@@ -8,6 +8,7 @@ all kinds of work would take seconds.
 from __future__ import annotations
 
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -205,6 +206,19 @@ def alternate(processes: Sequence[subprocess.Popen[str]], repeats: int) -> list[
     for process in processes:
         process.communicate()
     return seconds
+
+
+def summarize_ratios(subject: str, numerators: Sequence[float], denominators: Sequence[float]) -> dict[str, float]:
+    """Return median, minimum and maximum of ratios as `<subject>_ratio`, `_ratio_min` and `_ratio_max`.
+
+    Each time (s) in `numerators` is divided by the one in `denominators` that was measured next to it.
+    """
+    ratios = [numerator / denominator for numerator, denominator in zip(numerators, denominators, strict=True)]
+    return {
+        f"{subject}_ratio": statistics.median(ratios),
+        f"{subject}_ratio_min": min(ratios),
+        f"{subject}_ratio_max": max(ratios),
+    }
 
 
 if __name__ == "__main__":

@@ -76,11 +76,8 @@ def compare(subject: str, base: Path, repeats: int, quick: bool) -> dict[str, fl
             for folder in (ROOT, base)
         ]
         new, old = _subjects.alternate(processes, repeats)
-    ratios = [seconds / base_seconds for seconds, base_seconds in zip(new, old, strict=True)]
     return {
-        f"{subject}_ratio": statistics.median(ratios),
-        f"{subject}_ratio_min": min(ratios),
-        f"{subject}_ratio_max": max(ratios),
+        **_subjects.summarize_ratios(subject, new, old),
         f"{subject}_base_s": statistics.median(old),
         f"{subject}_s": statistics.median(new),
     }

@@ -56,11 +56,8 @@ def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
             for setting in SETTINGS
         ]
         seconds = dict(zip(SETTINGS, _subjects.alternate(processes, repeats), strict=True))
-    ratios = [portable / native for portable, native in zip(*seconds.values(), strict=True)]
     return {
-        f"{subject}_ratio": statistics.median(ratios),
-        f"{subject}_ratio_min": min(ratios),
-        f"{subject}_ratio_max": max(ratios),
+        **_subjects.summarize_ratios(subject, *seconds.values()),
         **{f"{subject}_{setting}_s": statistics.median(values) for setting, values in seconds.items()},
     }
 
