@@ -2,10 +2,9 @@
 
 The light is smooth far from the middle of a galaxy. It is therefore evaluated at the nodes of a coarse grid, and pixels
 are interpolated between them. The distances of the nodes from the middle of the galaxy are multiples of their spacing.
-With the same spacing, the light of a pixel is therefore the same in any frame (image of the detector) or window that
-contains the pixel. Spacings may differ for a galaxy outside the frame or the window: its light then differs by the
-error of the interpolation. A cell is the square between four nodes. Where interpolation is not accurate in the middle
-of a cell, the light of each pixel in the cell is evaluated.
+The light of a pixel is therefore the same in any frame (image of the detector) or window with this spacing. A
+cell is the square between four nodes. Where interpolation is not accurate in the middle of a cell, the light of each
+pixel in the cell is evaluated.
 
 In all functions `light` [11] (parameters of bulge and disc), `disk` (table of the disc's light), `across` (factor of
 the disc's minor axis), `blurred` (change of the light by the PSF at the nodes of another grid), `block` (spacing of
