@@ -46,7 +46,9 @@ def main() -> None:
     listed_elsewhere = {name for other in listed for name in listed[other] if other != group}
     for name, arguments in signatures(Path(folder)).items():
         if name not in listed_elsewhere:
-            group_of_function = "catalogues" if name.split(".")[1] in _CATALOGUE_PACKAGES else group
+            # Few functions of these packages are for images of one group only, and stay in it.
+            is_general = name.split(".")[1] in _CATALOGUE_PACKAGES and name not in listed.get(group, {})
+            group_of_function = "catalogues" if is_general else group
             listed.setdefault(group_of_function, {})[name] = arguments
     compile_ahead.LIST.write_text(json.dumps(listed, indent=1, sort_keys=True) + "\n")
 

@@ -63,11 +63,12 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
             block.mix, amplitude, library, dust, int(reference.wavelength[0]), len(weights)
         )
         scale = continuum_scale(block.mag_r01, matrices.matmul(reference_shape, weights))
-        shape = observed_shape(block.mix, amplitude, library, dust, first, count)
-        spectra = shape * scale[:, None]
+        spectra = observed_shape(block.mix, amplitude, library, dust, first, count)
+        # Single precision is enough for the factors, and keeps all steps in it.
+        spectra *= scale.astype(np.float32)[:, None]
         profiles = lines.profiles(block.lines, block.mix.z_obs, sigma[indices], "vacuum", grid[0], grid[-1])
         lines.add(spectra, first, profiles)
-        spectra *= block.magnification[:, None]
+        spectra *= block.magnification.astype(np.float32)[:, None]
         spectra *= extinction.transmission(milky_way, block.a_v.astype(np.float32)[:, None])
         out[indices] = spectra
     return out

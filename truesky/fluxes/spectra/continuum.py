@@ -24,6 +24,7 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, intergalactic
 from truesky.numerics import matrices
+from truesky.numerics.compiling import exact_jit
 
 REFERENCE_BAND = "sdss_r01"
 COMPONENTS = (1, 2)
@@ -248,21 +249,29 @@ def observed_shape(
     # Number of rest-frame samples of each galaxy, with the sample after the last position, for interpolation.
     width = int(np.max(np.floor(start + (count - 1) * shrink).astype(np.int64) - first_index)) + 2
     rest = _rest_shape(mix, (amplitude * shrink).astype(np.float32), library, dust, first_index, width)
-    # Positions (index of a sample, with fraction) need double precision: single precision would be wrong by 1e-3 A.
-    position = shrink[:, None] * np.arange(float(count))
-    position += (start - first_index + width * np.arange(len(mix)))[:, None]
-    floor = np.floor(position)
-    index = floor.astype(np.int64)
-    position -= floor
-    steps = np.empty_like(rest)
-    np.subtract(rest[:, 1:], rest[:, :-1], out=steps[:, :-1])
-    # mode="clip" is twice as fast as the default, which checks indices. Here all indices are valid.
-    shape = steps.ravel().take(index, mode="clip")
-    shape *= position.astype(np.float32)
-    shape += rest.ravel().take(index, mode="clip")
+    shape = np.empty((len(mix), count), np.float32)
+    _interpolate(rest, start - first_index, shrink, shape)
     if library.intergalactic:
-        shape *= intergalactic.transmission(first + np.arange(float(count)), mix.z_obs).astype(np.float32)
+        (absorbed,) = np.nonzero(first < intergalactic.first_transparent(mix.z_obs))
+        if len(absorbed):
+            grid = first + np.arange(float(count))
+            shape[absorbed] *= intergalactic.transmission(grid, mix.z_obs[absorbed]).astype(np.float32)
     return shape
+
+
+@exact_jit
+def _interpolate(rest: Float32, start: Float, shrink: Float, out: Float32) -> None:
+    """Interpolate n rows of samples linearly at the positions `start` + `shrink` j, and store them in `out` [n, w].
+
+    Positions are indices of samples with fractions, in double precision: single precision would be wrong by 1e-3 A.
+    Each must have a sample on both sides.
+    """
+    for i in range(len(out)):
+        samples, line = rest[i], out[i]
+        for j in range(len(line)):
+            position = start[i] + shrink[i] * j
+            index = int(position)
+            line[j] = samples[index] + np.float32(position - index) * (samples[index + 1] - samples[index])
 
 
 def _rest_shape(
@@ -297,10 +306,16 @@ def _transmission(mix: TemplateMix, component: int, dust: Float32, start: Int, w
 def _windows(table: Float32, row: Int, start: Int, width: int) -> Float32:
     """Return table[row[i], start[i] : start[i] + width] for every i, float32[n, width].
 
-    Values beyond the end of the table are 0. Slices are copied one by one, which is faster than an index array.
+    Values beyond the end of the table are 0. `start` must not be negative.
     """
-    out = np.zeros((len(row), width), np.float32)
-    for i, (r, s) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
-        window = table[r, s : s + width]
-        out[i, : len(window)] = window
+    out = np.empty((len(row), width), np.float32)
+    _copy_windows(table, row, start, out)
     return out
+
+
+@exact_jit
+def _copy_windows(table: Float32, row: Int, start: Int, out: Float32) -> None:
+    for i in range(len(row)):
+        inside = max(min(table.shape[1] - start[i], out.shape[1]), 0)
+        out[i, :inside] = table[row[i], start[i] : start[i] + inside]
+        out[i, inside:] = np.float32(0.0)

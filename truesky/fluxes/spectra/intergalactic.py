@@ -75,6 +75,14 @@ def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     return np.asarray(np.exp(-np.maximum(depth + _continuum_depth(at, stretch), 0.0)))
 
 
+def first_transparent(z: npt.ArrayLike) -> Float:
+    """Return the wavelengths in A from which on the light of sources at redshifts `z` is not absorbed.
+
+    Each is half a wavelength bin (0.5 A) above Lyman alpha, because a bin may be absorbed in part.
+    """
+    return np.asarray(lyman_series()[0][0] * (1.0 + np.asarray(z, float)) + 0.5)
+
+
 def is_absorbed(band: Passband, z: float) -> bool:
     """Return True if the band begins blueward of Lyman alpha at redshift `z`, so that hydrogen absorbs light in it."""
     return bool(band.wavelength[0] < lyman_series()[0][0] * (1.0 + z))

@@ -10,13 +10,15 @@ import csv
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_KM_S
+from truesky.numerics.compiling import exact_jit
 
 TABLE = Path(__file__).with_suffix(".csv")
 
@@ -34,6 +36,8 @@ _CIDDOR = ((5_792_105.0, 238.0185), (167_917.0, 57.362))
 # Line profiles are cut at this distance from the centre, in sigma. The flux outside, a fraction of 2e-8, is distributed
 # over the inside.
 _REACH = 5.6
+
+_Spectra = TypeVar("_Spectra", Float, Float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +246,7 @@ def profiles(
     return Profiles(row, first, np.diff(cumulative, axis=1) * (fluxes[row, line_index][:, None] / inside))
 
 
-def add(spectra: Float, first: int, lines: Profiles) -> Float:
+def add(spectra: _Spectra, first: int, lines: Profiles) -> _Spectra:
     """Add line profiles to spectra in place.
 
     Parameters
@@ -259,9 +263,14 @@ def add(spectra: Float, first: int, lines: Profiles) -> Float:
     float array, shape (n, w)
         The array `spectra` itself.
     """
-    index = lines.first[:, None] - first + np.arange(lines.f_lambda.shape[1])
-    inside = (index >= 0) & (index < spectra.shape[1])
-    row = np.broadcast_to(lines.row[:, None], index.shape)
-    # Use np.add.at, because two lines of a galaxy may be in the same bin and `+=` would add only one of them.
-    np.add.at(spectra, (row[inside], index[inside]), lines.f_lambda[inside])
+    _add_profiles(spectra, lines.first - first, lines.row, lines.f_lambda)
     return spectra
+
+
+@exact_jit
+def _add_profiles(spectra: _Spectra, start: Int, row: Int, profiles: Float) -> None:
+    """Add m profiles [m, w] to the rows `row` [m] of spectra, from the columns `start` [m] on."""
+    for m in range(len(row)):
+        spectrum, profile = spectra[row[m]], profiles[m]
+        for i in range(max(0, -start[m]), min(len(profile), len(spectrum) - start[m])):
+            spectrum[start[m] + i] += profile[i]
