@@ -16,6 +16,7 @@ from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import kind_from_id
 from lake_schema.sky.ecliptic import ecliptic, equatorial
+from tests.truesky import nightly
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.fields import MISSION, aimed, small
 from truesky.fluxes import passbands
@@ -344,8 +345,8 @@ def test_a_request_names_it(tmp_path, monkeypatch):
         parse(path)
 
 
-@pytest.mark.parametrize(
-    ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)]
+@nightly.parametrize(
+    ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)], (2,)
 )
 def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
     """The light that a body leaves on the detector is proportional to the time it takes to cross it."""
