@@ -15,6 +15,7 @@ from lake_schema.store import plan, publish, read, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
+from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import FLAT_CELLS, SEED
 from truesky.catalogue import build_strong_lenses
 from truesky.catalogue.galaxies import strong_lenses
@@ -67,9 +68,10 @@ def test_the_deflection_diverges_as_the_convergence():
     assert grad[:, 0, 1] == pytest.approx(grad[:, 1, 0], abs=1e-8)
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("lens", "east", "north"),
     [(Lens(1.2, 0.7, 30.0), 0.02, 0.03), (Lens(1.5, 0.6, 120.0), 0.5, 0.1), (Lens(0.9, 0.8, 0.0), -0.2, 0.4)],
+    (0,),
 )
 def test_rays_end_at_the_analytic_images(lens, east, north):
     """A small source has one spot per image, at the expected position and with the flux of its magnification."""
