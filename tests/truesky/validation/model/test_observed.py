@@ -13,6 +13,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.galaxies import GALAXIES
+from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import FLAT_CELLS, made
 from truesky.catalogue.galaxies import high_redshift
 from truesky.catalogue.halos import quenching
@@ -190,19 +191,20 @@ def far_quasars(flat):
     return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("mutant", "name"),
     [
-        # By default one of lines, one of halos and one of distant objects, because each draws a sky of its own.
+        # By default one of halos, because each draws a sky of its own.
         (unmatched_lines, "halpha_nii_2e-16"),
         (idle_halos, "red_centrals_13.5_z1"),
         (far_quasars, "quasars_r_22.5"),
-        pytest.param(old_metals, "oiii_2e-16", marks=pytest.mark.nightly),
-        pytest.param(light_stars, "mass_function_11_z0.95", marks=pytest.mark.nightly),
-        pytest.param(template_rates, "main_sequence_z1.0", marks=pytest.mark.nightly),
-        pytest.param(wide_colours, "main_sequence_scatter_z0.4", marks=pytest.mark.nightly),
-        pytest.param(hole, "uv_21_z3.8", marks=pytest.mark.nightly),
+        (old_metals, "oiii_2e-16"),
+        (light_stars, "mass_function_11_z0.95"),
+        (template_rates, "main_sequence_z1.0"),
+        (wide_colours, "main_sequence_scatter_z0.4"),
+        (hole, "uv_21_z3.8"),
     ],
+    (1,),
 )
 def test_wrong_recipe_fails(flat, whole, mutant, name):
     assert name not in off(whole)
