@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput
 from lake_schema.tables.strong_lenses import STRONG_LENSES
+from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import SIDE, field, render
 from tests.truesky.render.fields import galaxies, moments, one_source, psf_of, small
 from truesky.render.camera.astrometry import sky_of_pixel, wcs
@@ -73,7 +74,7 @@ def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
     assert ours.sum() == pytest.approx(electrons, rel=1e-5)
 
 
-@pytest.mark.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)])
+@nightly.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)], (0,))
 def test_memory_is_what_was_predicted(size, electrons):
     source = pictured("vis", "2-3", ring(200), electrons)
     stamps.draw(source, np.array([96]), psf_of("vis"), 64, 64)
