@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import _errors as errors
 from benchmarks._scenes import LSST, VIS, Scene
+from tests.truesky import nightly
 from tests.truesky.render.fields import galaxies, psf_of
 from truesky.render.drawing import reference
 from truesky.render.drawing.settings import settings_for
@@ -62,7 +63,7 @@ def some_more(*cases):
             yield pytest.param(kind, magnitude, marks=() if (kind, magnitude) in cases else pytest.mark.nightly)
 
 
-@pytest.mark.parametrize("tier", BOUNDS)
+@nightly.parametrize("tier", BOUNDS, (0,))
 @pytest.mark.parametrize(("kind", "magnitude"), tuple(some_more(("bulge", 20.0), ("small disc", 24.5))))
 def test_response_to_shear(tier, kind, magnitude):
     accuracy, most_m, most_c = BOUNDS[tier]

@@ -307,7 +307,13 @@ def test_the_seed_changes_the_noise_alone():
     assert (base.science != other.science).mean() > 0.5
 
 
-@pytest.mark.parametrize("changed", [{"noise_seed": 5}, {"exposed": {"realisation": 2}}], ids=["seed", "realisation"])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        pytest.param({"noise_seed": 5}, id="seed"),
+        pytest.param({"exposed": {"realisation": 2}}, id="realisation", marks=pytest.mark.nightly),
+    ],
+)
 def test_the_same_sky_with_other_noise(changed):
     """Sources and fixed patterns of the detector stay; the noise of every pixel is different and independent.
 
