@@ -73,7 +73,7 @@ def build(folder, side, darks, flats, sources=STARS):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("infrared"), 192, DARKS, 3)
+    return build(tmp_path_factory.mktemp("infrared"), 192, DARKS, 6)
 
 
 def master(made, name):
