@@ -35,9 +35,11 @@ def _marked(cases, default, several):
     marked = []
     for number, case in enumerate(cases):
         if isinstance(case, type(pytest.param())):
-            values, marks, name = case.values, list(case.marks), case.id
+            values, marks, name = case.values, [getattr(mark, "mark", mark) for mark in case.marks], case.id
         else:
             values, marks, name = case if several else (case,), [], None
+        if number in default and "nightly" in {mark.name for mark in marks}:
+            raise ValueError(f"case {number} of the default run is nightly")
         if number not in default:
             marks = [*marks, pytest.mark.nightly]
         marked.append(pytest.param(*values, marks=marks, id=name))

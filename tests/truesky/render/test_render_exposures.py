@@ -274,6 +274,7 @@ def _check_archive(lake, capsys):
         assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
+@pytest.mark.nightly
 def test_distant_sources_do_not_change_the_image(lake, rendered):
     """Sources 8 arcmin or more from the detectors are removed from the lake, in cells that the detectors read."""
     for name in ("galaxies", "stars"):
@@ -402,6 +403,7 @@ def size_of(root, *tables):
     return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.nightly
 def test_reused_files_need_no_disk_space(rendered):
     """Reused catalogues and images with unchanged keys need no space; products of other requests do not count."""
     lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
@@ -577,6 +579,7 @@ def test_a_product_is_rendered_again_from_its_manifest(rendered, tmp_path):
     assert rebuilt == 4
 
 
+@pytest.mark.nightly
 def test_an_old_product_is_rendered_again_with_its_mission(rendered, tmp_path, capsys):
     old = read.version(rendered, "products")
     before = images(rendered)

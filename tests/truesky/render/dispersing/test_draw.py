@@ -46,7 +46,7 @@ def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
         assert np.abs(fast - slow).mean() < 3e-3 * slow.mean()
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.07])
+@nightly.parametrize("slope", [0.0, 0.07], (1,))
 def test_orders_share_images_and_are_drawn_as_from_their_own(slope, monkeypatch):
     """An order that is curved within a few pixels shares the sheared stamps of a straight order."""
     bent, straight = trace((-70.0, 5.0, 2.0, -1.0), -0.03, 0, 1.0), trace((-10.0, 512.0), slope)

@@ -124,7 +124,7 @@ def far_galaxy(channel, **columns):
     return galaxies(exposed["ra"], exposed["dec"] + 3.0, **columns)
 
 
-@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+@nightly.parametrize("channel", ["VIS", "EXT"], (1,))
 def test_arcs_are_where_the_lens_has_them_and_as_bright(channel):
     """A blob north-east of the lens, of 5 times the source's flux: read off the frame by its header."""
     found, (ra, dec) = lensed(channel, [(1.0, 0.6, 5.0)], far_galaxy(channel), flux=30.0)

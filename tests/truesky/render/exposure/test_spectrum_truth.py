@@ -174,7 +174,7 @@ def with_line(flux, x=300.0, **options):
     return spectroscopic.rendered([mag], [x], [48.0], body=column, **options)
 
 
-@pytest.mark.parametrize(("x", "there"), [(300.0, True), (630.0, False)])
+@nightly.parametrize(("x", "there"), [(300.0, True), (630.0, False)], (1,))
 def test_a_line_beyond_the_detector_is_not_seen(x, there):
     """At 1.6 um, 40 columns from the undispersed place; half of the order is on the detector."""
     (row,) = (row for row in rows(with_line(2e-16, x)) if row["order"] == 1)

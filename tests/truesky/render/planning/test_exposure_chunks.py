@@ -54,7 +54,7 @@ def planner(request_, most):
 @nightly.parametrize(
     "most",
     [pytest.param(1, marks=pytest.mark.nightly), 100, pytest.param(700, marks=pytest.mark.nightly), 9000],
-    (0,),
+    (1,),
 )
 def test_chunks_of_any_size_together_equal_the_plan(request_, whole, most):
     own = planner(request_, most)

@@ -130,7 +130,7 @@ def test_bright_bodies_shine_around_corners(tmp_path):
     )
 
 
-@pytest.mark.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)])
+@nightly.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)], (0,))
 def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
     """Far from the body, its light equals the light of a star at its position in the middle of the exposure."""
     detector = small("vis", "3-4", 256)
@@ -236,7 +236,7 @@ def test_each_row_has_a_name_where_there_are_names(tmp_path, kind):
             ephemerides.read(written(tmp_path / f"half.{kind}", {**two, "name": [0.5, 1.5]}), "half")
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@nightly.parametrize("kind", FORMATS, (0,))
 def test_long_tables_have_names_too(tmp_path, kind):
     count = 150_000
     values = {
