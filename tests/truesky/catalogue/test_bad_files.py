@@ -6,6 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests import requests
+from tests.truesky import nightly
 from tests.truesky.catalogue import synthetic, test_dust_map
 from tests.truesky.catalogue.galaxies import test_nearest_sed
 from tests.truesky.catalogue.halos import test_halo_catalogue
@@ -51,7 +52,7 @@ def without(values, key):
     return {name: column for name, column in values.items() if name != key}
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("text", "values", "said"),
     [
         (HALOS, changed(halos(), "ra", 4, np.nan), ("column ra", "row 5")),
@@ -64,6 +65,7 @@ def without(values, key):
         (TRAINING, changed(test_nearest_sed.observed(), "ebv", 6, np.nan), ("column ebv", "row 7")),
         (TRAINING, without(test_nearest_sed.observed(), "z_true"), ("z_true",)),
     ],
+    (0, 1, 5, 6),
 )
 def test_a_wrong_value_or_a_missing_column(tmp_path, monkeypatch, capsys, text, values, said):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))

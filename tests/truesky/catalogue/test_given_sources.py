@@ -16,6 +16,7 @@ from lake_schema.store import publish, read, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from tests import requests
+from tests.truesky import nightly
 from truesky.catalogue import build_galaxies, build_stars, given_sources
 from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import templates
@@ -176,7 +177,7 @@ def written_as(form, path, columns):
         Table(columns).write(path)
 
 
-@pytest.mark.parametrize("form", ["csv", "fits", "parquet", "hdf5"])
+@nightly.parametrize("form", ["csv", "fits", "parquet", "hdf5"], (0, 1, 2))
 def test_every_format_of_ingest_is_read_with_a_mapping(tmp_path, form):
     """Columns that are not mapped are ignored; ellipticities become axis ratios and position angles."""
     columns = {

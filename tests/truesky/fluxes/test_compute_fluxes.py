@@ -165,6 +165,7 @@ format = "extinction"
     assert compute_fluxes.flux_step("galaxy", filled, parse(path)).plan.key != made.key
 
 
+@pytest.mark.nightly
 def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     """Models and an infrared spectrum of the user are used for the stars in the lake."""
     black_bodies(tmp_path / "synthetic.cor")

@@ -26,15 +26,22 @@ def own_cache(tmp_path, monkeypatch):
 
 def store(name, megabytes=1, age_days=0.0):
     """Let another process store an entry, so that no lease remains, and return its folder."""
+    (folder,) = store_each({name: age_days}, megabytes)
+    return folder
+
+
+def store_each(ages, megabytes=1):
+    """Let another process store entries by name; `ages` has the days since their last use. Return their folders."""
     code = (
-        "import numpy as np; from truesky.numerics import cache; "
-        f"cache.cached_arrays({name!r}, 'k', lambda: {{'a': np.zeros({int(megabytes * 125_000)})}})"
+        f"import numpy as np; from truesky.numerics import cache\nfor name in {list(ages)}:\n"
+        f"    cache.cached_arrays(name, 'k', lambda: {{'a': np.zeros({int(megabytes * 125_000)})}})"
     )
     environment = {**os.environ, "TRUESKY_CACHE_LIMIT": "none"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment, cwd=ROOT)
-    (folder,) = cache.cache_dir().glob(f"{name}-*")
-    set_age(folder, age_days)
-    return folder
+    folders = [next(cache.cache_dir().glob(f"{name}-*")) for name in ages]
+    for folder, days in zip(folders, ages.values(), strict=True):
+        set_age(folder, days)
+    return folders
 
 
 def set_age(folder, days):
@@ -102,8 +109,7 @@ def test_machine_code_and_settings_are_entries_and_foreign_folders_are_not():
 
 
 def test_the_least_recently_used_are_removed_first():
-    for name, days in (("box_g", 1), ("lensing_64_1", 3), ("sersic", 2)):
-        store(name, age_days=days)
+    store_each({"box_g": 1, "lensing_64_1": 3, "sersic": 2})
     root = cache.cache_dir()
     removal = cache_entries.prune(root, cache_entries.entries(root), 2.5e6)
     assert [entry.kind for entry in removal.removed] == ["lensing"]
@@ -125,8 +131,7 @@ def test_a_use_is_recorded_once_per_process():
 
 
 def test_storing_an_entry_enforces_the_limit(monkeypatch):
-    for name, days in (("box_g", 2), ("box_u0", 1)):
-        store(name, megabytes=2, age_days=days)
+    store_each({"box_g": 2, "box_u0": 1}, megabytes=2)
     monkeypatch.setenv("TRUESKY_CACHE_LIMIT", "0.0035")
     cache.cached_arrays("sersic", "k", lambda: {"a": np.zeros(125_000)})
     assert stored_names() == ["box_u0", "sersic"]

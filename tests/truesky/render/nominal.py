@@ -1,6 +1,7 @@
 """Nominal exposures of a VIS detector, or part of one, with given sources."""
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from tests.truesky.render.fields import MISSION, fluxes, galaxies, stars
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry
 from truesky.render.camera.pointing import boresight_for
+from truesky.render.drawing.settings import settings_for
 from truesky.render.planning import planned_exposures
-from truesky.render.psf import euclid
+from truesky.render.psf import euclid, model
 from truesky.request.accuracy import SURVEY
 
 TIME = MISSION.value("vis.exposure_time", "s")
@@ -30,6 +32,15 @@ def off(*names):
 def psf_of(detector):
     """Return the PSF of the detector, shared by all of its exposures."""
     return euclid.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
+
+
+@lru_cache(maxsize=1)
+def psf_with_transforms(detector, colours):
+    """Return the PSF of the detector with at most `colours` wavelengths, which keeps its Fourier transforms.
+
+    Exposures of the same detector share them. Those of one PSF alone are kept, because they are large.
+    """
+    return replace(model.reduce_colours(psf_of(detector), colours), derived={})
 
 
 @cache
@@ -59,7 +70,7 @@ def rendered(
     f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
     with pytest.MonkeyPatch.context() as patch:
         if mission is MISSION:
-            own = psf_of(detector)
+            own = psf_with_transforms(detector, settings_for(accuracy).colours)
             patch.setattr(euclid, "vis_psf", lambda *_: own)
         tables = (
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),

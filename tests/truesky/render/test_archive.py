@@ -7,13 +7,14 @@ import pyarrow as pa
 import pytest
 
 from lake_schema.errors import BadInput, Damaged
+from tests.truesky import nightly
 from truesky.render import archive
 
 ROWS = pa.table({"path": ["images/a.fits", "images/b.fits"], "seconds": [1.5, None]})
 LINE = {"job": "render_exposures", "table": "products", "part": "a", "seconds": 2.0, "peak_gb": 0.5, "attempt": 1}
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("sql", "words"),
     [
         ("SELECT count(*) FROM range(1000000000) a, range(1000000000) b", "memory|stopped after 15 s"),
@@ -22,6 +23,7 @@ LINE = {"job": "render_exposures", "table": "products", "part": "a", "seconds": 
         ("SELECT * FROM products; DROP VIEW products", "write a"),
         ("SELECT nothing FROM products", "nothing"),
     ],
+    (0, 2, 3),
 )
 def test_invalid_and_endless_queries_are_refused(sql, words):
     started = time.monotonic()

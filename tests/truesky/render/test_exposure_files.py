@@ -144,6 +144,7 @@ def _killed(root, request):
     publish.make_version(root, step.plan, work, name="x")
 
 
+@pytest.mark.nightly
 def test_the_same_bytes_in_any_order_and_after_a_kill(lake, whole, request_file):
     request = parse(request_file)
     shutil.rmtree(layout.table_folder(lake, "exposure_files"))

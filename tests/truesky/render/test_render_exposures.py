@@ -25,6 +25,7 @@ from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
 from tests.faults.victims import CONTEXT
+from tests.truesky import nightly
 from tests.truesky.render.psf.test_from_file import cube, gaussian
 from truesky.catalogue import build_galaxies, build_stars, build_strong_lenses
 from truesky.catalogue.galaxies import strong_lenses
@@ -273,6 +274,7 @@ def _check_archive(lake, capsys):
         assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
+@pytest.mark.nightly
 def test_distant_sources_do_not_change_the_image(lake, rendered):
     """Sources 8 arcmin or more from the detectors are removed from the lake, in cells that the detectors read."""
     for name in ("galaxies", "stars"):
@@ -334,6 +336,7 @@ def _manifests(root):
     return [(read.version(root, name).folder / "manifest.json").read_bytes() for name in ("products", "rendered_truth")]
 
 
+@pytest.mark.nightly
 def test_a_staged_image_that_changed_is_rendered_again(lake, rendered):
     render(lake, wanted(), fail=["R22_S11"])
     (image,) = layout.table_folder(lake, "products").glob(".stage-*/images/*/*science.fits")
@@ -400,6 +403,7 @@ def size_of(root, *tables):
     return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.nightly
 def test_reused_files_need_no_disk_space(rendered):
     """Reused catalogues and images with unchanged keys need no space; products of other requests do not count."""
     lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
@@ -464,6 +468,7 @@ def test_product_keys_depend_on_all_inputs(rendered, monkeypatch, tmp_path):
     assert found[0].items() < keys(rendered, wanted(pointings=2), plan=True).items()
 
 
+@pytest.mark.nightly
 def test_another_mission_changes_all_keys(rendered):
     before = images(rendered)
     noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
@@ -574,6 +579,7 @@ def test_a_product_is_rendered_again_from_its_manifest(rendered, tmp_path):
     assert rebuilt == 4
 
 
+@pytest.mark.nightly
 def test_an_old_product_is_rendered_again_with_its_mission(rendered, tmp_path, capsys):
     old = read.version(rendered, "products")
     before = images(rendered)
@@ -641,7 +647,7 @@ def test_missing_cells_are_refused_before_rendering(lake):
     assert not (lake / "products").exists()
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("other", "words"),
     [
         ({"seed": 8}, "table galaxies has seed 7, the request 8: run build_galaxies first"),
@@ -649,6 +655,7 @@ def test_missing_cells_are_refused_before_rendering(lake):
         ({"lensing": "none"}, r"table galaxies has lensing None, the request \(0.0, 0.0\): run build_galaxies first"),
         ({"star_limit": 21.0}, "table stars has star_limit 20.0, the request 21.0: run build_stars first"),
     ],
+    (0, 2),
 )
 def test_a_catalogue_of_another_universe_is_refused(lake, other, words):
     universe = {**REQUEST["universe"], **{key: value for key, value in other.items() if key != "seed"}}

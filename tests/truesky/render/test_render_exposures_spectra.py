@@ -200,6 +200,7 @@ def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder
         np.testing.assert_allclose(sum(models.frame(unit, (NY, NX)) for unit in units), bright.frame, rtol=1e-6)
 
 
+@pytest.mark.nightly
 def test_a_lake_on_object_storage_has_the_same_models(rendered, bucket):
     source, place = drawn_first(rendered), s3.parse_address(f"s3://{bucket[1]}/lake", bucket[0].url)
     list(push.push(rendered, place))

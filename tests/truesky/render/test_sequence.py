@@ -13,6 +13,7 @@ from lake_schema.store import layout, publish, read
 from lake_schema.tables.exposures import ExposureRow
 from tests import requests
 from tests.faults.victims import CONTEXT
+from tests.truesky import nightly
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.randomness.rng import stream
@@ -150,13 +151,13 @@ def parts(root, request):
     return step, {part.facts["exposure_id"]: part for part in step.plan.tasks}
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("numbers", "megabytes", "drawings"),
     [
         ((5,), "0", [2, 3, 4]), ((4, 5), "500", [2, 3, 4]),
         pytest.param((2, 4, 5), "0", [2, 3, 2, 3, 4], marks=pytest.mark.nightly),
         pytest.param((4, 5, 3), "0.6", [2, 3, 4, 2], marks=pytest.mark.nightly),
-    ],
+    ], (0,),
 )  # fmt: skip
 def test_the_same_bytes_in_any_order_with_any_memory(lake, whole, folder, monkeypatch, numbers, megabytes, drawings):
     """Compare with all exposures rendered backwards. A charge map has 0.26 MB; each is drawn once if it is kept."""
@@ -207,7 +208,7 @@ def changed(lake, folder, sequence):
     return {number for number in before if before[number] != after[number]}
 
 
-@pytest.mark.parametrize("number", range(1, len(SEQUENCE) + 1))
+@nightly.parametrize("number", range(1, len(SEQUENCE) + 1), (0, 3))
 def test_products_depend_on_earlier_exposures(lake, folder, number):
     """Products depend on earlier exposures and on no others."""
     channel, band, field, before = SEQUENCE[number - 1]

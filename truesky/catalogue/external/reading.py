@@ -107,27 +107,28 @@ def _read_file(file: Path, columns: Columns, kind: str, mistakes: TableMistakes)
     try:
         yield from _read_batches(file, columns, kind)
     except BadInput as error:
-        present = _with_present_columns(file, columns, kind)
+        names = external_rows.column_names(file, kind)
+        present = _with_present_columns(names, columns)
         if len(present.fields) == len(columns.fields):
             raise
         missing = {key: field for key, field in columns.fields.items() if key not in present.fields}
-        error = _with_keys(error, file, replace(columns, fields=missing), kind)
+        error = _with_keys(error, file, replace(columns, fields=missing), names)
         if not present.fields:
             raise error from None
         mistakes.add(error)
         yield from _read_batches(file, present, kind)
 
 
-def _with_keys(error: BadInput, file: Path, missing: Columns, kind: str) -> BadInput:
+def _with_keys(error: BadInput, file: Path, missing: Columns, names: Sequence[str]) -> BadInput:
     """Return an error about missing columns of a file with the keys of the request that name them.
 
-    `missing` has the properties whose columns are missing.
+    `missing` has the properties whose columns are missing, and `names` are the columns of the file.
     """
     if not _IS_KEY.fullmatch(missing.path):
         return error
     if len(missing.fields) > _MAX_KEYS:
         return error.with_prefix(missing.path)
-    names, listed = external_rows.column_names(file, kind), Mistakes()
+    listed = Mistakes()
     for key, field in missing.fields.items():
         try:
             check_column_names(file, names, field.titles())
@@ -143,9 +144,8 @@ def _read_batches(file: Path, columns: Columns, kind: str) -> Iterator[tuple[Row
         yield piece, _with_stored_units(piece, columns)
 
 
-def _with_present_columns(file: Path, columns: Columns, kind: str) -> Columns:
-    """Return a mapping without the properties whose columns a file does not have."""
-    names = external_rows.column_names(file, kind)
+def _with_present_columns(names: Sequence[str], columns: Columns) -> Columns:
+    """Return a mapping without the properties whose columns are not among the names of a file's columns."""
     return replace(
         columns,
         fields={

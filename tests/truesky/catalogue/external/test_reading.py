@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lake_schema.errors import BadInput
+from tests.truesky import nightly
 from truesky.catalogue.external import ingest, mapping, reading
 from truesky.request.area import Area
 
@@ -252,7 +253,7 @@ def in_units(folder, **units):
 SIZES = {**GALAXIES, "half_light_radius": "Z"}
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("column", "unit", "key", "factor"),
     [
         ("Z", "arcmin", "disk_half_light_radius", 60.0),
@@ -263,6 +264,7 @@ SIZES = {**GALAXIES, "half_light_radius": "Z"}
         ("MAG", "--", "mag", 1.0),
         ("ID", "count", "origin_id", 1.0),
     ],
+    (1, 4),
 )
 def test_stored_units_that_convert_are_converted(tmp_path, column, unit, key, factor):
     path, values = in_units(tmp_path, **{column: unit})

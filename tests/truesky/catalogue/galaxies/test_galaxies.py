@@ -13,6 +13,7 @@ from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 from lake_schema.units import LIGHT_KM_S
+from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import SEED, SMALL
 from truesky.catalogue import build_galaxies, dust_map
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, observed_cells
@@ -183,6 +184,7 @@ def test_positions_are_lensed(drawn):
     assert shift[drawn.z < 0.1].max() < 0.2 * shift.max()
 
 
+@pytest.mark.nightly
 def test_a_cell_is_the_same_alone_or_among_others(dust, monkeypatch):
     """A cell has identical bytes in another process, and in a file between other cells."""
     universe = galaxies.model(SEED, Universe(galaxy_limit=22.5, **SMALL))
@@ -234,7 +236,7 @@ def test_an_empty_cell_is_an_empty_table(dust):
     assert validate.find_violations(rows, GALAXIES) == []
 
 
-@pytest.mark.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)])
+@nightly.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)], (1,))
 def test_a_limit_in_another_band(drawn, dust, band, limit):
     """The number equals that of a deeper catalogue, no galaxy is fainter, and fewer halos are drawn."""
     there = galaxies.model(SEED, Universe(galaxy_limit=limit, galaxy_band=band, **SMALL, **NEARBY))
@@ -268,7 +270,7 @@ def test_a_shallow_limit_needs_little_of_the_volume():
     assert np.sum(number[1][deep.steps.z > 1.2]) > 0.3 * number[1].sum()
 
 
-@pytest.mark.parametrize("place", [(0.0, 90.0), pytest.param((0.0, -90.0), marks=pytest.mark.nightly), (0.0, 0.0)])
+@nightly.parametrize("place", [(0.0, 90.0), pytest.param((0.0, -90.0), marks=pytest.mark.nightly), (0.0, 0.0)], (2,))
 def test_poles_and_the_first_meridian(universe, dust, place):
     at = int(sky.cell_at([place[0]], [place[1]], ids.GENERATION_ORDER)[0])
     rows = galaxies.draw(at, universe, population.CellCache(universe.population), dust)

@@ -265,6 +265,7 @@ def stacked(universe, places, least, number):
     return (*(np.bincount(ring[inside], value[inside]) for value in values), len(kept))
 
 
+@pytest.mark.nightly
 def test_stacked_shear_about_massive_halos(universe):
     """Observed sources around observed halos show the halo profile and no cross shear; the sky is small."""
     first = CELL // 16 * 16

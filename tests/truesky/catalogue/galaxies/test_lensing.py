@@ -6,7 +6,7 @@ import healpy as hp
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lake_schema import sky
@@ -191,6 +191,7 @@ def test_without_lensing_everything_else_is_the_same(drawn_with, unlensed):
     assert all(np.all(unlensed[name].to_numpy() == 0) for name in LENSED[4:])
 
 
+@settings(max_examples=5)
 @given(size=st.floats(0.0, MAX_SHEAR - 1e-6), angle=st.floats(0.0, 6.3))
 def test_a_constant_shear_acts_on_every_ellipticity(drawn_with, unlensed, size, angle):
     """e -> (e + g) / (1 + g* e), at the same places; g2 is of (east, north), shapes are drawn in (west, north)."""

@@ -14,7 +14,6 @@ from tests import requests
 from truesky.catalogue import build_galaxies
 from truesky.catalogue.external import mapping
 from truesky.catalogue.galaxies import galaxies, nearest_sed
-from truesky.catalogue.halos import population
 from truesky.request.from_toml import parse
 from truesky.request.schema import Universe
 
@@ -75,12 +74,12 @@ def test_the_scatter_is_as_stated_and_stays_in_the_library(given, rng):
     assert np.all(ends.ebv[ends.law == 0] == 0)
 
 
-def test_galaxies_are_drawn_with_these_spectra(universe, dust, given):
+def test_galaxies_are_drawn_with_these_spectra(universe, cells, dust, given):
     """Spectra from a training table are in the library and in the table's bounds; the number of galaxies is usual."""
     there = dataclasses.replace(universe, training=given)
-    rows = galaxies.draw(303_117, there, population.CellCache(there.population), dust)
+    rows = galaxies.draw(303_117, there, cells, dust)
     assert validate.find_violations(rows, GALAXIES) == []
-    again = galaxies.draw(303_117, there, population.CellCache(there.population), dust)
+    again = galaxies.draw(303_117, there, cells, dust)
     assert rows.equals(again)
     theirs = set(observed()["ext_law"].tolist())
     assert set(np.unique(rows["ext_law_1"].to_numpy()).tolist()) == theirs

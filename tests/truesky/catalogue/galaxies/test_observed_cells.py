@@ -10,6 +10,7 @@ from lake_schema import ids, sky
 from lake_schema.errors import BadInput
 from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
+from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import SEED, SMALL
 from truesky.catalogue.galaxies import galaxies, lensing, observed_cells
 from truesky.catalogue.halos.population import CellCache
@@ -18,8 +19,6 @@ from truesky.request.schema import Universe
 ORDER = ids.GENERATION_ORDER
 # Both poles, RA 0 on the equator, and a corner of three files.
 PLACES = [(10.0, 90.0), (200.0, -90.0), (0.0, 0.0), (45.0, 41.8)]
-# One pole, and the corner.
-SOME = PLACES[0], PLACES[3]
 
 
 def made(limit):
@@ -58,9 +57,7 @@ def crossing(rows):
 NAMES = ("ra", "dec"), ("ra_true", "dec_true")
 
 
-@pytest.mark.parametrize(
-    "place", [pytest.param(place, marks=[] if place in SOME else [pytest.mark.nightly]) for place in PLACES]
-)
+@nightly.parametrize("place", PLACES, (0,))
 def test_a_cell_contains_all_galaxies_observed_in_it(place, shallow, population, dust):
     """The bytes equal those of a complete draw of the cell and all its neighbours by true position."""
     cell = cell_at(place)
@@ -89,6 +86,7 @@ def test_files_made_apart_hold_every_galaxy_once(shallow, population, dust):
     assert crossing(together) > 3
 
 
+@pytest.mark.nightly
 def test_a_shallower_request_has_fewer_of_the_same(shallow, population, dust):
     cell = cell_at(PLACES[3])
     deep, bright = observed_cells.draw([cell], shallow, population, dust), made(20.5)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema import ids, sky
+from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import SEED
 from truesky.catalogue.halos import halos
 
@@ -103,7 +104,7 @@ def test_mass_function_comes_out(model, drawn):
             assert found == pytest.approx(mean, rel=0.10, abs=4 * np.sqrt(mean))
 
 
-@pytest.mark.parametrize("low_k", [0.03, 0.08])
+@nightly.parametrize("low_k", [0.03, 0.08], (0,))
 @pytest.mark.parametrize(("low", "high", "redshift"), [(11.5, 12.5, 0.0), (12.5, 13.5, 0.5), (12.0, 13.0, 1.5)])
 def test_bias_of_the_field_that_halos_follow(model, low, high, redshift, low_k):
     """On large scales the power of exp(x g - ...) is x^2 / D^2 times that of the matter."""

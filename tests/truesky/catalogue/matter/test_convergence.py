@@ -6,6 +6,7 @@ import healpy as hp
 import numpy as np
 import pytest
 
+from tests.truesky import nightly
 from truesky.catalogue.galaxies import lensing
 from truesky.catalogue.matter import convergence, density_box, lightcone
 
@@ -53,7 +54,7 @@ def test_no_cell_lies_beyond_the_last():
         assert np.all(sums == np.ravel_multi_index(wanted, (n, n, n)))
 
 
-@pytest.mark.parametrize("factor", [1, 2, 4])
+@nightly.parametrize("factor", [1, 2, 4], (1,))
 def test_averages(box, factor):
     with ThreadPoolExecutor(2) as pool:
         found = convergence.average_density(box, 0.7, factor, pool)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.truesky import nightly
 from truesky.fluxes import band_fluxes, integration, passbands, sources
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.templates import Library
@@ -38,7 +39,7 @@ def drawn(n, seed=5):
     return dataclasses.replace(errors_measured.draw_galaxies(n, 31, rng), magnification=rng.uniform(0.5, 3.0, n))
 
 
-@pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
+@nightly.parametrize("accuracy", [DRAFT, SURVEY], (1,))
 def test_tables_agree_with_integration_within_the_accuracy(library, accuracy):
     rows = drawn(1500)
     fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid(CURVES, chosen(accuracy), library))

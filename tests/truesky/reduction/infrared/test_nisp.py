@@ -17,6 +17,8 @@ from truesky.render.effects.effect import Effect
 from truesky.request.from_toml import parse
 
 SEED, BLOCK = 3, 64
+# Number of darks of the small lake.
+DARKS = 6
 OBSERVATION = """
 [[observation]]
 channels = ["NISP-P"]
@@ -36,7 +38,7 @@ bands = ["euclid_j"]
 {OBSERVATION}
 image_type = "dark"
 bands = ["euclid_j"]
-exposures = 12
+exposures = {{darks}}
 {OBSERVATION}
 image_type = "flat"
 bands = ["euclid_j"]
@@ -53,10 +55,10 @@ stars = "stars.csv"
 """
 
 
-def build(folder, side, flats, sources=STARS):
+def build(folder, side, darks, flats, sources=STARS):
     """Make a field in four dithers with calibration frames, their masters and calibrated images."""
     root = layout.resolve_lake(folder / "lake")
-    text = REQUEST.format(flats=flats, sources=sources)
+    text = REQUEST.format(darks=darks, flats=flats, sources=sources)
     (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,17.0\n53.119,-27.807,20.0\n")
     wanted = parse(requests.written(folder, text, requests.FIELD.format(0.5), seed=SEED))
     with small_detectors(side):
@@ -71,7 +73,7 @@ def build(folder, side, flats, sources=STARS):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("infrared"), 192, 6)
+    return build(tmp_path_factory.mktemp("infrared"), 192, DARKS, 6)
 
 
 def master(made, name):
@@ -118,7 +120,7 @@ def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
 
 @pytest.mark.nightly
 def test_a_quarter_of_a_detector(tmp_path):
-    check(build(tmp_path, 1024, 6, requests.shallow(19.0, 19.0) + '[fluxes]\nbands = ["euclid_j"]\n'))
+    check(build(tmp_path, 1024, 12, 6, requests.shallow(19.0, 19.0) + '[fluxes]\nbands = ["euclid_j"]\n'))
 
 
 def test_masters_agree_with_the_detector(made):
@@ -129,7 +131,7 @@ def test_masters_agree_with_the_detector(made):
     dark, error = master(made, "NISP-P_4-16-4_DET22_dark.fits")
     assert np.median(dark) == pytest.approx(0.02, abs=2e-3)
     # Single frames have 7 e- less the drift, in 87 s.
-    assert np.median(error) == pytest.approx(4.9 / np.sqrt(12) / 87.24, rel=0.1)
+    assert np.median(error) == pytest.approx(4.9 / np.sqrt(DARKS) / 87.24, rel=0.1)
     flags = calibration.dark_flags(frames_of_master(dark, error))
     assert 0 < (flags == calibration.HOT).sum() < 0.01 * dark.size
     flat, _ = master(made, "NISP-P_euclid_j_DET22_flat.fits")

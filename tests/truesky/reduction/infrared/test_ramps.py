@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.truesky import nightly
 from tests.truesky.render import infrared
 from truesky.fluxes import passbands
 from truesky.reduction.infrared import lamp_mix
@@ -45,7 +46,7 @@ def test_bias_and_variance_are_those_of_drawn_ramps(kind, signal):
     assert -0.8 < float(estimator.bias(np.array(signal))) < -0.05
 
 
-@pytest.mark.parametrize(("kind", "signal"), [("photometric", 6e4), ("spectroscopic", 4e4)])
+@nightly.parametrize(("kind", "signal"), [("photometric", 6e4), ("spectroscopic", 4e4)], (0,))
 def test_nonlinearity_of_a_ramp_is_corrected(kind, signal):
     scene, b = scene_of(kind), 6e-7
     bend = RampNonlinearity.from_scene(scene, EVERY)

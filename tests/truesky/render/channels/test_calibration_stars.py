@@ -7,6 +7,7 @@ import pytest
 from scipy import optimize
 
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render import fields
 from truesky.render.camera import astrometry, detectors
 from truesky.render.channels.aim import Aim
@@ -44,7 +45,7 @@ def rendered(kind, magnitude, name="3-4", forced=None, truth=("noise_free", "sat
     return one, {keyword: value for keyword, value, _ in headers.science_cards(one)}
 
 
-@pytest.mark.parametrize(("kind", "magnitude"), [("bleeding", 15.0), ("white_dwarf", 19.0)])
+@nightly.parametrize(("kind", "magnitude"), [("bleeding", 15.0), ("white_dwarf", 19.0)], (1,))
 def test_five_are_on_a_detector(kind, magnitude):
     one, header = rendered(kind, magnitude)
     rows = truth_table.truth(one)

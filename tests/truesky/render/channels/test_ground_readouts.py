@@ -7,6 +7,7 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from tests.truesky import nightly
 from tests.truesky.render.channels.test_readout import put
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION
@@ -138,7 +139,7 @@ def test_the_rotation_of_a_table_of_pointings_turns_the_camera(tmp_path):
     assert np.degrees(np.arctan2(header["CD1_2"], header["CD2_2"])) == pytest.approx(-50.0, abs=0.01)
 
 
-@pytest.mark.parametrize("camera", ["lsstcam", "hsc"])
+@nightly.parametrize("camera", ["lsstcam", "hsc"], (1,))
 def test_ccdproc_reduces_amplifiers_by_their_headers(camera, tmp_path):
     one = tools.stars_on(camera, 5.0, way="amplifiers")
     path = tools.put(one, tmp_path).path

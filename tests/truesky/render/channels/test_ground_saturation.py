@@ -8,6 +8,7 @@ from astropy.io import fits
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render import fields
 from tests.truesky.render.channels.test_readout import put
 from tests.truesky.render.fields import MISSION
@@ -39,7 +40,7 @@ def star(camera, electrons=3e7, largest=None, way="raw"):
     return fields.rendered(exposed, one, tables, mission, SURVEY, forced=quiet, truth=truth, way=way)
 
 
-@pytest.mark.parametrize("camera", [*BANDS])
+@nightly.parametrize("camera", [*BANDS], (0,))
 def test_a_full_pixel_reads_what_its_well_holds_and_bleeds_along_its_column(camera, tmp_path):
     one = star(camera)
     files = put(one, tmp_path, ("saturation",))

@@ -142,6 +142,7 @@ def check(name, pitch, count, psf, folder):
     assert rms(offsets[:, :, both] - offsets[:, :, both].mean(axis=0)) <= 1.0
 
 
+@pytest.mark.nightly
 def test_positions_of_light_agree_with_the_headers_of_all_dithers(tmp_path):
     detector = detectors.detector("nisp", "DET11", MISSION)
     check("DET11", 500, 2, infrared.psf_of(detector, "euclid_h"), tmp_path)

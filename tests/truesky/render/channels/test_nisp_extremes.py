@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render import infrared
 from tests.truesky.render.fields import small
 from truesky.render.products import headers
@@ -34,8 +35,8 @@ def test_a_star_of_ab_0():
     assert np.isfinite(found.noise_free).all()
 
 
-@pytest.mark.parametrize(
-    ("choice", "off", "error"), [(0.0, (), 0.02), (1.0, (), 5e-3), (0.0, ("ramp_nonlinearity",), 5e-3)]
+@nightly.parametrize(
+    ("choice", "off", "error"), [(0.0, (), 0.02), (1.0, (), 5e-3), (0.0, ("ramp_nonlinearity",), 5e-3)], (1,)
 )
 def test_the_level_of_saturation(choice, off, error):
     """A pixel that is full at the end of the ramp has the signal SATURATE.

@@ -184,6 +184,7 @@ def check_depth(band, detector):
     assert fit > circle
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "band", [pytest.param(band, marks=[] if band == "euclid_j" else [pytest.mark.nightly]) for band in CIRCLES]
 )

@@ -10,6 +10,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render import fields, infrared, spectroscopic
 from tests.truesky.render.infrared import SEED
 from tests.truesky.render.spectroscopic import MISSION, QUIET, TIME, strip
@@ -158,9 +159,10 @@ def test_the_paper_s_selection_is_one_value_of_a_parameter():
     assert len(spectroscopic.rendered(mags, x, y, mission=chosen).sources) == 1
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("flux", "kappa", "a_v", "chosen"),
     [(0.9e-16, 0.0, 0.0, 0), (1.1e-16, 0.0, 0.0, 1), (0.8e-16, 0.2, 0.0, 1), (1.1e-16, 0.0, 3.0, 0)],
+    (0, 2),
 )
 def test_a_line_is_as_bright_as_it_is_seen(flux, kappa, a_v, chosen):
     """H alpha at 1.6 um is magnified by 1.56, or dimmed to 60 % by dust. The galaxy is fainter than 23 mag."""

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 from scipy.special import k1
 
+from tests.truesky import nightly
 from tests.truesky.render import infrared, spectroscopic
 from tests.truesky.render.channels import spectral_lines
 from tests.truesky.render.channels.spectral_lines import Lines
@@ -39,7 +40,7 @@ def electrons(mag, detector):
     return 10 ** (-0.4 * (mag - row["zero_point"])) * TIME
 
 
-@pytest.mark.parametrize("angle", [0.0, 4.0])
+@nightly.parametrize("angle", [0.0, 4.0], (1,))
 def test_a_star_of_ab_2_in_order_0(angle):
     detector = strip(nx=512, ny=256)
     found = spectroscopic.rendered(
@@ -53,6 +54,7 @@ def test_a_star_of_ab_2_in_order_0(angle):
     assert found.maps["order_0"].sum(dtype=float) == pytest.approx(zeroth["drawn"], rel=1e-5)
 
 
+@pytest.mark.nightly
 def test_a_galaxy_of_half_a_minute_with_lines():
     """The galaxy is wider than the largest stamp: time and memory stay bounded, and the light is in place."""
     detector, column = strip(nx=1300, ny=1200), dict.fromkeys(colours.GALAXY_COLUMNS, 0.0)
@@ -80,7 +82,7 @@ def test_a_galaxy_of_half_a_minute_with_lines():
     assert peak < 1.5e9
 
 
-@pytest.mark.parametrize("edge", ["first", "last"])
+@nightly.parametrize("edge", ["first", "last"], (0,))
 def test_a_line_leaves_the_passband_by_and_by(edge):
     """The light of a line decreases to zero with the response at the edge of the passband."""
     ends = BAND.wavelength[BAND.response > 1e-3 * BAND.response.max()]

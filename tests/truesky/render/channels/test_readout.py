@@ -7,6 +7,7 @@ import pytest
 from astropy.io import fits as astropy_fits
 
 from lake_schema.errors import BadInput
+from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import render
 from truesky.render.channels import ground, readout, registry, vis
 from truesky.render.products import fits_files, read_back
@@ -81,7 +82,7 @@ def test_common_unit_of_arrays_is_in_each_header_and_in_the_primary_header(chann
         assert [unit.header.get("BUNIT") for unit in units] == ["adu"] * len(units)
 
 
-@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+@nightly.parametrize("channel", ["VIS", "EXT"], (1,))
 def test_truth_maps_are_read_as_electrons(channel, tmp_path):
     one = render(channel, truth=TRUTH)
     paths = put(one, tmp_path, TRUTH)

@@ -96,6 +96,7 @@ def check(detector):
         assert scatter <= 1.1
 
 
+@pytest.mark.nightly
 def test_masters_calibrate_a_science_frame():
     check(small("vis", "3-4", 256))
 

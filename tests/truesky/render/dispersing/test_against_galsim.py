@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import _scenes as scenes
+from tests.truesky import nightly
 from tests.truesky.render.dispersing import fine
 from tests.truesky.render.dispersing.made import DETECTOR, FIRST, LAST, MISSION, drawn, one, order, psf
 from truesky.render.camera import traces
@@ -88,20 +89,20 @@ def test_first_orders_are_as_galsim_draws_them(case):
     within(*compared(case, LONG))
 
 
-@pytest.mark.parametrize("case", [CASES[1], CASES[5]])
+@nightly.parametrize("case", [CASES[1], CASES[5]], (1,))
 def test_a_piece_of_a_first_order_is_as_galsim_draws_it(case):
     within(*compared(case, SHORT))
 
 
-@pytest.mark.parametrize(
-    "case", [CASES[1], CASES[2], *(pytest.param(c, marks=pytest.mark.nightly) for c in CASES[3:5])]
+@nightly.parametrize(
+    "case", [CASES[1], CASES[2], *(pytest.param(c, marks=pytest.mark.nightly) for c in CASES[3:5])], (0,)
 )
 def test_zeroth_orders_are_as_galsim_draws_them(case):
     """The whole band is within ten pixels, and the PSF changes by half over the band."""
     within(*compared((*case[:3], 50.0 * case[3], 0), len(WAVES), 0))
 
 
-@pytest.mark.parametrize("accuracy", [SURVEY, REFERENCE])
+@nightly.parametrize("accuracy", [SURVEY, REFERENCE], (0,))
 def test_a_star_s_zeroth_order_is_as_galsim_draws_it(accuracy):
     """The order is the brightest possible, and nearly as sharp as the PSF."""
     settings = draw.settings_for(accuracy)

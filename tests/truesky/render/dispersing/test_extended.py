@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.truesky.render.dispersing.made import FIRST, LAST, drawn, order, psf, trace
 from tests.truesky.render.fields import one_source, small
@@ -62,6 +63,7 @@ def test_a_trail_is_its_points():
     check(replace(body, trail=trail[None]), alike, 1.0)
 
 
+@pytest.mark.nightly
 def test_a_trail_of_a_thousand_pixels_is_its_points():
     """The trail is longer than the largest stamp, so it is drawn in pieces."""
     body, trail = source(), np.array([998.0, 40.0])

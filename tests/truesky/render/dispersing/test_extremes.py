@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import _scenes as scenes
+from tests.truesky import nightly
 from tests.truesky.render.dispersing import fine
 from tests.truesky.render.dispersing.made import FIRST, LAST, drawn, one, order, psf, trace
 from truesky.render.dispersing import draw
@@ -31,7 +32,7 @@ def total(orders, spectrum=FLAT, i=1):
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-300, 1e-12, 1e-3, -1e-9, -0.5, 0.9])
-@pytest.mark.parametrize("i", [1, 4])
+@nightly.parametrize("i", [1, 4], (1,))
 def test_light_that_is_not_spread_is_an_image(length, i):
     """With hardly any dispersion, flux and position are the same as in an undispersed image."""
     frame = total([order(trace((0.0, length)))], i=i)

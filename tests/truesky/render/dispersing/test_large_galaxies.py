@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from benchmarks import _scenes as scenes
+from tests.truesky import nightly
 from tests.truesky.render.dispersing import fine
 from tests.truesky.render.dispersing.made import FIRST, LAST, NODES, drawn, one, order, psf, trace
 from truesky.numerics import matrices
@@ -97,7 +98,7 @@ def test_a_coarse_frame_is_refined_as_its_spline():
     assert added == (frame - 7).sum()
 
 
-@pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
+@nightly.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)], (1,))
 def test_large_galaxies_agree_with_their_undispersed_images(index, fraction):
     """Each of two lines, 100 pixels apart, equals the image of a galaxy of 15 arcsec without a grism."""
     electrons, shape, source = 2e6, (260, 700), galaxy(15.0, index, fraction, 180.4, 130.2)

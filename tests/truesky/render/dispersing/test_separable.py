@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from benchmarks import _scenes as scenes
+from tests.truesky import nightly
 from tests.truesky.render.dispersing.made import DETECTOR, FIRST, LAST, MISSION, order, psf
 from truesky.render.camera import traces
 from truesky.render.dispersing import draw, kernels
@@ -57,7 +57,7 @@ def at_the_limit(sources, orders, spectra, settings):
     return replace(sources, electrons=electrons)
 
 
-@pytest.mark.parametrize(("accuracy", "tilt"), [(SURVEY, 0.0), (SURVEY, -4.0), (DRAFT, 4.0), (REFERENCE, 4.0)])
+@nightly.parametrize(("accuracy", "tilt"), [(SURVEY, 0.0), (SURVEY, -4.0), (DRAFT, 4.0), (REFERENCE, 4.0)], (0, 2))
 def test_errors_are_below_those_that_are_allowed(accuracy, tilt):
     """The largest error of a pixel is below `allowed`, even for lines in the brightest spectra of this kind."""
     settings = draw.settings_for(accuracy)

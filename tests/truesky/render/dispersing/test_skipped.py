@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from benchmarks import _scenes as scenes
+from tests.truesky import nightly
 from tests.truesky.render.dispersing.made import FIRST, LAST, order, psf, trace
 from truesky.render.dispersing import draw
 
@@ -58,7 +58,7 @@ def spectra_of(seed):
     return spectra, computed
 
 
-@pytest.mark.parametrize("seed", range(3))
+@nightly.parametrize("seed", range(3), (0,))
 def test_bytes_are_the_same_as_with_all_spectra(seed):
     sources, results = scene(seed), []
     for weights in (None, WEIGHTS):

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput
 from lake_schema.tables.strong_lenses import STRONG_LENSES
+from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import SIDE, field, render
 from tests.truesky.render.fields import galaxies, moments, one_source, psf_of, small
 from truesky.render.camera.astrometry import sky_of_pixel, wcs
@@ -73,7 +74,7 @@ def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
     assert ours.sum() == pytest.approx(electrons, rel=1e-5)
 
 
-@pytest.mark.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)])
+@nightly.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)], (0,))
 def test_memory_is_what_was_predicted(size, electrons):
     source = pictured("vis", "2-3", ring(200), electrons)
     stamps.draw(source, np.array([96]), psf_of("vis"), 64, 64)
@@ -123,7 +124,7 @@ def far_galaxy(channel, **columns):
     return galaxies(exposed["ra"], exposed["dec"] + 3.0, **columns)
 
 
-@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+@nightly.parametrize("channel", ["VIS", "EXT"], (1,))
 def test_arcs_are_where_the_lens_has_them_and_as_bright(channel):
     """A blob north-east of the lens, of 5 times the source's flux: read off the frame by its header."""
     found, (ra, dec) = lensed(channel, [(1.0, 0.6, 5.0)], far_galaxy(channel), flux=30.0)

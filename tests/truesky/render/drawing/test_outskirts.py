@@ -15,6 +15,7 @@ from scipy.integrate import quad
 from scipy.special import gammaincinv, gammaln, k1
 
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT, GALAXIES
+from tests.truesky import nightly
 from tests.truesky.render import nominal
 from tests.truesky.render.fields import galaxies, one_source, psf_of, small
 from truesky.render.camera.astrometry import wcs
@@ -145,7 +146,7 @@ def check(found, expected, noise, size):
     np.testing.assert_allclose(found, expected, rtol=4e-3, atol=0.1 * noise)
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("shape", "mag", "place"),
     [
         (EDGE_ON, 10.0, (HALF, 400.0)),
@@ -153,6 +154,7 @@ def check(found, expected, noise, size):
         pytest.param(HUGE, 10.0, (300.0, 900.0), marks=pytest.mark.nightly),
         pytest.param(SHARP, 6.0, (-HALF, 280.0), marks=pytest.mark.nightly),
     ],
+    (1,),
 )
 def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
     """The PSF is the PSF of the optics.
@@ -164,6 +166,7 @@ def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
     check(found, expected, NOISE["vis"], size)
 
 
+@pytest.mark.nightly
 @settings(max_examples=1)
 @given(LARGE, st.sampled_from([8.0, 10.0, 12.0]), PLACES, st.sampled_from(["vis", "lsstcam"]))
 @example(EDGE_ON, 10.0, (HALF, 400.0), "lsstcam")
@@ -217,7 +220,7 @@ def test_nodes_of_distant_copies_are_close_enough(inclination, angle, monkeypatc
     assert np.abs(found - expected).max() < 3e-11 * electrons
 
 
-@settings(max_examples=10)
+@settings(max_examples=3)
 @given(st.floats(0.5, 6.2), st.floats(0.02, 1.0), st.floats(0.0, 179.0), st.none() | st.floats(0.0, 90.0))
 @example(4.0, 0.02, 10.0, None)
 @example(6.2, 0.02, 0.0, None)
@@ -314,7 +317,7 @@ def check_interpolated(found, expected, electrons):
     np.testing.assert_allclose(found, expected, rtol=3e-4, atol=3e-4 + 1e-14 * electrons)
 
 
-@settings(max_examples=3)
+@settings(max_examples=1)
 @given(LARGE, st.floats(-0.5, 0.5), st.sampled_from([1e7, 1e9, 1e11]))
 @example(EDGE_ON, 0.3, 1e10)
 @example(HUGE, 0.3, 1e10)

@@ -12,6 +12,7 @@ from benchmarks import _positions as positions
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import NISP, VIS, scene_psf
 from lake_schema.errors import BadInput
+from tests.truesky import nightly
 from truesky.render.drawing import stamp_sizes, stamps, transfer
 from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.psf import euclid, model, seeing
@@ -112,7 +113,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
     np.testing.assert_allclose(ground.rim[8:200], ground.surface[8:200], rtol=0.1)
 
 
-@pytest.mark.parametrize(("scene", "file"), [(VIS, "psf_positions.csv"), (NISP, "psf_positions_nisp.csv")])
+@nightly.parametrize(("scene", "file"), [(VIS, "psf_positions.csv"), (NISP, "psf_positions_nisp.csv")], (0,))
 def test_psf_errors_between_positions_are_those_of_the_table(scene, file):
     """Errors are relative to the optics computed at the position of a star."""
     table = {row["positions"]: row for row in rows(file) if row["nearest"] == 0}
@@ -126,6 +127,7 @@ def test_psf_errors_between_positions_are_those_of_the_table(scene, file):
     assert positions.star_errors(at((0.0, 0.0)), star, scene)[2] > 3 * r2
 
 
+@pytest.mark.nightly
 def test_a_row_counts_the_error_of_its_psf():
     """No row promises smaller errors than stars have with its positions and colours."""
     table = accuracy.rows()

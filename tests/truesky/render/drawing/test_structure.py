@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 
 from lake_schema.store.provenance import file_sha256
+from tests.truesky import nightly
 from tests.truesky.render import fields, infrared
 from tests.truesky.render.exposure.test_render import SIDE, field, render
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, moments, one_source, psf_of, small, stars
@@ -32,7 +33,7 @@ SPIRAL = {"disk_half_light_radius": 1.4, "bulge_fraction": 0.2, "bulge_half_ligh
 
 
 @pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("lsstcam", "R22_S11")])
-@pytest.mark.parametrize("electrons", [2e4, 3e7])
+@nightly.parametrize("electrons", [2e4, 3e7], (1,))
 def test_a_sheared_spiral_is_what_galsim_draws(camera, name, electrons):
     """The disc is face-on, because galsim has no thick images. It is sheared, magnified, and on a rotated detector."""
     detector, psf = small(camera, name, 256), psf_of(camera)
@@ -121,7 +122,7 @@ def test_a_knot_is_at_the_same_place_in_every_band_and_dither():
     np.testing.assert_allclose(offset(*infra, place), at, atol=0.06)
 
 
-@pytest.mark.parametrize("kind", ["arms", "stamps"])
+@nightly.parametrize("kind", ["arms", "stamps"], (0,))
 def test_brighter_bulge_in_a_band_does_not_change_the_picture(kind, monkeypatch, tmp_path):
     """The picture depends on the catalogue, but the fraction of light in the disc depends on the band."""
     asked = {"discs": DISCS}

@@ -107,6 +107,7 @@ def test_whom_nobody_names_brings_no_light(vis, seed, kind):
     assert not stamps.draw(some.take(~here), sizes[~here], psf, SIDE, SIDE).any()
 
 
+@pytest.mark.nightly
 def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
     """A frame agrees with the same part of a larger frame, within the promised accuracy."""
     margin = 304

@@ -154,6 +154,7 @@ def test_ordinary_sources_do_not_need_it():
 # ------------------------------------------------------------------------------------------------ in an exposure
 
 
+@pytest.mark.nightly
 def test_an_exposure_draws_noticeable_colours_again():
     """A few of its sources, on small stamps; pixel by pixel within a tenth of the noise of all of them drawn slowly."""
     side = 256

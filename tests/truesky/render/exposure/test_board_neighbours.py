@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, small, stars
 from tests.truesky.render.sources.test_catalogue_rows import Files
@@ -71,7 +72,7 @@ def in_order(camera, frame, detector):
     return amplifiers.layout(detector, MISSION).split(frame)
 
 
-@pytest.mark.parametrize("camera", PAIRS)
+@nightly.parametrize("camera", PAIRS, (0,))
 def test_the_coefficient_is_recovered(camera):
     """From two raw frames, one of which has a full star on the other detector: what that one's own frame has."""
     mission, places, light = stronger(camera), [(60.3, 40.8), (200.0, 180.0)], [3e6, 4e6]
@@ -98,7 +99,7 @@ def test_the_coefficient_is_recovered(camera):
     assert np.abs(change[far]).max() < 1.01 * gain.max()
 
 
-@pytest.mark.parametrize("camera", PAIRS)
+@nightly.parametrize("camera", PAIRS, (1,))
 def test_an_image_with_an_additional_star_has_the_same_crosstalk_if_it_is_kept(camera):
     """The star is so bright that VIS takes the response inside a pixel into account, which changes other stars."""
     mission, others = stronger(camera), (beside(camera, [(60.3, 40.8), (200.0, 180.0)], [3e6, 4e6]),)
@@ -116,7 +117,7 @@ def test_an_image_with_an_additional_star_has_the_same_crosstalk_if_it_is_kept(c
         assert empty.psf.intra_pixel != alone.psf.intra_pixel
 
 
-@pytest.mark.parametrize("camera", PAIRS)
+@nightly.parametrize("camera", PAIRS, (0,))
 def test_charge_of_the_columns_with_bright_stars_is_that_of_whole_frames(camera, monkeypatch):
     """A star that bleeds, stars at the border and at a corner, and one that is too faint to be noticed."""
     places = [(60.3, 40.8), (200.0, 180.0), (2.0, 120.5), (SIDE - 1.4, SIDE - 2.3), (130.0, 90.0)]

@@ -121,6 +121,7 @@ def dither(count, draw):
     return [draw(134.0 * (n + 1), mags, x + 2.0 * n, y) for n in range(count)]
 
 
+@pytest.mark.nightly
 def test_the_map_agrees_with_one_of_much_fainter_sources():
     """The reference has twenty times fainter limits: after 15 exposures, less than 1 electron is missing."""
 
@@ -208,6 +209,7 @@ def spectrum_before(seconds, mags, x, y):
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("before", [700.0, pytest.param(3000.0, marks=pytest.mark.nightly)])
 def test_traces_leave_what_whole_spectra_leave(before):
     """All orders of all sources against those of the bright ones alone: 1.2 e- in any pixel, of 30 and more."""

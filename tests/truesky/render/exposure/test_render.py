@@ -12,6 +12,7 @@ import pytest
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_from_id
+from tests.truesky import nightly
 from tests.truesky.render import calibrated, fields, nominal
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, small, stars
 from truesky.fluxes import passbands
@@ -131,7 +132,7 @@ def test_published_saturation_magnitude():
     assert zero_point + 2.5 * np.log10(t * 0.20 / MISSION.value("vis.full_well")) == pytest.approx(17.80, abs=0.03)
 
 
-@pytest.mark.parametrize("channel", CASES)
+@nightly.parametrize("channel", CASES, (1,))
 def test_noise_free_totals_are_the_table_s(channel):
     """Each source alone: galaxies to 1 %, stars to 0.5 %."""
     _, exposed, body, points = field(channel)
@@ -234,7 +235,7 @@ def ghost_of(mag):
     return MISSION.value("vis.ghost.flux_ratio") * rate * nominal.TIME
 
 
-@pytest.mark.parametrize("name", SHOWS)
+@nightly.parametrize("name", SHOWS, (0, 2, 4))
 def test_each_effect_can_be_forced_on_and_off(name):
     detector = small("vis", "3-4", SIDE)
     beside = SIDE / 2 - 750.0 * (-1 if detector.upside_down else 1)
@@ -306,7 +307,13 @@ def test_the_seed_changes_the_noise_alone():
     assert (base.science != other.science).mean() > 0.5
 
 
-@pytest.mark.parametrize("changed", [{"noise_seed": 5}, {"exposed": {"realisation": 2}}], ids=["seed", "realisation"])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        pytest.param({"noise_seed": 5}, id="seed"),
+        pytest.param({"exposed": {"realisation": 2}}, id="realisation", marks=pytest.mark.nightly),
+    ],
+)
 def test_the_same_sky_with_other_noise(changed):
     """Sources and fixed patterns of the detector stay; the noise of every pixel is different and independent.
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.truesky import nightly
 from tests.truesky.render import fields, spectroscopic
 from tests.truesky.render.infrared import SEED
 from tests.truesky.render.spectroscopic import MISSION
@@ -43,7 +44,7 @@ def exact(scene, aim, column, row):
     return total * scene.exposure_time_s
 
 
-@pytest.mark.parametrize(("name", "angle"), [("DET22", 0.0), ("DET14", 0.0), ("DET41", 0.0), ("DET14", -4.0)])
+@nightly.parametrize(("name", "angle"), [("DET22", 0.0), ("DET14", 0.0), ("DET41", 0.0), ("DET14", -4.0)], (0, 3))
 def test_it_is_the_sum_over_orders_of_what_the_field_stop_lets_through(name, angle):
     """Wavelength steps of 100 A have an error of 2 % of the second order's light."""
     scene, aim, found = seen(name, angle=angle)
@@ -59,7 +60,7 @@ def test_in_the_middle_other_orders_add_a_few_percent_and_at_the_edge_they_are_g
     assert edge.min() < middle.max() - 0.01 * scene.sky_electrons
 
 
-@pytest.mark.parametrize("name", ["DET14", "DET44", "DET11", "DET41"])
+@nightly.parametrize("name", ["DET14", "DET44", "DET11", "DET41"], (0, 2))
 def test_a_turned_grism_vignettes_the_sky_as_sources(name):
     """A corner detector receives less sky than with the grism straight, by the fraction by which sources are dimmed."""
     (scene, _, straight), (_, turned, tilted) = seen(name), seen(name, angle=-4.0)

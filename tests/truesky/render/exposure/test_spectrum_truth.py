@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 
 from lake_schema import units
+from tests.truesky import nightly
 from tests.truesky.render import fields, infrared, spectroscopic
 from tests.truesky.render.drawing import test_arcs
 from tests.truesky.render.spectroscopic import strip
@@ -123,7 +124,7 @@ def test_a_crowd_fits_into_memory(n):
     assert (part > 0.0).sum() == sum(len(some) > 0 for some in beside)
 
 
-@pytest.mark.parametrize(("times", "counts"), [(0.5, False), (2.0, True)])
+@nightly.parametrize(("times", "counts"), [(0.5, False), (2.0, True)], (1,))
 def test_a_neighbour_counts_that_brings_as_much_to_a_column_as_a_pixel_s_noise(times, counts):
     """To ten pixels of a square of ten as much as the noise of their sum."""
     x, y = [290.0, 320.0], [48.0, 48.5]
@@ -173,7 +174,7 @@ def with_line(flux, x=300.0, **options):
     return spectroscopic.rendered([mag], [x], [48.0], body=column, **options)
 
 
-@pytest.mark.parametrize(("x", "there"), [(300.0, True), (630.0, False)])
+@nightly.parametrize(("x", "there"), [(300.0, True), (630.0, False)], (1,))
 def test_a_line_beyond_the_detector_is_not_seen(x, there):
     """At 1.6 um, 40 columns from the undispersed place; half of the order is on the detector."""
     (row,) = (row for row in rows(with_line(2e-16, x)) if row["order"] == 1)

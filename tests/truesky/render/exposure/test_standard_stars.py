@@ -5,6 +5,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
+from tests.truesky import nightly
 from tests.truesky.render import fields, infrared
 from tests.truesky.render.fields import MISSION, small
 from truesky.fluxes import passbands
@@ -55,7 +56,7 @@ def test_the_star_is_named_once_in_a_file_of_the_exposure(tmp_path):
     assert "TARGET" not in {key for unit in arrays for key, *_ in unit.cards}
 
 
-@pytest.mark.parametrize("target", ["Vega", "white dwarf DA"])
+@nightly.parametrize("target", ["Vega", "white dwarf DA"], (1,))
 def test_they_are_where_and_as_bright_as_the_mission_says(target):
     """With the field's own sources; Y_E = 17.5, in H by their spectrum."""
     light = {}

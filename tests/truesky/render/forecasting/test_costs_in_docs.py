@@ -82,7 +82,11 @@ def test_the_table_contains_every_shipped_request():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.nightly] * name.startswith("sc8")) for name in sorted(ROWS)]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.nightly] * name.startswith(("sc8", "pilot", "vis")))
+        for name in sorted(ROWS)
+    ],
 )
 def test_the_costs_of_shipped_requests(name):
     agree(stated(ROWS[name]), forecast(parse(ROOT / "requests" / f"{name}.toml")))

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from lake_schema.mission import configuration
+from tests.truesky import nightly
 from truesky.catalogue import dust_map
 from truesky.catalogue.galaxies import band_ratios, lensing
 from truesky.catalogue.matter import density_box
@@ -128,6 +129,8 @@ def test_products_have_the_labels_for_which_forecasts_look(empty_cache):
         assert cache.has_label(label)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "requests").glob("*.toml")), ids=lambda path: path.stem)
+@nightly.parametrize(
+    "path", [pytest.param(path, id=path.stem) for path in sorted((ROOT / "requests").glob("*.toml"))], (0, 3, 8)
+)
 def test_every_shipped_request_has_finite_costs(path):
     assert all(math.isfinite(item.cpu_s) for item in preparation.items(parse(path), (), {"VIS", "NISP-S"}))

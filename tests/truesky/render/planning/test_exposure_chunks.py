@@ -10,6 +10,7 @@ import pytest
 
 from lake_schema.errors import TasksFailed
 from lake_schema.store import layout, publish, read
+from tests.truesky import nightly
 from tests.truesky.render.planning.test_survey import VIS
 from truesky.render import plan_exposures
 from truesky.render.planning import exposure_chunks, survey, tasks
@@ -50,9 +51,10 @@ def planner(request_, most):
     return replace(found, layout=exposure_chunks.Layout.from_request(request_, mission, most))
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     "most",
     [pytest.param(1, marks=pytest.mark.nightly), 100, pytest.param(700, marks=pytest.mark.nightly), 9000],
+    (1,),
 )
 def test_chunks_of_any_size_together_equal_the_plan(request_, whole, most):
     own = planner(request_, most)

@@ -10,6 +10,7 @@ from astropy.time import Time
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from truesky.render.planning import ground_surveys, planned_exposures
 from truesky.request.area import Area
 from truesky.request.exposures.observations import Observation
@@ -73,7 +74,7 @@ def survey_of(name, number, seed=3, **changes):
     return [*ground_surveys.exposures(block, area, MISSION, seed, 60500.0)]
 
 
-@pytest.mark.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)])
+@nightly.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)], (0, 2))
 def test_surveys_observe_at_night_with_pointing_errors(name, error):
     found = survey_of(name, 30)
     table = planned_exposures.table(found, [MISSION] * len(found))

@@ -11,6 +11,7 @@ from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import validate
 from lake_schema.tables.products import CONTENTS, PRODUCTS
+from tests.truesky import nightly
 from tests.truesky.render import nominal
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import small
@@ -172,7 +173,7 @@ def test_total_error_is_within_the_allowed_error(preset):
     assert charge_transfer.source_errors(scene, "bleeding") == {}
 
 
-@pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])
+@nightly.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}], (1,))
 def test_pixels_above_saturate_are_saturated(tmp_path, forced):
     """A star of 8 mag: all saturated pixels, and almost no others, are at or above SATURATE."""
     one = nominal.rendered(small("vis", "3-4", 256), [8.0], [100.3], [90.2], forced=forced, truth=("saturation",))

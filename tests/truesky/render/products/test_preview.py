@@ -5,12 +5,13 @@ import pyarrow as pa
 import pytest
 from matplotlib.image import imread
 
+from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import render
 from truesky.render.products import headers, preview, preview_labels
 from truesky.render.products.preview_labels import Label
 
 
-@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+@nightly.parametrize("channel", ["VIS", "EXT"], (1,))
 def test_a_picture_is_drawn(channel, tmp_path):
     one = render(channel, flux=30.0)
     s = one.sources
@@ -112,7 +113,7 @@ def test_labels_of_a_grism_image_follow_first_orders():
     assert (label.column, label.row, label.box) == (350.0, 52.0, boxes[7])
 
 
-@pytest.mark.parametrize("is_vertical", [False, True])
+@nightly.parametrize("is_vertical", [False, True], (1,))
 def test_close_ups_of_traces(is_vertical, tmp_path):
     """A close-up shows the whole trace, and not a square at the position of its source."""
     one = render("VIS", flux=0.0)

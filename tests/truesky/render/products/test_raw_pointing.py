@@ -12,6 +12,7 @@ from astropy.wcs import WCS
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.truesky import nightly
 from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION, small
 from tests.truesky.render.products import test_tools as tools
@@ -142,7 +143,7 @@ def test_head_file_and_read_back_have_the_true_wcs(chips):
         assert "CSYER1" not in cards
 
 
-@pytest.mark.parametrize("way", ["amplifiers", "electrons"])
+@nightly.parametrize("way", ["amplifiers", "electrons"], (1,))
 def test_all_forms_of_a_raw_frame_have_the_error(way, tmp_path):
     """All forms of a raw frame have the error in their headers; read_back returns the true WCS."""
     one = tools.stars_on("decam", 0.05, small("decam", "N31", tools.SIDE), POINTED, MISSION, way=way)

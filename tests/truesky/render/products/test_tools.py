@@ -18,6 +18,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from lake_schema.mission.parameter import CAMERAS
+from tests.truesky import nightly
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.fields import MISSION, small
 from truesky.render.camera import astrometry, observatories
@@ -112,7 +113,7 @@ def put(one, folder):
     return Field(path, SkyCoord(*astrometry.sky_of_pixel(one.wcs, *there), unit="deg"), one)
 
 
-@pytest.fixture(scope="module", params=["vis", *CAMERAS])
+@pytest.fixture(scope="module", params=nightly.params(["vis", *CAMERAS], (0, 4)))
 def field(request, tmp_path_factory):
     return written(request.param, tmp_path_factory.mktemp("tools"))
 
@@ -294,7 +295,7 @@ def reduced(path):
             yield header[f"CSEC{n}"], ccdproc.gain_correct(level, header[f"GAIN{n}"] * u.electron / u.adu)
 
 
-@pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam"])
+@nightly.parametrize("camera", ["vis", "decam", "lsstcam"], (0, 1))
 def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
     """The result is in electrons on the pixels of the detector, and keeps the WCS."""
     field = written(camera, tmp_path, sky=5.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from truesky.fluxes import passbands
 from truesky.render.camera.detectors import detector
 from truesky.render.psf import diffraction, euclid
@@ -31,7 +32,7 @@ def test_in_focus_it_is_the_psf_of_science_exposures():
     assert planes[2].max() < 0.2 * planes[0].max()
 
 
-@pytest.mark.parametrize("nm", [-300.0, 300.0])
+@nightly.parametrize("nm", [-300.0, 300.0], (1,))
 def test_it_is_a_sum_over_the_pupil(nm):
     """Fraunhofer's integral is summed directly, without a transform, and with Noll's polynomials as printed."""
     mission, n = resolve(), 1500

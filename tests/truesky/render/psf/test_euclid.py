@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from truesky.fluxes import passbands
 from truesky.render.camera.detectors import detector
 from truesky.render.psf import diffraction, euclid, sub_bands
@@ -85,7 +86,7 @@ def test_diffraction_is_galsims():
     assert ours[inner, inner].sum() == pytest.approx(theirs[inner, inner].sum(), rel=1e-2)
 
 
-@pytest.mark.parametrize("wavelength", [5500.0, 7000.0, 9000.0])
+@nightly.parametrize("wavelength", [5500.0, 7000.0, 9000.0], (1,))
 def test_wings_hold_what_edges_diffract(wavelength):
     """The light beyond a large angle is lambda P / (2 pi^2 A angle), with perimeter P and area A of the pupil.
 

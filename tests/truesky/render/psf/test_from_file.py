@@ -11,6 +11,7 @@ from scipy.special import ndtr
 
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import field, render
 from tests.truesky.render.fields import moments, one_source, small
 from truesky.fluxes import passbands
@@ -133,7 +134,7 @@ def psfex(path, degree=2, samples=0.65, side=33, **cards):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize(("column", "row"), [(80.3, 77.6), (30.1, 120.4), (131.7, 25.2)])
+@nightly.parametrize(("column", "row"), [(80.3, 77.6), (30.1, 120.4), (131.7, 25.2)], (1, 2))
 def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
     """A small body and a star agree with galsim at each position, without an additional pixel."""
     path, detector = psfex(tmp_path / "a.psf", degree), small("lsstcam", "R22_S11")

@@ -12,6 +12,7 @@ from astropy.io import fits
 from lake_schema.errors import BadInput
 from lake_schema.fits import psfex
 from lake_schema.mission.configuration import resolve
+from tests.truesky import nightly
 from tests.truesky.render.fields import moments, one_source
 from truesky.fluxes import passbands
 from truesky.render.camera import detectors
@@ -127,7 +128,7 @@ def positions(detector):
     return [(middle[0] + 0.3, middle[1] - 0.4), (160.2, 180.9), (detector.nx - 201.5, middle[1] - 512.8)]
 
 
-@pytest.mark.parametrize("of", CAMERAS)
+@nightly.parametrize("of", CAMERAS, (1,))
 def test_a_star_of_the_file_is_that_of_galsim(tmp_path, of):
     """Light in the stamp, pixels and position agree everywhere on the detector."""
     (psf, detector, band), path = model_of(*of), tmp_path / "a.psf"
@@ -141,7 +142,7 @@ def test_a_star_of_the_file_is_that_of_galsim(tmp_path, of):
         np.testing.assert_allclose(moments(ours)[0], moments(theirs)[0], atol=5e-3)
 
 
-@pytest.mark.parametrize(("of", "share"), list(zip(CAMERAS, (0.977, 0.943, 0.949), strict=True)))
+@nightly.parametrize(("of", "share"), list(zip(CAMERAS, (0.977, 0.943, 0.949), strict=True)), (1,))
 def test_the_file_has_the_light_of_a_star(tmp_path, of, share):
     """PSFLIGHT is the fraction of a star's light in the image, so that stars have the same light as in the simulation.
 

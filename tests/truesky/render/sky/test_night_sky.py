@@ -8,6 +8,7 @@ import pytest
 from lake_schema.mission.configuration import resolve
 from lake_schema.sky import separation
 from lake_schema.sky.ecliptic import equatorial
+from tests.truesky import nightly
 from truesky.render.camera import detectors
 from truesky.render.sky import diffuse_light, night_sky, observatory
 from truesky.render.sky.night_sky import Night
@@ -40,7 +41,7 @@ def dates(site, ra, dec):
     return times[(high > high.max() - 1.0) & night & (observatory.moon_altitude(times, site) < -5.0)].tolist()
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("camera", "band", "dark"),
     [
         ("megacam", "cfis_u", 22.7),
@@ -48,6 +49,7 @@ def dates(site, ra, dec):
         pytest.param("jpcam", "jedis_g", 22.0, marks=pytest.mark.nightly),
         ("lsstcam", "lsst_r", 21.07),
     ],
+    (3,),
 )
 def test_a_dark_zenith_far_from_the_ecliptic_has_its_level(camera, band, dark):
     """The level is also correct for cameras in the north."""

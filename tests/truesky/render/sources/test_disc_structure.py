@@ -61,6 +61,7 @@ def test_it_is_there():
     assert np.mean(knotted) > 3.0
 
 
+@pytest.mark.nightly
 def test_arms_are_logarithmic_spirals_of_ten_to_thirty_degrees():
     """The pitch follows from the strongest spiral in the Fourier transform of a ring over angle and log radius."""
     radii, angles = np.exp(np.linspace(np.log(1.0), np.log(3.4), 64)), np.linspace(0, 2 * np.pi, 128, endpoint=False)

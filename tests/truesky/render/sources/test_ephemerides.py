@@ -16,6 +16,7 @@ from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import kind_from_id
 from lake_schema.sky.ecliptic import ecliptic, equatorial
+from tests.truesky import nightly
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.fields import MISSION, aimed, small
 from truesky.fluxes import passbands
@@ -129,7 +130,7 @@ def test_bright_bodies_shine_around_corners(tmp_path):
     )
 
 
-@pytest.mark.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)])
+@nightly.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)], (0,))
 def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
     """Far from the body, its light equals the light of a star at its position in the middle of the exposure."""
     detector = small("vis", "3-4", 256)
@@ -235,7 +236,7 @@ def test_each_row_has_a_name_where_there_are_names(tmp_path, kind):
             ephemerides.read(written(tmp_path / f"half.{kind}", {**two, "name": [0.5, 1.5]}), "half")
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@nightly.parametrize("kind", FORMATS, (0,))
 def test_long_tables_have_names_too(tmp_path, kind):
     count = 150_000
     values = {
@@ -344,8 +345,8 @@ def test_a_request_names_it(tmp_path, monkeypatch):
         parse(path)
 
 
-@pytest.mark.parametrize(
-    ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)]
+@nightly.parametrize(
+    ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)], (2,)
 )
 def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
     """The light that a body leaves on the detector is proportional to the time it takes to cross it."""

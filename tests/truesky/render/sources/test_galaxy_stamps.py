@@ -10,6 +10,7 @@ from astropy.io import fits
 
 from lake_schema.errors import BadInput
 from lake_schema.store.provenance import file_sha256
+from tests.truesky import nightly
 from tests.truesky.render.drawing.test_structure import with_structure
 from tests.truesky.render.exposure.test_render import SIDE
 from tests.truesky.render.fields import galaxies, moments
@@ -64,12 +65,13 @@ def test_a_library_is_measured(cube):
     assert found.inner.argmax() == 2
 
 
-@pytest.mark.parametrize(
+@nightly.parametrize(
     ("number", "body"),
     [
         (1, {"bulge_fraction": 0.0, "disk_half_light_radius": 1.0, "inclination": 0.0}),
         (2, {"bulge_fraction": 1.0, "bulge_half_light_radius": 1.0, "bulge_axis_ratio": 0.8}),
     ],
+    (0,),
 )
 def test_a_stamp_of_a_profile_is_drawn_as_the_profile(cube, number, body, monkeypatch):
     """Position, flux, size, orientation and shear agree. The pixels of a stamp are a twelfth of the radius."""

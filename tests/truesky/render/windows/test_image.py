@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema.errors import BadInput
+from tests.truesky import nightly
 from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, stars
 from truesky.reduction import amplifiers
@@ -31,7 +32,7 @@ CAMERAS = {
 LARGEST = 1.0 / 320.0
 
 
-@pytest.fixture(scope="module", params=CAMERAS)
+@pytest.fixture(scope="module", params=nightly.params(CAMERAS, (1, 2)))
 def field(request):
     """An exposure of a part of a detector with stars and galaxies, and the image of all its pixels."""
     camera = request.param

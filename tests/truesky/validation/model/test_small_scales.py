@@ -45,6 +45,7 @@ def test_galaxies_cluster_as_observed(found):
     assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
 
 
+@pytest.mark.nightly
 def test_galaxies_cluster_less_with_satellites_of_today(found, monkeypatch):
     monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))
     fewer = small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)

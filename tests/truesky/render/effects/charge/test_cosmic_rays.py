@@ -8,6 +8,7 @@ import pytest
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import CAMERAS
+from tests.truesky import nightly
 from tests.truesky.render.effects.readout.test_charge_transfer import every_transfer
 from truesky.render.camera import detectors
 from truesky.render.effects.charge import cosmic_rays, ramp_cosmic_rays
@@ -106,7 +107,7 @@ def test_readout_hits_lie_in_readout_coordinates():
     assert hits[120:].mean() > 0.8 * late
 
 
-@pytest.mark.parametrize(("rows", "charges"), [([12], [12_000.0]), ([30, 31, 32], [600.0] * 3)])
+@nightly.parametrize(("rows", "charges"), [([12], [12_000.0]), ([30, 31, 32], [600.0] * 3)], (1,))
 def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
     """Pixel by pixel, with the charge put where it hits, 30 rows after the readout began, against its own trail."""
     before, pixels, silicon = 30, 80, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)

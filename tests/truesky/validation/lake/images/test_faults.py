@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from tests.truesky import nightly
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.astrometry import ASTROMETRY
 from truesky.validation.lake.images.background import BACKGROUND
@@ -133,7 +134,7 @@ def test_points_that_are_wider_than_the_header_says(good):
     assert turned(PSF, replace(of, frame=replace(of.frame, header=header), series={}), "fwhm")
 
 
-@pytest.mark.parametrize("hits", [0.0, 2.5 * made.HITS])
+@nightly.parametrize("hits", [0.0, 2.5 * made.HITS], (1,))
 def test_cosmic_rays_that_are_off_or_too_many(folder, good, hits):
     of, _ = made.vis(folder, of=good[1], hits=hits)
     assert turned(COSMIC_RAYS, of, "cover")

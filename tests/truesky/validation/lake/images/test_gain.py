@@ -7,6 +7,7 @@ import pytest
 import scipy.ndimage
 
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+from tests.truesky import nightly
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.gain import GAIN
 from truesky.validation.lake.images.noise import NOISE
@@ -46,7 +47,7 @@ def rows(of):
     return {row.quantity: row for row in GAIN.run(of)}
 
 
-@pytest.mark.parametrize("sharing", [0.0, 0.005])
+@nightly.parametrize("sharing", [0.0, 0.005], (1,))
 def test_pixel_response_cancels_in_two_frames(tmp_path, sharing):
     found = rows(pair(tmp_path, sharing=sharing))
     assert found["pair"].value == pytest.approx(1.0, abs=4.0 * found["pair"].error)
@@ -60,7 +61,7 @@ def test_pixel_response_misleads_a_single_frame(tmp_path):
     assert single["ratio"].value < 0.9
 
 
-@pytest.mark.parametrize("wrong", [0.955, 1.045])
+@nightly.parametrize("wrong", [0.955, 1.045], (1,))
 def test_a_gain_that_is_off(tmp_path, wrong):
     assert rows(pair(tmp_path, told=wrong * made.GAIN))["pair"].verdict == FAIL
 

@@ -6,6 +6,7 @@ import pytest
 
 from lake_schema.store import validate
 from lake_schema.tables.validation import VALIDATION
+from tests.truesky import nightly
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.spectra import SPECTRA
 from truesky.validation.lake.measure.frame_context import FrameContext
@@ -63,7 +64,7 @@ def test_faulty_spectra_fail(wrong, quantity):
     assert set(found.values()) == {PASS}
 
 
-@pytest.mark.parametrize("redder", [5.0, 8.0, -20.0])
+@nightly.parametrize("redder", [5.0, 8.0, -20.0], (1,))
 def test_lines_far_from_expected_positions_fail(redder):
     """The expected positions then contain noise, whose centroids scatter around 0."""
     found = made.verdicts(SPECTRA, frame(redder=redder))
