@@ -187,7 +187,8 @@ def test_python_reads_images_and_truth(either):
         stored, electrons = lake.image(first["path"]), lake.image(first["path"], electrons=True)
         assert stored.data.shape == electrons.data.shape
         assert 0 < np.median(electrons.data) < np.median(stored.data)
-        assert len(lake.extensions(first["path"])) > 1
+        # Amplifiers of the cameras of the demo have an extension each; the small one is written as one image.
+        assert (len(lake.extensions(first["path"])) > 1) == (either.request == DEMO)
         truth = lake.truth(first["exposure_id"], first["detector"])
         # The WCS counts from the pixels that `image` returns. Galaxies do not move, as stars do.
         found = truth.merge(lake.table("galaxies", ["id", "ra", "dec"]), on="id")
