@@ -21,8 +21,8 @@ from truesky.running import memory_reuse
 
 pytest.approx = tolerances.approx
 
-settings.register_profile("default", max_examples=15, deadline=None)
-settings.register_profile("ci", max_examples=15, deadline=None, derandomize=True)
+settings.register_profile("default", max_examples=8, deadline=None)
+settings.register_profile("ci", max_examples=8, deadline=None, derandomize=True)
 settings.register_profile("nightly", max_examples=5000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 

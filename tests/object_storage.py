@@ -4,6 +4,8 @@ import logging
 import threading
 from contextlib import contextmanager
 
+import pytest
+
 CREDENTIALS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_EC2_METADATA_DISABLED": "true"}
 
 
@@ -45,6 +47,23 @@ class Service:
 
 
 @contextmanager
+def parsed_once():
+    """Let clients share the parsed descriptions of the service, which every client would parse again for 0.1 s."""
+    from botocore.loaders import JSONFileLoader
+
+    load, kept = JSONFileLoader.load_file, {}
+
+    def load_once(self, path):
+        if path not in kept:
+            kept[path] = load(self, path)
+        return kept[path]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(JSONFileLoader, "load_file", load_once)
+        yield
+
+
+@contextmanager
 def service():
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
@@ -55,7 +74,8 @@ def service():
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
-        yield Service(f"http://127.0.0.1:{server.server_port}", recorder)
+        with parsed_once():
+            yield Service(f"http://127.0.0.1:{server.server_port}", recorder)
     finally:
         server.shutdown()
         thread.join()

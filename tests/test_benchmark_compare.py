@@ -17,11 +17,10 @@ def worktrees():
     return subprocess.run(listed, capture_output=True, text=True, check=True).stdout
 
 
-@pytest.mark.parametrize(
-    "subjects", [["fluxes"], pytest.param(list(_subjects.SUBJECTS), marks=pytest.mark.nightly)], ids=["fluxes", "all"]
-)
-def test_the_ratios(tmp_path, subjects):
-    file, before = tmp_path / "figures.json", worktrees()
+# The default run has test_ratios_are_new_times_by_old_times.
+@pytest.mark.nightly
+def test_the_ratios(tmp_path):
+    file, before, subjects = tmp_path / "figures.json", worktrees(), list(_subjects.SUBJECTS)
     assert compare.main(["HEAD", "--quick", "--json", str(file), "--subjects", *subjects]) == 0
     assert worktrees() == before
     figures = json.loads(file.read_text())
@@ -30,6 +29,7 @@ def test_the_ratios(tmp_path, subjects):
         assert figures[f"{subject}_ratio_min"] <= figures[f"{subject}_ratio"] <= figures[f"{subject}_ratio_max"]
 
 
+@pytest.mark.nightly
 def test_the_base_is_imported_from_its_commit(tmp_path):
     """A change of the base's package is seen by the process of the base, but not by that of this working copy."""
     with compare.checkout("HEAD") as base:

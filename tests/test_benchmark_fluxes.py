@@ -28,12 +28,14 @@ def figures(tmp_path_factory):
     return json.loads(file.read_text())
 
 
+@pytest.mark.nightly
 def test_all_figures_are_present(figures):
     assert set(KEYS) <= set(figures)
     assert {"name", "commit", "machine", "repeats"} <= set(figures)
     assert figures["name"] == "fluxes"
 
 
+@pytest.mark.nightly
 def test_the_accuracy_holds_on_galaxies_that_were_not_used_to_choose(figures):
     assert figures["rms_mag_all"] <= 1e-4
     assert figures["rms_mag_worst_band"] <= 5e-4
@@ -42,11 +44,13 @@ def test_the_accuracy_holds_on_galaxies_that_were_not_used_to_choose(figures):
     assert figures["stars_max_mag"] <= 1e-5
 
 
+@pytest.mark.nightly
 def test_speclite_agrees(figures):
     # speclite is independent code for synthetic photometry of the same spectra.
     assert 0.0 < figures["oracle_mag_max"] <= 1e-4
 
 
+@pytest.mark.nightly
 def test_tables_are_small(figures):
     assert figures["table_mb"] <= 4.5
 

@@ -15,6 +15,7 @@ def test_a_few_exposures_represent_all():
     assert all(hours > 0.0 for hours in few.values())
 
 
+@pytest.mark.nightly
 def test_the_validation_of_a_lake_is_timed(tmp_path):
     found = benchmark.time_validation(lakes.lake(tmp_path / "lake"))
     assert found["validation_detectors"] == 2.0

@@ -1,6 +1,7 @@
-"""A whole field, from a request to two FITS images, measured as an astronomer would measure it.
+"""A whole field, from a request to FITS images, measured as an astronomer would measure it.
 
-The five jobs run once per session, for the demo request. The tests examine the tables and images that they published.
+The five jobs run under Spark once per session and request. The tests examine the tables and images that they published.
+A small field has one detector of 0.4 megapixels; the field of the demo request, which takes minutes, is for the night.
 """
 
 import hashlib
@@ -22,6 +23,8 @@ from lake_schema import sky
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
 from lake_schema.store.provenance import libraries, machine
+from tests import requests
+from tests.extremes.test_detector_sizes import write_camera
 from tests.truesky.render import calibrated
 from tests.truesky.render.exposure.test_render import render as small
 from truesky.catalogue import build_galaxies, build_stars
@@ -39,6 +42,7 @@ from truesky.running import submitted_job
 
 pytestmark = pytest.mark.spark
 
+RA, DEC = 53.117, -27.808
 DEMO = Path(__file__).parents[1] / "requests" / "demo.toml"
 JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB)
 
@@ -67,17 +71,86 @@ class Image:
     blend: float
 
 
+SMALL = f"""
+[universe]
+galaxy_limit = 22.5
+star_limit = 21.0
+box_cells = 192
+lensing_nside = 64
+[mission]
+cameras = ["mini"]
+[[pointing]]
+channel = "EXT"
+camera = "mini"
+band = "des_r"
+ra = {RA}
+dec = {DEC}
+centre_on = "chip"
+mjd = 60905.25
+[products]
+truth = ["noise_free", "cosmic_rays"]
+"""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A lake with all tables of a request, and the least number of sources on each of its detectors."""
+
+    root: Path
+    request: Path
+    channels: tuple[str, ...]
+    sources: int
+
+
+def made(root, path, channels, sources):
+    """Run the jobs of a request."""
+    for job in JOBS:
+        submitted_job.run(job, root, parse(path))
+    return Field(root, path, channels, sources)
+
+
 @pytest.fixture(scope="session")
-def field(spark, tmp_path_factory):
-    """Return the root folder of a lake with all tables of the demo request."""
-    root = layout.resolve_lake(tmp_path_factory.mktemp("field") / "lake")
-    wanted = parse(DEMO)
+def small_field(spark, tmp_path_factory):
+    """A field with one detector of 640 x 600 pixels, which is read by two amplifiers."""
+    folder = tmp_path_factory.mktemp("small")
+    write_camera(folder / "mini", 640, 600)
+    amplifiers = folder / "mini" / "amplifiers.csv"
+    head, one = amplifiers.read_text().splitlines()
+    half = one.replace("A,0,0,640,", "A,0,0,320,")
+    amplifiers.write_text("\n".join((head, half, half.replace("A,0,0,320,600,0", "B,320,0,320,600,1"), "")))
+    path = requests.written(folder, SMALL, requests.FIELD.format(0.03), name="small", seed=20240401)
+    return made(layout.resolve_lake(folder / "lake"), path, ("EXT",), 20)
+
+
+@pytest.fixture(scope="session")
+def demo(spark, tmp_path_factory):
+    """The field of the demo request, with a whole detector of VIS and one of LSSTCam."""
     # Compile here, so that the memory of the workers does not include the compiler.
     for channel in ("VIS", "EXT"):
         small(channel, forced={effect.name: True for effect in registry.CHANNELS[channel].effects["science"]})
-    for job in JOBS:
-        submitted_job.run(job, root, wanted)
-    return root
+    return made(layout.resolve_lake(tmp_path_factory.mktemp("field") / "lake"), DEMO, ("EXT", "VIS"), 1000)
+
+
+@pytest.fixture(scope="session", params=["small_field", pytest.param("demo", marks=pytest.mark.nightly)])
+def either(request):
+    """Return one field after the other."""
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="session")
+def field(demo):
+    """Return the root folder of the lake of the demo request."""
+    return demo.root
+
+
+# Of the small field.
+SMALL_DIGESTS = {
+    "halos": "8c01d32e33e2fede4a8c2dbcd9fab24126a103b5e061ea755c51536227b0adf0",
+    "galaxies": "38b219888197fce4691db92245187ea1c348123abbd5b39b876221b81981771d",
+    "stars": "9a32733575d38388edc939bcd158f2ad9d04cca842e6db791e8f7d71abc3090f",
+    "galaxy_fluxes": "277f7ad8b0a9d687769d9e8fa7f0c12e8824a2014115cd034fea67a784304161",
+    "star_fluxes": "f9df21235aab21a247f81524452b6c3acd781b152897398c46f32ef0b5f7cd09",
+}
 
 
 def published_digests():
@@ -86,7 +159,7 @@ def published_digests():
     return {table: digest for digest, table in re.findall(r"^([0-9a-f]{64})  (\w+)$", text, re.MULTILINE)}
 
 
-def test_tables_have_the_published_checksums(field):
+def test_tables_have_the_published_checksums(either):
     """Compare on documented machines with the pinned packages; on others, last bits may differ."""
     pins = (Path(__file__).parents[1] / "requirements" / "run.txt").read_text(encoding="utf-8")
     pinned = dict(re.findall(r"^([\w.-]+)==(\S+) ", pins, re.MULTILINE))
@@ -96,49 +169,49 @@ def test_tables_have_the_published_checksums(field):
     others = [name for name, value in versions.items() if pinned[name] != value]
     if machine() != "x86-64-v3 glibc 2.36" or others:
         pytest.skip(f"computed on {machine()} with other versions than the pinned ones: {others}")
-    found = {}
+    expected, found = published_digests() if either.request == DEMO else SMALL_DIGESTS, {}
     for table in published_digests():
-        folder = read.version(field, table).folder / table / "dataset"
+        folder = read.version(either.root, table).folder / table / "dataset"
         content = b"".join(path.read_bytes() for path in sorted(folder.glob("Norder=*/Dir=*/Npix=*.parquet")))
         found[table] = hashlib.sha256(content).hexdigest()
     assert len(found) == 5
-    assert found == published_digests(), "where a change of the results is intended, update docs/promises.md"
+    assert found == expected, "where a change of the results is intended, update docs/promises.md and SMALL_DIGESTS"
 
 
-def test_python_reads_images_and_truth(field):
-    with truesky.open(field) as lake:
+def test_python_reads_images_and_truth(either):
+    with truesky.open(either.root) as lake:
         images = lake.images()
-        assert sorted(images["channel"]) == ["EXT", "VIS"]
-        assert all((field / file).is_file() for file in images["file"])
+        assert sorted(images["channel"]) == list(either.channels)
+        assert all((either.root / file).is_file() for file in images["file"])
         first = images.iloc[0]
         stored, electrons = lake.image(first["path"]), lake.image(first["path"], electrons=True)
         assert stored.data.shape == electrons.data.shape
         assert 0 < np.median(electrons.data) < np.median(stored.data)
-        assert len(lake.extensions(first["path"])) > 1
+        # Amplifiers of the cameras of the demo have an extension each; the small one is written as one image.
+        assert (len(lake.extensions(first["path"])) > 1) == (either.request == DEMO)
         truth = lake.truth(first["exposure_id"], first["detector"])
         # The WCS counts from the pixels that `image` returns. Galaxies do not move, as stars do.
         found = truth.merge(lake.table("galaxies", ["id", "ra", "dec"]), on="id")
         x, y = lake.wcs(first["path"]).all_world2pix(found["ra"], found["dec"], 0)
-        assert len(found) > 100
+        assert len(found) > either.sources // 10
         assert np.abs(x - found["x"]).max() < 1e-3
         assert np.abs(y - found["y"]).max() < 1e-3
         with pytest.raises(truesky.BadInput, match="is no image of spectra"):
             lake.models(first["exposure_id"], first["detector"])
-        assert len(truth) > 1000
+        assert len(truth) > either.sources
         assert set(truth["detector"]) == {first["detector"]}
         with pytest.raises(truesky.BadInput, match="nothing was rendered for detector 9-9"):
             lake.truth(1, "9-9")
-        ra, dec = 53.117, -27.808
-        near = lake.cone("galaxies", ra, dec, 0.02, ["id", "ra", "dec"])
-        assert len(near) > 100
-        assert sky.separation(near["ra"].to_numpy(), near["dec"].to_numpy(), ra, dec).max() <= 0.02
+        near = lake.cone("galaxies", RA, DEC, 0.02, ["id", "ra", "dec"])
+        assert len(near) > either.sources // 10
+        assert sky.separation(near["ra"].to_numpy(), near["dec"].to_numpy(), RA, DEC).max() <= 0.02
 
 
-def test_python_runs_a_request_and_reuses_tables(field):
-    before = {path.name for path in field.glob("*/v-*")}
-    with truesky.run(DEMO, field) as lake:
-        assert lake.sql("SELECT count(*) AS n FROM tasks")["n"].tolist() == [2]
-    assert {path.name for path in field.glob("*/v-*")} == before
+def test_python_runs_a_request_and_reuses_tables(either):
+    before = {path.name for path in either.root.glob("*/v-*")}
+    with truesky.run(either.request, either.root) as lake:
+        assert lake.sql("SELECT count(*) AS n FROM tasks")["n"].tolist() == [len(either.channels)]
+    assert {path.name for path in either.root.glob("*/v-*")} == before
 
 
 def product(field, channel, content):
@@ -269,6 +342,7 @@ def photometry(image):
     return index, aperture(image.electrons), aperture(image.noise_free), noise
 
 
+@pytest.mark.nightly
 def test_forecast_agrees_with_measured_costs(field):
     """Memory and size of every detector agree within 30 %; time depends on the load of the machine."""
     rows, tasks = archive.products(field).to_pylist(), read.version(field, "tasks").rows().to_pylist()
@@ -279,6 +353,7 @@ def test_forecast_agrees_with_measured_costs(field):
         assert task["memory"] == pytest.approx(own[0]["peak_gb"], rel=0.3)
 
 
+@pytest.mark.nightly
 def test_bright_unblended_sources_are_found(image, photometry):
     index, _, truth, noise = photometry
     bright = index[truth > 10 * noise]
@@ -300,6 +375,7 @@ def test_bright_unblended_sources_are_found(image, photometry):
     assert abs(np.median((y[which] - image.y[bright])[found])) < 0.15
 
 
+@pytest.mark.nightly
 def test_photometry_and_its_noise_agree_with_prediction(image, photometry):
     _, measured, truth, noise = photometry
     bright = truth > 10 * noise
@@ -314,12 +390,14 @@ def test_photometry_and_its_noise_agree_with_prediction(image, photometry):
     assert 0.9 < spread < 1.3
 
 
+@pytest.mark.nightly
 def test_frame_contains_the_light_of_its_sources(image):
     """The total light agrees, up to the wings that cross the edges of the detector."""
     assert image.noise_free.sum() == pytest.approx(image.expected.sum(), rel=0.02)
     assert image.noise_free.min() > -1e-3 * np.sqrt(np.median(image.variance))
 
 
+@pytest.mark.nightly
 def test_background_agrees_with_prediction(image):
     """The sample is at least a fifth of the pixels; its mean agrees within 5 standard errors (significance 6e-7)."""
     empty = (image.noise_free < 0.05 * np.sqrt(image.variance)) & ~image.bad
@@ -331,22 +409,29 @@ def test_background_agrees_with_prediction(image):
 
 
 @pytest.mark.parametrize("content", ["science", "noise_free"])
-@pytest.mark.parametrize("channel", ["VIS", "EXT"])
-def test_files_are_valid_fits(field, channel, content):
-    path = product(field, channel, content)
-    with fits.open(path, checksum=True) as hdus:
-        hdus.verify("exception")
-        for hdu in hdus:
-            assert hdu.verify_checksum() == hdu.verify_datasum() == 1
-    header = fits.getheader(path)
-    for key in ("EXPTIME", "BUNIT", "SEED", "MISSION", "CTYPE1", "CD1_1", "MJD-OBS", "TRUESKY"):
-        assert key in header, key
-    if channel == "VIS" and content == "noise_free":
-        assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4136)
-    elif channel == "VIS":
-        assert [unit.shape for unit in fits.open(path)[1:]] == [(2086, 2128)] * 4
+def test_files_are_valid_fits(either, content):
+    for channel in either.channels:
+        path = product(either.root, channel, content)
+        with fits.open(path, checksum=True) as hdus:
+            hdus.verify("exception")
+            for hdu in hdus:
+                assert hdu.verify_checksum() == hdu.verify_datasum() == 1
+        header = fits.getheader(path)
+        for key in ("EXPTIME", "BUNIT", "SEED", "MISSION", "CTYPE1", "CD1_1", "MJD-OBS", "TRUESKY"):
+            assert key in header, key
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("content", ["science", "noise_free"])
+def test_images_of_vis_have_the_size_of_the_detector(field, content):
+    with fits.open(product(field, "VIS", content)) as hdus:
+        if content == "noise_free":
+            assert hdus[0].shape == (4136, 4096)
+        else:
+            assert [hdu.shape for hdu in hdus[1:]] == [(2086, 2128)] * 4
+
+
+@pytest.mark.nightly
 def test_preview_labels_the_brightest_sources(field, image):
     channel = image.header["CHANNEL"]
     products = read.version(field, "products").rows().to_pylist()
@@ -359,29 +444,32 @@ def test_preview_labels_the_brightest_sources(field, image):
         assert [label.mag for label in names if label.kind == kind][:16] == pytest.approx(list(brightest), abs=1e-3)
 
 
-def test_other_tools_can_open_the_lake(field):
+def test_other_tools_can_open_the_lake(either):
     import lsdb
 
-    galaxies = read.version(field, "galaxies")
-    found = lsdb.open_catalog(str(layout.current_link(field, "galaxies"))).cone_search(53.117, -27.808, 60.0).compute()
+    galaxies = read.version(either.root, "galaxies")
+    catalogue = lsdb.open_catalog(str(layout.current_link(either.root, "galaxies")))
+    found = catalogue.cone_search(RA, DEC, 60.0).compute()
     everything = galaxies.rows(["ra", "dec"])
-    near = sky.separation(53.117, -27.808, everything["ra"].to_numpy(), everything["dec"].to_numpy()) < 60 / 3600
-    assert len(found) == near.sum() > 100
+    near = sky.separation(RA, DEC, everything["ra"].to_numpy(), everything["dec"].to_numpy()) < 60 / 3600
+    assert len(found) == near.sum() > either.sources // 10
 
 
-def test_fluxes_have_the_cells_of_their_catalogues(field):
+def test_fluxes_have_the_cells_of_their_catalogues(either):
     for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
-        left, right = read.version(field, catalogue), read.version(field, fluxes)
+        left, right = read.version(either.root, catalogue), read.version(either.root, fluxes)
         assert left.partitions == right.partitions
         assert left.rows(["id"]).equals(right.rows(["id"]))
 
 
-def test_every_table_is_valid(field):
-    assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(read.table_names(field))
-    for name in read.table_names(field):
-        assert read.find_faults(read.version(field, name), deep=True) == []
+def test_every_table_is_valid(either):
+    names = read.table_names(either.root)
+    assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(names)
+    for name in names:
+        assert read.find_faults(read.version(either.root, name), deep=True) == []
 
 
+@pytest.mark.nightly
 def test_demo_covers_only_cells_of_its_detectors(field):
     tasks = read.version(field, "tasks").rows(["cells"])["cells"].to_pylist()
     touched = sorted({cell for cells in tasks for cell in cells})
@@ -390,6 +478,7 @@ def test_demo_covers_only_cells_of_its_detectors(field):
     assert len(drawn) * sky.cell_area(8) <= 0.6
 
 
+@pytest.mark.nightly
 def test_galaxy_counts_agree_with_observations(field):
     """102 galaxies per arcmin2 with I_E < 26, as in deep surveys and the Flagship mock, within 15 %."""
     area = len(parse(DEMO).area.cells()) * sky.cell_area(8) * 3600

@@ -59,6 +59,16 @@ def standard(tmp_path_factory):
     return digests("quick", folder, folder / "cache", 1, KERNELS[0])
 
 
+def test_threads_and_kernels_change_no_bit_of_a_table(tmp_path):
+    first, other = (
+        digests("table", tmp_path / str(threads), tmp_path / f"cache {threads}", threads, kernel)
+        for threads, kernel in zip((1, 2), KERNELS, strict=True)
+    )
+    assert len(first) == 2
+    assert differing(first, other) == []
+
+
+@pytest.mark.nightly
 def test_threads_and_kernels_change_no_bit(standard, tmp_path):
     other = digests("quick", tmp_path, tmp_path / "cache", 2, KERNELS[1])
     assert len(standard) > 10
@@ -93,16 +103,11 @@ def emulator():
     return command
 
 
+# In the default run, the test of threads compares two processes of the standard kind, and
+# tests/lake_schema/test_instruction_set.py tests what is reported.
+@pytest.mark.nightly
 @on_avx2
-@pytest.mark.parametrize(
-    "setting",
-    [
-        # In the default run, the test of threads compares two processes of the standard kind.
-        pytest.param({}, marks=pytest.mark.nightly),
-        pytest.param({"TRUESKY_CPU": "native"}, marks=pytest.mark.nightly),
-        {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
-    ],
-)
+@pytest.mark.parametrize("setting", [{}, {"TRUESKY_CPU": "native"}, {"NPY_DISABLE_CPU_FEATURES": "X86_V3"}])
 def test_other_instruction_sets_are_reported(standard, tmp_path, setting):
     """numpy without AVX2 represents another instruction set: it is reported, and its results differ."""
     command = [sys.executable, "-c", "from lake_schema.store.provenance import machine; print(machine())"]

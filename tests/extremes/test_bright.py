@@ -78,7 +78,7 @@ def test_frame_resolution_depends_only_on_the_total_charge():
     assert np.log2(unit) == np.rint(np.log2(unit))
 
 
-@pytest.mark.parametrize(("mag", "seconds"), [(-1.46, 560.5), (8.0, 1e6)])
+@pytest.mark.parametrize(("mag", "seconds"), [(-1.46, 560.5), pytest.param(8.0, 1e6, marks=pytest.mark.nightly)])
 def test_the_brightest_star_in_the_longest_exposure(mag, seconds):
     """The star is in the truth, and its pixels are saturated, without a dark centre."""
     quiet = nominal.off("cosmic_rays", "readout_cosmic_rays")

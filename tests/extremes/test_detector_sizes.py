@@ -88,8 +88,8 @@ def middle(frame):
 @pytest.mark.parametrize(
     "sizes",
     [
-        [(2, 2), (32_000, 16)],
-        pytest.param([(16, 16), (16, 32_000), (32_000, 2_000)], id="more", marks=pytest.mark.nightly),
+        [(2, 2)],
+        pytest.param([(16, 16), (32_000, 16), (16, 32_000), (32_000, 2_000)], id="more", marks=pytest.mark.nightly),
     ],
 )
 def test_a_star_is_the_same_on_a_detector_of_any_size(tmp_path, sizes):

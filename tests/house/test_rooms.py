@@ -62,8 +62,8 @@ def test_number_of_modules_per_package_is_limited():
 
 
 def test_length_of_files_is_limited():
-    long = {path.as_posix(): n for path in SOURCES if (n := lines_of_code(path.read_text())) > LINES}
-    assert long == {}
+    texts = {path.as_posix(): text for path in SOURCES if (text := path.read_text()).count("\n") > LINES}
+    assert {path: n for path, text in texts.items() if (n := lines_of_code(text)) > LINES} == {}
 
 
 def test_size_of_functions_is_limited():

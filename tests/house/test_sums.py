@@ -4,6 +4,7 @@ The validation and the reduction measure what is published; their results are th
 """
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,10 @@ NAMES = {
     "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
     "polyfit", "leggauss", "hermgauss", "laggauss", "roots_legendre", "lstsq", "pinv", "eigh", "svd", "cholesky",
 }  # fmt: skip
+
+
+# A file with none of these contains no such product, so it is not parsed.
+WORDS = re.compile(rf"{'|'.join(NAMES)}|\S *@|optimize|parallel")
 
 
 def faults(tree):
@@ -43,9 +48,11 @@ def faults(tree):
      "numba.njit(parallel=True)"],
 )  # fmt: skip
 def test_forbidden_products_are_detected(text):
+    assert WORDS.search(text)
     assert list(faults(ast.parse(text)))
 
 
 def test_only_reproducible_products_are_used():
-    found = [f"{p.relative_to(ROOT)}:{line}" for p in SOURCES for line in faults(ast.parse(p.read_text()))]
+    texts = {path: text for path in SOURCES if WORDS.search(text := path.read_text())}
+    found = [f"{p.relative_to(ROOT)}:{line}" for p, text in texts.items() for line in faults(ast.parse(text))]
     assert found == [], "truesky/numerics/matrices.py has products and solutions whose last bit is the same everywhere"

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import sys
 from lake_schema.lazy_healpy import healpy as lazy
@@ -31,6 +33,7 @@ def test_functions_of_pixels_need_no_other_library():
     assert run(CODE) == [".", "module 'healpy' has no attribute 'nothing'"]
 
 
+@pytest.mark.nightly
 def test_a_package_that_was_imported_before_is_used():
     code = "import healpy; from lake_schema import lazy_healpy; print(lazy_healpy.healpy is healpy)"
     assert run(code) == ["True"]

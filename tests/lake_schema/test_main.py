@@ -161,7 +161,7 @@ def test_describe_names_every_column_with_its_unit(filled, capsys):
     assert "uJy" in out
 
 
-@pytest.mark.parametrize("command", ["verify", "gc", "describe"])
+@pytest.mark.parametrize("command", ["verify", "gc", pytest.param("describe", marks=pytest.mark.nightly)])
 def test_a_missing_table_is_a_wrong_call(lake, capsys, command):
     assert main([command, str(lake)]) == 2
     assert main([command, str(lake), "galaxies"]) == 2

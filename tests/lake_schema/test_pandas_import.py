@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import sys
 {}
@@ -29,5 +31,6 @@ def test_arrow_and_astropy_work_without_pandas():
     assert run("") == "pandas is missing\n"
 
 
+@pytest.mark.nightly
 def test_an_imported_pandas_stays():
     assert run("import pandas") == "imported\n"

@@ -167,7 +167,7 @@ def test_statistics_are_not_believed(tmp_path):
     assert read(path)["ra"].to_pylist() == list(np.arange(1.0, 101.0))
 
 
-@pytest.mark.parametrize("trials", [25, pytest.param(600, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("trials", [8, pytest.param(600, marks=pytest.mark.nightly)])
 def test_changed_bytes_end_in_rows_or_in_one_line(trials, tmp_path):
     path = tmp_path / "theirs.parquet"
     write(path, GOOD)

@@ -83,4 +83,5 @@ def test_code_uses_every_row():
 def test_every_pattern_fits_a_row(table):
     with (ROOT / "lake_schema" / "mission" / f"{table}.csv").open(encoding="utf-8") as stream:
         patterns = {row["pattern"] for row in csv.DictReader(stream)}
-    assert {pattern for pattern in patterns if not any(fnmatchcase(key, pattern) for key in keys())} == set()
+    known = keys()
+    assert {pattern for pattern in patterns if not any(fnmatchcase(key, pattern) for key in known)} == set()

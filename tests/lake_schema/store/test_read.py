@@ -136,6 +136,7 @@ def test_any_hats_reader_can_open_it(toy):
     assert sorted(found["id"]) == sorted(everything["id"].to_numpy()[apart < 0.8])
 
 
+@pytest.mark.nightly
 def test_pairs_across_cell_edges_are_matched(lake):
     """Every source has a twin 1" away in another catalogue; with the margin, no pair is lost at an edge."""
     from tests.universe import TOY

@@ -15,6 +15,12 @@ from tests.universe import TOY, rows_of, toy_rows
 
 TABLES = all_tables(["euclid_vis", "lsst_r"])
 each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+# Tables for tests that change every column. Together they have every type of column; the others are checked at night.
+VARIED = ("stars", "exposures", "tasks", "rendered_spectra", "galaxy_fluxes", "templates")
+varied_tables = pytest.mark.parametrize(
+    "table",
+    [pytest.param(table, marks=() if table.name in VARIED else pytest.mark.nightly, id=table.name) for table in TABLES],
+)
 
 
 @functools.cache
@@ -30,6 +36,11 @@ def refused(rows, table, *words):
     with pytest.raises(BadInput) as found:
         validate.check_rows(rows, table)
     assert all(word in str(found.value) for word in (table.name, *words)), str(found.value)
+
+
+def test_varied_tables_have_every_type_of_column():
+    types = {column.type for table in TABLES if table.name in VARIED for column in table.columns}
+    assert types == {column.type for table in TABLES for column in table.columns}
 
 
 @each_table
@@ -66,14 +77,14 @@ def test_a_wrong_type_unit_or_nullability(table):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@each_table
+@varied_tables
 def test_nan_and_infinity_are_refused(table, bad):
     for column in table.columns:
         if column.is_float or column.type.startswith("list<float"):
             refused(changed(three_rows(table), column, bad), table, column.name, "row 1")
 
 
-@each_table
+@varied_tables
 def test_a_value_out_of_bounds(table):
     for column in bounded(table):
         kind = np.dtype(column.type.removeprefix("list<").removesuffix(">"))
@@ -83,7 +94,7 @@ def test_a_value_out_of_bounds(table):
                 refused(changed(three_rows(table), column, beyond), table, column.name, "row 1")
 
 
-@each_table
+@varied_tables
 def test_the_bounds_themselves_are_legal(table):
     for column in bounded(table):
         for bound in (column.lo, column.hi):
@@ -92,7 +103,7 @@ def test_the_bounds_themselves_are_legal(table):
                 assert validate.find_violations(changed(three_rows(table), column, value), table) == [], column.name
 
 
-@each_table
+@varied_tables
 def test_a_missing_value_only_where_declared(table):
     for place, column in enumerate(table.columns):
         rows = three_rows(table)
@@ -143,7 +154,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("number", ODD.values(), ids=ODD)
-@each_table
+@varied_tables
 def test_an_odd_number_is_kept_or_refused_but_never_changed(table, number, tmp_path):
     """Each column is checked alone; the allowed numbers of all columns are then written to one file."""
     rows, kept = three_rows(table), {}

@@ -18,6 +18,7 @@ import truesky
 from lake_schema.errors import BadInput
 from lake_schema.store import publish
 from tests import requests
+from tests.extremes.test_detector_sizes import write_camera
 from truesky.api.sky_images import SkyImage
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.commands.__main__ import main
@@ -60,13 +61,32 @@ def lake(tmp_path_factory):
         folder / "galaxies.csv", index=False
     )
     pd.DataFrame({**places, **mags})[3000:].to_csv(folder / "stars.csv", index=False)
-    wanted, root = parse(requests.written(folder, REQUEST, requests.FIELD.format(0.2), seed=7)), folder / "lake"
+    with truesky.open(made(folder, REQUEST, 0.2)) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def small_lake(tmp_path_factory):
+    """A lake with one image of a camera that has one detector of 600 x 560 pixels."""
+    folder, rng = tmp_path_factory.mktemp("small"), np.random.default_rng(3)
+    places = {"ra": RA + rng.uniform(-0.02, 0.02, 80), "dec": DEC + rng.uniform(-0.02, 0.02, 80)}
+    mags = {"mag": rng.uniform(18.0, 26.0, 80)}
+    pd.DataFrame({**places, **mags, "half_light_radius": 0.5}).to_csv(folder / "galaxies.csv", index=False)
+    pd.DataFrame({**places, **mags})[60:].to_csv(folder / "stars.csv", index=False)
+    write_camera(folder / "mini", 600, 560)
+    text = REQUEST.replace('"lsstcam"', '"mini"').replace("R22_S11", "chip").replace('"lsst_r"', '"des_r"')
+    with truesky.open(made(folder, f'{text}[mission]\ncameras = ["mini"]\n', 0.05)) as opened:
+        yield opened
+
+
+def made(folder, text, radius):
+    """Make all tables of a request and return the folder of their lake."""
+    wanted, root = parse(requests.written(folder, text, requests.FIELD.format(radius), seed=7)), folder / "lake"
     root.mkdir()
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(root, wanted):
             publish.make_version(root, step.plan, step.run_task)
-    with truesky.open(root) as opened:
-        yield opened
+    return root
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +155,14 @@ def test_sources_are_left_out_and_added(lake):
     )
 
 
-def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "detector"), [("small_lake", "chip"), pytest.param("lake", "R22_S11", marks=pytest.mark.nightly)]
+)
+def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(request, tmp_path, kind, detector):
+    lake = request.getfixturevalue(kind)
     path = lake.images()["path"][0]
     stored = lake.image(path)
-    frame = lake.frame(1, "R22_S11")
+    frame = lake.frame(1, detector)
     assert np.array_equal(frame.raw, stored.data)
     new = frame.with_sources(NEW)
     assert len(new.added_rows) == 2
@@ -148,7 +172,7 @@ def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
     near = np.hypot(changed[:, 1] - x[0], changed[:, 0] - y[0]) < 100.0
     assert near.mean() > 0.3
     # The drawing of all other sources is shared. A frame that shares nothing is the same.
-    alone = lake.frame(1, "R22_S11").with_sources(NEW)
+    alone = lake.frame(1, detector).with_sources(NEW)
     assert np.array_equal(alone.raw, new.raw)
     assert np.array_equal(alone.noise_free, new.noise_free)
     assert alone.truth.equals(new.truth)
@@ -159,8 +183,8 @@ def test_a_frame_with_sources_is_that_of_a_catalogue_with_them(lake, tmp_path):
         assert units[0].header["EXPOSURE"] == before[0].header["EXPOSURE"] == 1
     with pytest.raises(BadInput, match="additional sources already"):
         new.with_sources(NEW)
-    with pytest.raises(BadInput, match=r"rendered for detector R22_S12 of exposure 1; it has .* of exposure"):
-        lake.frame(1, "R22_S12")
+    with pytest.raises(BadInput, match=r"rendered for detector 9-9 of exposure 1; it has .* of exposure"):
+        lake.frame(1, "9-9")
 
 
 def test_the_psf_is_what_galsim_draws_from_the_psf_file(lake):

@@ -71,6 +71,7 @@ def test_a_changed_object_is_refused_by_name_in_sql(there, bucket):
             service.client.put_object(Bucket=name, Key=key, Body=data)
 
 
+@pytest.mark.nightly
 def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
     monkeypatch.delenv("AWS_ENDPOINT_URL")
     galaxies = hats_readers.open_catalog(catalogue(there, "galaxies"), columns="all")
@@ -80,6 +81,11 @@ def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
     found = galaxies.cone_search(ra, dec, 1800.0).compute()
     assert sorted(found["id"]) == sorted(here.cone(ra, dec, 0.5)["id"].to_pylist())
     assert 0 < len(found) < 500
+
+
+def test_a_catalogue_for_lsdb_has_a_name_and_an_address(explored, there):
+    key = read.version(explored, "galaxies").key
+    assert str(catalogue(there, "galaxies")).endswith(f"/lake/galaxies/v-{key}")
     with pytest.raises(BadInput, match="plain is not a catalogue"):
         catalogue(there, "plain")
     with pytest.raises(BadInput, match="is not an address"):

@@ -15,7 +15,7 @@ from tests.waiting import PATIENCE
 from truesky.explore import guard
 from truesky.explore.explorer import Explorer
 
-STATEMENTS, MANY_STATEMENTS = 240, 10_000
+STATEMENTS, MANY_STATEMENTS = 120, 10_000
 # The state of the session is compared after this number of statements.
 BLOCK = 40
 # Longest CPU time (s) in which a statement is checked, by the guard and by this test.

@@ -75,6 +75,7 @@ def test_a_new_version_of_the_lake_is_announced(browser, shown, tmp_path):
         assert page.server.lake.key in tab.inner_text("#version")
 
 
+@pytest.mark.nightly
 def test_a_tab_is_notified_if_another_tab_opens_a_new_version(browser, shown, tmp_path):
     root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page, tab_of(browser, page, at("sql")) as tab, tab_of(browser, page, at("sql")) as other:
@@ -91,6 +92,7 @@ def test_a_tab_is_notified_if_another_tab_opens_a_new_version(browser, shown, tm
         assert other.is_visible("#changed")
 
 
+@pytest.mark.nightly
 def test_the_address_holds_the_view(browser, page):
     with tab_of(browser, page, at("images")) as tab:
         until(tab, "document.getElementById('image-one').childElementCount === 3")
@@ -171,7 +173,7 @@ SEEN = """() => {
 }"""
 
 
-@pytest.mark.parametrize("theme", ["dark", "light"])
+@pytest.mark.parametrize("theme", [pytest.param("dark", marks=pytest.mark.nightly), "light"])
 def test_every_control_has_a_name_and_text_can_be_read_where_it_stands(any_view, theme):
     tab = in_theme(any_view, theme)
     for number, view in enumerate(VIEWS, start=1):

@@ -6,6 +6,8 @@ Answers are delayed or replaced in the page, so that no request fails.
 import json
 import tomllib
 
+import pytest
+
 from tests.truesky.page.browsing import HELD, at, copied, tab_of, until
 from tests.truesky.page.conftest import CENTRE
 from tests.truesky.page.test_browser_sky import CLIPBOARD, LEGEND, STATES, gone_to
@@ -32,6 +34,7 @@ def replaced(tab, part, delay=0, error=None, times=1):
     tab.evaluate(REPLACED, [part, delay, error, times])
 
 
+@pytest.mark.nightly
 def test_the_later_of_two_pinned_sources_is_shown(tab, page):
     first, second = page.json("truth/0")["id"][:2]
     replaced(tab, f"source/{first}", 700)
@@ -41,6 +44,7 @@ def test_the_later_of_two_pinned_sources_is_shown(tab, page):
     assert tab.evaluate("import('/static/pin.js').then(({ pinned }) => pinned().id)") == second
 
 
+@pytest.mark.nightly
 def test_refused_true_sources_are_requested_again(tab):
     tab.keyboard.press("4")
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
@@ -52,6 +56,7 @@ def test_refused_true_sources_are_requested_again(tab):
     until(tab, "document.getElementById('image-legend').textContent.includes('sources')")
 
 
+@pytest.mark.nightly
 def test_a_source_is_described_again_on_another_image(tab):
     """A source on two images that blink has different numbers on each."""
     told = tab.evaluate("""async () => {
@@ -74,6 +79,7 @@ def test_a_source_is_described_again_on_another_image(tab):
     assert [text.split()[0] for text in told] == ["8", "9"]
 
 
+@pytest.mark.nightly
 def test_textures_of_late_tiles_are_deleted(tab):
     """Tiles may arrive after other tiles have replaced them in the cache."""
     made, kept, textures = tab.evaluate("""async () => {
@@ -110,6 +116,7 @@ def test_refusals_are_shown(tab):
     until(tab, "document.querySelector('#runs-content details').textContent.includes('version')")
 
 
+@pytest.mark.nightly
 def test_a_refused_source_of_the_sky_is_shown(tab, page):
     truth = page.json("truth/0")
     place = page.json(f"source/{truth['id'][0]}")["place"]
@@ -123,6 +130,7 @@ def test_a_refused_source_of_the_sky_is_shown(tab, page):
     until(tab, f"{SAID}.includes('no place in the queue')")
 
 
+@pytest.mark.nightly
 def test_a_removed_brush_selects_nothing(tab):
     tab.keyboard.press("2")
     until(tab, "[...document.querySelectorAll('#plot-grid .range')].every((one) => one.textContent.includes('rows'))")
@@ -144,6 +152,7 @@ BRUSHED = """import('/static/plots.js').then((plots) => plots.restore({ source: 
   charts: [{ axes: [{ expression: 'z_obs -- z', log: false }], spans: null, brush: [[1, 2]] }] }))"""
 
 
+@pytest.mark.nightly
 def test_copied_queries_keep_conditions_that_end_in_a_comment(browser, page):
     with tab_of(browser, page, **CLIPBOARD) as tab:
         until(tab, f"{LEGEND}.includes('deg')")
@@ -181,6 +190,7 @@ def test_the_first_sources_are_the_largest(tab):
     assert (name, bright > faint > 0) == ("brightest", True)
 
 
+@pytest.mark.nightly
 def test_only_exposures_in_view_are_shown_if_there_are_many(browser, sky, monkeypatch):
     monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 1)
     with tab_of(browser, sky, refused="/exposures") as tab:
@@ -206,6 +216,7 @@ TRACES = """async ([identifier, number]) => {
 }"""
 
 
+@pytest.mark.nightly
 def test_traces_and_copied_requests_belong_to_the_request_of_the_image(browser, two):  # noqa: F811
     page, identifier = two
     with tab_of(browser, page, at("images"), **CLIPBOARD) as tab:
@@ -235,6 +246,7 @@ def test_traces_and_copied_requests_belong_to_the_request_of_the_image(browser, 
         assert [(one.band, one.ra, one.mjd) for one in request.pointings] == [("nisp_blue", far, 61001.0)]
 
 
+@pytest.mark.nightly
 def test_names_of_footprints_at_one_position_do_not_overlap(browser, two):  # noqa: F811
     page, _ = two
     with tab_of(browser, page) as tab:

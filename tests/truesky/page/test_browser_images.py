@@ -13,6 +13,7 @@ from truesky.page import pictures
 VIEW = "images"
 
 
+@pytest.mark.nightly
 def test_a_source_through_the_grism(browser, tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
@@ -69,6 +70,7 @@ def peaks(tab, page, number, most):
     return len(inside)
 
 
+@pytest.mark.nightly
 def test_true_sources_are_drawn_at_peaks_of_pixels(tab, page):
     assert peaks(tab, page, 1, 8) == 8
 
@@ -110,6 +112,7 @@ def opened(tab):
     return box, 0.98 * min(box["width"] / 700, box["height"] / 600)
 
 
+@pytest.mark.nightly
 def test_the_number_of_marked_sources_is_shown_if_there_are_many(tab, page, monkeypatch):
     total = page.json("truth/0")["total"]
     monkeypatch.setattr(pictures.bright_sources, "__defaults__", (40,))
@@ -118,6 +121,7 @@ def test_the_number_of_marked_sources_is_shown_if_there_are_many(tab, page, monk
     until(tab, f"document.getElementById('image-legend').textContent.includes('the brightest 40 of {total}')")
 
 
+@pytest.mark.nightly
 def test_the_description_of_a_source_stays_with_the_cursor(tab, page):
     box, zoom = opened(tab)
     tab.check("#image-truth")
@@ -133,6 +137,7 @@ def test_the_description_of_a_source_stays_with_the_cursor(tab, page):
     assert "mag_h" in tab.evaluate(tip)
 
 
+@pytest.mark.nightly
 def test_keys_announce_pixels_and_pin_sources(tab, page):
     opened(tab)
     tab.check("#image-truth")
@@ -186,6 +191,7 @@ def test_cosmic_rays_come_and_go(tab):
     assert tab.locator("#image-mended").is_checked()
 
 
+@pytest.mark.nightly
 def test_blinking_shows_both_in_turn(tab):
     opened(tab)
     tab.select_option("#image-two", "1")

@@ -1,5 +1,7 @@
 """The layout of every view on a phone and on a desk, and the rules of axe-core for accessibility."""
 
+from itertools import product
+
 import pytest
 
 from tests.truesky.page.browsing import DRAWN, VIEWS, at, tab_of, until
@@ -50,14 +52,15 @@ def test_nothing_covers_a_view(sized, view):
         assert found["covered"] < 0.1
 
 
-@pytest.mark.parametrize("view", VIEWS)
+# A view of each size and each theme; the others are tested at night.
+DAILY = {("phone", "dark", "images"), ("desk", "light", "sql")}
+
+
 @pytest.mark.parametrize(
-    ("sized", "theme"),
+    ("sized", "theme", "view"),
     [
-        ("phone", "dark"),
-        ("desk", "light"),
-        pytest.param("phone", "light", marks=pytest.mark.nightly),
-        pytest.param("desk", "dark", marks=pytest.mark.nightly),
+        pytest.param(*one, marks=() if one in DAILY else pytest.mark.nightly)
+        for one in product(SIZES, ("dark", "light"), VIEWS)
     ],
     indirect=["sized"],
 )

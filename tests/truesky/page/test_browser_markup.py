@@ -141,6 +141,7 @@ def shown(tab, view):
     until(tab, f"!document.getElementById('{view}').hidden")
 
 
+@pytest.mark.nightly
 def test_the_lake_the_sky_and_the_runs(tab, stranger):
     assert tab.text_content("#lake-name") == str(stranger.server.lake.root)
     shown(tab, "sky")
@@ -178,6 +179,7 @@ def test_the_lake_the_sky_and_the_runs(tab, stranger):
     until(tab, "document.querySelectorAll('#runs-content details ul').length >= 3")
 
 
+@pytest.mark.nightly
 def test_images_and_their_sources(tab):
     shown(tab, "images")
     until(tab, f"{HELD}.images?.zoom > 0 && {DRAWN['images']}")
@@ -245,6 +247,7 @@ def test_downloads_contain_the_text(stranger, kind):
     assert (IMAGE.replace("<", "&lt;").replace(">", "&gt;") if kind == "vot" else IMAGE).encode() in body
 
 
+@pytest.mark.nightly
 def test_charts_of_columns_with_markup(tab):
     shown(tab, "plots")
     until(tab, DRAWN["plots"])
@@ -269,6 +272,7 @@ def test_charts_of_columns_with_markup(tab):
     until(tab, f"{ranges}.every((text) => text.startsWith('20 rows'))")
 
 
+@pytest.mark.nightly
 def test_errors_with_markup(browser, stranger):
     with tab_of(browser, stranger, at("sql"), refused="/api/") as tab:
         until(tab, DRAWN["sql"])
@@ -287,6 +291,7 @@ def test_errors_with_markup(browser, stranger):
         assert tab.evaluate(STRANGERS) == []
 
 
+@pytest.mark.nightly
 def test_an_address_with_markup(browser, stranger):
     """The state in an address comes from whoever sends the link."""
     held = {"view": SVG, "lake": IMAGE, "theme": SVG, "sql": {"text": SCRIPT},
@@ -303,6 +308,7 @@ def test_an_address_with_markup(browser, stranger):
         assert tab.evaluate(STRANGERS) == []
 
 
+@pytest.mark.nightly
 def test_documents_of_the_tap_service(browser, stranger):
     """A browser that opens an address of the service runs nothing, and XML readers find the text."""
     from playwright import sync_api as playwright

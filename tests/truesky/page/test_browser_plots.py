@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 
 from lake_schema.store import read
 from tests.truesky.page.browsing import at, drag, plain, tab_of, until
@@ -36,6 +37,7 @@ def test_brushes_filter_the_other_charts(tab, shown):
     until(tab, f"{ranges}[1] !== {whole[1]!r}")
 
 
+@pytest.mark.nightly
 def test_a_held_brush_sends_no_requests(tab):
     until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
     asked, answered = [], []
@@ -58,6 +60,7 @@ def test_a_held_brush_sends_no_requests(tab):
     mouse.up()
 
 
+@pytest.mark.nightly
 def test_an_error_clears_the_charts(browser, page):
     with tab_of(browser, page, at(VIEW), refused="/charts") as tab:
         until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
@@ -75,6 +78,7 @@ def test_an_error_clears_the_charts(browser, page):
         assert tab.get_attribute("#plot-state", "class") == "quiet"
 
 
+@pytest.mark.nightly
 def test_a_computation_is_shown(tab):
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     waiting = []
@@ -89,6 +93,7 @@ def test_a_computation_is_shown(tab):
     assert tab.get_attribute("#plot-grid", "aria-busy") == "false"
 
 
+@pytest.mark.nightly
 def test_a_sample_is_counted_first_if_there_are_many_rows(browser, page, monkeypatch):
     monkeypatch.setattr(charts, "ROWS_PER_CORE", 10)
     with tab_of(browser, page, at(VIEW)) as tab:
@@ -105,6 +110,7 @@ def test_a_sample_is_counted_first_if_there_are_many_rows(browser, page, monkeyp
             assert (asked[0], asked[-1]) == (None, 1)
 
 
+@pytest.mark.nightly
 def test_a_map_as_points(tab, shown):
     ranges = "[...document.querySelectorAll('#plot-grid figure.map .range')].map((one) => one.textContent)"
     until(tab, f"{ranges}[0].includes('per bin')")
@@ -117,6 +123,7 @@ def test_a_map_as_points(tab, shown):
     until(tab, "JSON.parse(decodeURIComponent(location.hash.slice(1))).plots.charts[4].points === true")
 
 
+@pytest.mark.nightly
 def test_charts_are_tables_too(tab):
     """Tables of the sky, of a histogram, of a map and of the bands of a spectrum contain the numbers of the charts."""
     tab.keyboard.press("1")
@@ -136,6 +143,7 @@ def test_charts_are_tables_too(tab):
         assert sum(numbers) == int(total) if place == 0 else 0 < sum(numbers) <= int(total)
 
 
+@pytest.mark.nightly
 def test_a_table_that_is_open_follows_its_chart(tab):
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     figure = tab.locator("#plot-grid figure").nth(1)
@@ -148,6 +156,7 @@ def test_a_table_that_is_open_follows_its_chart(tab):
     until(tab, f"{shown} === Number({RANGES}[1].replaceAll('\u202f', '').split(' rows')[0])")
 
 
+@pytest.mark.nightly
 def test_rows_outside_all_bins_are_counted_for_every_axis(tab, shown):
     galaxies = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
     z = galaxies["z_obs"].to_numpy()
@@ -165,6 +174,7 @@ def test_rows_outside_all_bins_are_counted_for_every_axis(tab, shown):
     assert "without" not in text
 
 
+@pytest.mark.nightly
 def test_screen_readers_announce_a_moved_brush_once(tab):
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     assert tab.locator("#plots [aria-live], #plots [role=status]").count() == 0

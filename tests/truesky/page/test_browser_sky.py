@@ -25,6 +25,7 @@ def gone_to(tab, place=CENTRE):
     until(tab, f"{LEGEND}.includes('individual')")
 
 
+@pytest.mark.nightly
 def test_footprints_by_state(browser, sky):
     with tab_of(browser, sky) as tab:
         until(tab, f"{STATES} === 'tasks planned: 2 observed: 1'")
@@ -67,6 +68,7 @@ def test_from_the_sky_to_a_pixel_and_back(browser, sky):
         assert (there["ra"], there["dec"]) == pytest.approx(aimed, abs=2 * PIXEL)
 
 
+@pytest.mark.nightly
 def test_keys_announce_the_position_pin_and_open(browser, sky):
     with tab_of(browser, sky) as tab:
         truth = sky.json("truth/0")
@@ -87,6 +89,7 @@ def test_keys_announce_the_position_pin_and_open(browser, sky):
         until(tab, f"{HELD}.view === 'images'")
 
 
+@pytest.mark.nightly
 def test_an_open_table_follows_the_map(browser, sky):
     with tab_of(browser, sky) as tab:
         until(tab, f"{LEGEND}.includes('deg')")
@@ -98,6 +101,7 @@ def test_an_open_table_follows_the_map(browser, sky):
         assert heads[:2] == ["id", "RA deg"]
 
 
+@pytest.mark.nightly
 def test_captions_count_omitted_sources_and_cells(browser, sky, monkeypatch):
     with tab_of(browser, sky) as tab:
         tab.select_option("#sky-table", "stars")
@@ -111,6 +115,7 @@ def test_captions_count_omitted_sources_and_cells(browser, sky, monkeypatch):
         assert f"the brightest 100 by mag_h of {whole} sources" in plain(tab.evaluate(caption))
 
 
+@pytest.mark.nightly
 def test_the_copied_request_covers_the_view(browser, sky):
     with tab_of(browser, sky, **CLIPBOARD) as tab:
         gone_to(tab)
@@ -136,6 +141,7 @@ def test_the_copied_request_covers_the_view(browser, sky):
 PLACES = """([ra, dec]) => import('/static/api.js').then((api) => ra.map((one, k) => api.place(one, dec[k])))"""
 
 
+@pytest.mark.nightly
 def test_places_have_the_digits_of_a_hundredth_of_an_arcsecond(browser, page):
     rng = np.random.default_rng(2)
     ra, dec = rng.uniform(0.0, 360.0, 500), rng.uniform(-90.0, 90.0, 500)

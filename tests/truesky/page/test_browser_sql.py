@@ -1,5 +1,7 @@
 """Queries in a browser: results with all digits, and refusals."""
 
+import pytest
+
 from tests.truesky.page.browsing import at, tab_of, until, write_query
 
 VIEW = "sql"
@@ -36,6 +38,7 @@ def test_a_query_and_its_refusal(browser, page):
         until(tab, "document.getElementById('plot-state').textContent.startsWith('3 rows')")
 
 
+@pytest.mark.nightly
 def test_an_error_clears_the_previous_result(browser, page):
     with tab_of(browser, page, at(VIEW), refused="/sql") as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
@@ -47,6 +50,7 @@ def test_an_error_clears_the_previous_result(browser, page):
         assert tab.get_attribute("#sql-result", "aria-busy") == "false"
 
 
+@pytest.mark.nightly
 def test_a_running_query_is_shown(tab):
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     waiting = []
@@ -62,6 +66,7 @@ def test_a_running_query_is_shown(tab):
     assert tab.get_attribute("#sql-result", "aria-busy") == "false"
 
 
+@pytest.mark.nightly
 def test_the_editor_completes_and_highlights(tab):
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     write_query(tab, "SELECT 1 FROM galaxies WHERE ")
@@ -95,6 +100,7 @@ def test_the_editor_completes_and_highlights(tab):
     assert "SELECT" in tab.get_attribute("#sql-text", "aria-label")
 
 
+@pytest.mark.nightly
 def test_names_have_their_ucds_beside_them(tab):
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     assert "pos.eq.ra" in tab.inner_text("#sql-result thead")
@@ -102,6 +108,7 @@ def test_names_have_their_ucds_beside_them(tab):
     assert "pos.eq.dec" in tab.locator("#sql-schema details[open]").inner_text()
 
 
+@pytest.mark.nightly
 def test_a_download_that_is_refused_says_why(browser, page):
     with tab_of(browser, page, at(VIEW), refused="/export?", accept_downloads=True) as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
@@ -121,6 +128,7 @@ def test_a_download_that_is_refused_says_why(browser, page):
             assert file.read().split() == ['"seven"', "7"]
 
 
+@pytest.mark.nightly
 def test_the_browser_takes_over_a_large_download(browser, page):
     with tab_of(browser, page, at(VIEW), accept_downloads=True) as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
@@ -131,6 +139,7 @@ def test_the_browser_takes_over_a_large_download(browser, page):
         assert begun.value.path().stat().st_size > 40_000_000
 
 
+@pytest.mark.nightly
 def test_the_last_of_overlapping_queries_is_shown(tab):
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     write_query(tab, "SELECT sum(a.range * b.range) AS slow FROM range(40000) a, range(10000) b")

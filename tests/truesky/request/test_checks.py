@@ -30,9 +30,10 @@ def test_rendered_types_have_effects():
     }
 
 
-# The half a million detectors of the main run take a minute, and those of the pilot some seconds.
+# The half a million detectors of the main run take a minute, and those of the other surveys seconds.
+SURVEYS = ("pilot_one_observation", "sc8_deep", "sc8_main", "sc8_pilot")
 SHIPPED = [
-    pytest.param(path, marks=[pytest.mark.nightly] if path.stem in ("sc8_main", "sc8_pilot") else [], id=path.stem)
+    pytest.param(path, marks=[pytest.mark.nightly] if path.stem in SURVEYS else [], id=path.stem)
     for path in sorted(REQUESTS.glob("*.toml"))
 ]
 

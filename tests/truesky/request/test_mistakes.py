@@ -189,21 +189,37 @@ def test_requests_without_mistakes_are_valid(tmp_path, capsys):
         assert check.main([str(tmp_path / f"{number}.toml")]) == 0, capsys.readouterr().err
 
 
+def refused_in_one_line(folder, capsys, text, rows, words, command):
+    """Give a request to the check or to the forecast, which must print one line and write nothing."""
+    path, lake = folder / "x.toml", folder / "lake"
+    path.write_text(text)
+    (folder / "p.csv").write_text(rows)
+    before = sorted(folder.iterdir())
+    if command == "check":
+        assert check.main([str(path)]) == 2
+    else:
+        assert submitted_job.main(plan.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert sorted(folder.iterdir()) == before
+
+
 @pytest.mark.parametrize(("text", "rows", "words"), CASES.values(), ids=CASES)
 def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsys, text, rows, words):
-    path, lake = tmp_path / "x.toml", tmp_path / "lake"
-    path.write_text(text)
-    (tmp_path / "p.csv").write_text(rows)
-    before = sorted(tmp_path.iterdir())
-    for call in (
-        lambda: check.main([str(path)]),
-        lambda: submitted_job.main(plan.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
-    ):
-        assert call() == 2
-        said = capsys.readouterr()
-        assert words in said.err
-        assert (said.out, said.err.count("\n")) == ("", 1)
-    assert sorted(tmp_path.iterdir()) == before
+    refused_in_one_line(tmp_path, capsys, text, rows, words, "check")
+
+
+# One of each kind: a key, a pointing table, and what is known only after the plan.
+BRIEF = ("a band misspelt", "semicolons", "towards the Sun", "a line's detector")
+
+
+@pytest.mark.parametrize(
+    ("text", "rows", "words"),
+    [pytest.param(*case, marks=() if name in BRIEF else pytest.mark.nightly, id=name) for name, case in CASES.items()],
+)
+def test_a_mistake_is_refused_by_the_forecast_as_well(tmp_path, capsys, text, rows, words):
+    refused_in_one_line(tmp_path, capsys, text, rows, words, "forecast")
 
 
 def test_an_unknown_column_does_not_hide_wrong_values(tmp_path):

@@ -103,7 +103,9 @@ def test_the_display_on_a_terminal_and_ctrl_c(tmp_path):
     wait_until_gone(run_processes, 2.0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.nightly)])
+# test_the_display_on_a_terminal_and_ctrl_c has a short version.
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_lines_without_a_terminal_and_the_end_by_a_signal(tmp_path, number):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words(_RUN, tmp_path, _WORKER), env=environment(), **pipes) as parent:

@@ -113,11 +113,12 @@ def test_some_tables_leave_the_others_as_they_were(filled, place):
         pushed(filled, place, only=["stars"])
 
 
-def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucket):
+@pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.nightly)])
+def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucket, stride):
     pushed(filled, place, only=["plain"])
     publish.make_version(filled, plain_plan(2), plain_work, name="first")
     service = bucket[0]
-    for most in range(100):
+    for most in range(0, 100, stride):
         before = len(service.recorder.sent())
 
         def answer(environ, before=before, most=most):
@@ -175,7 +176,9 @@ def test_a_switch_whose_answer_is_lost_has_happened(filled, place, bucket):
     assert seed(place) == 1.0
 
 
-@pytest.mark.parametrize("harm", ["changed", "cut short", "removed"])
+@pytest.mark.parametrize(
+    "harm", ["changed", *(pytest.param(harm, marks=pytest.mark.nightly) for harm in ("cut short", "removed"))]
+)
 def test_an_object_that_is_not_as_it_was_is_refused_by_name_and_sent_again(filled, place, bucket, harm):
     pushed(filled, place)
     service, name = bucket
