@@ -109,10 +109,8 @@ def made(root, path, channels, sources):
     return Field(root, path, channels, sources)
 
 
-@pytest.fixture(scope="session")
-def small_field(spark, tmp_path_factory):
-    """A field with one detector of 640 x 600 pixels, which is read by two amplifiers."""
-    folder = tmp_path_factory.mktemp("small")
+def make_small_field(folder):
+    """Make a field with one detector of 640 x 600 pixels, which is read by two amplifiers."""
     write_camera(folder / "mini", 640, 600)
     amplifiers = folder / "mini" / "amplifiers.csv"
     head, one = amplifiers.read_text().splitlines()
@@ -131,10 +129,12 @@ def demo(spark, tmp_path_factory):
     return made(layout.resolve_lake(tmp_path_factory.mktemp("field") / "lake"), DEMO, ("EXT", "VIS"), 1000)
 
 
-@pytest.fixture(scope="session", params=["small_field", pytest.param("demo", marks=pytest.mark.nightly)])
-def either(request):
+@pytest.fixture(scope="session", params=["small", pytest.param("demo", marks=pytest.mark.nightly)])
+def either(request, spark, tmp_path_factory):
     """Return one field after the other."""
-    return request.getfixturevalue(request.param)
+    if request.param == "demo":
+        return request.getfixturevalue("demo")
+    return make_small_field(tmp_path_factory.mktemp("small"))
 
 
 @pytest.fixture(scope="session")
