@@ -67,6 +67,14 @@ def test_effects_in_place_have_the_same_result(name, off):
     np.testing.assert_array_equal(changed, expected)
 
 
+def test_effects_of_vis_need_no_new_frame():
+    """Exceptions are a map of all pixels and the quadrants, which have other pixels than the frame."""
+    new = {effect.name for effects in vis.EFFECTS.values() for effect in effects if not effect.in_place}
+    assert new == {
+        "pixel_area", "quadrants", "readout_trail", "calibration_lamp", "charge_injection", "injection_noise", "trap_pumping",
+    }  # fmt: skip
+
+
 @named
 @given(data=st.data(), electrons=ELECTRONS)
 def test_arguments_are_not_written_and_numbers_stay_finite(name, data, electrons):

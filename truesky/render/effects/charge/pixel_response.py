@@ -135,7 +135,7 @@ def response(
 def _multiply_response(
     out: Frame, parameters: Parameters, rng: np.random.Generator, part: DetectorPart | None = None
 ) -> Frame:
-    """Multiply a frame by the sensitivity of each pixel in place, and return it; the arguments are those of `apply`."""
+    """Multiply a frame by the sensitivity of each pixel in place, and return it. `parameters` are as for `response`."""
     rms, dead, dark_columns, (grains, radius, depth), segments = parameters
     for name, value, highest in (
         ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
@@ -214,11 +214,11 @@ def _sky_parameters(scene: Scene) -> Parameters:
     It is negligible if it changes the flux, the shape and the position of any star by less than the errors that the
     request accepts, and the sky by at most a tenth of the noise of a pixel. Dead pixels, dark columns and dust remain.
     """
-    rms, *others = parameters(scene)
+    rms, *defects = parameters(scene)
     accepted = scene.accuracy
     source_error = max(FLUX_ERROR / accepted.flux, SHAPE_ERROR / accepted.shape, POSITION_ERROR / accepted.position)
     is_negligible = rms * source_error <= 1.0 and rms * scene.sky_electrons <= NOTICEABLE * scene.pixel_noise
-    return 0.0 if is_negligible else rms, *others
+    return 0.0 if is_negligible else rms, *defects
 
 
 def _contribution(scene: Scene) -> float:

@@ -171,4 +171,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.max(light - apply(light, *curve)))
 
 
-EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)
+EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3, in_place=True)
