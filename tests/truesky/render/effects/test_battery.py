@@ -71,7 +71,8 @@ def test_effects_of_vis_need_no_new_frame():
     """Exceptions are a map of all pixels and the quadrants, which have other pixels than the frame."""
     new = {effect.name for effects in vis.EFFECTS.values() for effect in effects if not effect.in_place}
     assert new == {
-        "pixel_area", "quadrants", "readout_trail", "calibration_lamp", "charge_injection", "injection_noise", "trap_pumping",
+        "pixel_area", "quadrants", "readout_trail", "calibration_lamp", "charge_injection", "injection_noise",
+        "trap_pumping",
     }  # fmt: skip
 
 
