@@ -49,8 +49,8 @@ class Effect:
         Function of a `Scene` that returns the part of the contribution that does not average out in a mean over many
         frames or pixels, in electrons. By default the whole contribution does not average out.
     in_place : bool
-        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. Effects that change
-        few pixels have it, because a copy of all pixels takes longer than their change.
+        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. A new array for all
+        pixels takes longer than most effects.
     """
 
     name: str
@@ -117,42 +117,41 @@ def copy_frame(frame: Frame, out: Frame | None) -> Frame:
     return out
 
 
-def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Frame:
+def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any, out: Frame | None = None) -> Frame:
     """Apply a compiled function to all pixels of a frame, with different parameters for each amplifier if necessary.
 
     Parameters
     ----------
     kernel : callable
-        Compiled function (pixels, out_pixels, *arguments) that fills `out_pixels`. Both are flat float64 arrays of the
+        Compiled function (pixels, *arguments) that changes `pixels` in place. They are a flat float64 array of the
         pixels of the frame, or of one of its amplifiers.
     frame : float array, shape (ny, nx) or (q, ...)
         Input frame. If any argument has one value per amplifier, the first axis counts the q amplifiers.
     *arguments : float, uint64 or array, shape (q,)
         Further arguments of `kernel`, at least one. Each is one value for the whole frame, or an array with one value
         for each of the q amplifiers.
+    out : float64 array, shape of `frame`, optional
+        Contiguous array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
     float array, shape of `frame`
-        New frame.
+        Changed frame.
 
     Raises
     ------
     BadInput
         If an argument has q values and the first axis of the frame does not have the length q.
     """
-    out = np.empty(frame.shape)
-    pixels, out_pixels = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
     n_amplifiers = max(np.size(number) for number in arguments)
-    if n_amplifiers == 1:
-        kernel(pixels, out_pixels, *arguments)
-        return out
-    if frame.shape[0] != n_amplifiers:
+    if n_amplifiers > 1 and frame.shape[0] != n_amplifiers:
         raise BadInput(f"parameters have values for {n_amplifiers} amplifiers, but the frame has {frame.shape[0]}")
-    for number, (amplifier_pixels, amplifier_out) in enumerate(
-        zip(np.split(pixels, n_amplifiers), np.split(out_pixels, n_amplifiers), strict=True)
-    ):
-        kernel(amplifier_pixels, amplifier_out, *(n[number] if np.ndim(n) else n for n in arguments))
+    out = copy_frame(frame, out)
+    if n_amplifiers == 1:
+        kernel(out.reshape(-1), *arguments)
+        return out
+    for number, pixels in enumerate(np.split(out.reshape(-1), n_amplifiers)):
+        kernel(pixels, *(n[number] if np.ndim(n) else n for n in arguments))
     return out
 
 

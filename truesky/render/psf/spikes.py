@@ -65,6 +65,8 @@ ARCSEC = np.pi / 180.0 / 3600.0
 # this distance, spikes of a star of 7.4 mag have a tenth of the pixel noise of a nominal exposure, and spikes of a star
 # of 4.9 mag equal the pixel noise.
 FARTHEST = 1200.0
+# Tables along spikes are computed for a multiple of this number of distances, so that stars share them.
+_COUNT_STEP = 512
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +210,11 @@ def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
     """
     share = np.repeat(photons / _WAVES, _WAVES)
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
-    out = LONG * np.arange(int(reach / LONG) + 2)
-    lines = []
+    count, lines = int(reach / LONG) + 2, []
     for _, width, length in edges.bars:
         height = share * (width * length * cycles) ** 2 / edges.area
-        along = np.sinc(width * cycles * out[:, None]) ** 2 * height
+        fringes = _fringes(cycles.tobytes(), float(width), -(-count // _COUNT_STEP) * _COUNT_STEP)
+        along = fringes[:count] * height
         across = _blurred_profiles(cycles.tobytes(), float(length), edges.blur / edges.pixel_scale)
         lines.append(matrices.matmul(along, across))
     return np.stack(lines)
@@ -260,6 +262,18 @@ def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
     return np.asarray(
         np.minimum(np.sqrt(max(*middle, edges.halo[0]) * electrons / max(min_electrons, 1e-300)), farthest)
     )
+
+
+@lru_cache(maxsize=32)
+def _fringes(cycles: bytes, width: float, count: int) -> Float:
+    """Return the light [count, w] along the spike of a bar at w wavelengths, relative to that at the star.
+
+    Rows are LONG pixels apart. `cycles` [w] are the float64 numbers of pixel scales per wavelength in 1/mm, as bytes,
+    and `width` is the width of the bar in mm. Bright stars of an exposure share the result.
+    """
+    fringes: Float = np.sinc(width * np.frombuffer(cycles) * (LONG * np.arange(count))[:, None]) ** 2
+    fringes.flags.writeable = False
+    return fringes
 
 
 @lru_cache(maxsize=32)

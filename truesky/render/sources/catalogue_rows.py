@@ -36,6 +36,8 @@ _MJD_2000 = 51544.5
 _DAYS_A_YEAR = 365.25
 # Milliarcseconds in a degree.
 _MAS_A_DEG = 3.6e6
+# Column of all catalogues and tables of fluxes with the HEALPix index of a source.
+_CELL_COLUMN = "_healpix_29"
 # Key of the list of order-8 HEALPix cells in the facts of a catalogue file (recorded dictionary of its inputs).
 CELLS = "generation_cells"
 
@@ -98,7 +100,8 @@ def read_sources(
         Distance beyond the circle, in arcsec, up to which sources are read if they exceed `min_flux`.
     min_flux : float
         Smallest flux in microjansky of sources outside the HEALPix cells that overlap the circle. Sources inside these
-        cells are read at any flux. If it is infinite (for exposures without sources), no source of either kind is read.
+        cells are read at any flux, up to `reach_arcsec` beyond the circle. If it is infinite (for exposures without
+        sources), no source of either kind is read.
     min_bright_flux : float
         Smallest flux in microjansky of sources still farther out, up to 1200 arcsec, from where diffraction spikes and
         outskirts may reach the detector. Infinite to read none of these.
@@ -122,16 +125,34 @@ def read_sources(
             task, deflection, max(FARTHEST, reach_arcsec), drawn_cells(catalogue)
         )
         farthest_cells = sorted(set(reachable) - set(outer_cells))
-    rows, light = (v.rows_in_cells(inner_cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-    for cells, limit in ((outer_cells, min_flux), (farthest_cells, min_bright_flux)):
-        if not cells:
-            continue
-        outer_rows, outer_fluxes = (
-            v.rows_in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux))
+    # Fluxes are a small table. Read the large catalogue once, and only from cells with a source that is bright enough.
+    light = fluxes.rows_in_cells(
+        sorted({*inner_cells, *outer_cells, *farthest_cells}), GENERATION_ORDER, [*flux, _CELL_COLUMN]
+    )
+    cell = sky.parent(light[_CELL_COLUMN].to_numpy(), sky.MAX_ORDER, GENERATION_ORDER)
+    brightness = light[flux[1]].to_numpy().astype(float)
+    group = np.select([np.isin(cell, cells) for cells in (inner_cells, outer_cells)], [0, 1], 2)
+    shows = brightness >= np.array([-np.inf, min_flux, min_bright_flux])[group]
+    read_cells = np.unique(cell[shows])
+    is_read = np.isin(cell, read_cells)
+    rows = catalogue.rows_in_cells(read_cells.tolist(), GENERATION_ORDER, list(dict.fromkeys([*columns, "ra", "dec"])))
+    light, group, shows, brightness = (
+        light.filter(pa.array(is_read)),
+        group[is_read],
+        shows[is_read],
+        brightness[is_read],
+    )
+    if len(rows) == len(light):
+        # Faint sources beyond the reach are in the cells of the circle only because cells are large.
+        reach = task["radius"] + deflection + reach_arcsec / 3600.0
+        is_near = selection.within_radius(
+            rows["ra"].to_numpy(), rows["dec"].to_numpy(), (task["ra"], task["dec"]), reach
         )
-        shows = pc.greater_equal(outer_fluxes[flux[1]], limit)
-        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, outer_rows), (light, outer_fluxes)))
-    return rows, light, complete
+        shows &= is_near | (brightness >= min(min_flux, min_bright_flux))
+        indices = np.flatnonzero(shows)
+        indices = pa.array(indices[np.argsort(group[indices], kind="stable")])
+        rows, light = rows.take(indices), light.take(indices)
+    return rows.select(list(columns)), light.select(flux), complete
 
 
 @dataclass(frozen=True, slots=True)

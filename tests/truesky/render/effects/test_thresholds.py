@@ -230,7 +230,9 @@ def test_a_quicklook_leaves_out_no_more_than_the_error_that_it_allows():
     assert needed - few == {"pixel_area", "dark_current"}
     assert needed == drafted
     noise, change = one.scene.pixel_noise, fine - quick
-    assert 0.0 < np.sqrt(np.mean(change**2)) < QUICKLOOK.background * noise
+    # Sources have relative errors, of the scatter between pixels.
+    sky = change[vis.CHANNEL.readout.split(one.noise_free, one.scene) < noise]
+    assert 0.0 < np.sqrt(np.mean(sky**2)) < QUICKLOOK.background * noise
     # What repeats in every pixel may be 25 times as large as in a survey, because 25 times the background may be wrong.
     biased = QUICKLOOK.background / SURVEY.background * NOTICEABLE * noise / np.sqrt(STACK_SIZE)
     assert abs(change.mean()) < biased + 5.0 * change.std() / np.sqrt(change.size)

@@ -54,7 +54,10 @@ class Catalogue:
 
     def rows_in_cells(self, cells, order, columns):
         assert order == 8
-        return self.rows.filter(pa.array(np.isin(self.cells, cells)))
+        rows = self.rows
+        if "_healpix_29" in columns:
+            rows = rows.append_column("_healpix_29", pa.array(np.asarray(self.cells, np.int64) << 42))
+        return rows.filter(pa.array(np.isin(self.cells, cells)))
 
 
 def place():
@@ -88,7 +91,13 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
         least = limits_of(exposed, DETECTOR, "lsst_r").min_flux
         body, light, complete = catalogue_rows.read_sources(
-            Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], [BAND], FARTHER, least
+            Catalogue(body, cells, wanted),
+            Catalogue(light, cells, wanted),
+            task,
+            body.column_names,
+            [BAND],
+            FARTHER,
+            least,
         )
     tables = body, light, nothing, fluxes(nothing, BAND, 1.0)
     return fields.rendered(exposed, DETECTOR, tables, MISSION, SURVEY, complete_margin_arcsec=MARGIN + complete)
@@ -116,6 +125,25 @@ def test_sources_beyond_the_reach_or_too_faint_do_not_change_the_image():
         one = rendered(distance, flux)
         np.testing.assert_array_equal(one.science, empty.science)
         np.testing.assert_array_equal(one.noise_free, empty.noise_free)
+
+
+def test_faint_sources_in_the_cells_of_the_circle_are_read_up_to_the_reach():
+    """Bright ones are read from the whole cell. Rows keep their order: first the cells of the circle, then others."""
+    task = {"ra": 53.1, "dec": -28.0, "radius": 0.02}
+    offsets = np.array([0.0, 0.03, 0.05, 0.06, 0.2, -0.2])
+    rows = galaxies(np.full(6, 53.1), -28.0 + offsets)
+    light = fluxes(rows, BAND, np.array([1.0, 1.0, 1.0, 9.0, 9.0, 1.0]))
+    inner = selection.cells_of_task(task, 0.0)[0]
+    outer = selection.cells_beyond_task(task, 0.0, 2e3, set(range(12 * 4**8)))[0][0]
+    cells = np.array([outer if abs(offset) > 0.1 else inner for offset in offsets])[::-1]
+    turned = pa.array(np.arange(6)[::-1].copy())
+    tables = (Catalogue(table.take(turned), cells, set(range(12 * 4**8))) for table in (rows, light))
+    found, electrons, _ = catalogue_rows.read_sources(*tables, task, ["id"], [BAND], 72.0, 5.0)
+    assert found.column_names == ["id"]
+    ids = rows["id"].to_numpy()
+    # The cell beyond the circle is farther away than the reach.
+    assert found["id"].to_pylist() == ids[[3, 1, 0]].tolist()
+    assert electrons["id"].equals(found["id"])
 
 
 def test_where_the_catalogue_ends_is_said():
@@ -175,7 +203,8 @@ def test_a_frame_that_no_source_shows_in_reads_none(dark):
     cells = sky.cell_at([task["ra"]], [task["dec"]], 8)
     assert np.isfinite(limits_of(field_of("VIS")[1], detector).min_flux)
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
-    rows, light, complete = catalogue_rows.read_sources(body, body, task, [], [BAND], FARTHER, least)
+    faint = Catalogue(fluxes(body.rows, BAND, 1.0), cells, set(cells.tolist()))
+    rows, light, complete = catalogue_rows.read_sources(body, faint, task, ["id"], [BAND], FARTHER, least)
     assert len(rows) == len(light) == 0
     assert complete == FARTHER
 
@@ -194,7 +223,9 @@ def test_bright_stars_are_read_up_to_the_visible_length_of_their_spikes():
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
     least = limits_of(exposed, detector).min_flux
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
-        found, light, complete = catalogue_rows.read_sources(*catalogues, task, [], ["euclid_vis"], 85.0, least, limit)
+        found, light, complete = catalogue_rows.read_sources(
+            *catalogues, task, rows.column_names, ["euclid_vis"], 85.0, least, limit
+        )
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert light["id"].equals(found["id"])
         assert complete == 85.0
@@ -325,7 +356,9 @@ def test_large_galaxies_are_read_and_drawn_up_to_their_visible_radius(channel, c
     cells = sky.cell_at(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    found, light, _ = catalogue_rows.read_sources(*catalogues, task, [], ["euclid_vis"], 85.0, limit, limit)
+    found, light, _ = catalogue_rows.read_sources(
+        *catalogues, task, rows.column_names, ["euclid_vis"], 85.0, limit, limit
+    )
     assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
     assert light["id"].equals(found["id"])
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from truesky.numerics.compiling import jit
 from truesky.render.camera import windows
 from truesky.render.camera.windows import DetectorPart, Window
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect
-from truesky.render.effects.scene import Frame, Scene
+from truesky.render.effects.effect import Effect, copy_frame
+from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 
 # Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
 # is above the part and False if it is below).
@@ -27,6 +28,10 @@ Parameters = tuple[float, float, float, tuple[float, float, float], Segments]
 _MAX_DEAD = 0.5
 # The Gaussian shadow of a dust grain is drawn up to this distance from its centre, in standard deviations.
 _SHADOW_RANGE = 4.0
+# Errors (rms) of a star's relative flux, reduced shear and position (pixels) that a scatter of the sensitivity between
+# pixels causes, divided by the scatter. They are for fits of a Gaussian star with a standard deviation of 0.7 pixels.
+# Wider sources cover more pixels and have smaller errors.
+FLUX_ERROR, SHAPE_ERROR, POSITION_ERROR = 0.6, 0.5, 0.4
 
 
 def apply(
@@ -38,6 +43,7 @@ def apply(
     segments: Segments,
     rng: np.random.Generator,
     part: DetectorPart | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Multiply a frame by the sensitivity of each pixel, which is the same in every exposure.
 
@@ -62,6 +68,8 @@ def apply(
         Random generator of the detector, in the same state in every exposure, so that the sensitivity does not change.
     part : DetectorPart, optional
         Part of the detector that the frame shows. By default the frame is the whole detector.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -73,9 +81,7 @@ def apply(
     OutOfRange
         If a number is outside its limits or NaN.
     """
-    out = response(frame.shape, rms, dead, dark_columns, dust, segments, rng, part)
-    out *= frame
-    return out
+    return _multiply_response(copy_frame(frame, out), (rms, dead, dark_columns, dust, segments), rng, part)
 
 
 def response(
@@ -123,20 +129,30 @@ def response(
     OutOfRange
         If `rms`, `dead`, `dark_columns` or a number of `dust` is outside its limits or NaN.
     """
-    grains, radius, depth = dust
+    return _multiply_response(np.ones(shape), (rms, dead, dark_columns, dust, segments), rng, part)
+
+
+def _multiply_response(
+    out: Frame, parameters: Parameters, rng: np.random.Generator, part: DetectorPart | None = None
+) -> Frame:
+    """Multiply a frame by the sensitivity of each pixel in place, and return it. `parameters` are as for `response`."""
+    rms, dead, dark_columns, (grains, radius, depth), segments = parameters
     for name, value, highest in (
         ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
         ("dust grains per pixel", grains, 0.1), ("dust radius", radius, 1e3), ("dust depth", depth, 1.0),
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
-    part, out = part or windows.whole(shape), np.empty(shape)
+    part = part or windows.whole(out.shape)
     ny, nx, window = part.ny, part.nx, part.window
-    for run, key in pixel_random.split_key(pixel_random.draw_key(rng), part):
-        _draw_sensitivity(out.reshape(-1)[run], rms, key)
+    key = pixel_random.draw_key(rng)
     count = int(rng.binomial(ny * nx, dead))
     is_inside, rows, columns = part.find_pixels(rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count))
-    out[rows, columns] = (_MAX_DEAD * rng.random(count))[is_inside]
+    dead_light = out[rows, columns] * (_MAX_DEAD * rng.random(count))[is_inside]
+    if rms > 0.0:
+        for run, run_key in pixel_random.split_key(key, part):
+            _multiply_scatter(out.reshape(-1)[run], rms, run_key)
+    out[rows, columns] = dead_light
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
         row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx)) - window.column
         # Charge from pixels beyond the defect cannot pass the defect on its way to the serial register.
@@ -174,9 +190,10 @@ def _multiply_shadow(out: Frame, place: tuple[float, float], sigma: float, depth
 
 
 @jit
-def _draw_sensitivity(out: Any, rms: float, key: Any) -> None:
-    for i in range(len(out)):
-        out[i] = max(1.0 + rms * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
+def _multiply_scatter(pixels: Any, rms: float, key: Any) -> None:
+    """Multiply pixels by random sensitivities with the mean 1 and the standard deviation `rms`, in place."""
+    for i in range(len(pixels)):
+        pixels[i] *= max(1.0 + rms * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
 
 
 def parameters(scene: Scene) -> Parameters:
@@ -191,6 +208,19 @@ def parameters(scene: Scene) -> Parameters:
     return rms, dead, dark_columns, dust, scene.column_segments
 
 
+def _sky_parameters(scene: Scene) -> Parameters:
+    """Return the parameters for an image of the sky: without the scatter between pixels if it is negligible.
+
+    It is negligible if it changes the flux, the shape and the position of any star by less than the errors that the
+    request accepts, and the sky by at most a tenth of the noise of a pixel. Dead pixels, dark columns and dust remain.
+    """
+    rms, *defects = parameters(scene)
+    accepted = scene.accuracy
+    source_error = max(FLUX_ERROR / accepted.flux, SHAPE_ERROR / accepted.shape, POSITION_ERROR / accepted.position)
+    is_negligible = rms * source_error <= 1.0 and rms * scene.sky_electrons <= NOTICEABLE * scene.pixel_noise
+    return 0.0 if is_negligible else rms, *defects
+
+
 def _contribution(scene: Scene) -> float:
     rms, dead, dark_columns, (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
@@ -198,4 +228,6 @@ def _contribution(scene: Scene) -> float:
     return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or dark_columns > 0), shadow))
 
 
-EFFECT = Effect("pixel_response", apply, parameters, _contribution, fixed=True, cost=1.2e-2)
+EFFECT = Effect("pixel_response", apply, parameters, _contribution, fixed=True, cost=1.2e-2, in_place=True)
+# The same for images of the sky. In flats, the light of the lamp shows a smaller scatter than that of the sky does.
+SKY_EFFECT = replace(EFFECT, parameters=_sky_parameters)

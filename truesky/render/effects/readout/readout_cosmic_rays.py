@@ -9,7 +9,7 @@ import numpy as np
 from lake_schema.arrays import Int
 from truesky.numerics.compiling import jit
 from truesky.render.effects.charge import cosmic_rays
-from truesky.render.effects.effect import Effect, zero_contribution
+from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Frame, Scene
@@ -19,8 +19,8 @@ _NEGLIGIBLE = 1e-3
 
 
 def apply_readout(
-    frame: Frame, expected: float, quantiles: Frame, rows: int, prescan: int, columns: int, silicon: Traps | None,
-    rng: np.random.Generator,
+    frame: Frame, expected: float, quantiles: Frame, pixels: tuple[int, int, int], silicon: Traps | None,
+    rng: np.random.Generator, out: Frame | None = None,
 ) -> Frame:  # fmt: skip
     """Draw the cosmic rays that arrive while the quadrants of a detector are read, and add their charge.
 
@@ -32,16 +32,15 @@ def apply_readout(
         Expected number of tracks on the pixels of one quadrant during the readout, 0 to 1e8.
     quantiles : float array, shape (n, 3)
         Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons.
-    rows : int
-        Number of rows of a quadrant that are pixels; the following rows are overscan.
-    prescan : int
-        Number of prescan columns before the pixels.
-    columns : int
-        Number of columns of a quadrant that are pixels.
+    pixels : (int, int, int)
+        Number of rows of a quadrant that are pixels (the following rows are overscan), number of prescan columns
+        before the pixels, and number of columns that are pixels.
     silicon : Traps or None
         Traps along the columns, which capture and release charge. None to ignore them.
     rng : numpy.random.Generator
         Random generator of the tracks.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -53,7 +52,7 @@ def apply_readout(
     OutOfRange
         If `expected` is outside its limits or NaN.
     """
-    out = np.array(frame, dtype=float)
+    out, (rows, prescan, columns) = copy_frame(frame, out), pixels
     for quadrant in out.reshape(-1, *frame.shape[-2:]):
         count = cosmic_rays.draw_event_count(expected, rng)
         part = quadrant[:, prescan : prescan + columns]
@@ -129,10 +128,10 @@ def _expected_readout(scene: Scene) -> float:
     return cosmic_rays.event_rate(scene, float((scene.nx // 2) * scene.half_rows)) * scene.value("readout_time", "s")
 
 
-def _readout_parameters(scene: Scene) -> tuple[float, Frame, int, int, int, Traps | None]:
+def _readout_parameters(scene: Scene) -> tuple[float, Frame, tuple[int, int, int], Traps | None]:
     prescan, half = int(scene.value("fpa.prescan", "pix")), scene.nx // 2
     silicon = charge_transfer.silicon_traps(scene, "parallel") if charge_transfer.PARALLEL.is_applied(scene) else None
-    return _expected_readout(scene), cosmic_rays.track_quantiles(scene), scene.half_rows, prescan, half, silicon
+    return _expected_readout(scene), cosmic_rays.track_quantiles(scene), (scene.half_rows, prescan, half), silicon
 
 
 READOUT = Effect(
@@ -142,4 +141,5 @@ READOUT = Effect(
     lambda scene: cosmic_rays.median_pixel(scene, _expected_readout(scene)),
     cost=6.5e-3,
     systematic=zero_contribution,
+    in_place=True,
 )

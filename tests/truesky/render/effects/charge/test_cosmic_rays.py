@@ -91,13 +91,13 @@ def test_even_over_the_frame():
 
 def test_readout_hits_lie_in_readout_coordinates():
     """Rows that are read later have been on the detector for longer; prescan and overscan columns have no silicon."""
-    expected, _, rows, prescan, columns, silicon = readout_cosmic_rays.READOUT.parameters(SCENE)
+    expected, _, (rows, prescan, columns), silicon = readout_cosmic_rays.READOUT.parameters(SCENE)
     assert silicon == charge_transfer.silicon_traps(SCENE, "parallel")
     assert readout_cosmic_rays.READOUT.parameters(replace(SCENE, forced={"parallel_cti": False}))[-1] is None
     assert (rows, prescan, columns) == (2066, 51, 2048)
     assert expected == pytest.approx(72 * 2066 * 2048 * (12e-4) ** 2)
     empty = np.zeros((40, 126, 90))
-    out = readout_cosmic_rays.apply_readout(empty, 60.0, TRACKS, 120, 10, 64, None, np.random.default_rng(1))
+    out = readout_cosmic_rays.apply_readout(empty, 60.0, TRACKS, (120, 10, 64), None, np.random.default_rng(1))
     assert (out[:, :, :10] == 0).all()
     assert (out[:, :, 74:] == 0).all()
     hits = (out[:, :, 10:74] > 0).mean(axis=(0, 2))
@@ -143,7 +143,7 @@ def apply_to_ramp(expected, rng):
 
 def apply_to_readout(expected, rng):
     # With one row of pixels and 63 rows of overscan, all charge is read.
-    return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, 1, 0, 64, None, rng)
+    return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, (1, 0, 64), None, rng)
 
 
 QUANTILES = np.array([[0.0, 0.01, 7.0], [1.0, 0.01, 7.0]])
