@@ -193,6 +193,34 @@ class Version:
         """
         return manifest.check_contents(self.folder, self._file_entry(relative))
 
+    def sidecar_paths(self, relatives: Sequence[str]) -> list[Path]:
+        """Return the paths of files of one folder, after comparing their sha256. They lie in one folder again.
+
+        On object storage, the files are copied to a temporary folder.
+
+        Parameters
+        ----------
+        relatives : sequence of str
+            Paths of the files in the folder of the version, at least one.
+
+        Returns
+        -------
+        list of Path
+            Paths of files on this machine, in the same order.
+
+        Raises
+        ------
+        BadInput
+            If the manifest does not list a file.
+        Damaged
+            If a file is missing or differs from the manifest.
+        """
+        copies = [self.sidecar_path(relative) for relative in relatives]
+        if isinstance(self.folder, Path):
+            return copies
+        folder = (self.folder / relatives[0]).parent.gather_copies(copies)
+        return [folder / copy.name for copy in copies]
+
     def sidecar_folder(self, relative: str) -> Path:
         """Return the path of a folder of the version, such as its folder of images.
 

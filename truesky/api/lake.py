@@ -338,8 +338,10 @@ class Lake(LakeTables):
         return lake_frames.LakeFrame(self._explorer.root, self._explorer._version("products"), number, str(detector))
 
     def _image_file(self, path: str) -> Path:
+        from truesky.render.products import read_back
+
         try:
-            return self._explorer._version("products").sidecar_path(path)
+            return read_back.image_file(self._explorer._version("products"), path)
         except BadInput as error:
             raise BadInput(f"{error}; Lake.images() lists the paths of the images") from None
 

@@ -100,7 +100,7 @@ class Picture:
     @cached_property
     def header_cards(self) -> tuple[tuple[str, Any, str], ...]:
         """Cards of the FITS header of the image: (keyword, value, comment)."""
-        return read_back.frame(self.version.sidecar_path(self.row["path"])).cards
+        return read_back.frame(read_back.image_file(self.version, self.row["path"])).cards
 
     @cached_property
     def wcs(self) -> WCS:

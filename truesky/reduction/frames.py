@@ -194,7 +194,7 @@ def from_lake(
         detector = detectors.detector(exposure.camera, row["detector"], variant.mission)
         scene = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy)
         scene = replace(scene, band=passband_from_facts(root, flux_facts, exposure.band), forced=variant.forced)
-        path = version.sidecar_path(row["path"])
+        path = read_back.image_file(version, row["path"])
         cards = read_back.header(path)
         key = (exposure.camera, row["detector"])
         psf_name = sidecar_files.psf_file(exposure.exposure_id, exposure.channel, exposure.band, row["detector"])

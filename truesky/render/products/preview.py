@@ -97,7 +97,7 @@ def draw(row: dict[str, Any], root: Path, out: Path, request: str | None = None)
     """
     version = read.version(root, "products", request=request)
     with activity.report(f"picture of detector {row['detector']}, exposure {row['exposure_id']}"):
-        image = read_back.electrons(version.sidecar_path(row["path"]))
+        image = read_back.electrons(read_back.image_file(version, row["path"]))
         if row["cosmic_rays"] is not None:
             (truth,) = images.read_images(version.sidecar_path(row["cosmic_rays"]))
             image = images.Image(repair_cosmic_rays(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)

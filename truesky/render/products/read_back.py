@@ -13,6 +13,7 @@ import numpy as np
 
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
+from lake_schema.store import read as versions
 from truesky.render.camera import tpv
 from truesky.render.camera.sections import Section
 from truesky.render.channels import registry
@@ -22,6 +23,32 @@ from truesky.render.products import head_files, raw_pointing
 # Keyword of the card that tells which part of an array contains the pixels of the detector. The card is present if the
 # array also has prescan or overscan.
 _DATA = "DATASEC"
+
+
+def image_file(version: versions.Version, path: str) -> Path:
+    """Return the path of an image of a lake, next to its head file, after comparing the sha256 of both.
+
+    Parameters
+    ----------
+    version : Version
+        Version of the table `products`.
+    path : str
+        Path of the image in the folder of the version.
+
+    Returns
+    -------
+    Path
+        The image file, an argument of the other functions. On object storage, it is a copy.
+
+    Raises
+    ------
+    BadInput
+        If the version has no such file.
+    Damaged
+        If one of both files is missing or damaged.
+    """
+    head = head_files.head_path(path)
+    return version.sidecar_paths([path, head] if head != path and version.has_file(head) else [path])[0]
 
 
 def frame(path: Path) -> images.Image:

@@ -176,7 +176,7 @@ def _rows(root: Path, request: str | None) -> list[Row]:
         exposure = exposures[row["exposure_id"]]
         if row["content"] == "science" and exposure["image_type"] in ("science", "deep"):
             task = tasks[row["exposure_id"], row["detector"]]
-            image_rows.append({**exposure, **task, "file": version.sidecar_path(row["path"])})
+            image_rows.append({**exposure, **task, "file": read_back.image_file(version, row["path"])})
     return image_rows
 
 
