@@ -29,7 +29,7 @@ _BLOCK = 512
 _CERTAIN = 1.0 - 2e-16
 
 
-def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, electrons: float, rng: np.random.Generator, out: Frame | None = None) -> Frame:
     """Add a random number of dark electrons to every pixel, with a Poisson distribution.
 
     Parameters
@@ -41,6 +41,8 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     rng : numpy.random.Generator
         Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
         index.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -54,23 +56,23 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
-    return map_pixels(_add_counts, frame, electrons, pixel_random.draw_key(rng))
+    return map_pixels(_add_counts, frame, electrons, pixel_random.draw_key(rng), out=out)
 
 
 @jit
-def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
+def _add_counts(pixels: Any, mean: float, key: Any) -> None:
     p_zero = math.exp(-mean)
     if mean >= _BLOCKWISE_BELOW:
-        for i in range(len(frame)):
-            out[i] = frame[i] + poisson.draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
+        for i in range(len(pixels)):
+            pixels[i] += poisson.draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
         return
     # For small means it is faster to increase the counts of a whole block of pixels one by one: for count = 0, 1, 2,
     # ... each pixel whose uniform random number exceeds the probability P(<= count) gets one more electron.
     u = np.empty(_BLOCK)
-    for first in range(0, len(frame), _BLOCK):
-        block, block_before = out[first : first + _BLOCK], frame[first : first + _BLOCK]
+    for first in range(0, len(pixels), _BLOCK):
+        block = pixels[first : first + _BLOCK]
         for j in range(len(block)):
-            u[j], block[j] = pixel_random.uniform(pixel_random.pixel_bits(key, first + j)), block_before[j]
+            u[j] = pixel_random.uniform(pixel_random.pixel_bits(key, first + j))
         term, cumulative, count = p_zero, p_zero, 0.0
         while cumulative < _CERTAIN and term > 0.0:
             for j in range(len(block)):
@@ -148,6 +150,7 @@ EFFECT = Effect(
     _contribution,
     cost=2e-3,
     systematic=lambda scene: scene.dark_electrons,
+    in_place=True,
 )
 HOT = Effect(
     "hot_pixels",

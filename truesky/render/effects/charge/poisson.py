@@ -16,7 +16,7 @@ from truesky.render.effects.scene import Frame, Scene
 _EXACT_BELOW = 10.0
 
 
-def apply(frame: Frame, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, rng: np.random.Generator, out: Frame | None = None) -> Frame:
     """Draw a random count of electrons for each pixel from a Poisson distribution.
 
     Parameters
@@ -26,6 +26,8 @@ def apply(frame: Frame, rng: np.random.Generator) -> Frame:
     rng : numpy.random.Generator
         Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
         index.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -42,15 +44,15 @@ def apply(frame: Frame, rng: np.random.Generator) -> Frame:
     ----------
     .. [1] Giles 2016, ACM Trans. Math. Softw. 42, 7: the inverse Poisson distribution to second order in its width.
     """
-    return map_pixels(_draw_counts, frame, pixel_random.draw_key(rng))
+    return map_pixels(_draw_counts, frame, pixel_random.draw_key(rng), out=out)
 
 
 @jit
-def _draw_counts(means: Any, counts: Any, key: Any) -> None:
-    for i in range(len(means)):
-        mean = max(means[i], 0.0)
+def _draw_counts(pixels: Any, key: Any) -> None:
+    for i in range(len(pixels)):
+        mean = max(pixels[i], 0.0)
         p_zero = math.exp(-mean) if mean < _EXACT_BELOW else 0.0
-        counts[i] = draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
+        pixels[i] = draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
 
 
 @jit
@@ -89,4 +91,6 @@ def _contribution(scene: Scene) -> float:
     return float(np.sqrt(max(scene.peak_electrons, 0.0) + scene.sky_electrons))
 
 
-EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=1.1e-2, systematic=zero_contribution)
+EFFECT = Effect(
+    "poisson", apply, lambda scene: (), _contribution, cost=1.1e-2, systematic=zero_contribution, in_place=True
+)

@@ -9,7 +9,7 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame
 
 
-def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None) -> Frame:
+def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None, out: Frame | None = None) -> Frame:
     """Add the sky background, a constant, to all pixels of a frame.
 
     Parameters
@@ -20,6 +20,8 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None
         Expected electrons of the sky per pixel, 0 or more.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -33,7 +35,14 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
-    return frame + electrons
+    return np.add(frame, electrons, out=out)
 
 
-EFFECT = Effect("background", apply, lambda scene: (scene.sky_electrons,), lambda scene: scene.sky_electrons, cost=3e-3)
+EFFECT = Effect(
+    "background",
+    apply,
+    lambda scene: (scene.sky_electrons,),
+    lambda scene: scene.sky_electrons,
+    cost=3e-3,
+    in_place=True,
+)

@@ -11,11 +11,13 @@ import numpy as np
 
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.render.camera import detectors as camera_detectors
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame, row_blocks
 from truesky.render.effects.scene import Frame, Scene
 
 
-def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
+def apply(
+    frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
     """Multiply a frame by the illumination 1 + columns + rows.
 
     Parameters
@@ -28,6 +30,8 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
         Term of the illumination that depends on the row, relative to the nominal illumination.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -45,9 +49,12 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
         raise BadInput(f"illumination has the shape {(len(rows), len(columns))}, must be {frame.shape[-2:]}")
     if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
         raise OutOfRange("illumination", 1.0 + float(columns.min() + rows.min()), 0.0, np.inf)
-    out = np.asarray(columns + rows[:, None])
-    out += 1.0
-    return np.multiply(frame, out, out=out) if frame.ndim == 2 else frame * out
+    out = copy_frame(frame, out)
+    for block in row_blocks(out):
+        illumination = columns + rows[block, None]
+        illumination += 1.0
+        out[..., block, :] *= illumination
+    return out
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
@@ -132,6 +139,7 @@ EFFECT = Effect(
     _vignetting_pattern,
     lambda scene: abs(scene.value("illumination", "")) * _brightest_electrons(scene),
     cost=5e-3,
+    in_place=True,
 )
 SHUTTER = Effect(
     "shutter",
@@ -139,4 +147,5 @@ SHUTTER = Effect(
     _shutter_pattern,
     lambda scene: abs(_shutter_excess(scene)) * _brightest_electrons(scene),
     cost=5e-3,
+    in_place=True,
 )

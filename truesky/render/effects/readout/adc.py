@@ -19,6 +19,7 @@ def apply(
     bias: float | Float,
     largest: float | Float,
     rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Convert electrons to digital numbers (ADU), with clipping to the range of the converter.
 
@@ -34,6 +35,8 @@ def apply(
         Highest output of the converter in ADU.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -47,7 +50,7 @@ def apply(
     """
     if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)
-    return map_pixels(_convert, frame, gain, bias + 0.5, largest)
+    return map_pixels(_convert, frame, gain, bias + 0.5, largest, out=out)
 
 
 def apply_signal(
@@ -82,9 +85,9 @@ def apply_signal(
 
 
 @jit
-def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: float) -> None:
-    for i in range(len(electrons)):
-        numbers[i] = min(max(np.floor(electrons[i] / gain + offset), 0.0), largest)
+def _convert(pixels: Any, gain: float, offset: float, largest: float) -> None:
+    for i in range(len(pixels)):
+        pixels[i] = min(max(np.floor(pixels[i] / gain + offset), 0.0), largest)
 
 
 def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Float]:
@@ -118,5 +121,5 @@ def _contribution(scene: Scene) -> float:
     return float(np.max(gain * (bias + 0.5)))
 
 
-EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3)
+EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3, in_place=True)
 SIGNAL = Effect("signal_adc", apply_signal, _parameters, _contribution, optional=False, cost=8e-3)

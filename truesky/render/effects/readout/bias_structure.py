@@ -17,7 +17,13 @@ Number = float | Float
 
 
 def apply(
-    frame: Frame, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
+    frame: Frame,
+    offset: Number,
+    settling: Number,
+    length: Number,
+    stripes: Number,
+    rng: np.random.Generator,
+    out: Frame | None = None,
 ) -> Frame:
     """Add the bias pattern to a frame. It is the same in every row and in every exposure.
 
@@ -35,6 +41,8 @@ def apply(
         Standard deviation of the random offsets of single columns in electrons, 0 or more.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the pattern does not change.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -48,7 +56,7 @@ def apply(
     """
     shape = frame.reshape(-1, *frame.shape[-2:]).shape
     pattern = structure(shape[0], shape[2], offset, settling, length, stripes, rng)
-    return np.asarray(frame + pattern.reshape(*frame.shape[:-2], 1, shape[2]))
+    return np.asarray(np.add(frame, pattern.reshape(*frame.shape[:-2], 1, shape[2]), out=out))
 
 
 def structure(
@@ -107,4 +115,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.max(offset + np.abs(settling) + stripes))
 
 
-EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True, cost=4e-3)
+EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True, cost=4e-3, in_place=True)

@@ -9,7 +9,7 @@ import numpy as np
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.camera import amplifiers
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 
 # Crosstalk coefficient of diagonally opposite quadrants of a detector, divided by that of quadrants with a common side
@@ -22,7 +22,7 @@ _BLOCK = 1024
 _ITERATIONS = 3
 
 
-def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
+def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None, out: Frame | None = None) -> Frame:
     """Add to the signal of each amplifier a share of the signals of all other amplifiers.
 
     Parameters
@@ -34,6 +34,8 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
         diagonal are ignored.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -52,10 +54,9 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
         raise BadInput(f"crosstalk coefficients have the shape {coefficients.shape}, must be {(count, count)}")
     if not np.all(np.abs(coefficients) <= 1.0):
         raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
-    flat = np.ascontiguousarray(frame, dtype=float).reshape(count, -1)
-    out = np.empty_like(flat)
-    _mix(flat, np.asarray(coefficients, float), out)
-    return out.reshape(frame.shape)
+    out = copy_frame(frame, out)
+    _mix(out.reshape(count, -1), np.asarray(coefficients, float))
+    return out
 
 
 def remove(frame: Frame, coefficients: Frame) -> Frame:
@@ -72,15 +73,18 @@ def remove(frame: Frame, coefficients: Frame) -> Frame:
 
 
 @jit
-def _mix(frame: Any, coefficients: Any, out: Any) -> None:
+def _mix(frame: Any, coefficients: Any) -> None:
+    """Add the crosstalk to a frame [amplifier, pixel] in place."""
+    block = np.empty((len(frame), _BLOCK))
     # Add the crosstalk to `_BLOCK` pixels of all amplifiers before the next pixels: these fit into the processor's
     # cache.
     for start in range(0, frame.shape[1], _BLOCK):
+        size = min(_BLOCK, frame.shape[1] - start)
+        block[:, :size] = frame[:, start : start + size]
         for victim in range(len(frame)):
-            line = out[victim, start : start + _BLOCK]
-            line[:] = frame[victim, start : start + _BLOCK]
+            line = frame[victim, start : start + size]
             for source in range(len(frame)):
-                share, other = coefficients[victim, source], frame[source, start : start + _BLOCK]
+                share, other = coefficients[victim, source], block[source]
                 if source != victim and share != 0.0:
                     for i in range(len(line)):
                         line[i] += share * other[i]
@@ -114,4 +118,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.abs(coefficients(scene)).max()) * full
 
 
-EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=4e-3)
+EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=4e-3, in_place=True)

@@ -24,13 +24,21 @@ from truesky.render.effects.series import SMALL, small_expm1
 # Number of steps of Newton's method in `linearise`. Each doubles the number of correct digits, because the function
 # that is inverted is smooth: its slope increases from 1 - `low` (at least 0.01) for no signal to 1 for strong signals.
 _ITERATIONS = 6
+# Number of pixels whose input is kept while their output replaces it.
+_BLOCK = 1024
 
 
 Number = float | Float
 
 
 def apply(
-    frame: Frame, high: Number, saturation: Number, low: Number, knee: Number, rng: np.random.Generator | None = None
+    frame: Frame,
+    high: Number,
+    saturation: Number,
+    low: Number,
+    knee: Number,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Convert the electrons of pixels to the output of their nonlinear amplifiers.
 
@@ -49,6 +57,8 @@ def apply(
         Scale n0 in electrons over which the loss of the first electrons ends, 1e-3 to 1e9.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -61,25 +71,43 @@ def apply(
         If `high`, `saturation`, `low` or `knee` is outside its limits or NaN.
     """
     _check_parameters(high, saturation, low, knee)
-    return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee)
+    if np.all(np.equal(low, 0.0)):
+        return map_pixels(_saturate, frame, high / saturation, out=out)
+    return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee, out=out)
 
 
 @jit
-def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -> None:
-    """Fill `signal` with the output of an amplifier for `light` in electrons.
+def _saturate(pixels: Any, high: float) -> None:
+    """Convert electrons to the output of an amplifier that loses no first electrons, in place.
+
+    `high` is the relative loss of signal per electron in the pixel, due to saturation.
+    """
+    for i in range(len(pixels)):
+        light = max(pixels[i], 0.0)
+        pixels[i] = min(pixels[i], 0.0) + light / (1.0 + high * light)
+
+
+@jit
+def _respond(pixels: Any, high: float, low: float, inverse: float) -> None:
+    """Convert electrons to the output of an amplifier, in place.
 
     `high` is the relative loss of signal per electron in the pixel, due to saturation. `low` is the number of electrons
     that are missing in any strong signal. `inverse` is 1 / (scale in electrons over which this loss is reached).
     """
-    for i in range(len(light)):
-        response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
-        signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
-    # Compute the brighter pixels, for which the power series in `small_expm1` is not accurate, again. An `if` in the
-    # first loop would prevent its vectorisation, which costs more than computing a few pixels twice.
-    for i in range(len(light)):
-        if light[i] * inverse > SMALL:
-            response = light[i] / (1.0 + high * light[i])
-            signal[i] = response + low * np.expm1(-response * inverse)
+    light_of_block = np.empty(_BLOCK)
+    for start in range(0, len(pixels), _BLOCK):
+        signal = pixels[start : start + _BLOCK]
+        light = light_of_block[: len(signal)]
+        light[:] = signal
+        for i in range(len(light)):
+            response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
+            signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
+        # Compute the brighter pixels, for which the power series in `small_expm1` is not accurate, again. An `if` in
+        # the first loop would prevent its vectorisation, which costs more than computing a few pixels twice.
+        for i in range(len(light)):
+            if light[i] * inverse > SMALL:
+                response = light[i] / (1.0 + high * light[i])
+                signal[i] = response + low * np.expm1(-response * inverse)
 
 
 def linearise(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
@@ -157,4 +185,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.max(light - apply(light, *curve)))
 
 
-EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)
+EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3, in_place=True)

@@ -14,7 +14,7 @@ from truesky.render.effects.effect import Effect, map_pixels, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 
-def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator, out: Frame | None = None) -> Frame:
     """Add Gaussian read noise to every pixel of a frame.
 
     Parameters
@@ -26,6 +26,8 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame
     rng : numpy.random.Generator
         Random generator from which one 64-bit key is drawn. Each pixel derives its random number from the key and its
         index.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -42,13 +44,13 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame
     # Index of the first pixel of each amplifier in the flat frame. It gives every pixel of the detector its own random
     # number.
     first = np.arange(len(frame)) * frame[0].size if np.ndim(sigma) else 0
-    return map_pixels(_add, frame, sigma, pixel_random.draw_key(rng), first)
+    return map_pixels(_add, frame, sigma, pixel_random.draw_key(rng), first, out=out)
 
 
 @jit
-def _add(frame: Any, out: Any, sigma: float, key: Any, first: int) -> None:
-    for i in range(len(frame)):
-        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.pixel_bits(key, first + i))
+def _add(pixels: Any, sigma: float, key: Any, first: int) -> None:
+    for i in range(len(pixels)):
+        pixels[i] += sigma * pixel_random.normal(pixel_random.pixel_bits(key, first + i))
 
 
 def _sigma(scene: Scene) -> float | Float:
@@ -62,4 +64,5 @@ EFFECT = Effect(
     lambda scene: float(np.max(_sigma(scene))),
     cost=9e-3,
     systematic=zero_contribution,
+    in_place=True,
 )
