@@ -143,11 +143,23 @@ def normal(bits: Any) -> Any:
 
 @jit
 def fill_normals(out: Any, bits: Any, frame_key: Any, first: int) -> None:
-    """Fill `out` with the standard normal deviates of successive pixels, the first of which has the flat index `first`.
+    """Fill an array with the standard normal deviates of successive pixels.
 
-    The numbers are those of `normal` for the random bits of the pixels, computed in half the time: a loop without
-    branches treats nearly all pixels, and the others are computed again. `bits` is memory for uint64 numbers, at least
-    as many as `out` has. `frame_key` is the key of the frame (uint64).
+    Parameters
+    ----------
+    out : float64 array, shape (n,)
+        Array for the deviates.
+    bits : uint64 array, shape (n,) or longer
+        Memory for random bits.
+    frame_key : uint64
+        Key of the frame.
+    first : int
+        Flat index of the first pixel in the frame.
+
+    Notes
+    -----
+    The numbers equal the results of `normal` for the random bits of the pixels, and take half the time: a loop without
+    branches draws 99 % of the numbers, and the other numbers are drawn again.
     """
     for i in range(len(out)):
         bits[i] = pixel_bits(frame_key, first + i)

@@ -135,7 +135,7 @@ def _multiply_response(
     rng: np.random.Generator,
     part: DetectorPart,
 ) -> None:
-    """Multiply a frame by the sensitivity of its pixels in place; the other arguments are those of `response`."""
+    """Multiply a frame by the sensitivity of its pixels in place, with the arguments of `response`."""
     (dead, dark_columns), (grains, radius, depth) = defects, dust
     for name, value, highest in (
         ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
