@@ -71,4 +71,7 @@ def write(
     table.header["PSFNAXIS"] = (3, "number of axes of PSF_MASK")
     for number, length in enumerate((side, side, len(planes)), start=1):
         table.header[f"PSFAXIS{number}"] = length
+    # Swap the bytes here, because astropy treats the numbers of a table's cell one after the other in Python.
+    table.data.byteswap(inplace=True)
+    table.data.dtype = table.data.dtype.newbyteorder(">")
     fits_file.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), table]))

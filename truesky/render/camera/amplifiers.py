@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Bool, Float
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.detector_overrides import DetectorPlace
@@ -139,12 +139,33 @@ class Layout:
         """
         if frame.shape != (self.ny, self.nx):
             raise BadInput(f"frame has the shape {frame.shape}, but the amplifiers cover {self.ny} x {self.nx} pixels")
-        shape = len(self.amplifiers), self.height + self.overscan_rows, self.scan_columns + self.width
-        out = np.zeros(shape, frame.dtype)
+        out = np.zeros(self.planes_shape, frame.dtype)
         for plane, amplifier in zip(out, self.amplifiers, strict=True):
             plane[: self.height, self.prescan : self.prescan + self.width] = _flip_to_readout_order(
                 frame[amplifier.pixels.slices], amplifier
             )
+        return out
+
+    @property
+    def planes_shape(self) -> tuple[int, int, int]:
+        """Numbers of amplifiers, rows and columns of the result of `split`."""
+        return len(self.amplifiers), self.height + self.overscan_rows, self.scan_columns + self.width
+
+    def readout_places(self, rows: Int, columns: Int) -> Int:
+        """Return where n pixels of the detector are in the result of `split`.
+
+        `rows` and `columns` are int64[n]. The result, int64[n, 3], has the amplifier, the row and the column of each
+        pixel. They are -1 for pixels that no amplifier reads.
+        """
+        out = np.full((len(rows), 3), -1)
+        for number, amplifier in enumerate(self.amplifiers):
+            pixels = amplifier.pixels
+            row, column = rows - pixels.y, columns - pixels.x
+            is_inside = (row >= 0) & (row < pixels.ny) & (column >= 0) & (column < pixels.nx)
+            row, column = row[is_inside], column[is_inside]
+            out[is_inside, 0] = number
+            out[is_inside, 1] = pixels.ny - 1 - row if amplifier.read_top else row
+            out[is_inside, 2] = self.prescan + (pixels.nx - 1 - column if amplifier.read_right else column)
         return out
 
     def assemble(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:

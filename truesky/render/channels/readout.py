@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from lake_schema.arrays import Array, Float
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.fits.images import Card, Image
 from truesky.render.camera import astrometry
 from truesky.render.camera.sections import Section, Sections
@@ -109,9 +109,11 @@ class ReadoutMode:
         Name of the first effect of the channel that is not applied; "" if all effects are applied.
     file_bytes_per_pixel : int or None
         Bytes of the file per pixel of the detector; None for the measured value in the `Cost` of the channel.
-    split : callable
-        (array [ny, nx] of the detector, scene) -> one plane per amplifier. Pixels at the same place in all planes are
-        read at the same time.
+    readout_places : callable
+        (rows, columns, scene) -> (places, shape). `rows` and `columns` are the positions of n pixels on the detector,
+        int64[n]. `places`, int64[n, k], are their indices in an array with the shape `shape` (k axes), which has one
+        plane per amplifier. Pixels at the same place in all planes are read at the same time. Indices are -1 for pixels
+        that are not read.
     """
 
     make_readout: Callable[[Frame, Scene, str, WCS], Readout]
@@ -120,7 +122,10 @@ class ReadoutMode:
     read_electrons: Callable[[Sequence[Image]], Float]
     stop_before: str = ""
     file_bytes_per_pixel: int | None = None
-    split: Callable[[Array, Scene], Array] = lambda array, scene: array
+    readout_places: Callable[[Int, Int, Scene], tuple[Int, tuple[int, ...]]] = lambda rows, columns, scene: (
+        np.column_stack([rows, columns]),
+        (scene.ny, scene.nx),
+    )
 
 
 def _frame(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
@@ -282,8 +287,8 @@ def _header(image: Image) -> dict[str, Any]:
     return {keyword: value for keyword, value, _ in image.cards}
 
 
-def _split_quadrants(array: Array, scene: Scene) -> Array:
-    return layout.apply(array, *layout.overscan_sizes(scene))
+def _quadrant_places(rows: Int, columns: Int, scene: Scene) -> tuple[Int, tuple[int, ...]]:
+    return layout.readout_places((rows, columns), (scene.ny, scene.nx), *layout.overscan_sizes(scene))
 
 
 QUADRANTS = ReadoutMode(
@@ -291,7 +296,7 @@ QUADRANTS = ReadoutMode(
     assemble=_assemble_quadrants,
     read_pixels=_quadrant_pixels,
     read_electrons=_quadrant_electrons,
-    split=_split_quadrants,
+    readout_places=_quadrant_places,
 )
 
 
@@ -428,12 +433,18 @@ def _amplifier_electrons(read: Sequence[Image]) -> Float:
     return out
 
 
-def _split_amplifiers(array: Array, scene: Scene) -> Array:
-    return array if scene.layout is None else scene.layout.split(array)
+def _amplifier_places(rows: Int, columns: Int, scene: Scene) -> tuple[Int, tuple[int, ...]]:
+    if scene.layout is None:
+        return np.column_stack([rows, columns]), (scene.ny, scene.nx)
+    return scene.layout.readout_places(rows, columns), scene.layout.planes_shape
 
 
 AMPLIFIERS = ReadoutMode(
-    _amplifiers, _assemble_amplifiers, _amplifier_pixels, _amplifier_electrons, split=_split_amplifiers
+    _amplifiers,
+    _assemble_amplifiers,
+    _amplifier_pixels,
+    _amplifier_electrons,
+    readout_places=_amplifier_places,
 )
 BY_AMPLIFIER = replace(AMPLIFIERS, make_readout=_by_amplifier)
 

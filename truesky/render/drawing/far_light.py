@@ -38,6 +38,8 @@ _FAINTEST = 0.5
 # diffraction fringe. The table of a spike ends abruptly, which causes a step in the light at each point of the trail. A
 # value below 1 makes these steps smaller.
 _ALONG = 0.6
+# Number of points by which tables of spikes are longer than the spikes are visible.
+_MORE_POINTS = 4
 # Spacing of points along the trail of a moving star when aliased light is removed, pixels. It can be wide, since only
 # the ratio of direct and aliased light is needed.
 _POINT_SPACING = 4.0
@@ -117,7 +119,12 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     if _misses_frame(frame, (x, y), max(radius, inner * np.sqrt(2.0)), bar_directions):
         # The tables of the spikes take longer than everything else if the frame is a small part of a detector.
         return
-    lines = star.electrons * spikes.spike_light(edges, photons, max(farthest, edges.period))
+    table_reach = farthest
+    if faintest > 0.0:
+        # Spikes end where they are invisible. The kernels interpolate between this point and the next ones.
+        max_reach = spikes.max_reach(edges, photons, faintest / star.electrons)
+        table_reach = min(farthest, max(max_reach, inner * np.sqrt(2.0)) + _MORE_POINTS * LONG)
+    lines = star.electrons * spikes.spike_light(edges, photons, max(table_reach, edges.period))
     # Outside the PSF image, diffraction spikes are drawn where they are brighter than `faintest` (electrons per pixel):
     # compute the distance from the star and the distance from the axis of a spike up to which they are, in pixels.
     visible = lines[:, int(inner / LONG) :] > faintest

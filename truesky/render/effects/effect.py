@@ -7,7 +7,7 @@ pixels. An effect too small to be noticed in the image is omitted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,9 @@ import numpy as np
 
 from lake_schema.errors import BadInput
 from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
+
+# Bytes of the rows of a frame that are treated together, so that they stay in the cache of the processor.
+_BLOCK_BYTES = 2**19
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +52,8 @@ class Effect:
         Function of a `Scene` that returns the part of the contribution that does not average out in a mean over many
         frames or pixels, in electrons. By default the whole contribution does not average out.
     in_place : bool
-        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. A new array for all
-        pixels takes longer than most effects.
+        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. New memory for a
+        frame takes longer than most effects.
     """
 
     name: str
@@ -117,21 +120,28 @@ def copy_frame(frame: Frame, out: Frame | None) -> Frame:
     return out
 
 
+def row_blocks(frame: Frame) -> Iterator[slice]:
+    """Yield slices of successive rows of a frame (..., ny, nx), small enough for the cache of the processor."""
+    rows = max(_BLOCK_BYTES // max(frame.itemsize * frame.size // max(frame.shape[-2], 1), 1), 1)
+    for first in range(0, frame.shape[-2], rows):
+        yield slice(first, first + rows)
+
+
 def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any, out: Frame | None = None) -> Frame:
     """Apply a compiled function to all pixels of a frame, with different parameters for each amplifier if necessary.
 
     Parameters
     ----------
     kernel : callable
-        Compiled function (pixels, *arguments) that changes `pixels` in place. They are a flat float64 array of the
-        pixels of the frame, or of one of its amplifiers.
+        Compiled function (pixels, *arguments) that changes `pixels` in place, a flat float64 array of the pixels of the
+        frame, or of one of its amplifiers.
     frame : float array, shape (ny, nx) or (q, ...)
         Input frame. If any argument has one value per amplifier, the first axis counts the q amplifiers.
     *arguments : float, uint64 or array, shape (q,)
         Further arguments of `kernel`, at least one. Each is one value for the whole frame, or an array with one value
         for each of the q amplifiers.
     out : float64 array, shape of `frame`, optional
-        Contiguous array for the result, which may be `frame` itself. By default a new array.
+        Array for the result in C order, which may be `frame` itself. By default a new array.
 
     Returns
     -------

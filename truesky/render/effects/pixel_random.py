@@ -22,6 +22,8 @@ from truesky.numerics.compiling import jit
 from truesky.randomness.rng import GOLDEN, mix_bits
 from truesky.render.camera.windows import DetectorPart
 
+# Number of pixels for which `fill_normals` is called at once, so that its numbers stay in the cache of the processor.
+BLOCK = 512
 # Number of bits by which 64 random bits are shifted right, so that the remaining 53 fit into a float64.
 _S11 = np.uint64(11)
 # Mask of the 8 random bits that select one of the 256 layers of the ziggurat (a method for normal deviates).
@@ -137,3 +139,38 @@ def normal(bits: Any) -> Any:
                 continue
             return -x if sign else x
         return -x if bits & _SIGN else x
+
+
+@jit
+def fill_normals(out: Any, bits: Any, frame_key: Any, first: int) -> None:
+    """Fill an array with the standard normal deviates of successive pixels.
+
+    Parameters
+    ----------
+    out : float64 array, shape (n,)
+        Array for the deviates.
+    bits : uint64 array, shape (n,) or longer
+        Memory for random bits.
+    frame_key : uint64
+        Key of the frame.
+    first : int
+        Flat index of the first pixel in the frame.
+
+    Notes
+    -----
+    The numbers equal the results of `normal` for the random bits of the pixels, and take half the time: a loop without
+    branches draws 99 % of the numbers, and the other numbers are drawn again.
+    """
+    for i in range(len(out)):
+        bits[i] = pixel_bits(frame_key, first + i)
+    outside = 0
+    for i in range(len(out)):
+        layer, part = np.int64(bits[i] & _LAYER), np.float64(np.int64(bits[i] >> _S11)) * 2.0**-53
+        x = part * _ENDS[layer]
+        out[i] = -x if bits[i] & _SIGN else x
+        outside += part >= _INSIDE[layer]
+    if outside:
+        for i in range(len(out)):
+            layer, part = np.int64(bits[i] & _LAYER), np.float64(np.int64(bits[i] >> _S11)) * 2.0**-53
+            if part >= _INSIDE[layer]:
+                out[i] = normal(bits[i])

@@ -157,9 +157,9 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
         return None
     scene, psf = light.scene, replace(light.psf, edges=None)
     min_electrons = _noticeable_electrons(scene)
-    split_amplifiers = aim.channel.readout.split
-    shape = split_amplifiers(np.zeros((scene.ny, scene.nx), np.uint8), scene).shape
-    pixels: list[Int] = [np.zeros(0, np.int64)]
+    readout_places, empty = aim.channel.readout.readout_places, np.zeros(0, np.int64)
+    _, shape = readout_places(empty, empty, scene)
+    pixels: list[Int] = [empty]
     electrons: list[Float] = [np.zeros(0)]
     for neighbour in rows.neighbours:
         neighbour_aim = Aim.from_exposure(aim.exposure, neighbour.detector, aim.band, seed)
@@ -171,18 +171,12 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
         neighbour_scene = scene_factory.from_aim(neighbour_aim, variant)
         drawn = stamps.draw_in_units(sources, sizes, psf, (neighbour_aim.detector.nx, neighbour_aim.detector.ny))
         rows_columns, charge = _charged_pixels(drawn, neighbour_scene, _NEGLECTED * min_electrons)
-        # Find where the pixels are read: split a frame that contains the number of each pixel. A search for them is
-        # fastest in a mask.
-        numbers, mask = (np.zeros(drawn.frame.shape, dtype) for dtype in (np.int32, bool))
-        numbers[rows_columns], mask[rows_columns] = np.arange(len(charge)), True
-        planes = split_amplifiers(numbers, neighbour_scene)
-        flat_indices = np.flatnonzero(split_amplifiers(mask, neighbour_scene))
-        pixel_indices = np.column_stack(np.unravel_index(flat_indices, planes.shape))
+        places, _ = readout_places(*rows_columns, neighbour_scene)
         # A detector of another type may have more pixels than this detector. They are read when this detector reads no
         # pixel, so they are removed.
-        pixel_indices = pixel_indices[(pixel_indices < shape).all(axis=1)]
-        pixels.append(np.asarray(np.ravel_multi_index(tuple(pixel_indices.T), shape), np.int64))
-        electrons.append(charge[planes[tuple(pixel_indices.T)]])
+        is_read = ((places >= 0) & (places < shape)).all(axis=1)
+        pixels.append(np.asarray(np.ravel_multi_index(tuple(places[is_read].T), shape), np.int64))
+        electrons.append(charge[is_read])
     unique_pixels, inverse = np.unique(np.concatenate(pixels), return_inverse=True)
     if not len(unique_pixels):
         return None

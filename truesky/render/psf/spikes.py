@@ -220,6 +220,38 @@ def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
     return np.stack(lines)
 
 
+def max_reach(edges: Edges, photons: Float, faintest: float) -> float:
+    """Return a distance from a star in pixels beyond which its spikes are certainly fainter than a limit.
+
+    Parameters
+    ----------
+    edges : Edges
+        Edges of the pupil.
+    photons : float array, shape (w,)
+        Fraction of the star's photons in each sub-band of the passband.
+    faintest : float
+        Fraction of the star's light in a pixel, more than 0.
+
+    Returns
+    -------
+    float
+        Distance beyond which all numbers of `spike_light` are below `faintest`; 0 without bars.
+
+    Notes
+    -----
+    At the distance r along a spike, sinc(x) with x = width * cycles * r is at most 1 / (pi x).
+    """
+    share = np.repeat(photons / _WAVES, _WAVES)
+    cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
+    factors = [
+        share
+        * (length * length / (np.pi**2 * edges.area))
+        * _blurred_profiles(cycles.tobytes(), float(length), edges.blur / edges.pixel_scale).max(axis=1)
+        for _, _, length in edges.bars
+    ]
+    return float(np.sqrt(max((factor.sum() for factor in factors), default=0.0) / faintest))
+
+
 def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
     """Return the distance from each of n stars up to which its diffraction spikes or its aureole are noticeable.
 

@@ -51,6 +51,18 @@ def test_every_pixel_is_read_once_and_found_again(camera):
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
+def test_the_place_of_a_pixel_is_that_in_the_split_frame(camera):
+    own = layout_of(first(camera, nx=97, ny=83))
+    rows, columns = np.indices((83, 97)).reshape(2, -1)
+    numbers = np.arange(1, 83 * 97 + 1)
+    planes, places = own.split(numbers.reshape(83, 97)), own.readout_places(rows, columns)
+    there = ~own.unread_pixels.ravel()
+    assert planes.shape == own.planes_shape
+    np.testing.assert_array_equal(planes[tuple(places[there].T)], numbers[there])
+    assert (places[~there] == -1).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
 def test_the_first_pixel_to_be_read_is_at_its_corner(camera):
     own = layout_of(first(camera, nx=96, ny=80))
     frame = np.arange(96 * 80).reshape(80, 96)

@@ -298,6 +298,21 @@ def test_a_window_has_the_light_of_its_pixels(vis, first, electrons, trail):
     assert np.abs(wide[64:128, 64:128] - window).max() <= (0 if trail is None else 1)
 
 
+@pytest.mark.parametrize("trail", [None, np.array([30.0, 10.0])])
+@pytest.mark.parametrize(("electrons", "least"), [(1e5, 1.0), (1e7, 2.0), (1e9, 5.0), (1e9, 0.01)])
+def test_short_tables_of_spikes_give_the_same_light(vis, electrons, least, trail):
+    """Compare with tables that reach the farthest corner of the frame."""
+    star = far_light.Star(40.3, 900.6, electrons, np.linspace(0.2, 0.05, 8), SIDE, least, vis.edges, trail)
+    found, expected = np.zeros((2, 1000, 1200), np.int64)
+    with mock.patch.object(far_light.spikes, "spike_light", wraps=spikes.spike_light) as made:
+        far_light.add(found, star)
+    with mock.patch.object(far_light.spikes, "max_reach", return_value=np.inf):
+        far_light.add(expected, star)
+    np.testing.assert_array_equal(found, expected)
+    if electrons < 1e6:
+        assert made.call_args.args[2] < 700.0
+
+
 def test_most_windows_far_from_a_star_are_skipped(vis):
     star = far_light.Star(0.0, 0.0, 1e8, None, SIDE, 0.3, vis.edges)
     with mock.patch.object(far_light.spikes, "spike_light", wraps=spikes.spike_light) as made:

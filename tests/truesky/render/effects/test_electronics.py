@@ -46,6 +46,19 @@ def test_quadrants_are_put_together_again(half_y, half_x, pre, over, rows, middl
         np.testing.assert_array_equal(quadrants.to_detector_axes(turned, number), parts[number])
 
 
+@pytest.mark.parametrize("middle", [0, 4])
+def test_the_place_of_a_pixel_is_that_in_the_quadrants(middle):
+    sizes, numbers = (3, 2, 1, middle), np.arange(1, 20 * 12 + 1)
+    planes = quadrants.apply(numbers.reshape(20, 12), *sizes)
+    rows, columns = np.indices((20, 12)).reshape(2, -1)
+    places, shape = quadrants.readout_places((rows, columns), (20, 12), *sizes)
+    assert shape == planes.shape
+    is_read = np.isin(numbers, planes)
+    assert is_read.sum() == (20 - middle) * 12
+    np.testing.assert_array_equal(planes[tuple(places[is_read].T)], numbers[is_read])
+    assert (places[~is_read] == -1).all()
+
+
 def test_each_corner_is_read_first():
     frame = np.zeros((4132, 4096))
     frame[-1, 0], frame[-1, -1], frame[0, -1], frame[0, 0] = 1, 2, 3, 4

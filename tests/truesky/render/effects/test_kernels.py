@@ -8,6 +8,8 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from lake_schema.errors import OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects import pixel_random
 from truesky.render.effects.charge import dark_current, poisson
 from truesky.render.effects.light import background
 from truesky.render.effects.readout import adc, read_noise
@@ -66,6 +68,23 @@ def test_counts_are_distributed_as_poisson_s_law_says(mean):
     assert stats.chi2.sf(chi2, often.sum() - 1) > 1e-3
     rare = expected[~often].sum()
     assert abs(found[~often].sum() - rare) < 5 * np.sqrt(rare) + 1
+
+
+@jit
+def drawn(means, key):
+    """Return counts that are drawn pixel by pixel, without blocks."""
+    counts = np.empty(len(means))
+    for i in range(len(means)):
+        p_zero = np.exp(-means[i]) if means[i] < 10.0 else 0.0
+        counts[i] = poisson.draw_count(means[i], p_zero, pixel_random.pixel_bits(key, i))
+    return counts
+
+
+@pytest.mark.parametrize("least", [0.01, 10.0, 300.0])
+def test_counts_of_blocks_of_pixels_are_those_of_each_pixel(least):
+    means = least * np.random.default_rng(3).uniform(1.0, 1e3, 100_001)
+    found = poisson.apply(means, rng=rng())
+    np.testing.assert_array_equal(found, drawn(means, pixel_random.draw_key(rng())))
 
 
 def test_negative_expectations_count_nothing():

@@ -49,6 +49,16 @@ def many(request):
     return rolled(KEY, np.arange(request.param), 0)
 
 
+@pytest.mark.parametrize("first", [0, 77])
+def test_deviates_of_many_pixels_are_those_of_each_pixel(first):
+    """300,000 pixels, of which about 4,000 need more than one word and 80 lie in the tail."""
+    expected = rolled(KEY, first + np.arange(300_000), 0)[2]
+    found, bits = np.empty(len(expected)), np.empty(len(expected), np.uint64)
+    pixel_random.fill_normals(found, bits, KEY, first)
+    np.testing.assert_array_equal(found, expected)
+    assert (np.abs(expected) > 3.66).sum() > 20
+
+
 def test_words_are_those_of_splitmix():
     """The first of its generator begun from 1234567, as published with its code."""
     pixels = np.arange(1, 6)

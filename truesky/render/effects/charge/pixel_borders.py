@@ -19,7 +19,7 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 
 # Step in pixels of the distance from the axis of the wafer, in the table of displacements of charge by tree rings.
@@ -36,7 +36,13 @@ _MAX_SLOPE = 0.6
 
 
 def apply_rings(
-    frame: Frame, amplitude: float, inner: float, outer: float, centre: float, rng: np.random.Generator
+    frame: Frame,
+    amplitude: float,
+    inner: float,
+    outer: float,
+    centre: float,
+    rng: np.random.Generator,
+    out: Frame | None = None,
 ) -> Frame:
     """Displace charge radially by tree rings: circles of varying doping of the silicon, about the axis of the wafer.
 
@@ -54,6 +60,8 @@ def apply_rings(
         of the two distances are random.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, for the signs and the phase of the rings.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -76,8 +84,9 @@ def apply_rings(
     axis = (nx - 1) / 2 + side[0] * centre, (ny - 1) / 2 + side[1] * centre
     r_min, r_max = distance_range(nx, ny, axis)
     table = radial_displacement(amplitude, (inner, outer), phase, r_min, r_max)
-    out = np.array(frame, dtype=float, order="C")
-    _cross_borders(np.ascontiguousarray(frame, dtype=float), table, r_min, axis, np.zeros(nx), np.zeros(ny), out)
+    out = copy_frame(frame, out)
+    if amplitude > 0.0:
+        _cross_ring_borders(out, table, r_min, axis)
     return out
 
 
@@ -142,7 +151,9 @@ def radial_displacement(
     return np.asarray(amplitude * period / (2.0 * np.pi) * np.sin(waves))
 
 
-def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Generator | None = None) -> Frame:
+def apply_edges(
+    frame: Frame, shift: float, length: float, rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
     """Displace charge towards the nearest edges of the detector, or away from them if `shift` is negative.
 
     Parameters
@@ -155,6 +166,8 @@ def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Genera
         Distance in pixels over which the displacement falls by a factor of e, 0.01 to 1000.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -170,9 +183,10 @@ def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Genera
         raise OutOfRange("displacement at the edge", shift, -0.5, 0.5)
     if not 1e-2 <= length <= 1e3:
         raise OutOfRange("scale length of the edge displacement", length, 1e-2, 1e3)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     columns, rows = (_edge_displacement(n, shift, length) for n in frame.shape[::-1])
-    _cross_borders(np.ascontiguousarray(frame, dtype=float), np.zeros(2), 0.0, (0.0, 0.0), columns, rows, out)
+    if shift != 0.0:
+        _cross_edge_borders(out, columns, rows, np.flatnonzero(columns[:-1]))
     return out
 
 
@@ -189,46 +203,104 @@ def _edge_displacement(n: int, shift: float, length: float) -> Frame:
 
 
 @jit
-def _cross_borders(frame: Any, table: Any, r_min: float, axis: Any, columns: Any, rows: Any, out: Any) -> None:
-    """Move charge of `frame` across the borders of pixels, and add the changes (electrons) to `out` in place.
+def _cross_ring_borders(frame: Any, table: Any, r_min: float, axis: Any) -> None:
+    """Move charge of a frame across the borders of pixels by tree rings, in place.
 
     `table` contains displacements of charge away from `axis` (column, row) in pixels, at distances from `r_min` in
-    steps of `_STEP` pixels. `columns` and `rows` contain additional displacements in pixels, at the border of each
-    column or row with the next one, positive towards the next one.
+    steps of `_STEP` pixels.
     """
     ny, nx = frame.shape
-    rings = table.min() != table.max()
+    # Charge of the previous row, of this row and of the next row before any charge moved.
+    previous, line, following = frame[0].copy(), frame[0].copy(), frame[0].copy()
+    column = np.arange(nx) - axis[0]
+    border = column[: nx - 1] + 0.5
+    shift, moved = np.empty(nx), np.zeros(nx)
     for r in range(ny):
-        up = r - axis[1]
-        for c in range(nx):
-            if c + 1 < nx:
-                d = columns[c] + (_component(table, r_min, c + 0.5 - axis[0], up) if rings else 0.0)
-                if d != 0.0:
-                    previous, following = frame[r, max(c - 1, 0)], frame[r, min(c + 2, nx - 1)]
-                    moved = _strip_charge(d, previous, frame[r, c], frame[r, c + 1], following, 0 < c < nx - 2)
-                    out[r, c] -= moved
-                    out[r, c + 1] += moved
-            if r + 1 < ny:
-                d = rows[r] + (_component(table, r_min, up + 0.5, c - axis[0]) if rings else 0.0)
-                if d != 0.0:
-                    previous, following = frame[max(r - 1, 0), c], frame[min(r + 2, ny - 1), c]
-                    moved = _strip_charge(d, previous, frame[r, c], frame[r + 1, c], following, 0 < r < ny - 2)
-                    out[r, c] -= moved
-                    out[r + 1, c] += moved
+        up, row = r - axis[1], frame[r]
+        if nx > 1:
+            _compute_component(table, r_min, border, up, True, shift)
+            _move_strips(shift[1 : nx - 2], (line, line[1:], line[2:], line[3:]), True, moved[1 : nx - 2])
+            for c in (0, nx - 2):
+                moved[c] = _strip_charge(shift[c], 0.0, line[c], line[c + 1], 0.0, False)
+            row[0] -= moved[0]
+            # No charge crosses the border after the last pixel: the last number of `moved` is 0.
+            moved[nx - 1] = 0.0
+            for c in range(1, nx):
+                row[c] = row[c] + moved[c - 1] - moved[c]
+        if r + 1 < ny:
+            following[:] = frame[r + 1]
+            _compute_component(table, r_min, column, up + 0.5, False, shift)
+            neighbours = previous, line, following, frame[min(r + 2, ny - 1)]
+            _move_strips(shift, neighbours, 0 < r < ny - 2, moved)
+            _move_up(moved, row, frame[r + 1])
+        previous, line, following = line, following, previous
 
 
 @jit
-def _component(table: Any, r_min: float, along: float, across: float) -> Any:
-    """Return the component along one axis of the detector of a displacement away from the axis of the wafer, in pixels.
+def _cross_edge_borders(frame: Any, columns: Any, rows: Any, moving: Any) -> None:
+    """Move charge of a frame across the borders of pixels near the edges of the detector, in place.
 
-    The position is `along` this axis of the detector and `across` it, in pixels from the axis of the wafer. The
-    displacement is interpolated in `table`, from the distance `r_min` in steps of `_STEP` pixels.
+    `columns` and `rows` contain displacements in pixels at the border of each column or row with the next one, positive
+    towards the next one. `moving` are the indices of columns with a displacement other than 0 and a next column.
     """
-    distance = math.sqrt(along * along + across * across)
-    position = (distance - r_min) / _STEP
-    i = min(max(int(position), 0), len(table) - 2)
-    fraction = position - i
-    return (table[i] + fraction * (table[i + 1] - table[i])) * along / max(distance, 1e-9)
+    ny, nx = frame.shape
+    # Charge of the previous row, of this row and of the next row before any charge moved.
+    previous, line, following = frame[0].copy(), frame[0].copy(), frame[0].copy()
+    shift, moved = np.empty(nx), np.empty(nx)
+    for r in range(ny):
+        row = frame[r]
+        for c in moving:
+            outer = line[max(c - 1, 0)], line[min(c + 2, nx - 1)]
+            charge = _strip_charge(columns[c], outer[0], line[c], line[c + 1], outer[1], 0 < c < nx - 2)
+            row[c] -= charge
+            row[c + 1] += charge
+        if r + 1 < ny:
+            following[:] = frame[r + 1]
+            if rows[r] != 0.0:
+                shift[:] = rows[r]
+                neighbours = previous, line, following, frame[min(r + 2, ny - 1)]
+                _move_strips(shift, neighbours, 0 < r < ny - 2, moved)
+                _move_up(moved, row, frame[r + 1])
+        previous, line, following = line, following, previous
+
+
+@jit
+def _move_up(moved: Any, row: Any, next_row: Any) -> None:
+    for c in range(len(moved)):
+        row[c] -= moved[c]
+    for c in range(len(moved)):
+        next_row[c] += moved[c]
+
+
+@jit
+def _compute_component(table: Any, r_min: float, columns: Any, row: float, across: bool, component: Any) -> None:
+    """Fill `component` with one component of the displacement away from the axis of the wafer, in pixels.
+
+    The positions are `columns` and `row`, in pixels from the axis of the wafer. The component is that along the row if
+    `across`, and otherwise along the column. The displacement is interpolated in `table`, from the distance `r_min` in
+    steps of `_STEP` pixels.
+    """
+    places = np.empty(len(columns))
+    for c in range(len(columns)):
+        distance = math.sqrt(columns[c] * columns[c] + row * row)
+        places[c] = (distance - r_min) / _STEP
+        component[c] = (columns[c] if across else row) / max(distance, 1e-9)
+    # A separate loop for the table lets the compiler vectorise both loops.
+    for c in range(len(columns)):
+        i = min(max(int(places[c]), 0), len(table) - 2)
+        fraction = places[c] - i
+        component[c] *= table[i] + fraction * (table[i + 1] - table[i])
+
+
+@jit
+def _move_strips(shift: Any, charges: tuple[Any, Any, Any, Any], inside: bool, moved: Any) -> None:
+    """Fill `moved` with the charge that moves between pixels whose common borders are displaced by `shift` pixels.
+
+    `charges` are the charges of four successive pixels of each border, as for `_strip_charge`.
+    """
+    q0, q1, q2, q3 = charges
+    for c in range(len(shift)):
+        moved[c] = _strip_charge(shift[c], q0[c], q1[c], q2[c], q3[c], inside)
 
 
 @jit
@@ -272,11 +344,12 @@ def _edge_parameters(scene: Scene) -> tuple[float, float]:
     return shift, scene.value("edge.length", "pix") if shift else 1.0
 
 
-RINGS = Effect("tree_rings", apply_rings, _ring_parameters, _ring_contribution, fixed=True, cost=1.5e-2)
+RINGS = Effect("tree_rings", apply_rings, _ring_parameters, _ring_contribution, fixed=True, cost=1.5e-2, in_place=True)
 EDGES = Effect(
     "edge_displacement",
     apply_edges,
     _edge_parameters,
     lambda scene: abs(_edge_parameters(scene)[0]) * (scene.peak_electrons + scene.sky_electrons),
     cost=3e-3,
+    in_place=True,
 )

@@ -19,10 +19,10 @@ from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 # Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
 # is above the part and False if it is below).
 Segments = Sequence[tuple[int, int, bool]]
-# Parameters of the function `response`: standard deviation of the sensitivity between pixels, fraction of dead pixels,
-# mean number of dark columns, three numbers for dust (grains per pixel, mean radius of shadows in pixels, absorbed
+# Parameters of the function `response`: standard deviation of the sensitivity between pixels, (fraction of dead pixels,
+# mean number of dark columns), three numbers for dust (grains per pixel, mean radius of shadows in pixels, absorbed
 # fraction of the light), and parts of the columns (`Segments`).
-Parameters = tuple[float, float, float, tuple[float, float, float], Segments]
+Parameters = tuple[float, tuple[float, float], tuple[float, float, float], Segments]
 
 # Highest sensitivity of a dead pixel, relative to a normal pixel. It is uniform between 0 and this.
 _MAX_DEAD = 0.5
@@ -37,8 +37,7 @@ FLUX_ERROR, SHAPE_ERROR, POSITION_ERROR = 0.6, 0.5, 0.4
 def apply(
     frame: Frame,
     rms: float,
-    dead: float,
-    dark_columns: float,
+    defects: tuple[float, float],
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
@@ -53,11 +52,9 @@ def apply(
         Electrons.
     rms : float
         Standard deviation of the sensitivity between pixels, 0 to 1.
-    dead : float
-        Fraction of dead pixels, 0 to 1.
-    dark_columns : float
-        Mean number of dark columns, 0 to 1e4. A dark column has no signal on the far side of a defect, as seen from the
-        serial register.
+    defects : (float, float)
+        Fraction of dead pixels (0 to 1) and mean number of dark columns (0 to 1e4). A dark column has no signal on the
+        far side of a defect, as seen from the serial register.
     dust : (float, float, float)
         Dust grains per pixel (0 to 0.1), mean radius (Gaussian sigma) of their shadows in pixels (0 to 1000), and
         fraction of light absorbed at the centre of a shadow (0 to 1).
@@ -81,14 +78,15 @@ def apply(
     OutOfRange
         If a number is outside its limits or NaN.
     """
-    return _multiply_response(copy_frame(frame, out), (rms, dead, dark_columns, dust, segments), rng, part)
+    out = copy_frame(frame, out)
+    _multiply_response(out, rms, defects, dust, segments, rng, part or windows.whole(frame.shape))
+    return out
 
 
 def response(
     shape: tuple[int, ...],
     rms: float,
-    dead: float,
-    dark_columns: float,
+    defects: tuple[float, float],
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
@@ -102,11 +100,10 @@ def response(
         Number of rows and columns.
     rms : float
         Standard deviation of the sensitivity between pixels, 0 to 1.
-    dead : float
-        Fraction of dead pixels, 0 to 1. Their sensitivity is uniform between 0 and 0.5.
-    dark_columns : float
-        Mean number of dark columns, 0 to 1e4. Their number has a Poisson distribution. A dark column has a defect in a
-        random row. Pixels on the far side of the defect, as seen from the serial register, have a sensitivity of 0.
+    defects : (float, float)
+        Fraction of dead pixels (0 to 1) and mean number of dark columns (0 to 1e4). The sensitivity of dead pixels is
+        uniform between 0 and 0.5. The number of dark columns has a Poisson distribution. A dark column has a defect in
+        a random row. Pixels on the far side of the defect, as seen from the serial register, have a sensitivity of 0.
     dust : (float, float, float)
         Mean number of dust grains per pixel (0 to 0.1), mean radius of their shadows in pixels (0 to 1000), and
         fraction of light absorbed at the centre of a shadow (0 to 1). A radius is the standard deviation of a Gaussian
@@ -127,32 +124,39 @@ def response(
     Raises
     ------
     OutOfRange
-        If `rms`, `dead`, `dark_columns` or a number of `dust` is outside its limits or NaN.
+        If `rms` or a number of `defects` or `dust` is outside its limits or NaN.
     """
-    return _multiply_response(np.ones(shape), (rms, dead, dark_columns, dust, segments), rng, part)
+    out = np.ones(shape)
+    _multiply_response(out, rms, defects, dust, segments, rng, part or windows.whole(shape))
+    return out
 
 
 def _multiply_response(
-    out: Frame, parameters: Parameters, rng: np.random.Generator, part: DetectorPart | None = None
-) -> Frame:
-    """Multiply a frame by the sensitivity of each pixel in place, and return it. `parameters` are as for `response`."""
-    rms, dead, dark_columns, (grains, radius, depth), segments = parameters
+    out: Frame,
+    rms: float,
+    defects: tuple[float, float],
+    dust: tuple[float, float, float],
+    segments: Segments,
+    rng: np.random.Generator,
+    part: DetectorPart,
+) -> None:
+    """Multiply a frame by the sensitivity of its pixels in place, with the arguments of `response`."""
+    (dead, dark_columns), (grains, radius, depth) = defects, dust
     for name, value, highest in (
         ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
         ("dust grains per pixel", grains, 0.1), ("dust radius", radius, 1e3), ("dust depth", depth, 1.0),
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
-    part = part or windows.whole(out.shape)
-    ny, nx, window = part.ny, part.nx, part.window
-    key = pixel_random.draw_key(rng)
+    ny, nx, window, frame_key = part.ny, part.nx, part.window, pixel_random.draw_key(rng)
     count = int(rng.binomial(ny * nx, dead))
     is_inside, rows, columns = part.find_pixels(rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count))
-    dead_light = out[rows, columns] * (_MAX_DEAD * rng.random(count))[is_inside]
+    # A dead pixel has its own sensitivity in place of the one that all pixels draw.
+    dead_pixels = out[rows, columns] * (_MAX_DEAD * rng.random(count))[is_inside]
     if rms > 0.0:
-        for run, run_key in pixel_random.split_key(key, part):
-            _multiply_scatter(out.reshape(-1)[run], rms, run_key)
-    out[rows, columns] = dead_light
+        for run, key in pixel_random.split_key(frame_key, part):
+            _multiply_sensitivity(out.reshape(-1)[run], rms, key)
+    out[rows, columns] = dead_pixels
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
         row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx)) - window.column
         # Charge from pixels beyond the defect cannot pass the defect on its way to the serial register.
@@ -164,7 +168,6 @@ def _multiply_response(
     shadows = rng.random((count, 2)) * (ny, nx), radius * rng.standard_exponential(count)
     for (y, x), sigma in zip(shadows[0].tolist(), shadows[1].tolist(), strict=True):
         _multiply_shadow(out, (y, x), sigma, depth, window)
-    return out
 
 
 def _multiply_shadow(out: Frame, place: tuple[float, float], sigma: float, depth: float, window: Window) -> None:
@@ -190,22 +193,27 @@ def _multiply_shadow(out: Frame, place: tuple[float, float], sigma: float, depth
 
 
 @jit
-def _multiply_scatter(pixels: Any, rms: float, key: Any) -> None:
+def _multiply_sensitivity(pixels: Any, rms: float, key: Any) -> None:
     """Multiply pixels by random sensitivities with the mean 1 and the standard deviation `rms`, in place."""
-    for i in range(len(pixels)):
-        pixels[i] *= max(1.0 + rms * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    for first in range(0, len(pixels), pixel_random.BLOCK):
+        block = pixels[first : first + pixel_random.BLOCK]
+        deviates = normals[: len(block)]
+        pixel_random.fill_normals(deviates, bits, key, first)
+        for i in range(len(block)):
+            block[i] *= max(1.0 + rms * deviates[i], 0.0)
 
 
 def parameters(scene: Scene) -> Parameters:
     """Return the parameters of `response` for the detector of a scene, from the mission database.
 
-    They are the standard deviation of the sensitivity between pixels, the fraction of dead pixels, the mean number of
-    dark columns, three numbers for dust, and the parts of the columns that are read through one serial register. Dust
+    They are the standard deviation of the sensitivity between pixels, (the fraction of dead pixels, the mean number of
+    dark columns), three numbers for dust, and the parts of the columns that are read through one serial register. Dust
     has grains per pixel, the mean radius of their shadows in pixels, and the fraction of light absorbed at the centre.
     """
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
-    return rms, dead, dark_columns, dust, scene.column_segments
+    return rms, (dead, dark_columns), dust, scene.column_segments
 
 
 def _sky_parameters(scene: Scene) -> Parameters:
@@ -222,7 +230,7 @@ def _sky_parameters(scene: Scene) -> Parameters:
 
 
 def _contribution(scene: Scene) -> float:
-    rms, dead, dark_columns, (grains, *_, depth), _ = parameters(scene)
+    rms, (dead, dark_columns), (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
     shadow = depth * (grains > 0)
     return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or dark_columns > 0), shadow))

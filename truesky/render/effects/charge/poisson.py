@@ -50,10 +50,19 @@ def apply(frame: Frame, rng: np.random.Generator, out: Frame | None = None) -> F
 @jit
 def _draw_counts(pixels: Any, key: Any) -> None:
     """Replace expected electrons by random counts, in place. `key` is the random key of the frame."""
-    for i in range(len(pixels)):
-        mean = max(pixels[i], 0.0)
-        p_zero = math.exp(-mean) if mean < _EXACT_BELOW else 0.0
-        pixels[i] = draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    for first in range(0, len(pixels), pixel_random.BLOCK):
+        block = pixels[first : first + pixel_random.BLOCK]
+        if block.min() >= _EXACT_BELOW:
+            deviates = normals[: len(block)]
+            pixel_random.fill_normals(deviates, bits, key, first)
+            for i in range(len(block)):
+                block[i] = _count_from_normal(block[i], deviates[i])
+        else:
+            for i in range(len(block)):
+                mean = max(block[i], 0.0)
+                p_zero = math.exp(-mean) if mean < _EXACT_BELOW else 0.0
+                block[i] = draw_count(mean, p_zero, pixel_random.pixel_bits(key, first + i))
 
 
 @jit
@@ -81,7 +90,13 @@ def draw_count(mean: float, p_zero: float, bits: Any) -> Any:
             count += 1.0
             term *= mean / count
         return count
-    w, root = pixel_random.normal(bits), math.sqrt(mean)
+    return _count_from_normal(mean, pixel_random.normal(bits))
+
+
+@jit
+def _count_from_normal(mean: float, w: float) -> Any:
+    """Return the count of a Poisson distribution with a mean of 10 or more at the quantile of a normal deviate `w`."""
+    root = math.sqrt(mean)
     square, inverse = w * w, 1.0 / root
     third = inverse * (-8.0 / 405.0 + square * (7.0 / 810.0 + square / 270.0))
     second = inverse * (w * (-1.0 / 36.0 - square / 72.0) + third)

@@ -16,7 +16,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics import matrices
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 
 # (Relative wave number, relative intensity) of four groups of emission lines, as in the z and y bands (assumed).
@@ -37,7 +37,14 @@ _NODE_SPACING = 8
 _STEPS_PER_CYCLE = 64
 
 
-def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: np.random.Generator) -> Frame:
+def apply(
+    frame: Frame,
+    electrons: float,
+    amplitude: float,
+    period: float,
+    rng: np.random.Generator,
+    out: Frame | None = None,
+) -> Frame:
     """Add fringes of the sky background to a frame: a pattern of the detector that is the same in every exposure.
 
     Parameters
@@ -52,6 +59,8 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
         Mean distance between neighbouring fringes in pixels, 4 to 1e5.
     rng : numpy.random.Generator
         Random generator of the detector, in the same state in every exposure, so that the fringes do not change.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -72,7 +81,7 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
         raise OutOfRange("fringes", amplitude, 0.0, 1.0)
     if not 4.0 <= period <= 1e5:
         raise OutOfRange("period of fringes", period, 4.0, 1e5)
-    out = np.array(frame, dtype=float, order="C")
+    out = copy_frame(frame, out)
     if amplitude == 0.0 or electrons == 0.0 or not out.size:
         return out
     nodes = phase(frame.shape[1], frame.shape[0], period, rng)
@@ -164,4 +173,4 @@ def _contribution(scene: Scene) -> float:
     return electrons * amplitude
 
 
-EFFECT = Effect("fringes", apply, parameters, _contribution, fixed=True, cost=6e-3)
+EFFECT = Effect("fringes", apply, parameters, _contribution, fixed=True, cost=6e-3, in_place=True)

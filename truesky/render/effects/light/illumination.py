@@ -11,11 +11,8 @@ import numpy as np
 
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.render.camera import detectors as camera_detectors
-from truesky.render.effects.effect import Effect, copy_frame
+from truesky.render.effects.effect import Effect, copy_frame, row_blocks
 from truesky.render.effects.scene import Frame, Scene
-
-# Number of rows that are multiplied together.
-_ROWS = 64
 
 
 def apply(
@@ -53,11 +50,10 @@ def apply(
     if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
         raise OutOfRange("illumination", 1.0 + float(columns.min() + rows.min()), 0.0, np.inf)
     out = copy_frame(frame, out)
-    # A few rows of the map stay in the cache of the processor; the whole map does not.
-    for first in range(0, len(rows), _ROWS):
-        block = columns + rows[first : first + _ROWS, None]
-        block += 1.0
-        out[..., first : first + _ROWS, :] *= block
+    for block in row_blocks(out):
+        illumination = columns + rows[block, None]
+        illumination += 1.0
+        out[..., block, :] *= illumination
     return out
 
 

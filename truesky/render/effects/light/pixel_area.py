@@ -13,7 +13,7 @@ from lake_schema.errors import OutOfRange
 from truesky.numerics import matrices
 from truesky.render.camera import distortion
 from truesky.render.camera.pointing import ARCSEC
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame, row_blocks
 from truesky.render.effects.scene import Frame, Scene
 
 # The largest change of the sky area on a detector is found from pixels that are this number of pixels apart. The change
@@ -22,7 +22,13 @@ _SAMPLE_STEP = 64
 
 
 def apply(
-    frame: Frame, electrons: float, u: Frame, v: Frame, stretch: Frame, rng: np.random.Generator | None = None
+    frame: Frame,
+    electrons: float,
+    u: Frame,
+    v: Frame,
+    stretch: Frame,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Add the change of the sky background that is caused by the different sky areas of pixels.
 
@@ -40,6 +46,8 @@ def apply(
         Coefficients of u^p v^q, at index [p, q], of the sky area of a pixel relative to the boresight, minus 1.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -53,8 +61,10 @@ def apply(
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
-    out = area_change(u, v, electrons * stretch)
-    out += frame
+    out = copy_frame(frame, out)
+    along, across = _area_factors(u, v, electrons * stretch)
+    for rows in row_blocks(out):
+        out[rows] += matrices.matmul(along[rows], across)
     return out
 
 
@@ -79,8 +89,13 @@ def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
     -----
     The error is 1e-4, because the product of the changes by distortion and by projection is neglected.
     """
+    return np.asarray(matrices.matmul(*_area_factors(u, v, stretch)))
+
+
+def _area_factors(u: Frame, v: Frame, stretch: Frame) -> tuple[Frame, Frame]:
+    """Return two matrices, (ny, m) and (m, nx), whose product is the result of `area_change`."""
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
-    return np.asarray(matrices.matmul(along, matrices.matmul(stretch.T, across.T)))
+    return np.asarray(along, float), np.asarray(matrices.matmul(stretch.T, across.T))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
@@ -114,4 +129,4 @@ def _contribution(scene: Scene) -> float:
     return electrons * float(np.abs(area_change(sampled_u, sampled_v, stretch)).max(initial=0.0))
 
 
-EFFECT = Effect("pixel_area", apply, parameters, _contribution, cost=5e-3)
+EFFECT = Effect("pixel_area", apply, parameters, _contribution, cost=5e-3, in_place=True)

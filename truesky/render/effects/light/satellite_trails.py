@@ -17,7 +17,7 @@ from truesky.numerics.compiling import jit
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.camera import distortion
 from truesky.render.camera.detectors import Detector
-from truesky.render.effects.effect import Effect, zero_contribution
+from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 # Distance in pixels between computed points of a satellite trail, which is drawn as a straight line between them.
@@ -74,7 +74,13 @@ class Blur(NamedTuple):
 
 
 def apply(
-    frame: Frame, satellites: Satellites, blur: Blur, detector: Detector | None, radius: float, rng: np.random.Generator
+    frame: Frame,
+    satellites: Satellites,
+    blur: Blur,
+    detector: Detector | None,
+    radius: float,
+    rng: np.random.Generator,
+    out: Frame | None = None,
 ) -> Frame:
     """Draw the random satellites of an exposure, and add the trails that cross a frame.
 
@@ -92,6 +98,8 @@ def apply(
         Radius of the circle around the field in arcsec.
     rng : numpy.random.Generator
         Random generator of the exposure, in the same state for all detectors, so that they see the same satellites.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -110,7 +118,7 @@ def apply(
     """
     if not 0.0 <= satellites.number < 1e4:
         raise OutOfRange("satellites of an exposure", satellites.number, 0.0, 1e4)
-    out, trail_profile = np.array(frame, dtype=float, order="C"), profile(blur)
+    out, trail_profile = copy_frame(frame, out), profile(blur)
     for _ in range(int(rng.poisson(satellites.number))):
         direction, offset, deviate = np.pi * rng.random(), radius * (2.0 * rng.random() - 1.0), rng.standard_normal()
         fainter = satellites.spread * float(np.clip(deviate, -_MAX_SIGMA, _MAX_SIGMA))
@@ -266,5 +274,12 @@ def _contribution(scene: Scene) -> float:
 # `systematic` (the part of the effect that remains in a mean of exposures) is 0, because each exposure has different
 # satellites.
 EFFECT = Effect(
-    "satellite_trails", apply, parameters, _contribution, shared=True, cost=3e-3, systematic=zero_contribution
+    "satellite_trails",
+    apply,
+    parameters,
+    _contribution,
+    shared=True,
+    cost=3e-3,
+    systematic=zero_contribution,
+    in_place=True,
 )

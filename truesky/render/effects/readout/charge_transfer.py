@@ -15,7 +15,7 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect
+from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.readout import traps
 from truesky.render.effects.readout.traps import Sweeps, Traps
 from truesky.render.effects.scene import Frame, Scene
@@ -176,7 +176,9 @@ def silicon_traps(scene: Scene, direction: str) -> Traps:
     )
 
 
-def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
+def apply_parallel_loss(
+    frame: Frame, loss: float, rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
     """Leave a fraction of each charge packet behind in the next packet, at each transfer down the columns.
 
     Parameters
@@ -187,6 +189,8 @@ def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | No
         Fraction of a packet that each transfer leaves to the next packet, 0 to 1e-3.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -203,10 +207,12 @@ def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | No
     As an approximation, charge that falls back by more than two packets is added to the second packet behind. For a
     loss of 1e-6 and a few thousand transfers, the error is 2e-8 of a packet. It grows with the third power of the loss.
     """
-    return _defer_charge(frame, loss, along=False)
+    return _defer_charge(frame, loss, along=False, out=out)
 
 
-def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
+def apply_serial_loss(
+    frame: Frame, loss: float, rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
     """Leave a fraction of each charge packet behind in the next packet, at each transfer along the serial register.
 
     Parameters
@@ -217,6 +223,8 @@ def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None
         Fraction of a packet that each transfer leaves to the next packet, 0 to 1e-3.
     rng : numpy.random.Generator, optional
         Not used.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
 
     Returns
     -------
@@ -232,40 +240,65 @@ def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None
     -----
     As an approximation, charge that falls back by more than two packets is added to the second packet behind.
     """
-    return _defer_charge(frame, loss, along=True)
+    return _defer_charge(frame, loss, along=True, out=out)
 
 
-def _defer_charge(frame: Frame, loss: float, along: bool) -> Frame:
+def _defer_charge(frame: Frame, loss: float, along: bool, out: Frame | None) -> Frame:
     if not 0.0 <= loss <= _MAX_LOSS:
         raise OutOfRange("charge lost in a transfer", loss, 0.0, _MAX_LOSS)
     transfers = np.arange(1.0, frame.shape[-1 if along else -2] + 1.0)
     staying = (1.0 - loss) ** transfers
     to_next = transfers * loss * staying
-    packets = np.ascontiguousarray(frame, dtype=float)
-    out = np.empty(packets.shape)
-    shape = -1, *packets.shape[-2:]
-    _defer_packets(packets.reshape(shape), staying, to_next, 1.0 - staying - to_next, along, out.reshape(shape))
+    out = copy_frame(frame, out)
+    defer_packets = _defer_along_rows if along else _defer_down_columns
+    defer_packets(out.reshape(-1, *out.shape[-2:]), staying, to_next, 1.0 - staying - to_next)
     return out
 
 
 @jit
-def _defer_packets(frame: Any, staying: Any, to_next: Any, to_second: Any, along: bool, out: Any) -> None:
-    """Fill `out` with the charge of each packet after all transfers along the rows (if `along`) or down the columns.
+def _defer_down_columns(frame: Any, staying: Any, to_next: Any, to_second: Any) -> None:
+    """Replace the charge of each packet by that after all transfers down the columns, in place.
 
-    `frame` and `out` have the axes [amplifier, row, column], in electrons, with the pixel at [0, 0] read first.
-    `staying`, `to_next` and `to_second` are the fractions of a packet that remain in it, that join the packet read
-    next, and that join the one after it. Their index is the column (if `along`) or row in which the packet starts.
+    `frame` has the axes [amplifier, row, column], in electrons, with the pixel at [0, 0] read first. `staying`,
+    `to_next` and `to_second` are the fractions of a packet that remain in it, that join the packet read next, and that
+    join the one after it. Their index is the row in which the packet starts.
     """
     for q in range(len(frame)):
+        # Start with the last row, because each row depends on rows before it.
+        for r in range(frame.shape[1] - 1, -1, -1):
+            row = frame[q, r]
+            if r == 0:
+                for c in range(len(row)):
+                    row[c] = row[c] * staying[0]
+            elif r == 1:
+                first = frame[q, 0]
+                for c in range(len(row)):
+                    row[c] = row[c] * staying[1] + first[c] * to_next[0]
+            else:
+                second, first = frame[q, r - 2], frame[q, r - 1]
+                for c in range(len(row)):
+                    row[c] = row[c] * staying[r] + first[c] * to_next[r - 1] + second[c] * to_second[r - 2]
+
+
+@jit
+def _defer_along_rows(frame: Any, staying: Any, to_next: Any, to_second: Any) -> None:
+    """Replace the charge of each packet by that after all transfers along the serial register, in place.
+
+    The arguments have the same meaning as for `_defer_down_columns`, except that the index of the fractions is the
+    column in which the packet starts.
+    """
+    nx = frame.shape[2]
+    line = np.empty(nx)
+    for q in range(len(frame)):
         for r in range(frame.shape[1]):
-            row_in, row_out = frame[q, r], out[q, r]
-            for c in range(len(row_in)):
-                i = c if along else r
-                row_out[c] = row_in[c] * staying[i]
-                if i > 0:
-                    row_out[c] += (row_in[c - 1] if along else frame[q, r - 1, c]) * to_next[i - 1]
-                if i > 1:
-                    row_out[c] += (row_in[c - 2] if along else frame[q, r - 2, c]) * to_second[i - 2]
+            row = frame[q, r]
+            line[:] = row
+            for c in range(nx):
+                row[c] = line[c] * staying[c]
+            for c in range(1, nx):
+                row[c] += line[c - 1] * to_next[c - 1]
+            for c in range(2, nx):
+                row[c] += line[c - 2] * to_second[c - 2]
 
 
 def _transfer_loss(scene: Scene, direction: str) -> float:
@@ -369,6 +402,7 @@ PARALLEL_LOSS = Effect(
     lambda scene: (_transfer_loss(scene, "parallel"),),
     lambda scene: _max_deferred(scene, "parallel"),
     cost=2e-3,
+    in_place=True,
 )
 SERIAL_LOSS = Effect(
     "serial_loss",
@@ -376,4 +410,5 @@ SERIAL_LOSS = Effect(
     lambda scene: (_transfer_loss(scene, "serial"),),
     lambda scene: _max_deferred(scene, "serial"),
     cost=2e-3,
+    in_place=True,
 )

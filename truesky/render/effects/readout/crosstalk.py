@@ -74,16 +74,17 @@ def remove(frame: Frame, coefficients: Frame) -> Frame:
 
 @jit
 def _mix(frame: Any, coefficients: Any) -> None:
+    """Add the crosstalk to a frame [amplifier, pixel] in place."""
+    block = np.empty((len(frame), _BLOCK))
     # Add the crosstalk to `_BLOCK` pixels of all amplifiers before the next pixels: these fit into the processor's
     # cache.
-    signals = np.empty((len(frame), _BLOCK))
     for start in range(0, frame.shape[1], _BLOCK):
-        lines = frame[:, start : start + _BLOCK]
-        signals[:, : lines.shape[1]] = lines
+        size = min(_BLOCK, frame.shape[1] - start)
+        block[:, :size] = frame[:, start : start + size]
         for victim in range(len(frame)):
-            line = lines[victim]
+            line = frame[victim, start : start + size]
             for source in range(len(frame)):
-                share, other = coefficients[victim, source], signals[source]
+                share, other = coefficients[victim, source], block[source]
                 if source != victim and share != 0.0:
                     for i in range(len(line)):
                         line[i] += share * other[i]

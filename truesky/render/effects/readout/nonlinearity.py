@@ -24,7 +24,7 @@ from truesky.render.effects.series import SMALL, small_expm1
 # Number of steps of Newton's method in `linearise`. Each doubles the number of correct digits, because the function
 # that is inverted is smooth: its slope increases from 1 - `low` (at least 0.01) for no signal to 1 for strong signals.
 _ITERATIONS = 6
-# Number of pixels that are treated together, so that they fit into the cache of the processor.
+# Number of pixels whose input is kept while their output replaces it.
 _BLOCK = 1024
 
 
@@ -71,26 +71,40 @@ def apply(
         If `high`, `saturation`, `low` or `knee` is outside its limits or NaN.
     """
     _check_parameters(high, saturation, low, knee)
+    if np.all(np.equal(low, 0.0)):
+        return map_pixels(_saturate, frame, high / saturation, out=out)
     return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee, out=out)
 
 
 @jit
+def _saturate(pixels: Any, high: float) -> None:
+    """Convert electrons to the output of an amplifier that loses no first electrons, in place.
+
+    `high` is the relative loss of signal per electron in the pixel, due to saturation.
+    """
+    for i in range(len(pixels)):
+        light = max(pixels[i], 0.0)
+        pixels[i] = min(pixels[i], 0.0) + light / (1.0 + high * light)
+
+
+@jit
 def _respond(pixels: Any, high: float, low: float, inverse: float) -> None:
-    """Replace the electrons of pixels by the output of an amplifier, in place.
+    """Convert electrons to the output of an amplifier, in place.
 
     `high` is the relative loss of signal per electron in the pixel, due to saturation. `low` is the number of electrons
     that are missing in any strong signal. `inverse` is 1 / (scale in electrons over which this loss is reached).
     """
-    light = np.empty(_BLOCK)
-    for first in range(0, len(pixels), _BLOCK):
-        signal = pixels[first : first + _BLOCK]
-        light[: len(signal)] = signal
-        for i in range(len(signal)):
+    light_of_block = np.empty(_BLOCK)
+    for start in range(0, len(pixels), _BLOCK):
+        signal = pixels[start : start + _BLOCK]
+        light = light_of_block[: len(signal)]
+        light[:] = signal
+        for i in range(len(light)):
             response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
             signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
         # Compute the brighter pixels, for which the power series in `small_expm1` is not accurate, again. An `if` in
         # the first loop would prevent its vectorisation, which costs more than computing a few pixels twice.
-        for i in range(len(signal)):
+        for i in range(len(light)):
             if light[i] * inverse > SMALL:
                 response = light[i] / (1.0 + high * light[i])
                 signal[i] = response + low * np.expm1(-response * inverse)

@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Int
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.render.camera.amplifiers import Layout
 from truesky.render.camera.sections import Section, Sections
@@ -85,6 +86,46 @@ def apply(
         part = frame[y : y + half_y, x : x + half_x]
         out[number, :half_y, prescan : prescan + half_x] = to_detector_axes(part, number)
     return out
+
+
+def readout_places(
+    pixels: tuple[Int, Int],
+    shape: tuple[int, int],
+    prescan: int,
+    overscan: int,
+    rows: int,
+    injection_rows: int = 0,
+) -> tuple[Int, tuple[int, int, int]]:
+    """Return where n pixels of a detector are in the result of `apply`.
+
+    Parameters
+    ----------
+    pixels : (int64 array, int64 array), each of shape (n,)
+        Rows and columns of the pixels on the detector.
+    shape : (int, int)
+        Number of rows and columns of the detector.
+    prescan, overscan : int
+        Number of columns that are read before and after the pixels of a quadrant.
+    rows : int
+        Number of overscan rows that are read after the pixels of a quadrant.
+    injection_rows : int, optional
+        Number of rows between the halves of the detector, which are not read.
+
+    Returns
+    -------
+    places : int64 array, shape (n, 3)
+        Quadrant, row and column of each pixel; -1 for pixels that are not read.
+    shape : (int, int, int)
+        Shape of the result of `apply`.
+    """
+    (row, column), (ny, nx) = pixels, shape
+    half_y, half_x = (ny - injection_rows) // 2, nx // 2
+    is_upper, is_right = row >= half_y + injection_rows, column >= half_x
+    quadrant = np.where(is_upper, is_right, 3 - is_right)
+    place_row = np.where(is_upper, ny - 1 - row, row)
+    places = np.column_stack([quadrant, place_row, prescan + np.where(is_right, nx - 1 - column, column)])
+    places[(row >= half_y) & ~is_upper] = -1
+    return places, (4, half_y + rows, prescan + half_x + overscan)
 
 
 def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:

@@ -50,8 +50,13 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator, out: Fra
 @jit
 def _add(pixels: Any, sigma: float, key: Any, first: int) -> None:
     """Add Gaussian noise to pixels, in place. Pixel `i` has the random bits of index `first` + i with the key `key`."""
-    for i in range(len(pixels)):
-        pixels[i] += sigma * pixel_random.normal(pixel_random.pixel_bits(key, first + i))
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    for start in range(0, len(pixels), pixel_random.BLOCK):
+        block = pixels[start : start + pixel_random.BLOCK]
+        noise = normals[: len(block)]
+        pixel_random.fill_normals(noise, bits, key, first + start)
+        for i in range(len(block)):
+            block[i] += sigma * noise[i]
 
 
 def _sigma(scene: Scene) -> float | Float:

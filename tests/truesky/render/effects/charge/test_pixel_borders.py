@@ -89,6 +89,64 @@ def test_sources_are_displaced_as_all_their_light_is(sigma, moved, widened):
         assert abs(change) < widened * 2.0 * sigma**2
 
 
+def crossed(frame, columns, rows, component=lambda along, across: 0.0):
+    """Return a frame after charge crossed all borders: the slow calculation, one border after the other.
+
+    `component` is the displacement along one axis at a position along and across it, in addition to `columns` and
+    `rows`.
+    """
+    out = frame.copy()
+    for line, changed, shifts in ((frame, out, columns), (frame.T, out.T, rows)):
+        n = line.shape[1]
+        for r, c in np.ndindex(len(line), n - 1):
+            d = shifts[c] + component((c + 0.5, r) if line is frame else (r, c + 0.5), line is frame)
+            q1, q2 = line[r, c], line[r, c + 1]
+            level = 0.5 * (q1 + q2)
+            if 0 < c < n - 2:
+                level = (7.0 * (q1 + q2) - line[r, c - 1] - line[r, c + 2]) / 12.0
+            moved = np.clip(d * (level - 0.5 * d * (q2 - q1)), -0.2 * q2, 0.2 * q1)
+            changed[r, c] -= moved
+            changed[r, c + 1] += moved
+    return out
+
+
+SHAPES = [(1, 1), (1, 7), (7, 1), (2, 2), (3, 2), (2, 3), (4, 5), (40, 33)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rings_are_those_of_the_slow_calculation(shape):
+    frame = 10.0 ** np.random.default_rng(4).uniform(0, 4, shape)
+    rng = np.random.default_rng(3)
+    side, phase = np.sign(rng.random(2) - 0.5), 2 * np.pi * rng.random()
+    axis = [(n - 1) / 2 + 20.0 * sign for n, sign in zip(shape[::-1], side, strict=True)]
+    near, far = pixel_borders.distance_range(*shape[::-1], tuple(axis))
+    table = pixel_borders.radial_displacement(0.05, (8.0, 12.0), phase, near, far)
+
+    def component(place, along_row):
+        x, y = np.subtract(place, axis)
+        distance = np.hypot(x, y)
+        return np.interp(distance, near + 0.25 * np.arange(len(table)), table) * (x if along_row else y) / distance
+
+    found = pixel_borders.apply_rings(frame, 0.05, 8.0, 12.0, 20.0, np.random.default_rng(3))
+    expected = crossed(frame, np.zeros(shape[1]), np.zeros(shape[0]), component)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    assert shape == (1, 1) or np.abs(found - frame).max() > 1e-3
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("length", [0.3, 5.0])
+def test_edges_are_those_of_the_slow_calculation(shape, length):
+    frame = 10.0 ** np.random.default_rng(4).uniform(0, 4, shape)
+    shifts = []
+    for n in shape[::-1]:
+        to_start = np.arange(n) + 1.0
+        to_end = n - to_start
+        shift = 0.2 * (np.exp(-to_end / length) - np.exp(-to_start / length))
+        shifts.append(np.where(np.minimum(to_start, to_end) < 8.0 * length, shift, 0.0))
+    found = pixel_borders.apply_edges(frame, 0.2, length)
+    np.testing.assert_allclose(found, crossed(frame, *shifts), rtol=1e-9, atol=1e-9)
+
+
 def test_charge_stays_and_nothing_is_negative():
     frame = 10.0 ** np.random.default_rng(1).uniform(0, 5, (60, 70))
     for out in (
