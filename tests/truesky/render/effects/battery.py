@@ -143,8 +143,8 @@ _CASES = (
     Case("illumination", bowl, flat, linear=True),
     Case(
         "pixel_response",
-        lambda shape: (0.01, 1e-2, 1.0, DUST, columns(shape)),
-        lambda shape: (0.0, 0.0, 0.0, (0.0, 3.0, 0.2), columns(shape)),
+        lambda shape: (0.01, (1e-2, 1.0), DUST, columns(shape)),
+        lambda shape: (0.0, (0.0, 0.0), (0.0, 3.0, 0.2), columns(shape)),
         linear=True,
     ),
     Case("tree_rings", (0.03, 5.0, 3.0, 9.0), (0.0, 5.0, 3.0, 9.0), linear=True, conserves=True),
@@ -154,7 +154,7 @@ _CASES = (
     Case("calibration_lamp", lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False),
     Case(
         "readout_trail",
-        lambda shape: (6e-5, 2, (0.01, 1e-2, 1.0, DUST, columns(shape))),
+        lambda shape: (6e-5, 2, (0.01, (1e-2, 1.0), DUST, columns(shape))),
         (0.0, 2),
         linear=True,
     ),

@@ -12,7 +12,7 @@ NY, NX = 61, 83
 SEGMENTS = (0, 30, False), (33, NY, True)
 # Function, frame of the whole detector and parameters. All kinds of defects are frequent.
 PATTERNS = {
-    "pixel_response": (pixel_response.apply, (NY, NX), (0.1, 0.05, 30.0, (5e-3, 3.0, 0.5), SEGMENTS)),
+    "pixel_response": (pixel_response.apply, (NY, NX), (0.1, (0.05, 30.0), (5e-3, 3.0, 0.5), SEGMENTS)),
     "dark_map": (dark_map.apply, (NY, NX), (3.0, 0.5, 0.05, 300.0)),
     "hot_pixels": (dark_current.apply_hot, (NY, NX), (0.05, 300.0)),
     "ramp_nonlinearity": (ramp_nonlinearity.apply, (3, NY, NX), (1e-6, 0.3)),

@@ -337,7 +337,7 @@ def halves(ny):
 def test_columns_of_one_register_are_blind_to_their_far_end():
     pieces = [(0, 40, False)], [(0, 40, True)], [(0, 10, False), (12, 40, False)]
     maps = [
-        pixel_response.response((40, 300), 0.0, 0.0, 90.0, CLEAN, runs, np.random.default_rng(3)) == 0
+        pixel_response.response((40, 300), 0.0, (0.0, 90.0), CLEAN, runs, np.random.default_rng(3)) == 0
         for runs in pieces
     ]
     assert (np.diff(maps[0].astype(int), axis=0) >= 0).all()
@@ -348,7 +348,7 @@ def test_columns_of_one_register_are_blind_to_their_far_end():
 
 
 def test_the_response_of_pixels():
-    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, CLEAN, halves(600), np.random.default_rng(2))
+    response = pixel_response.response((600, 500), 0.01, (1e-3, 3.0), CLEAN, halves(600), np.random.default_rng(2))
     good = response > 0.6
     assert response[good].std() == pytest.approx(0.01, rel=0.02)
     assert response[good].mean() == pytest.approx(1.0, abs=1e-4)
@@ -357,7 +357,7 @@ def test_the_response_of_pixels():
     assert ((response > 0) & ~good).sum() == pytest.approx(300, abs=80)
     assert pixel_response.EFFECT.fixed
     # A defect hides what lies behind it, as seen from its own register: up to the middle, and no farther.
-    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, CLEAN, halves(40), np.random.default_rng(3)) == 0
+    many = pixel_response.response((40, 500), 0.0, (0.0, 200.0), CLEAN, halves(40), np.random.default_rng(3)) == 0
     below, above = many[:20], many[20:][::-1]
     assert below.any()
     assert above.any()
@@ -370,14 +370,14 @@ def test_dust_casts_shadows():
     """Shadows have the stated number, depth and mean width."""
     grains, radius, depth = 2e-4, 2.0, 0.3
     dust = (grains, radius, depth)
-    dusty = pixel_response.response((1000, 900), 0.0, 0.0, 0.0, dust, halves(1000), np.random.default_rng(4))
+    dusty = pixel_response.response((1000, 900), 0.0, (0.0, 0.0), dust, halves(1000), np.random.default_rng(4))
     # Two may lie on each other.
     assert (1 - depth) ** 2 * 0.99 < dusty.min() < 1 - 0.95 * depth
     # A Gaussian shadow lacks 2 pi size^2 of the light; the mean of size^2 is twice the square of the mean size.
     missing = grains * dusty.size * depth * 2 * np.pi * 2 * radius**2
     assert (1 - dusty).sum() == pytest.approx(missing, rel=0.25)
     # The other defects are where they are without.
-    defects = (0.01, 1e-3, 3.0)
+    defects = (0.01, (1e-3, 3.0))
     clean, same = (
         pixel_response.response((300, 200), *defects, dust, halves(300), np.random.default_rng(2))
         for dust in (CLEAN, (1e-4, radius, depth))
@@ -391,8 +391,8 @@ def test_dust_casts_shadows():
 @pytest.mark.parametrize(
     "wrong",
     [
-        (-1.0, 0.0, 0.0, CLEAN), (0.0, 2.0, 0.0, CLEAN), (0.0, 0.0, -1.0, CLEAN), (np.nan, 0.0, 0.0, CLEAN),
-        (0.0, 0.0, 0.0, (-1.0, 1.0, 0.1)), (0.0, 0.0, 0.0, (0.0, np.inf, 0.1)), (0.0, 0.0, 0.0, (0.0, 1.0, 1.1)),
+        (-1.0, (0.0, 0.0), CLEAN), (0.0, (2.0, 0.0), CLEAN), (0.0, (0.0, -1.0), CLEAN), (np.nan, (0.0, 0.0), CLEAN),
+        *((0.0, (0.0, 0.0), dust) for dust in ((-1.0, 1.0, 0.1), (0.0, np.inf, 0.1), (0.0, 1.0, 1.1))),
     ],
 )  # fmt: skip
 def test_impossible_responses_are_refused(wrong):
@@ -524,7 +524,7 @@ def test_a_quicklook_has_no_scatter_between_pixels_but_all_defects():
     for accuracy in (DRAFT, SURVEY):
         assert of_science.parameters(scene(accuracy=accuracy))[0] == scatter
     frame = np.full((64, 48), 100.0)
-    seen = pixel_response.apply(frame, 0.0, 0.02, 3.0, (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
-    full = pixel_response.apply(frame, 1e-9, 0.02, 3.0, (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
+    seen = pixel_response.apply(frame, 0.0, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
+    full = pixel_response.apply(frame, 1e-9, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
     np.testing.assert_allclose(seen, full, rtol=1e-7)
     assert np.unique(seen).size > 100

@@ -19,10 +19,10 @@ from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 # Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
 # is above the part and False if it is below).
 Segments = Sequence[tuple[int, int, bool]]
-# Parameters of the function `response`: standard deviation of the sensitivity between pixels, fraction of dead pixels,
-# mean number of dark columns, three numbers for dust (grains per pixel, mean radius of shadows in pixels, absorbed
+# Parameters of the function `response`: standard deviation of the sensitivity between pixels, fraction of dead pixels
+# and mean number of dark columns, three numbers for dust (grains per pixel, mean radius of shadows in pixels, absorbed
 # fraction of the light), and parts of the columns (`Segments`).
-Parameters = tuple[float, float, float, tuple[float, float, float], Segments]
+Parameters = tuple[float, tuple[float, float], tuple[float, float, float], Segments]
 
 # Highest sensitivity of a dead pixel, relative to a normal pixel. It is uniform between 0 and this.
 _MAX_DEAD = 0.5
@@ -37,8 +37,7 @@ FLUX_ERROR, SHAPE_ERROR, POSITION_ERROR = 0.6, 0.5, 0.4
 def apply(
     frame: Frame,
     rms: float,
-    dead: float,
-    dark_columns: float,
+    defects: tuple[float, float],
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
@@ -53,11 +52,9 @@ def apply(
         Electrons.
     rms : float
         Standard deviation of the sensitivity between pixels, 0 to 1.
-    dead : float
-        Fraction of dead pixels, 0 to 1.
-    dark_columns : float
-        Mean number of dark columns, 0 to 1e4. A dark column has no signal on the far side of a defect, as seen from the
-        serial register.
+    defects : (float, float)
+        Fraction of dead pixels (0 to 1), and mean number of dark columns (0 to 1e4). A dark column has no signal on the
+        far side of a defect, as seen from the serial register.
     dust : (float, float, float)
         Dust grains per pixel (0 to 0.1), mean radius (Gaussian sigma) of their shadows in pixels (0 to 1000), and
         fraction of light absorbed at the centre of a shadow (0 to 1).
@@ -81,14 +78,13 @@ def apply(
     OutOfRange
         If a number is outside its limits or NaN.
     """
-    return _multiply_response(copy_frame(frame, out), (rms, dead, dark_columns, dust, segments), rng, part)
+    return _multiply_response(copy_frame(frame, out), (rms, defects, dust, segments), rng, part)
 
 
 def response(
     shape: tuple[int, ...],
     rms: float,
-    dead: float,
-    dark_columns: float,
+    defects: tuple[float, float],
     dust: tuple[float, float, float],
     segments: Segments,
     rng: np.random.Generator,
@@ -102,11 +98,10 @@ def response(
         Number of rows and columns.
     rms : float
         Standard deviation of the sensitivity between pixels, 0 to 1.
-    dead : float
-        Fraction of dead pixels, 0 to 1. Their sensitivity is uniform between 0 and 0.5.
-    dark_columns : float
-        Mean number of dark columns, 0 to 1e4. Their number has a Poisson distribution. A dark column has a defect in a
-        random row. Pixels on the far side of the defect, as seen from the serial register, have a sensitivity of 0.
+    defects : (float, float)
+        Fraction of dead pixels (0 to 1), and mean number of dark columns (0 to 1e4). The sensitivity of a dead pixel is
+        uniform between 0 and 0.5. The number of dark columns has a Poisson distribution. A dark column has a defect in
+        a random row. Pixels on the far side of the defect, as seen from the serial register, have a sensitivity of 0.
     dust : (float, float, float)
         Mean number of dust grains per pixel (0 to 0.1), mean radius of their shadows in pixels (0 to 1000), and
         fraction of light absorbed at the centre of a shadow (0 to 1). A radius is the standard deviation of a Gaussian
@@ -127,16 +122,16 @@ def response(
     Raises
     ------
     OutOfRange
-        If `rms`, `dead`, `dark_columns` or a number of `dust` is outside its limits or NaN.
+        If `rms` or a number of `defects` or `dust` is outside its limits or NaN.
     """
-    return _multiply_response(np.ones(shape), (rms, dead, dark_columns, dust, segments), rng, part)
+    return _multiply_response(np.ones(shape), (rms, defects, dust, segments), rng, part)
 
 
 def _multiply_response(
     out: Frame, parameters: Parameters, rng: np.random.Generator, part: DetectorPart | None = None
 ) -> Frame:
     """Multiply a frame by the sensitivity of each pixel in place, and return it. `parameters` are as for `response`."""
-    rms, dead, dark_columns, (grains, radius, depth), segments = parameters
+    rms, (dead, dark_columns), (grains, radius, depth), segments = parameters
     for name, value, highest in (
         ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
         ("dust grains per pixel", grains, 0.1), ("dust radius", radius, 1e3), ("dust depth", depth, 1.0),
@@ -205,7 +200,7 @@ def parameters(scene: Scene) -> Parameters:
     """
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
-    return rms, dead, dark_columns, dust, scene.column_segments
+    return rms, (dead, dark_columns), dust, scene.column_segments
 
 
 def _sky_parameters(scene: Scene) -> Parameters:
@@ -214,15 +209,15 @@ def _sky_parameters(scene: Scene) -> Parameters:
     It is negligible if it changes the flux, the shape and the position of any star by less than the errors that the
     request accepts, and the sky by at most a tenth of the noise of a pixel. Dead pixels, dark columns and dust remain.
     """
-    rms, *defects = parameters(scene)
+    rms, defects, dust, segments = parameters(scene)
     accepted = scene.accuracy
     source_error = max(FLUX_ERROR / accepted.flux, SHAPE_ERROR / accepted.shape, POSITION_ERROR / accepted.position)
     is_negligible = rms * source_error <= 1.0 and rms * scene.sky_electrons <= NOTICEABLE * scene.pixel_noise
-    return 0.0 if is_negligible else rms, *defects
+    return 0.0 if is_negligible else rms, defects, dust, segments
 
 
 def _contribution(scene: Scene) -> float:
-    rms, dead, dark_columns, (grains, *_, depth), _ = parameters(scene)
+    rms, (dead, dark_columns), (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
     shadow = depth * (grains > 0)
     return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or dark_columns > 0), shadow))
