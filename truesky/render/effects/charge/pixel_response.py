@@ -222,11 +222,11 @@ def _sky_parameters(scene: Scene) -> Parameters:
     It is negligible if it changes the flux, the shape and the position of any star by less than the errors that the
     request accepts, and the sky by at most a tenth of the noise of a pixel. Dead pixels, dark columns and dust remain.
     """
-    rms, *defects = parameters(scene)
+    rms, defects, dust, segments = parameters(scene)
     accepted = scene.accuracy
     source_error = max(FLUX_ERROR / accepted.flux, SHAPE_ERROR / accepted.shape, POSITION_ERROR / accepted.position)
     is_negligible = rms * source_error <= 1.0 and rms * scene.sky_electrons <= NOTICEABLE * scene.pixel_noise
-    return 0.0 if is_negligible else rms, *defects
+    return 0.0 if is_negligible else rms, defects, dust, segments
 
 
 def _contribution(scene: Scene) -> float:
