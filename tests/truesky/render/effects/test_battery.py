@@ -66,10 +66,10 @@ def test_effects_in_place_have_the_same_result(name, off):
 
 
 def test_effects_of_vis_need_no_new_frame():
-    """Exceptions are a map of all pixels and the quadrants, which have other pixels than the frame."""
+    """Exceptions are the quadrants, which have other pixels than the frame, and effects of calibration frames."""
     new = {effect.name for effects in vis.EFFECTS.values() for effect in effects if not effect.in_place}
     assert new == {
-        "pixel_area", "quadrants", "readout_trail", "calibration_lamp", "charge_injection", "injection_noise",
+        "quadrants", "readout_trail", "calibration_lamp", "charge_injection", "injection_noise",
         "trap_pumping",
     }  # fmt: skip
 

@@ -524,7 +524,7 @@ def test_a_quicklook_has_no_scatter_between_pixels_but_all_defects():
     for accuracy in (DRAFT, SURVEY):
         assert of_science.parameters(scene(accuracy=accuracy))[0] == scatter
     frame = np.full((64, 48), 100.0)
-    seen = pixel_response.apply(frame, 0.0, 0.02, 3.0, (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
-    full = pixel_response.apply(frame, 1e-9, 0.02, 3.0, (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
+    seen = pixel_response.apply(frame, 0.0, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
+    full = pixel_response.apply(frame, 1e-9, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
     np.testing.assert_allclose(seen, full, rtol=1e-7)
     assert np.unique(seen).size > 100
