@@ -171,7 +171,7 @@ def parse_unit(text: str, where: str = "mission", allowed: str = "") -> u.UnitBa
 
     try:
         unit = u.Unit(text)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, ArithmeticError):
         raise BadInput(f"{where}: {text!r} is not a unit{f': the unit must be {allowed}' if allowed else ''}") from None
     if not isinstance(unit, u.UnitBase):
         # Refuse logarithmic units: astropy would convert a value in mag(um) to um without computing the power of ten.
@@ -196,7 +196,8 @@ def _conversion_factor(unit: str, to: str) -> float | None:
 
     try:
         factor = float(parse_unit(unit).to(parse_unit(to)))
-    except u.UnitsError:
+    except (u.UnitsError, ArithmeticError):
+        # The factor of units such as km^999 exceeds the range of numbers.
         return None
     return factor if math.isfinite(factor) else None
 

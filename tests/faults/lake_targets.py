@@ -215,12 +215,23 @@ def of_head(path):
 
 
 def of_progress(folder):
-    progress.read_state(folder)
+    state = progress.read_state(folder)
+    progress.time_left(state, 1.8e9)
+
+
+RUN_FILES = {
+    progress._RUN: {"jobs": [["build", 3.0]], "workers": 2},
+    progress._JOB: {"finished": [2.5], "job_started": 1.7e9},
+    progress._TABLES: {"tables_started": 1.7e9, "parts_of_job": 3},
+    progress._TABLE: {"name": "products", "unit": "detector", "parts": 3, "parts_before": 1, "receipts": "receipts"},
+    "activity-1-1.json": {"text": "map", "started": 1.7e9, "done": 1, "total": 2, "process": 1},
+}
 
 
 def run_folder(folder):
     folder.mkdir(parents=True)
-    (folder / progress._RUN).write_text(json.dumps({"jobs": [["build", 3.0]], "workers": 2}))
+    for name, content in RUN_FILES.items():
+        (folder / name).write_text(json.dumps(content))
 
 
 def slices(path):
@@ -257,7 +268,12 @@ TARGETS = {
     "link": (lambda: [b"v-0123456789abcdef", b"../../toy/v-0123456789abcdef"], of_link),
     "cache, checksums": folder_target(entry, lambda folder: folder / cache_entries.CHECKSUM_FILE, of_entry, ".json"),
     "cache, array": folder_target(entry, lambda folder: folder / "one.npy", of_array, ".npy"),
-    "progress of a run": folder_target(run_folder, lambda folder: folder / progress._RUN, of_progress, ".json"),
+    **{
+        f"progress of a run, {name}": folder_target(
+            run_folder, lambda folder, name=name: folder / name, of_progress, ".json"
+        )
+        for name in RUN_FILES
+    },
     "image": (lambda: [written(stored), written(packed)], read_back.frame, ".fits"),
     "calibrated image": (lambda: [written(calibrated)], reduction_files.read_image, ".fits"),
     "frame of a user": (

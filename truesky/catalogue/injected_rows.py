@@ -226,7 +226,7 @@ def _numbers(column: Any, where: str, title: str) -> Float:
             column = getattr(column, "value", column) if unit is not None else column
         values = column.to_numpy() if hasattr(column, "to_numpy") else column
         numbers = np.ma.filled(np.ma.asarray(values, float), np.nan) * factor
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         raise BadInput(f"{where} must hold numbers: {' '.join(str(error).split())[:200]}") from None
     if numbers.ndim != 1:
         got = "one number" if numbers.ndim == 0 else f"an array of shape {numbers.shape}"

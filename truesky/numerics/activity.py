@@ -20,6 +20,8 @@ SETTING = "TRUESKY_ACTIVITY"
 _PREFIX = "activity-"
 # Smallest time between two updates of the file of an activity, s.
 _UPDATE_INTERVAL = 0.2
+# Largest number in a file that is believed.
+_MOST = 1e15
 
 Item = TypeVar("Item")
 
@@ -98,10 +100,15 @@ def read_activities(folder: Path) -> list[Activity]:
     """Return the activities of all processes that are still running, the oldest first."""
     activities = []
     for path in folder.glob(f"{_PREFIX}*.json"):
-        with contextlib.suppress(OSError, ValueError, TypeError):
+        # A file that is damaged is left out, because activities are only shown.
+        with contextlib.suppress(OSError, ValueError, TypeError, OverflowError, RecursionError):
             activity = Activity(**json.loads(path.read_bytes()))
             os.kill(activity.process, 0)
-            activities.append(activity)
+            if isinstance(activity.text, str) and all(
+                isinstance(number, int | float) and 0 <= number <= _MOST
+                for number in (activity.started, activity.done, activity.total)
+            ):
+                activities.append(activity)
     return sorted(activities, key=lambda activity: activity.started)
 
 

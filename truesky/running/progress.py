@@ -22,6 +22,8 @@ from truesky.numerics.activity import Activity
 _RUN, _JOB, _TABLES, _TABLE = "run.json", "job.json", "tables.json", "table.json"
 # Average progress of a part on which a worker is working, as a fraction.
 _PART_IN_WORK = 0.5
+# Largest number in a file that is believed.
+_MOST = 1e15
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,26 +138,48 @@ def table_in_work(name: str, unit: str, receipts: Path, parts: int, parts_before
 
 
 def count_receipts(folder: Path) -> int:
-    """Return the number of finished parts, each of which has left a JSON file in the folder."""
-    return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
+    """Return the number of finished parts, each of which has left a JSON file in the folder; 0 if it is unreadable."""
+    try:
+        return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
+    except (OSError, ValueError):
+        return 0
 
 
 def read_state(folder: Path) -> RunState:
-    """Return the state of a run from the files in its folder; files that are not there yet are left out."""
+    """Return the state of a run from the files in its folder.
+
+    Files that are not there yet, or are damaged, are left out: the state is only shown.
+    """
     run, job, tables, table = (_read(folder / name) for name in (_RUN, _JOB, _TABLES, _TABLE))
-    if table:
-        receipts = table.pop("receipts", None)
-        table.setdefault("done", 0 if receipts is None else count_receipts(Path(receipts)))
+    jobs, finished = run.get("jobs"), job.get("finished")
+    pairs = jobs if isinstance(jobs, list) else []
     return RunState(
-        tuple((str(name), float(seconds)) for name, seconds in run.get("jobs", ())),
-        run.get("workers", 1),
-        tuple(job.get("finished", ())),
-        job.get("job_started", 0.0),
-        tables.get("tables_started", 0.0),
-        tables.get("parts_of_job", 0),
-        TableState(**table) if table else None,
+        tuple((str(pair[0]), _seconds(pair[1])) for pair in pairs if isinstance(pair, list) and len(pair) == 2),
+        max(_count(run.get("workers")), 1),
+        tuple(_seconds(value) for value in finished) if isinstance(finished, list) else (),
+        _seconds(job.get("job_started")),
+        _seconds(tables.get("tables_started")),
+        _count(tables.get("parts_of_job")),
+        _table_state(table) if table else None,
         tuple(activity.read_activities(folder)),
     )
+
+
+def _table_state(table: dict[str, Any]) -> TableState:
+    receipts = table.get("receipts")
+    done = _count(table["done"]) if "done" in table else count_receipts(Path(str(receipts))) if receipts else 0
+    name, unit = (str(table.get(key, "")) for key in ("name", "unit"))
+    return TableState(name, unit, _count(table.get("parts")), done, _count(table.get("parts_before")))
+
+
+def _seconds(value: object) -> float:
+    """Return a time that was read; 0 if it is no finite number of 0 or more."""
+    return float(value) if isinstance(value, int | float) and 0 <= value <= _MOST else 0.0
+
+
+def _count(value: object) -> int:
+    """Return a number of things that was read; 0 if it is no whole number of 0 or more."""
+    return value if isinstance(value, int) and 0 <= value <= _MOST else 0
 
 
 def time_left(state: RunState, now: float) -> float | None:
@@ -204,7 +228,7 @@ def _write(name: str, content: dict[str, object]) -> None:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        content: dict[str, Any] = json.loads(path.read_bytes())
-        return content
-    except (OSError, ValueError):
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
         return {}
+    return content if isinstance(content, dict) else {}

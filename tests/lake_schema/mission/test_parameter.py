@@ -101,6 +101,12 @@ def test_a_unit_without_a_finite_factor_is_refused(unit, words):
         convert(15.0, unit, "mm / pix", "here")
 
 
+@pytest.mark.parametrize("unit", ["1 / mm9223372036854775807", "km999999999", "1 / km999"])
+def test_a_unit_whose_factor_exceeds_the_range_of_numbers_is_refused(unit):
+    with pytest.raises(BadInput, match=r"^here: .*the unit must be 1 / mm4"):
+        convert(15.0, unit, "1 / mm4", "here")
+
+
 def test_the_zodiacal_table_is_the_published_one():
     table = {row[0]: row[1:] for row in resolve().numbers("env.zodi.map")}
     assert len(table) == 19

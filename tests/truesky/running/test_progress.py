@@ -44,6 +44,27 @@ def test_what_is_announced_is_read(tmp_path, monkeypatch):
     assert progress.time_left(state, 1e9) is None
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1]", "3", '"x"', "[" * 100_000, "{", '{"jobs": 3, "finished": 3, "name": 3, "receipts": 3, "parts": "x"}',
+        '{"jobs": [["a"], 3, "ab"], "workers": -1, "finished": ["x", null], "job_started": "x", "done": 1e400}',
+        '{"jobs": [["a", 1' + "0" * 400 + ']], "workers": NaN, "parts_of_job": 2.5, "receipts": "\\u0000"}',
+        '{"text": 3, "started": "x", "done": 1, "total": 2, "process": 1' + "0" * 30 + "}",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["run.json", "job.json", "tables.json", "table.json", "activity-1-1.json"])
+def test_a_damaged_file_is_left_out(tmp_path, name, text):
+    (tmp_path / "run.json").write_text('{"jobs": [["build", 3.0]]}')
+    (tmp_path / name).write_text(text)
+    state = progress.read_state(tmp_path)
+    assert state.workers == 1
+    assert state.activities == ()
+    assert all(seconds == 0.0 for seconds in state.finished)
+    left = progress.time_left(state, 1e9)
+    assert left is None or left >= 0.0
+
+
 def test_the_time_left_is_that_of_the_forecast_at_first():
     state = RunState(JOBS, 2, (), 1000.0)
     assert progress.time_left(RunState(), 1000.0) is None

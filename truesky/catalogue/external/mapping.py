@@ -498,8 +498,8 @@ def factor_of_unit(key: str, stored: str) -> float:
         for spelling_of_unit in (text, text.lower(), text.lower().rstrip("s")):
             try:
                 return float(units.Unit(spelling_of_unit).to(expected))
-            except ValueError:
-                # The text is not a unit of astropy, or does not convert.
+            except (ValueError, ArithmeticError):
+                # The text is not a unit of astropy, or does not convert, or the factor exceeds the range of numbers.
                 continue
     if expected:
         raise BadInput(f"has the unit {text[:40]}, but must be in {expected} or a unit that converts to it")
