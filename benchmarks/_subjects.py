@@ -83,8 +83,7 @@ def _ground(folder: Path, quick: bool, camera: str) -> Work:
     from truesky.request.from_toml import parse
 
     file = folder / "request.toml"
-    field, limits = (ext._QUICK_RADIUS, ext._BRIGHT) if quick else (ext._FIELD_RADIUS, ext._DEEP)
-    file.write_text(ext.request_text([ext.CAMERAS[camera]], field, limits), encoding="utf-8")
+    file.write_text(ext.one_detector_text(camera, quick), encoding="utf-8")
     request = parse(file)
     root = _detectors.make_lake(folder, request)
     facts = _detectors.plan_detector(root, ext.with_all_effects(request))

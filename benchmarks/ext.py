@@ -128,6 +128,12 @@ mjd = {camera.mjd!r}
     return f"{text}\n[products]\ntruth = []\n"
 
 
+def one_detector_text(name: str, quick: bool) -> str:
+    """Return a request for one detector of a camera of `CAMERAS`, as TOML; `quick` simulates only bright sources."""
+    radius, limits = (_QUICK_RADIUS, _BRIGHT) if quick else (_FIELD_RADIUS, _DEEP)
+    return request_text([CAMERAS[name]], radius, limits)
+
+
 def with_all_effects(request: Request) -> Request:
     """Return a copy of a request that switches on all optional effects of science images of ground cameras."""
     return replace(request, effects=Effects(on=tuple(effect.name for effect in ground.SKY if effect.optional)))

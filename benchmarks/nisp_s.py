@@ -47,7 +47,7 @@ _NUM_GALSIM = 8
 _STAMP = 32
 # Values of the mission parameter `nisp.spectra.selection`: all sources with noticeable light (the default), and sources
 # above flux limits.
-_NOTICEABLE, _FLUX_LIMITED = 0, 1
+NOTICEABLE, _FLUX_LIMITED = 0, 1
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed",
     "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
@@ -266,7 +266,7 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
     out |= measure_stages(root, full_task, folder)
-    file.write_text(request_text(quick, selection=_NOTICEABLE), encoding="utf-8")
+    file.write_text(request_text(quick, selection=NOTICEABLE), encoding="utf-8")
     default_task = plan_detector(root, with_all_effects(parse(file)))
     out |= measure_default_selection(root, default_task, folder, repeats)
     for name, variant in (("draft", request), ("reference", with_all_effects(request))):

@@ -15,7 +15,7 @@ def selection(tmp_path, **options):
 
 
 def test_the_default_selection_is_that_of_users(tmp_path):
-    assert selection(tmp_path, selection=nisp_s._NOTICEABLE) == resolve().value(NAME, "")
+    assert selection(tmp_path, selection=nisp_s.NOTICEABLE) == resolve().value(NAME, "")
 
 
 def test_other_figures_are_of_sources_above_flux_limits(tmp_path):
