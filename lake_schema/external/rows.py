@@ -7,6 +7,7 @@ determines its format, or its first bytes if the ending is unknown.
 from __future__ import annotations
 
 import gzip
+import os
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -239,8 +240,8 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if properties.is_file():
         lines = (line.partition("=") for line in user_files.read_text(properties, "request").splitlines())
         primary = {key.strip(): value.strip() for key, _, value in lines}.get("hats_primary_table_url", "")
-        if Path(primary).is_absolute() or ".." in Path(primary).parts or "\0" in primary:
-            # All files of a disc might be read.
+        # All files of a disc might be read through an absolute path or "..". A name may also be too long for a file.
+        if Path(primary).is_absolute() or ".." in Path(primary).parts or not os.path.isdir(folder / primary):
             raise BadInput(f"{properties}: hats_primary_table_url = {primary[:80]!r} is not a folder of the collection")
         folder = folder / primary
     data_folder = folder / "dataset" if (folder / "dataset").is_dir() else folder

@@ -31,7 +31,7 @@ def test_titles_of_any_length_are_refused(tmp_path):
         rows(path)
 
 
-@pytest.mark.parametrize("primary", ["/", "../other", "a/../..", "x\0"])
+@pytest.mark.parametrize("primary", ["/", "../other", "a/../..", "x\0", "x" * 300, "missing"])
 def test_the_catalogue_of_a_collection_is_a_folder_in_it(tmp_path, primary):
     """Otherwise all files of a disc might be read."""
     (tmp_path / "collection.properties").write_text(f"hats_primary_table_url = {primary}\n")
