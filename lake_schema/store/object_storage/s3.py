@@ -10,6 +10,7 @@ The objects of a lake are::
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import json
 import os
@@ -439,7 +440,8 @@ class ObjectPath:
         target = Path(self.store.copies.name).joinpath(*self.parts)
         target.mkdir(parents=True, exist_ok=True)
         for copy in copies:
-            if not (target / copy.name).exists():
+            # Another thread may have made the link.
+            with contextlib.suppress(FileExistsError):
                 os.link(copy, target / copy.name)
         return target
 

@@ -65,6 +65,7 @@ _LIGHT = (
     illumination.EFFECT,
 )
 _COUNTED = (
+    pixel_response.EFFECT,
     poisson.EFFECT,
     brighter_fatter.EFFECT,
 )
@@ -87,14 +88,13 @@ _READOUT = (
     adc.EFFECT,
 )
 
-SKY = (*_LIGHT, illumination.SHUTTER, pixel_response.SKY_EFFECT, *_COUNTED, *_CHARGE, *_READOUT)
+SKY = (*_LIGHT, illumination.SHUTTER, *_COUNTED, *_CHARGE, *_READOUT)
 # Effects of a flat. It is taken with an open shutter and contains sky and stars, and the trails of both during readout.
 # The lamp is switched off before the readout, and its brightness does not depend on the exposure time.
 FLAT = (
     *_LIGHT,
     readout_trail.EFFECT,
     calibration_lamp.EFFECT,
-    pixel_response.EFFECT,
     *_COUNTED,
     *_CHARGE,
     *_READOUT,

@@ -100,8 +100,8 @@ def read_sources(
         Distance beyond the circle, in arcsec, up to which sources are read if they exceed `min_flux`.
     min_flux : float
         Smallest flux in microjansky of sources outside the HEALPix cells that overlap the circle. Sources inside these
-        cells are read at any flux, up to `reach_arcsec` beyond the circle. If it is infinite (for exposures without
-        sources), no source of either kind is read.
+        cells are read at any flux up to `reach_arcsec` beyond the circle, and with the smaller of both limits farther
+        out. If it is infinite (for exposures without sources), no source of either kind is read.
     min_bright_flux : float
         Smallest flux in microjansky of sources still farther out, up to 1200 arcsec, from where diffraction spikes and
         outskirts may reach the detector. Infinite to read none of these.
@@ -132,8 +132,9 @@ def read_sources(
     cell = sky.parent(light[_CELL_COLUMN].to_numpy(), sky.MAX_ORDER, GENERATION_ORDER)
     brightness = light[flux[1]].to_numpy().astype(float)
     group = np.select([np.isin(cell, cells) for cells in (inner_cells, outer_cells)], [0, 1], 2)
-    shows = brightness >= np.array([-np.inf, min_flux, min_bright_flux])[group]
-    read_cells = np.unique(cell[shows])
+    shows = (group == 0) | (brightness >= np.array([-np.inf, min_flux, min_bright_flux])[group])
+    # All cells of the circle are read, so that a table of fluxes that lacks one of them is noticed.
+    read_cells = np.union1d(np.array(inner_cells, np.int64), cell[shows])
     is_read = np.isin(cell, read_cells)
     rows = catalogue.rows_in_cells(read_cells.tolist(), GENERATION_ORDER, list(dict.fromkeys([*columns, "ra", "dec"])))
     light, group, shows, brightness = (
@@ -143,7 +144,8 @@ def read_sources(
         brightness[is_read],
     )
     if len(rows) == len(light):
-        # Faint sources beyond the reach are in the cells of the circle only because cells are large.
+        # Remove faint sources that are in the cells of the circle only because cells are large. Tables of different
+        # lengths do not belong together, which the caller reports.
         reach = task["radius"] + deflection + reach_arcsec / 3600.0
         is_near = selection.within_radius(
             rows["ra"].to_numpy(), rows["dec"].to_numpy(), (task["ra"], task["dec"]), reach

@@ -14,7 +14,6 @@ from tests.truesky.render.fields import exposure
 from truesky.fluxes import passbands
 from truesky.randomness import rng
 from truesky.render.camera import astrometry, detectors
-from truesky.render.channels import vis
 from truesky.render.effects.charge import pixel_response
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.light import calibration_lamp, ghosts, illumination, intra_pixel, pixel_area, straylight
@@ -22,7 +21,6 @@ from truesky.render.effects.readout import readout_trail
 from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Lights, Scene
 from truesky.render.exposure import rendered_detector
 from truesky.render.psf import diffraction
-from truesky.request.accuracy import DRAFT, QUICKLOOK, SURVEY
 
 MISSION = resolve()
 PLACES = ("1-1", "3-4", "6-2")
@@ -483,48 +481,3 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
     # Without a response all pixels are equal, whatever the random numbers.
     alike, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": False}), stream)
     np.testing.assert_array_equal(alike, readout_trail.apply(frame, share, 2))
-
-
-# ------------------------------------------------------------------------------------------------ scatter of pixels
-
-
-def test_the_scatter_between_pixels_changes_stars_by_less_than_its_constants():
-    """Fits of flux, position, size and shear to 400 Gaussian stars at random positions; rms errors, good to 4 %."""
-    random, sigma, scatter, x = np.random.default_rng(1), 0.7, 1e-3, np.arange(-7, 8)
-    errors = []
-    for _ in range(400):
-        across, up = np.meshgrid(*(x - at for at in random.uniform(-0.5, 0.5, 2)))
-        star = np.exp(-(across**2 + up**2) / (2 * sigma**2))
-        star /= star.sum()
-        size = (across**2 + up**2) / (2 * sigma**2) - 1.0
-        shear = (across**2 - up**2) / sigma**2
-        slopes = np.stack([np.ones(star.shape), across / sigma**2, size, shear], axis=-1) * star[..., None]
-        change = scatter * star * random.standard_normal(star.shape)
-        alone = np.linalg.lstsq(slopes[..., :1].reshape(-1, 1), change.ravel())[0]
-        errors.append([*np.linalg.lstsq(slopes.reshape(-1, 4), change.ravel())[0], *alone])
-    flux, position, growth, shear, flux_alone = np.sqrt(np.mean(np.square(errors), axis=0)) / scatter
-    assert 0.5 * pixel_response.FLUX_ERROR < max(flux, flux_alone) < pixel_response.FLUX_ERROR
-    assert 0.5 * pixel_response.POSITION_ERROR < position < pixel_response.POSITION_ERROR
-    assert 0.5 * pixel_response.SHAPE_ERROR < max(shear, 0.64 * growth) < pixel_response.SHAPE_ERROR
-
-
-def test_a_quicklook_has_no_scatter_between_pixels_but_all_defects():
-    """Flats and finer accuracies have it, and so has a quicklook of a bright sky."""
-    of_science, of_flat = (
-        next(effect for effect in vis.EFFECTS[kind] if effect.name == "pixel_response") for kind in ("science", "flat")
-    )
-    quick = scene(accuracy=QUICKLOOK)
-    rms, *defects = of_science.parameters(quick)
-    assert rms == 0.0
-    scatter, *others = pixel_response.parameters(quick)
-    assert scatter > 0.0
-    assert defects == others
-    assert of_flat.parameters(quick)[0] == scatter
-    assert of_science.parameters(replace(quick, sky_rate=1e3 * quick.sky_rate))[0] == scatter
-    for accuracy in (DRAFT, SURVEY):
-        assert of_science.parameters(scene(accuracy=accuracy))[0] == scatter
-    frame = np.full((64, 48), 100.0)
-    seen = pixel_response.apply(frame, 0.0, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
-    full = pixel_response.apply(frame, 1e-9, (0.02, 3.0), (1e-2, 2.0, 0.5), halves(64), np.random.default_rng(3))
-    np.testing.assert_allclose(seen, full, rtol=1e-7)
-    assert np.unique(seen).size > 100

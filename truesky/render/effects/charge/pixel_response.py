@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from truesky.render.camera import windows
 from truesky.render.camera.windows import DetectorPart, Window
 from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, copy_frame
-from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
+from truesky.render.effects.scene import Frame, Scene
 
 # Parts of every column that are read through one serial register: each (first row, last row + 1, True if the register
 # is above the part and False if it is below).
@@ -28,10 +27,6 @@ Parameters = tuple[float, tuple[float, float], tuple[float, float, float], Segme
 _MAX_DEAD = 0.5
 # The Gaussian shadow of a dust grain is drawn up to this distance from its centre, in standard deviations.
 _SHADOW_RANGE = 4.0
-# Errors (rms) of a star's relative flux, reduced shear and position (pixels) that a scatter of the sensitivity between
-# pixels causes, divided by the scatter. They are for fits of a Gaussian star with a standard deviation of 0.7 pixels.
-# Wider sources cover more pixels and have smaller errors.
-FLUX_ERROR, SHAPE_ERROR, POSITION_ERROR = 0.6, 0.5, 0.4
 
 
 def apply(
@@ -216,19 +211,6 @@ def parameters(scene: Scene) -> Parameters:
     return rms, (dead, dark_columns), dust, scene.column_segments
 
 
-def _sky_parameters(scene: Scene) -> Parameters:
-    """Return the parameters for an image of the sky: without the scatter between pixels if it is negligible.
-
-    It is negligible if it changes the flux, the shape and the position of any star by less than the errors that the
-    request accepts, and the sky by at most a tenth of the noise of a pixel. Dead pixels, dark columns and dust remain.
-    """
-    rms, defects, dust, segments = parameters(scene)
-    accepted = scene.accuracy
-    source_error = max(FLUX_ERROR / accepted.flux, SHAPE_ERROR / accepted.shape, POSITION_ERROR / accepted.position)
-    is_negligible = rms * source_error <= 1.0 and rms * scene.sky_electrons <= NOTICEABLE * scene.pixel_noise
-    return 0.0 if is_negligible else rms, defects, dust, segments
-
-
 def _contribution(scene: Scene) -> float:
     rms, (dead, dark_columns), (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
@@ -237,5 +219,3 @@ def _contribution(scene: Scene) -> float:
 
 
 EFFECT = Effect("pixel_response", apply, parameters, _contribution, fixed=True, cost=1.2e-2, in_place=True)
-# The same for images of the sky. In flats, the light of the lamp shows a smaller scatter than that of the sky does.
-SKY_EFFECT = replace(EFFECT, parameters=_sky_parameters)

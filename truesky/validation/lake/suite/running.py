@@ -6,7 +6,7 @@ import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pyarrow as pa
 from tqdm import tqdm
@@ -157,12 +157,18 @@ def _frame_tasks(contents: LakeContents) -> Sequence[FrameTask]:
     return out
 
 
+def _find_frame(products: read.Version, path: str) -> Path:
+    """Return the file of a frame, next to its head file with the true WCS, after comparing the sha256 of both."""
+    head = str(PurePosixPath(path).with_suffix(".head"))
+    return products.sidecar_paths([path, head] if products.has_file(head) else [path])[0]
+
+
 def check_frame(task: FrameTask) -> Result:
     """Open a frame, run all checks of single frames, and return their rows with verdicts and arrays for plots."""
-    path: Path = task.products.sidecar_path(task.path)
+    path = _find_frame(task.products, task.path)
     context = frame_context.measure_frame(path, task.place, task.sources, task.spectra, task.instrument)
     if task.partner is not None:
         partner_path, exposure_id, partner_sources = task.partner
-        context.partner = PartnerFrame(task.products.sidecar_path(partner_path), exposure_id, partner_sources)
+        context.partner = PartnerFrame(_find_frame(task.products, partner_path), exposure_id, partner_sources)
     rows = frame_context.all_rows(checks.FRAME_CHECKS, context)
     return Result(task.place, rows, context.series)
