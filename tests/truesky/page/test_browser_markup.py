@@ -291,7 +291,6 @@ def test_errors_with_markup(browser, stranger):
         assert tab.evaluate(STRANGERS) == []
 
 
-@pytest.mark.nightly
 def test_an_address_with_markup(browser, stranger):
     """The state in an address comes from whoever sends the link."""
     held = {"view": SVG, "lake": IMAGE, "theme": SVG, "sql": {"text": SCRIPT},

@@ -166,7 +166,6 @@ def test_read_back_has_the_true_wcs(lake):
         assert products.sidecar_path(head_files.head_path(row["path"])).is_file()
 
 
-@pytest.mark.nightly
 def test_crosstalk_is_independent_of_the_order_of_rendering(lake, tmp_path):
     """Render the CCDs one after another, two at a time in reverse order, and alone."""
     wanted = parse(lake.parent / "r.toml")

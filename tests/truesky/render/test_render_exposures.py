@@ -274,7 +274,6 @@ def _check_archive(lake, capsys):
         assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
-@pytest.mark.nightly
 def test_distant_sources_do_not_change_the_image(lake, rendered):
     """Sources 8 arcmin or more from the detectors are removed from the lake, in cells that the detectors read."""
     for name in ("galaxies", "stars"):

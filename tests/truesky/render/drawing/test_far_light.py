@@ -170,7 +170,6 @@ def test_the_frame_has_no_seam(vis):
     assert smooth.max() / smooth.min() < 2.0
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("length", [pytest.param(30.0, marks=pytest.mark.nightly), 94.0])
 def test_the_frame_of_a_trail_has_no_seam(vis, length):
     """A moving body has the light of stars along its trail, without holes where the planes of its pieces end."""

@@ -117,7 +117,7 @@ def test_an_image_with_an_additional_star_has_the_same_crosstalk_if_it_is_kept(c
         assert empty.psf.intra_pixel != alone.psf.intra_pixel
 
 
-@nightly.parametrize("camera", PAIRS, (0,))
+@pytest.mark.parametrize("camera", PAIRS)
 def test_charge_of_the_columns_with_bright_stars_is_that_of_whole_frames(camera, monkeypatch):
     """A star that bleeds, stars at the border and at a corner, and one that is too faint to be noticed."""
     places = [(60.3, 40.8), (200.0, 180.0), (2.0, 120.5), (SIDE - 1.4, SIDE - 2.3), (130.0, 90.0)]
