@@ -194,9 +194,9 @@ class Version:
         return manifest.check_contents(self.folder, self._file_entry(relative))
 
     def sidecar_paths(self, relatives: Sequence[str]) -> list[Path]:
-        """Return the paths of files of one folder, after comparing their sha256. They lie in one folder again.
+        """Return the paths of files that must lie in one folder, such as an image and its head file.
 
-        On object storage, the files are copied to a temporary folder.
+        Each file is verified as in `sidecar_path`. On object storage, all are copied to the same temporary folder.
 
         Parameters
         ----------
@@ -210,10 +210,8 @@ class Version:
 
         Raises
         ------
-        BadInput
-            If the manifest does not list a file.
-        Damaged
-            If a file is missing or differs from the manifest.
+        BadInput, Damaged
+            As for `sidecar_path`.
         """
         copies = [self.sidecar_path(relative) for relative in relatives]
         if isinstance(self.folder, Path):

@@ -25,7 +25,7 @@ NAMES = {
 
 
 # A file with none of these contains no such product, so it is not parsed.
-WORDS = re.compile(rf"{'|'.join(NAMES)}|\S *@|optimize|parallel")
+WORDS = re.compile(rf"(?m){'|'.join(NAMES)}|\S *@|^ +@ |optimize|parallel")
 
 
 def faults(tree):
@@ -43,7 +43,7 @@ def faults(tree):
 
 @pytest.mark.parametrize(
     "text",
-    ["a @ b", "a @= b", "np.matmul(a, b)", "np.dot(a, b)", "a.dot(b)", "np.linalg.inv(a)",
+    ["a @ b", "a @= b", "(a\n    @ b)", "(a @\n    b)", "np.matmul(a, b)", "np.dot(a, b)", "a.dot(b)", "np.linalg.inv(a)",
      "from numpy.linalg import inv", "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd",
      "numba.njit(parallel=True)"],
 )  # fmt: skip

@@ -29,7 +29,8 @@ class Effect:
     name : str
         Name of the effect, different from the names of all other effects of the channel (the instrument mode).
     apply : callable
-        Function (frame, *parameters, rng) that returns the changed frame. It does not modify its arguments.
+        Function (frame, *parameters, rng) that returns the changed frame. It does not modify its arguments, except
+        for `out`, where it has this parameter.
     parameters : callable
         Function of a `Scene` (the settings of one detector's exposure) that returns the tuple of the parameters of
         `apply`.
@@ -52,8 +53,8 @@ class Effect:
         Function of a `Scene` that returns the part of the contribution that does not average out in a mean over many
         frames or pixels, in electrons. By default the whole contribution does not average out.
     in_place : bool
-        True if `apply` has a parameter `out` for the changed frame, which may be the frame itself. New memory for a
-        frame takes longer than most effects.
+        True if `apply` has a parameter `out`, an array for the changed frame, which may be the frame itself. Allocating
+        memory for a new frame takes longer than most effects.
     """
 
     name: str

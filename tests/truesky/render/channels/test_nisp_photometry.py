@@ -185,9 +185,7 @@ def check_depth(band, detector):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    "band", [pytest.param(band, marks=[] if band == "euclid_j" else [pytest.mark.nightly]) for band in CIRCLES]
-)
+@pytest.mark.parametrize("band", CIRCLES)
 def test_faint_stars_are_seen_in_a_stack_of_four(band):
     check_depth(band, small("nisp", "DET23", 320))
 

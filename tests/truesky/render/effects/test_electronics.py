@@ -102,6 +102,28 @@ def test_nonlinearity_is_one_and_five_per_cent():
             nonlinearity.apply(n, *wrong)
 
 
+def test_nonlinearity_of_more_pixels_than_a_block():
+    """Signals below and above the change of the formula for exp(x) - 1 are in each block, in no order."""
+    high, saturation, low, knee = CURVE
+    electrons = 10.0 ** np.random.default_rng(1).uniform(-2, 6, (3, 1000)) - 5.0
+    light = np.maximum(electrons, 0.0)
+    response = light / (1.0 + high * light / saturation)
+    expected = np.minimum(electrons, 0.0) + response - low * knee * (1.0 - np.exp(-response / knee))
+    np.testing.assert_allclose(nonlinearity.apply(electrons, *CURVE), expected, rtol=1e-12, atol=1e-12)
+    per_amplifier = nonlinearity.apply(electrons, high, saturation, np.array([low, 0.0, low]), knee)
+    np.testing.assert_array_equal(per_amplifier[::2], nonlinearity.apply(electrons, *CURVE)[::2])
+    np.testing.assert_allclose(per_amplifier[1], (np.minimum(electrons, 0.0) + response)[1], rtol=1e-14)
+
+
+def test_crosstalk_of_more_pixels_than_a_block():
+    rng = np.random.default_rng(2)
+    frame, table = rng.exponential(1e4, (4, 50, 60)), rng.uniform(-1e-3, 1e-3, (4, 4))
+    expected = frame + np.einsum("vs,syx->vyx", table - np.diag(np.diag(table)), frame)
+    np.testing.assert_allclose(crosstalk.apply(frame, table), expected, rtol=1e-14)
+    np.testing.assert_array_equal(crosstalk.apply(frame, table, out=frame), crosstalk.apply(frame, np.zeros((4, 4))))
+    np.testing.assert_allclose(frame, expected, rtol=1e-14)
+
+
 def test_crosstalk_is_taken_from_what_was():
     frame = np.zeros((4, 3, 5))
     frame[0, 1, 2], frame[3, 0, 0] = 1e5, 2e4

@@ -210,7 +210,7 @@ def spectrum_before(seconds, mags, x, y):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("before", [700.0, pytest.param(3000.0, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("before", [700.0, 3000.0])
 def test_traces_leave_what_whole_spectra_leave(before):
     """All orders of all sources against those of the bright ones alone: 1.2 e- in any pixel, of 30 and more."""
     rng = np.random.default_rng(2)
