@@ -58,6 +58,10 @@ class Extension:
     sections: Sections | None = None
 
 
+def _identity(array: Array) -> Array:
+    return array
+
+
 @dataclass(frozen=True, slots=True)
 class Readout:
     """All arrays of the image file of a detector.
@@ -69,16 +73,22 @@ class Readout:
     raw : array
         Pixels after the last effect, with prescan and overscan. The pixels of each amplifier are in the order in which
         they are read, with one plane per amplifier if there are several.
-    pixels : array, shape (ny, nx)
-        Pixels of the detector in its own orientation, without prescan and overscan.
+    assemble : callable
+        Function of `raw` that returns the pixels of the detector in its own orientation, without prescan and overscan.
+        Few users need them, and they take as long as several effects.
     cards : tuple of Card
         FITS header cards that apply to all arrays.
     """
 
     extensions: tuple[Extension, ...]
     raw: Array
-    pixels: Array
+    assemble: Callable[[Array], Array] = _identity
     cards: tuple[Card, ...] = ()
+
+    @property
+    def pixels(self) -> Array:
+        """Pixels of the detector in its own orientation, without prescan and overscan, shape (ny, nx)."""
+        return self.assemble(self.raw)
 
     @property
     def unit(self) -> str | None:
@@ -134,7 +144,7 @@ def _frame(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     `frame` has the pixels after the last effect. `detector` and `system` (its WCS) are not used.
     """
     raw = adc.to_file_type(frame, scene)
-    return Readout((Extension("", raw, "adu", sections=Sections.full_frame(*raw.shape[::-1])),), raw, raw)
+    return Readout((Extension("", raw, "adu", sections=Sections.full_frame(*raw.shape[::-1])),), raw)
 
 
 def _frame_electrons(read: Sequence[Image]) -> Float:
@@ -192,7 +202,7 @@ def _ramp(frame: Frame, scene: Scene, detector: str, system: WCS, store_chi2: bo
         cards += (("QUALLIM", limit, text),)
     else:
         cards += (("QUALLIM", 0.0, "no quality: two groups have no chi^2"),)
-    return Readout(tuple(planes), signal, signal, cards)
+    return Readout(tuple(planes), signal, cards=cards)
 
 
 def _signal(read: Sequence[Image]) -> Array:
@@ -242,7 +252,7 @@ def _quadrants(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
             layout.to_detector_axes(raw[number], number),
         )
         extensions.append(Extension(f"{detector}.{name}", plane, "adu", cards, number, sections))
-    return Readout(tuple(extensions), raw, layout.assemble(raw, *sizes), scans)
+    return Readout(tuple(extensions), raw, lambda planes: layout.assemble(planes, *sizes), scans)
 
 
 def _assemble_quadrants(array: Array, scene: Scene) -> Array:
@@ -345,7 +355,7 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
     return Readout(
         (Extension("", amplifier_layout.to_raw_image(raw), "adu", tuple(cards), sections=parts),),
         raw,
-        amplifier_layout.assemble(raw),
+        amplifier_layout.assemble,
     )
 
 
@@ -373,7 +383,7 @@ def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Rea
         extensions.append(
             Extension(name, amplifier_layout.to_detector_axes(raw[number], number), "adu", cards, number, parts)
         )
-    return Readout(tuple(extensions), raw, amplifier_layout.assemble(raw))
+    return Readout(tuple(extensions), raw, amplifier_layout.assemble)
 
 
 def _assemble_extensions(read: Sequence[Image], calibrate: Callable[[Array, dict[str, Any]], Array]) -> Array:
@@ -453,7 +463,7 @@ def _electrons(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readou
     """Make the file of a detector with one float32 array [ny, nx]: the electrons in its pixels before readout."""
     pixels = frame.astype(np.float32)
     extension = Extension("", pixels, "electron", sections=Sections.full_frame(*pixels.shape[::-1]))
-    return Readout((extension,), pixels, pixels)
+    return Readout((extension,), pixels)
 
 
 ELECTRONS = replace(AMPLIFIERS, make_readout=_electrons, stop_before=layout.AMPLIFIERS.name, file_bytes_per_pixel=4)

@@ -29,8 +29,7 @@ def ramp(found, scene, detector, system):
             readout.Extension("GROUPS", groups, "adu"),
         ),
         slope,
-        slope,
-        (("NFRAMES", 9, "frames of the ramp"),),
+        cards=(("NFRAMES", 9, "frames of the ramp"),),
     )
 
 
