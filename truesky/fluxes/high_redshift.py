@@ -126,15 +126,18 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
         If a redshift, magnitude, extinction, template number or magnification is out of range.
     """
     out = np.zeros((galaxies.num_rows, len(bands)))
+    first = min((int(band.wavelength[0]) for band in bands), default=passbands.GRID_FIRST)
+    last = max((int(band.wavelength[-1]) for band in bands), default=first)
     for start in range(0, galaxies.num_rows, _BLOCK):
-        f_lambda = spectra(galaxies.slice(start, _BLOCK))
+        f_lambda = spectra(galaxies.slice(start, _BLOCK), first, last)
         for k, band in enumerate(bands):
-            in_band = f_lambda[:, band.first : band.first + len(band.wavelength)]
+            low = int(band.wavelength[0]) - first
+            in_band = f_lambda[:, low : low + len(band.wavelength)]
             out[start : start + _BLOCK, k] = matrices.matmul(in_band, passbands.weights(band))
     return units.ujy_of_cgs(out)
 
 
-def spectra(galaxies: pa.Table) -> Float:
+def spectra(galaxies: pa.Table, first: int = passbands.GRID_FIRST, last: int = passbands.GRID_LAST) -> Float:
     """Return the observed spectra of quasars and high-redshift galaxies.
 
     Lensing magnification, intergalactic absorption (quasars) and Milky Way extinction are included.
@@ -143,11 +146,13 @@ def spectra(galaxies: pa.Table) -> Float:
     ----------
     galaxies : pa.Table
         Rows of the table `galaxies` with `kind` 2 (quasars) or 3 (high-redshift galaxies). Other kinds give 0.
+    first, last : int, optional
+        First and last wavelength in A, by default 600 and 24000.
 
     Returns
     -------
-    float array, shape (n, 23401)
-        f_lambda in erg s-1 cm-2 A-1 at 600 to 24000 A.
+    float array, shape (n, last - first + 1)
+        f_lambda in erg s-1 cm-2 A-1 at `first` to `last` in steps of 1 A.
 
     Raises
     ------
@@ -162,7 +167,7 @@ def spectra(galaxies: pa.Table) -> Float:
     check_range("mag_r01", mag, -5.0, 60.0)
     check_range("a_v", a_v, 0.0, 40.0)
     _refuse_mixtures(galaxies)
-    grid, out = passbands.grid(), np.zeros((galaxies.num_rows, passbands.GRID_LAST - passbands.GRID_FIRST + 1))
+    grid, out = np.arange(first, last + 1.0), np.zeros((galaxies.num_rows, last - first + 1))
     for code, library in ((QUASAR, quasar_library), (HIGH_REDSHIFT, high_redshift_library)):
         indices = np.flatnonzero(kind == code)
         if not len(indices):
@@ -176,7 +181,7 @@ def spectra(galaxies: pa.Table) -> Float:
         if code == QUASAR:
             out[indices] *= intergalactic.transmission(grid, z[indices])
     out *= table_magnification(galaxies)[:, None]
-    out *= extinction.transmission(extinction.milky_way_table(passbands.GRID_FIRST, len(grid)), a_v[:, None])
+    out *= extinction.transmission(extinction.milky_way_table(first, len(grid)), a_v[:, None])
     return out
 
 

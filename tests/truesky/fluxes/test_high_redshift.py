@@ -104,6 +104,14 @@ def test_quasars_are_seen_through_the_intergalactic_medium(distant):
     assert left[2] < 0.1
 
 
+@pytest.mark.parametrize("kind", [2, 3])
+@pytest.mark.parametrize(("first", "last"), [(600, 601), (5500, 9300), (24000, 24000)])
+def test_a_part_of_a_spectrum_has_the_same_numbers(distant, kind, first, last):
+    rows = distant(4, kind, z_obs=np.array([0.1, 3.5, 6.0, 8.0]), a_v=0.3)
+    part = high_redshift.spectra(rows, first, last)
+    np.testing.assert_array_equal(part, high_redshift.spectra(rows)[:, first - 600 : last - 599])
+
+
 def test_apparent_magnitude():
     # A flat f_nu keeps its magnitude at any wavelength: M + DM - 2.5 log10(1 + z), in h = 0.67.
     distance_pc = float(cosmology.luminosity_distance(7.0)) / 0.67 * 1e6

@@ -91,9 +91,8 @@ def _galaxies(rows: pa.Table, band: Passband, library: Library | None) -> Spectr
                 parameters.select(row[numbers[from_library]]), first, count, library
             )
         if not from_library.all():
-            out[~from_library] = high_redshift.spectra(rows.take(numbers[~from_library]))[
-                :, band.first : band.first + count
-            ]
+            few = rows.take(numbers[~from_library])
+            out[~from_library] = high_redshift.spectra(few, first, first + count - 1)
         return out
 
     return spectra_of_rows
