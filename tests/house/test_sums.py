@@ -44,7 +44,8 @@ def faults(tree):
 @pytest.mark.parametrize(
     "text",
     ["a @ b", "a @= b", "(a\n    @ b)", "(a @\n    b)", "np.matmul(a, b)", "np.dot(a, b)", "a.dot(b)",
-     "np.linalg.inv(a)", "from numpy.linalg import inv", "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd", "numba.njit(parallel=True)"],
+     "np.linalg.inv(a)", "from numpy.linalg import inv", "np.einsum('i,i', a, b, optimize=True)",
+     "from scipy.linalg import svd", "numba.njit(parallel=True)"],
 )  # fmt: skip
 def test_forbidden_products_are_detected(text):
     assert WORDS.search(text)
