@@ -130,8 +130,9 @@ mjd = {camera.mjd!r}
 
 def one_detector_text(name: str, quick: bool) -> str:
     """Return a request for one detector of a camera of `CAMERAS`, as TOML; `quick` simulates only bright sources."""
-    radius, limits = (_QUICK_RADIUS, _BRIGHT) if quick else (_FIELD_RADIUS, _DEEP)
-    return request_text([CAMERAS[name]], radius, limits)
+    # A detector of the largest camera covers a wider area.
+    radius = _QUICK_RADIUS if quick and name != _LARGEST else _FIELD_RADIUS
+    return request_text([CAMERAS[name]], radius, _BRIGHT if quick else _DEEP)
 
 
 def with_all_effects(request: Request) -> Request:
