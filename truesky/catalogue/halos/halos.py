@@ -338,8 +338,8 @@ def _draw_blocks(
 
     Return for each halo its voxel (small piece of volume), mass bin, number in the block, random bits for its position,
     and three random numbers: uniform ones for the distance and the mass, and a normal deviate for the scatter between
-    mass and proxy mass. `weight` are the weights of the voxels, shape (v, fields). `thresholds` are the limits of log10 mass and of log10 proxy mass (mass with a scatter) by
-    step; a halo must reach one of them.
+    mass and proxy mass. `weight` are the weights of the voxels, shape (v, fields). `thresholds` are the limits of log10
+    mass and of log10 proxy mass (mass with a scatter) by step; a halo must reach one of them.
     """
     steps, first = np.unique(voxels.step, return_index=True)
     first = np.append(first, voxels.step.size)

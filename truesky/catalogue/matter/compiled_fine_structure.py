@@ -46,6 +46,12 @@ def _sum_bytes(bits: Any) -> Any:
 
 
 @exact_jit
+def _along_row(row: Any, z_0: Any, z_1: Any, z: Any) -> Any:
+    """Interpolate linearly between the lattice points z_0 and z_1 of a row, at the fraction z of the step."""
+    return (1.0 - z) * _sum_bytes(mix_32(np.uint32(row ^ z_0))) + z * _sum_bytes(mix_32(np.uint32(row ^ z_1)))
+
+
+@exact_jit
 def add_octave(key_1: Any, key_2: Any, step: Any, scatter: Any, vector: Any, chi: Any, out: Any) -> None:
     """Add one octave of lattice noise at positions.
 
@@ -67,7 +73,8 @@ def add_octave(key_1: Any, key_2: Any, step: Any, scatter: Any, vector: Any, chi
     scale, factor = 1.0 / step, scatter / BYTE_SCATTER
     for i in range(chi.size):
         distance = chi[i] * scale
-        x, y, z = vector[0, i] * distance + _ORIGIN, vector[1, i] * distance + _ORIGIN, vector[2, i] * distance + _ORIGIN
+        x, y = vector[0, i] * distance + _ORIGIN, vector[1, i] * distance + _ORIGIN
+        z = vector[2, i] * distance + _ORIGIN
         x_int, y_int, z_int = np.int32(x), np.int32(y), np.int32(z)
         x, y, z = x - np.float64(x_int), y - np.float64(y_int), z - np.float64(z_int)
         y_0, z_0 = np.uint32(np.uint32(y_int) + key_2), np.uint32(z_int)
@@ -77,10 +84,8 @@ def add_octave(key_1: Any, key_2: Any, step: Any, scatter: Any, vector: Any, chi
         plane_1 = mix_32(np.uint32(np.uint32(np.uint32(x_int) + _U1) + key_1))
         row_00, row_01 = mix_32(np.uint32(plane_0 ^ y_0)), mix_32(np.uint32(plane_0 ^ y_1))
         row_10, row_11 = mix_32(np.uint32(plane_1 ^ y_0)), mix_32(np.uint32(plane_1 ^ y_1))
-        sum_00 = (1.0 - z) * _sum_bytes(mix_32(np.uint32(row_00 ^ z_0))) + z * _sum_bytes(mix_32(np.uint32(row_00 ^ z_1)))
-        sum_01 = (1.0 - z) * _sum_bytes(mix_32(np.uint32(row_01 ^ z_0))) + z * _sum_bytes(mix_32(np.uint32(row_01 ^ z_1)))
-        sum_10 = (1.0 - z) * _sum_bytes(mix_32(np.uint32(row_10 ^ z_0))) + z * _sum_bytes(mix_32(np.uint32(row_10 ^ z_1)))
-        sum_11 = (1.0 - z) * _sum_bytes(mix_32(np.uint32(row_11 ^ z_0))) + z * _sum_bytes(mix_32(np.uint32(row_11 ^ z_1)))
+        sum_00, sum_01 = _along_row(row_00, z_0, z_1, z), _along_row(row_01, z_0, z_1, z)
+        sum_10, sum_11 = _along_row(row_10, z_0, z_1, z), _along_row(row_11, z_0, z_1, z)
         mean = (1.0 - x) * ((1.0 - y) * sum_00 + y * sum_01) + x * ((1.0 - y) * sum_10 + y * sum_11)
         # Interpolation decreases the variance between lattice points by this factor.
         variance = (1.0 - 2.0 * x * (1.0 - x)) * (1.0 - 2.0 * y * (1.0 - y)) * (1.0 - 2.0 * z * (1.0 - z))

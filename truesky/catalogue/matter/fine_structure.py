@@ -88,7 +88,7 @@ class Subvoxels:
     first : int array, shape (v + 1,)
         First subvoxel of each voxel; the last value is the number of subvoxels, p.
     value : float array, shape (p,)
-        G at the centre of each subvoxel. Those of the near half of a voxel are first.
+        G at the centre of each subvoxel. Subvoxels in the near half of a voxel are first.
     weight : float array, shape (v, fields)
         Mean of exp(B G) / <exp(B G)> over the subvoxels of each voxel, for the halos that follow each smoothed field.
     """
@@ -185,7 +185,8 @@ def divide(structure: FineStructure, steps: Steps, voxels: Voxels) -> Subvoxels:
     Subvoxels
         The subvoxels: 8 per voxel wider than `widest_undivided` of the parameters, 2 per other voxel.
     """
-    vectors, distances, counts = [], [], []
+    # The first items are empty, so that no voxels have no subvoxels.
+    vectors, distances, counts = [np.zeros((3, 0))], [np.zeros(0)], [np.zeros(0, np.int64)]
     for order in np.unique(voxels.order).tolist():
         rows = slice(*np.searchsorted(voxels.order, [order, order + 1]))
         step, cell = np.unique(voxels.step[rows]), np.unique(voxels.cell[rows])
@@ -199,8 +200,8 @@ def divide(structure: FineStructure, steps: Steps, voxels: Voxels) -> Subvoxels:
             chi = distance_at(steps, selected, np.array([[0.25], [0.75]]))
             distances.append(np.broadcast_to(chi.T[:, None, :, None], shape).ravel())
             counts.append(np.full(selected.size * cell.size, 2 * children.shape[1]))
-    first = np.append(0, np.cumsum(np.concatenate([np.zeros(0, np.int64), *counts])))
-    value = values(structure, np.concatenate([np.zeros((3, 0)), *vectors], 1), np.concatenate([np.zeros(0), *distances]))
+    first = np.append(0, np.cumsum(np.concatenate(counts)))
+    value = values(structure, np.concatenate(vectors, 1), np.concatenate(distances))
     weight = np.empty((voxels.step.size, structure.amplitude.size))
     compiled.mean_weights(value, first, structure.amplitude, structure.norm, weight)
     return Subvoxels(first, value, weight)

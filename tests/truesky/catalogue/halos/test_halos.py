@@ -14,6 +14,7 @@ from tests.truesky.catalogue.conftest import BOX_CELLS, SEED
 from truesky.catalogue.galaxies import galaxies
 from truesky.catalogue.halos import halos
 from truesky.catalogue.matter import fine_structure, lightcone
+from truesky.fluxes import cosmology
 from truesky.request.schema import Universe
 
 
@@ -92,6 +93,22 @@ def test_without_structure_below_the_cells_halos_have_random_positions_in_voxels
     columns = b"".join(getattr(drawn, name).tobytes() for name in drawn.__slots__)
     assert drawn.id.size == number
     assert hashlib.sha256(columns).hexdigest()[:16] == digest
+
+
+@pytest.mark.parametrize("seed", [0, 2**63 - 1])
+def test_the_nearest_halos_are_the_same_to_any_redshift(seed):
+    """Smallest and largest `z_max`, with the smallest box: the halos nearer than z = 0.01, bit by bit."""
+    drawn = []
+    for z_max in (0.01, 6.0):
+        requested = Universe(galaxy_limit=24.5, z_max=z_max, box_cells=BOX_CELLS, structure_below_cells=True)
+        whole = dataclasses.replace(galaxies.halos_and_galaxies(SEED, requested).halos, fine=fine_structure.model(seed))
+        cells = [halos.draw(whole, seed, order, 7 >> 2 * (8 - order)) for order in halos.LEVELS]
+        near = [found.select(found.chi < float(cosmology.comoving_distance(0.01))) for found in cells]
+        drawn.append([getattr(found, name).tobytes() for found in near for name in found.__slots__])
+    assert sum(found.id.size for found in near) > 0
+    assert drawn[0] == drawn[1]
+    # Most halos of the deep catalogue are farther.
+    assert cells[0].id.size > 1000 + near[0].id.size
 
 
 @cache

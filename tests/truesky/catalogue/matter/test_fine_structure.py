@@ -20,9 +20,12 @@ fractions = st.tuples(*[st.floats(0.0, 0.999)] * 3)
 def structure_with_octaves(count, seed=SEED):
     """Return a structure with only the first octaves, without the check of the variance."""
     whole = fine_structure.model(seed)
-    return replace(whole, keys=whole.keys[:count], scatter=np.ones(count) / np.sqrt(count), parameters=replace(
-        whole.parameters, steps=whole.parameters.steps[:count]
-    ))
+    return replace(
+        whole,
+        keys=whole.keys[:count],
+        scatter=np.ones(count) / np.sqrt(count),
+        parameters=replace(whole.parameters, steps=whole.parameters.steps[:count]),
+    )
 
 
 def at(structure, place):
@@ -47,7 +50,7 @@ def reference_value(structure, vector, chi):
         corner = np.floor(place).astype(int)
         part, mean, variance = place - corner, 0.0, 0.0
         for i, j, k in np.ndindex(2, 2, 2):
-            x, y, z = (corner + (i, j, k)).tolist()
+            x, y, z = (corner + np.array([i, j, k])).tolist()
             bits = reference_hash(reference_hash(reference_hash((x + key_1) % 2**32) ^ (y + key_2) % 2**32) ^ z)
             share = np.prod(np.where([i, j, k], part, 1.0 - part))
             mean += share * sum(bits.to_bytes(4, "little"))
@@ -86,7 +89,7 @@ def test_mean_0_and_variance_1_at_each_place_in_a_lattice_cell(fraction, seed):
 def test_the_field_is_continuous_across_lattice_borders(fraction, axis, border):
     structure = fine_structure.model(SEED)
     for step in structure.parameters.steps:
-        place = step * (np.array(fraction) + (300.0, -500.0, 700.0))[:, None] * np.ones(3)
+        place = step * (np.array(fraction) + np.array([300.0, -500.0, 700.0]))[:, None] * np.ones(3)
         place[axis] = step * (border + np.array([-1e-6, 0.0, 1e-6]))
         assert np.ptp(at(structure, place)) < 1e-4
 
@@ -122,7 +125,8 @@ def test_the_norm_is_the_mean_of_the_exponential(rng):
     structure = fine_structure.model(SEED)
     value = at(structure, rng.uniform(-4000.0, 4000.0, (3, 200_000)))
     part = rng.random((3, 3000))
-    corners = np.stack([np.prod(np.where(np.array(corner)[:, None], part, 1.0 - part), 0) for corner in np.ndindex(2, 2, 2)])
+    near = [np.where(np.array(corner)[:, None], part, 1.0 - part) for corner in np.ndindex(2, 2, 2)]
+    corners = np.stack([np.prod(share, 0) for share in near])
     corners /= np.sqrt(np.sum(corners**2, 0))
     byte = (np.arange(256) - 127.5) / np.sqrt(4 * (256**2 - 1) / 12)
     for amplitude, norm in zip(structure.amplitude, structure.norm, strict=True):
