@@ -208,9 +208,21 @@ def divide(structure: FineStructure, steps: Steps, voxels: Voxels) -> Subvoxels:
 
 
 def distance_at(steps: Steps, step: Int, nearer: Float) -> Float:
-    """Return the comoving distances (Mpc/h) at which a fraction `nearer` of the volume of a step is nearer.
+    """Return the comoving distances at which a fraction of the volume of a step is nearer.
 
-    `step` has the numbers of the steps, shape (n,). `nearer` and the result may have more axes before that axis.
+    Parameters
+    ----------
+    steps : Steps
+        Steps in comoving distance.
+    step : int array, shape (n,)
+        Numbers of the steps.
+    nearer : float array, shape (n,) or (m, n)
+        Fractions of the volume.
+
+    Returns
+    -------
+    float array, shape (n,) or (m, n)
+        Comoving distances, Mpc/h.
     """
     inner, outer = steps.edge[step], steps.edge[step + 1]
     return np.asarray(np.cbrt(inner**3 + nearer * (outer**3 - inner**3)))
