@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema import sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Float, Int, UInt32
 from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue import parameters
 from truesky.catalogue.matter import compiled_fine_structure as compiled
@@ -73,7 +73,7 @@ class FineStructure:
     """
 
     parameters: Parameters
-    keys: npt.NDArray[np.uint32]
+    keys: UInt32
     scatter: Float
     amplitude: Float
     norm: Float
