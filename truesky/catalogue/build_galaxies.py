@@ -36,7 +36,7 @@ from truesky.request.files import Catalogue, DustMap, Ingest, UserSources
 from truesky.request.schema import Request, Universe
 from truesky.running.submitted_job import Job, Step
 
-_HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
+_HALO_FACTS = ("galaxy_limit", "z_max", "box_cells", "structure_below_cells")
 _LENS_FACTS = ("lensing", "rotation")
 _GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "alignment", *_LENS_FACTS, "high_redshift_boost", "quasar_boost")
 

@@ -8,6 +8,7 @@ All keys::
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells
+                   structure_below_cells  true | false   clustering of galaxies below 4 Mpc/h, default: true
                    lensing_nside         64 to 2048, default: by area and accuracy (lensing_resolution.py)
                    high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
@@ -394,6 +395,9 @@ def _universe(table: Toml, lensing_nside: int) -> Universe:
             star_limit=read(_number, table, "universe.star_limit", 0.0, 30.0, default.star_limit, "mag"),
             z_max=read(_number, table, "universe.z_max", 0.01, 6.0, default.z_max),
             box_cells=read(_integer_choice, table, "universe.box_cells", BOX_CELLS, default.box_cells),
+            structure_below_cells=read(
+                _boolean, table, "universe.structure_below_cells", default.structure_below_cells
+            ),
             high_redshift_boost=read(
                 _number, table, "universe.high_redshift_boost", *boosts, default.high_redshift_boost
             ),

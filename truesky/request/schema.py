@@ -73,6 +73,9 @@ class Universe:
         Highest redshift of galaxies and quasars below z = 6. Those beyond z = 6 do not depend on it.
     box_cells : int
         Number of cells of 4 Mpc/h along each side of the periodic box with the simulated matter density.
+    structure_below_cells : bool
+        True if the density of halos has structure on scales below the cells of the box, which increases the clustering
+        of galaxies below 4 Mpc/h. False for random positions below this scale. Halos from a file do not depend on it.
     lensing_nside : int
         HEALPix N_side of the lensing maps computed from the matter box. Maps with 1024 need 4.8 GB in the cache on
         disc. A request without this key has the value of truesky/request/lensing_resolution.py.
@@ -92,6 +95,7 @@ class Universe:
     star_limit: float = 26.0
     z_max: float = 6.0
     box_cells: int = 256
+    structure_below_cells: bool = True
     lensing_nside: int = 1024
     lensing: tuple[float, float] | None = None
     alignment: float = 1.0

@@ -90,6 +90,7 @@ BAD = [
     ("universe", {"lensing": {"g1": 0.7, "g2": 0.7}}, r"universe.lensing = .*: \|g\| = 0.9899"),
     ("universe", {"lensing": {"g1": 0.1, "g2": float("nan")}}, "universe.lensing.g2"),
     ("universe", {"rotation": 400}, "universe.rotation"),
+    ("universe", {"structure_below_cells": 1}, "universe.structure_below_cells"),
     ("stars", {"bright_limit": 26.0}, "stars.bright_limit = 26 leaves no star"),
     ("stars", {"bright_limit": "none"}, "stars.bright_limit"),
     ("stars", {"plane_limit": -1}, "stars.plane_limit"),

@@ -241,7 +241,8 @@ def halos_and_galaxies(
         The population. It is complete for galaxies brighter than the magnitude limit, whatever their spectrum.
     """
     # Only these settings matter, so that the tables `halos` and `galaxies` share the population.
-    settings = {name: getattr(requested, name) for name in ("galaxy_band", "galaxy_limit", "z_max", "box_cells")}
+    names = ("galaxy_band", "galaxy_limit", "z_max", "box_cells", "structure_below_cells")
+    settings = {name: getattr(requested, name) for name in names}
     return _population(seed, Universe(**settings), light_cone, training)
 
 
@@ -255,7 +256,10 @@ def _population(seed: int, requested: Universe, light_cone: LightCone | None, tr
         )
 
     volume = luminosity_function.volume(requested.z_max)
-    return population.model(seed, requested.box_cells, volume, _inverse(), faintest, light_cone)
+    fine = requested.structure_below_cells
+    return population.model(
+        seed, requested.box_cells, volume, _inverse(), faintest, light_cone, structure_below_cells=fine
+    )
 
 
 @cache

@@ -47,7 +47,7 @@ def cut_normal(key: Any, number: Any, cut: Any) -> Any:
 
 
 @exact_jit
-def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amplitude: Any, field: Any, g: Any) -> Any:
+def draw_counts(key: Any, first: Any, steps: Any, used: Any, tables: Any) -> Any:
     """Draw the number of halos in each block (step in distance and mass bin) of a sky cell.
 
     Parameters
@@ -61,14 +61,11 @@ def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amp
         Numbers of the steps, counted from the observer.
     used : bool array, shape (s, bins)
         True for blocks that are drawn.
-    ln_number : float array, shape (s, bins)
-        ln of the number of halos per voxel where the Gaussian field is 0.
-    amplitude : float array, shape (s, bins)
-        Factor of the field in the exponential.
-    field : int array, shape (s, bins)
-        Column of `g` with the field that the halos of a block follow.
-    g : float32 array, shape (v, fields)
-        Gaussian fields of matter in the voxels.
+    tables : tuple of array
+        Five arrays: ln of the number of halos per voxel where the Gaussian field is 0, shape (s, bins); factor of the
+        field in the exponential, shape (s, bins); column of the last two arrays with the field that the halos of a
+        block follow, shape (s, bins); Gaussian fields of matter in the voxels, float32, shape (v, fields); and weights
+        of the voxels by structure that the fields do not have, shape (v, fields).
 
     Returns
     -------
@@ -77,8 +74,9 @@ def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amp
 
     Notes
     -----
-    The numbers are Poisson with the mean of exp(ln_number + amplitude g), summed over the voxels of the step.
+    The numbers are Poisson with the mean of exp(ln_number + amplitude g) weight, summed over the voxels of the step.
     """
+    ln_number, amplitude, field, g, weight = tables
     halo_counts = np.zeros(used.shape, np.int64)
     bins = used.shape[1]
     for s in range(steps.size):
@@ -86,24 +84,14 @@ def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amp
             if used[s, b]:
                 mean = 0.0
                 for v in range(first[s], first[s + 1]):
-                    mean += np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, field[s, b]]))
+                    f = field[s, b]
+                    mean += np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, f])) * weight[v, f]
                 halo_counts[s, b] = poisson(child_key(child_key(key, steps[s] * bins + b), 0), mean)
     return halo_counts
 
 
 @exact_jit
-def fill_halos(
-    key: Any,
-    first: Any,
-    steps: Any,
-    number: Any,
-    ln_number: Any,
-    amplitude: Any,
-    field: Any,
-    g: Any,
-    limits: Any,
-    out: Any,
-) -> int:
+def fill_halos(key: Any, first: Any, steps: Any, number: Any, tables: Any, limits: Any, out: Any) -> int:
     """Draw the voxel and the random numbers of each halo, and store the halos that may reach a mass limit in `out`.
 
     Parameters
@@ -114,7 +102,7 @@ def fill_halos(
         First voxel of each step and numbers of the steps, same as in `draw_counts`.
     number : int array, shape (s, bins)
         Number of halos in each block (step in distance and mass bin).
-    ln_number, amplitude, field, g : array
+    tables : tuple of array
         Same as in `draw_counts`.
     limits : tuple
         Five values: upper edges of the mass bins, shape (bins,); lower limits of log10 mass, shape (s,), and of log10
@@ -132,15 +120,20 @@ def fill_halos(
         Number of halos that are stored in `out`.
     """
     voxel, row, column, rank, place, drawn = out
+    ln_number, amplitude, field, g, weight = tables
     upper_edge, host_limit, central_limit, scatter, cut = limits
     bins, at = number.shape[1], 0
+    # Mean number of halos of a block in each voxel of its step.
+    mean = np.empty(np.max(first[1:] - first[:-1]) if steps.size else 0)
     for s in range(steps.size):
         for b in range(bins):
             block = child_key(key, steps[s] * bins + b)
             total = 0.0
             if number[s, b]:
+                f = field[s, b]
                 for v in range(first[s], first[s + 1]):
-                    total += np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, field[s, b]]))
+                    mean[v - first[s]] = np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, f])) * weight[v, f]
+                    total += mean[v - first[s]]
             for j in range(number[s, b]):
                 halo_key = child_key(block, j + 1)
                 deviate = cut_normal(halo_key, SCATTER, cut)
@@ -149,7 +142,7 @@ def fill_halos(
                 remaining = uniform(child_key(halo_key, VOXEL)) * total
                 v = first[s]
                 while v < first[s + 1] - 1:
-                    remaining -= np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, field[s, b]]))
+                    remaining -= mean[v - first[s]]
                     if remaining < 0.0:
                         break
                     v += 1

@@ -29,8 +29,9 @@ from truesky.catalogue import parameters
 from truesky.catalogue.halos import compiled_halos
 from truesky.catalogue.halos.luminosity_function import Volume
 from truesky.catalogue.halos.matching import Z_LAST, Masses, Matching
-from truesky.catalogue.matter import density_box, lightcone
+from truesky.catalogue.matter import density_box, fine_structure, lightcone
 from truesky.catalogue.matter.density_box import Box
+from truesky.catalogue.matter.fine_structure import FineStructure
 from truesky.catalogue.matter.lightcone import Distances, Replicas, Steps, Voxels
 from truesky.fluxes import cosmology
 from truesky.randomness import per_source
@@ -75,6 +76,8 @@ class HaloModel:
         Comoving distance of the farthest galaxies of the catalogue, Mpc/h.
     matching : Matching
         Absolute magnitudes by proxy mass.
+    fine : FineStructure or None
+        Structure of the density of halos below the voxels; None if halos have random positions in their voxels.
     """
 
     box: Box
@@ -91,6 +94,7 @@ class HaloModel:
     limit: Float
     max_distance: float
     matching: Matching
+    fine: FineStructure | None
 
     def mass_limit(self, chi: Float) -> Float:
         """Return log10 of the proxy mass (Msun/h) of the catalogue's faintest galaxy at comoving distances (Mpc/h).
@@ -174,7 +178,12 @@ class Halos:
 
 
 def model(
-    box: Box, volume: Volume, masses: Masses, matching: Matching, faintest: Callable[[Float], Float]
+    box: Box,
+    volume: Volume,
+    masses: Masses,
+    matching: Matching,
+    faintest: Callable[[Float], Float],
+    fine: FineStructure | None = None,
 ) -> HaloModel:
     """Return the tables from which halos are drawn, and the limits of the catalogue.
 
@@ -190,6 +199,8 @@ def model(
         Absolute magnitudes of galaxies by proxy mass (mass of the halo or sub-halo with a scatter).
     faintest : callable
         Function that returns the faintest absolute magnitude M_r (0.1r for h = 1) of the catalogue at redshifts.
+    fine : FineStructure, optional
+        Structure of the density of halos below the voxels; None for random positions in voxels.
 
     Returns
     -------
@@ -231,6 +242,7 @@ def model(
         limit=matching.proxy_mass(steps.z, faintest(steps.z)),
         max_distance=float(cosmology.comoving_distance(volume.z_max)),
         matching=matching,
+        fine=fine,
     )
 
 
@@ -280,18 +292,22 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int, min_log_mass: Float
     # `_identifiers` numbers them by counting.
     thresholds = (lowest + halos.host_offset, lowest) if min_log_mass is None else (min_log_mass, min_log_mass)
     thresholds = thresholds if order == GENERATION_ORDER else (np.full(lowest.size, -np.inf), lowest)
-    voxel, column, rank, place, numbers = _draw_blocks(
-        halos, used, voxels, thresholds, int(per_source.keys(np.array([cell]), seed, "halos", order)[0])
-    )
+    key = int(per_source.keys(np.array([cell]), seed, "halos", order)[0])
+    subvoxels = None if halos.fine is None else fine_structure.divide(halos.fine, halos.steps, voxels)
+    weight = np.ones((voxels.step.size, len(halos.box.smoothed))) if subvoxels is None else subvoxels.weight
+    voxel, column, rank, place, numbers = _draw_blocks(halos, used, voxels, weight, thresholds, key)
     step = voxels.step[voxel]
     fall, width = halos.ratio[step, column], halos.log_mass[1] - halos.log_mass[0]
     # Draw the mass from a dn/dlog10 M that decreases exponentially within the bin.
     log_mass = halos.log_mass[column] - width * np.log1p(numbers[:, 1] * np.expm1(-fall)) / fall
     proxy = log_mass + occupation.scatter * numbers[:, 2]
-    inner, outer = halos.steps.edge[step], halos.steps.edge[step + 1]
-    chi = np.cbrt(inner**3 + numbers[:, 0] * (outer**3 - inner**3))
-    shift = 2 * (sky.MAX_ORDER - voxels.order[voxel])
-    index = (voxels.cell[voxel] << shift) | (place >> np.uint64(2)).astype(np.int64) & ((np.int64(1) << shift) - 1)
+    if halos.fine is None or subvoxels is None:
+        chi = fine_structure.distance_at(halos.steps, step, numbers[:, 0])
+        shift = 2 * (sky.MAX_ORDER - voxels.order[voxel])
+        index = (voxels.cell[voxel] << shift) | (place >> np.uint64(2)).astype(np.int64) & ((np.int64(1) << shift) - 1)
+    else:
+        field = halos.field[step, column]
+        index, chi = fine_structure.place_halos(halos.fine, halos.steps, voxels, subvoxels, (voxel, field, place))
     factor = density_box.velocity_factor(halos.box.model, halos.steps.z)
     identifiers, bits = _identifiers(halos, step, column, index, rank if order == GENERATION_ORDER else None)
     drawn = Halos(index, chi, log_mass, proxy, factor[step] * voxels.velocity[voxel], identifiers, bits)
@@ -316,14 +332,14 @@ def levels(angle: Float) -> Int:
 
 
 def _draw_blocks(
-    halos: HaloModel, used: Bool, voxels: Voxels, thresholds: tuple[Float, Float], key: int
+    halos: HaloModel, used: Bool, voxels: Voxels, weight: Float, thresholds: tuple[Float, Float], key: int
 ) -> tuple[Int, Int, Int, npt.NDArray[np.uint64], Float]:
     """Draw halos in all blocks (step in distance and mass bin) of a cell, sorted by block.
 
     Return for each halo its voxel (small piece of volume), mass bin, number in the block, random bits for its position,
     and three random numbers: uniform ones for the distance and the mass, and a normal deviate for the scatter between
-    mass and proxy mass. `thresholds` are the limits of log10 mass and of log10 proxy mass (mass with a scatter) by
-    step; a halo must reach one of them.
+    mass and proxy mass. `weight` are the weights of the voxels, shape (v, fields). `thresholds` are the limits of log10
+    mass and of log10 proxy mass (mass with a scatter) by step; a halo must reach one of them.
     """
     steps, first = np.unique(voxels.step, return_index=True)
     first = np.append(first, voxels.step.size)
@@ -332,8 +348,8 @@ def _draw_blocks(
     with np.errstate(divide="ignore"):
         ln_number = np.log(halos.number[steps] * volume[:, None]) - 0.5 * amplitude**2 * halos.box.variance[field]
     g = np.stack([smooth.ravel()[voxels.box] for smooth in halos.box.smoothed], 1)
-    tables = (ln_number, amplitude, field, g)
-    number = compiled_halos.draw_counts(np.uint64(key), first, steps, used[steps], *tables)
+    tables = (ln_number, amplitude, field, g, weight)
+    number = compiled_halos.draw_counts(np.uint64(key), first, steps, used[steps], tables)
     n = int(number.sum())
     out = (*np.empty((4, n), np.int64), np.empty(n, np.uint64), np.empty((n, 3)))
     occupation = halos.matching.occupation
@@ -343,7 +359,7 @@ def _draw_blocks(
         occupation.scatter,
         occupation.depth / occupation.scatter,
     )
-    filled = slice(compiled_halos.fill_halos(np.uint64(key), first, steps, number, *tables, limits, out))
+    filled = slice(compiled_halos.fill_halos(np.uint64(key), first, steps, number, tables, limits, out))
     return out[0][filled], out[2][filled], out[3][filled], out[4][filled], out[5][filled]
 
 

@@ -25,7 +25,7 @@ from truesky.catalogue.halos.halos import LEVELS, HaloModel, Halos
 from truesky.catalogue.halos.luminosity_function import Inverse, Volume
 from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.halos.satellites import Satellites
-from truesky.catalogue.matter import density_box
+from truesky.catalogue.matter import density_box, fine_structure
 
 CENTRAL, SATELLITE = 0, 1
 # Largest number of HEALPix cells whose halos are kept in memory, enough for neighbouring cells drawn one after another.
@@ -156,6 +156,8 @@ def model(
     luminosities: Inverse,
     faintest: Callable[[Float], Float],
     light_cone: LightCone | None = None,
+    *,
+    structure_below_cells: bool = True,
 ) -> Population:
     """Return the model from which the halos of a seed, and the galaxies in them, are drawn.
 
@@ -174,6 +176,8 @@ def model(
         limit of `volume` also applies.
     light_cone : LightCone, optional
         The user's halos, which replace the drawn halos; None to draw halos.
+    structure_below_cells : bool, optional
+        True if the density of halos has structure below the cells of the box, False for random positions in voxels.
 
     Returns
     -------
@@ -187,7 +191,8 @@ def model(
         return np.minimum(faintest(z), volume.m_faintest)
 
     box = density_box.load(seed, box_cells)
-    halo_model = halos.model(box, volume, masses, matched, faintest_drawn)
+    fine = fine_structure.model(seed) if structure_below_cells else None
+    halo_model = halos.model(box, volume, masses, matched, faintest_drawn, fine)
     return Population(seed, halo_model, masses, light_cone)
 
 

@@ -191,6 +191,14 @@ def radial_steps(cell: float, start: float, end: float, table: Distances) -> Ste
     return Steps(edge, table.redshift(0.5 * (edge[1:] + edge[:-1])))
 
 
+def width(order: int, chi: Float) -> Float:
+    """Return the side (Mpc/h) of HEALPix cells of an order at comoving distances `chi` (Mpc/h), across the sight line.
+
+    It is the side of an average cell, so that it does not depend on the position on the sky.
+    """
+    return np.asarray(_SIDE * chi / (1 << order))
+
+
 def voxels(box: Box, replicas: Replicas, steps: Steps, order: int, cell: int, used: Bool) -> Voxels:
     """Divide the light-cone in a sky cell into voxels (small pieces of volume).
 

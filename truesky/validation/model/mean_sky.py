@@ -19,7 +19,7 @@ _CLEAR = np.zeros(12, np.float32)
 def without_clustering(universe: GalaxyModel) -> GalaxyModel:
     """Return a copy of a model of galaxies in which halos have their mean density everywhere, without lensing."""
     halos = universe.population.halos
-    uniform = replace(halos, amplitude=np.zeros_like(halos.amplitude))
+    uniform = replace(halos, amplitude=np.zeros_like(halos.amplitude), fine=None)
     return replace(universe, population=replace(universe.population, halos=uniform), lens=Shear())
 
 
