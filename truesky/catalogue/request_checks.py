@@ -47,16 +47,16 @@ def _check_sources(request: Request) -> None:
             for name, file in (("galaxies", request.sources.galaxies), ("stars", request.sources.stars)):
                 if file is not None:
                     mistakes.read(user_files.check_file, file, SOURCES_KIND, f"sources.{name}")
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, request.universe.cosmology)
 
 
 def _check_galaxies(request: Request) -> None:
     if request.sources is None:
         check_band(request)
     if (catalogue := request.ingest.galaxies) is not None:
-        replaces_lensing = request.universe.lensing is not None
+        settings = request.universe.lensing is not None, request.universe.cosmology
         columns = _with_existing_files(
-            "ingest.galaxies", catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing)
+            "ingest.galaxies", catalogue, lambda: ingest.galaxy_columns(catalogue, *settings)
         )
         files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
         split = ingest.split_by_cell(files, sha256, columns)
@@ -65,7 +65,8 @@ def _check_galaxies(request: Request) -> None:
 
 def _check_halos(request: Request) -> None:
     if (catalogue := request.ingest.halos) is not None:
-        columns = _with_existing_files("ingest.halos", catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
+        entries, cosmology = dict(catalogue.columns), request.universe.cosmology
+        columns = _with_existing_files("ingest.halos", catalogue, lambda: mapping.halo_columns(entries, cosmology))
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns, request.area)
 
 

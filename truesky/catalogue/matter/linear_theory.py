@@ -1,6 +1,7 @@
-"""Linear power spectrum, and halo abundance, bias and concentration in the built-in cosmology, computed with colossus.
+"""Linear power spectrum, and halo abundance, bias and concentration in a cosmology, computed with colossus.
 
-Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky.
+Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky. Colossus has
+one current cosmology per process, which is set before each use.
 
 References
 ----------
@@ -10,13 +11,13 @@ Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from lake_schema.arrays import Float
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
 from truesky.numerics.cache_labels import label_halo_tables
 from truesky.numerics.code_fingerprints import code_key
@@ -31,25 +32,38 @@ _Z_COARSE = 10
 _COARSE = 20
 
 
-def power(k: Float) -> Float:
+def power(cosmology: Cosmology, k: Float) -> Float:
     """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
-    return np.asarray(_power_cosmology().matterPowerSpectrum(k, 0.0, model=_POWER), float)
+    return np.asarray(_power_cosmology(cosmology).matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
-def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
+def halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
     """Return tables of halo properties by redshift and log10 M_200m (Msun/h), by name.
 
-    The tables are the abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m),
-    and the `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range. They are
-    read from the disc cache if they have been computed before.
+    They are read from the disc cache if they have been computed before.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    log_mass : float array, shape (m,)
+        log10 M_200m / (Msun/h).
+    z : float array, shape (z,)
+        Redshift.
+
+    Returns
+    -------
+    dict of str to float array
+        The abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m), and the
+        `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range.
     """
-    numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
-    key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
-    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z), label_halo_tables())
+    key = content_key(code_key(__name__), cosmology.fingerprint(), log_mass, z)
+    label = label_halo_tables(cosmology.fingerprint())
+    return cached_arrays("halo_tables", key, lambda: _halo_tables(cosmology, log_mass, z), label)
 
 
-def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
-    _set_cosmology()
+def _halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
+    _set_cosmology(cosmology)
     from colossus.halo import concentration
     from colossus.lss import bias, mass_function
 
@@ -62,25 +76,25 @@ def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": concentrations}
 
 
-@cache
-def _power_cosmology() -> Any:
+@lru_cache(maxsize=4)
+def _power_cosmology(cosmology: Cosmology) -> Any:
     """Return the colossus cosmology for `power`; it is cached, because a new one computes its power spectrum again."""
-    return _set_cosmology()
+    return _set_cosmology(cosmology)
 
 
-def _set_cosmology() -> Any:
-    """Set the cosmology of colossus to truesky's built-in cosmology, and return it; colossus must not write files."""
+def _set_cosmology(cosmology: Cosmology) -> Any:
+    """Set the cosmology of colossus, which is global in a process, and return it; colossus must not write files."""
     from colossus import settings
     from colossus.cosmology import cosmology as colossus
 
     settings.BASE_DIR, settings.PERSISTENCE = str(cache_dir() / "colossus"), ""
     numbers = {
         "flat": True,
-        "H0": 100.0 * cosmology.HUBBLE,
-        "Om0": cosmology.OMEGA_M,
-        "Ob0": cosmology.OMEGA_B,
-        "sigma8": cosmology.SIGMA_8,
-        "ns": cosmology.SPECTRAL_INDEX,
+        "H0": 100.0 * cosmology.h,
+        "Om0": cosmology.omega_m,
+        "Ob0": cosmology.omega_b,
+        "sigma8": cosmology.sigma_8,
+        "ns": cosmology.n_s,
         "relspecies": False,
     }
-    return colossus.setCosmology("truesky", numbers, persistence="")
+    return colossus.setCosmology(f"truesky {cosmology.fingerprint()}", numbers, persistence="")

@@ -9,6 +9,7 @@ from lake_schema import ids, sky
 from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import SEED
 from truesky.catalogue.halos import halos
+from truesky.cosmology import FIDUCIAL
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +110,9 @@ def test_mass_function_comes_out(model, drawn):
 def test_bias_of_the_field_that_halos_follow(model, low, high, redshift, low_k):
     """On large scales the power of exp(x g - ...) is x^2 / D^2 times that of the matter."""
     from tests.truesky.catalogue.matter.test_density_box import spectrum
-    from truesky.catalogue.matter import density_box
 
     box, step = model.box, int(np.searchsorted(model.steps.z, max(redshift, 0.003)))
-    growth = float(density_box.growth(redshift))
+    growth = float(FIDUCIAL.growth(redshift))
     for column in (np.searchsorted(model.log_mass, low), np.searchsorted(model.log_mass, high)):
         x, field, amplitude = (float(table[step, column]) for table in (model.x, model.field, model.amplitude))
         smooth, variance = box.smoothed[int(field)], box.variance[int(field)]
