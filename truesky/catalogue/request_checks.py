@@ -13,6 +13,7 @@ from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 from truesky.catalogue import dust_map, given_sources
 from truesky.catalogue.external import ingest, mapping
+from truesky.catalogue.matter import boltzmann
 from truesky.catalogue.stars import bright_stars, from_catalogue, stars
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
@@ -32,8 +33,21 @@ def check_request(request: Request) -> None:
     stars. There is one message for each mistake, which names the key of the request, or the file, its column and row.
     """
     with Mistakes() as mistakes:
-        for check in (_check_dust, _check_sources, _check_galaxies, _check_halos, _check_training, _check_stars):
+        for check in (
+            _check_cosmology,
+            _check_dust,
+            _check_sources,
+            _check_galaxies,
+            _check_halos,
+            _check_training,
+            _check_stars,
+        ):
             mistakes.read(check, request)
+
+
+def _check_cosmology(request: Request) -> None:
+    if request.sources is None and request.ingest.galaxies is None and request.universe.cosmology.power == "camb":
+        boltzmann.check(request.universe.cosmology)
 
 
 def _check_dust(request: Request) -> None:

@@ -11,12 +11,16 @@ Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 
 
 from __future__ import annotations
 
+import tempfile
+from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lake_schema.arrays import Float
+from truesky.catalogue.matter import boltzmann
 from truesky.cosmology import Cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
 from truesky.numerics.cache_labels import label_halo_tables
@@ -25,7 +29,11 @@ from truesky.numerics.code_fingerprints import code_key
 # Halo masses are M_200m, as colossus calls them.
 MASS_DEFINITION = "200m"
 # Colossus models of the linear power spectrum, the halo mass function, the halo bias and the concentration.
-_POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
+_MASS_FUNCTION, _BIAS, _CONCENTRATION = "tinker08", "tinker10", "diemer19"
+# Model of colossus for the power spectrum: the fitting formula of Eisenstein & Hu, without massive neutrinos.
+_FIT = "eisenstein98"
+# log10 of the wave numbers (h/Mpc) at which colossus gets the power spectrum of CAMB, beyond all halos of the tables.
+_LOG_K = np.linspace(-5.0, 5.0, 2001)
 # Number of redshifts of the table of concentrations. It is small, because a concentration takes 0.1 s to compute.
 _Z_COARSE = 10
 # Concentrations are computed only for every 20th mass, and interpolated between these masses.
@@ -33,8 +41,18 @@ _COARSE = 20
 
 
 def power(cosmology: Cosmology, k: Float) -> Float:
-    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
-    return np.asarray(_power_cosmology(cosmology).matterPowerSpectrum(k, 0.0, model=_POWER), float)
+    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc.
+
+    For `cosmology.power` = "camb", the spectrum of CAMB is continued beyond 1e-4 < k < 100 h/Mpc with the shape of the
+    fitting formula. Raises BadInput if CAMB is required and not installed.
+    """
+    fit = np.asarray(_power_cosmology(cosmology).matterPowerSpectrum(k, 0.0, model=_FIT), float)
+    if cosmology.power == _FIT:
+        return fit
+    ends = np.array(boltzmann.K_RANGE)
+    first, last = boltzmann.power(cosmology, ends) / power(replace(cosmology, power=_FIT), ends)
+    inside = (k >= ends[0]) & (k <= ends[1])
+    return np.where(inside, boltzmann.power(cosmology, k), fit * np.where(k < ends[0], first, last))
 
 
 def halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
@@ -63,15 +81,37 @@ def halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Fl
 
 
 def _halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
-    _set_cosmology(cosmology)
-    from colossus.halo import concentration
-    from colossus.lss import bias, mass_function
+    with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
+        return _colossus_tables(cosmology, log_mass, z, _spectrum(cosmology, Path(folder)))
 
-    mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION}
+
+def _spectrum(cosmology: Cosmology, folder: Path) -> dict[str, str | None]:
+    """Return the arguments that tell colossus the power spectrum; the one of CAMB is written to a file in `folder`."""
+    if cosmology.power == _FIT:
+        return {"model": _FIT, "path": None}
+    path = folder / "linear_power.txt"
+    np.savetxt(path, np.stack([_LOG_K, np.log10(power(cosmology, 10.0**_LOG_K))], 1))
+    return {"model": f"truesky_{cosmology.fingerprint()}", "path": str(path)}
+
+
+def _colossus_tables(
+    cosmology: Cosmology, log_mass: Float, z: Float, spectrum: dict[str, str | None]
+) -> dict[str, Float]:
+    _set_cosmology(cosmology, reads_files=spectrum["path"] is not None)
+    from colossus.halo import concentration
+    from colossus.lss import bias, mass_function, peaks
+
+    mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION, "ps_args": spectrum}
     rows = [mass_function.massFunction(mass, at, model=_MASS_FUNCTION, q_out="dndlnM", **args) for at in z]
-    biases = [bias.haloBias(mass, at, model=_BIAS, **args) for at in z]
+    biases = [
+        bias.haloBiasFromNu(peaks.peakHeight(mass, at, ps_args=spectrum), z=at, mdef=MASS_DEFINITION, model=_BIAS)
+        for at in z
+    ]
     coarse_mass, coarse_z = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
-    c = [concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse_z]
+    c = [
+        concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION, ps_args=spectrum)
+        for at in coarse_z
+    ]
     concentrations = np.array([np.exp(np.interp(log_mass, coarse_mass, np.log(row))) for row in c])
     return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": concentrations}
 
@@ -82,13 +122,16 @@ def _power_cosmology(cosmology: Cosmology) -> Any:
     return _set_cosmology(cosmology)
 
 
-def _set_cosmology(cosmology: Cosmology) -> Any:
-    """Set the cosmology of colossus, which is global in a process, and return it; colossus must not write files."""
+def _set_cosmology(cosmology: Cosmology, reads_files: bool = False) -> Any:
+    """Set the cosmology of colossus, which is global in a process, and return it; colossus must not write files.
+
+    If `reads_files` is True, colossus may read a power spectrum from a file.
+    """
     from colossus import settings
     from colossus.cosmology import cosmology as colossus
 
     settings.BASE_DIR, settings.PERSISTENCE = str(cache_dir() / "colossus"), ""
-    numbers = {
+    numbers: dict[str, Any] = {
         "flat": True,
         "H0": 100.0 * cosmology.h,
         "Om0": cosmology.omega_m,
@@ -97,4 +140,7 @@ def _set_cosmology(cosmology: Cosmology) -> Any:
         "ns": cosmology.n_s,
         "relspecies": False,
     }
-    return colossus.setCosmology(f"truesky {cosmology.fingerprint()}", numbers, persistence="")
+    if not cosmology.has_constant_dark_energy:
+        numbers |= {"de_model": "w0wa", "w0": cosmology.w0, "wa": cosmology.wa}
+    name = f"truesky_{cosmology.fingerprint()}"
+    return colossus.setCosmology(name, numbers, persistence="r" if reads_files else "")
