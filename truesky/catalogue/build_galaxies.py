@@ -28,7 +28,7 @@ from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.nearest_sed import Training
 from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.halos.halo_catalogue import LightCone
-from truesky.catalogue.request_checks import check_band
+from truesky.catalogue.request_checks import check_band, check_cosmology
 from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import sources
 from truesky.request.area import Area
@@ -90,6 +90,7 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
+    check_cosmology(request.universe.cosmology)
     # The user's training galaxies also change the table `halos`: their dust determines how faint galaxies must be
     # drawn, and therefore how light halos must be.
     external_facts = (

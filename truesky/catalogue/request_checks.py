@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from lake_schema import user_files
+from lake_schema import ids, user_files
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.external import rows as external_rows
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
-from truesky.catalogue import dust_map, given_sources
+from truesky.catalogue import dust_map, given_sources, parameters
 from truesky.catalogue.external import ingest, mapping
-from truesky.catalogue.matter import boltzmann
+from truesky.catalogue.halos import matching
+from truesky.catalogue.matter import boltzmann, density_box
 from truesky.catalogue.stars import bright_stars, from_catalogue, stars
+from truesky.cosmology import Cosmology
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.request.files import SOURCES_KIND, Catalogue
@@ -46,8 +48,24 @@ def check_request(request: Request) -> None:
 
 
 def _check_cosmology(request: Request) -> None:
-    if request.sources is None and request.ingest.galaxies is None and request.universe.cosmology.power == "camb":
-        boltzmann.check(request.universe.cosmology)
+    if request.sources is None and request.ingest.galaxies is None:
+        check_cosmology(request.universe.cosmology)
+
+
+def check_cosmology(cosmology: Cosmology) -> None:
+    """Raise BadInput if galaxies cannot be drawn in this cosmology.
+
+    The package CAMB may be missing, or the universe may be so large that its steps in distance have no identifiers.
+    """
+    if cosmology.power == "camb":
+        boltzmann.check(cosmology)
+    law, cell = parameters.section("halos.toml", "mass_function"), density_box.box_model(cosmology).cell
+    # There are two more steps than the distance has cells: around its end, and at the start.
+    largest = (ids.BLOCK_COUNT // round((law["highest"] - law["lowest"]) / law["bin"]) - 2) * cell
+    distance = float(cosmology.comoving_distance(matching.Z_LAST))
+    if distance > largest:
+        problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
+        raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
 
 
 def _check_dust(request: Request) -> None:

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lake_schema import ids
+from lake_schema.errors import BadInput
 from lake_schema.store.provenance import file_sha256
-from truesky.catalogue import build_galaxies
+from truesky.catalogue import build_galaxies, request_checks
 from truesky.catalogue.external import ingest, mapping
 from truesky.catalogue.galaxies import lensing
-from truesky.catalogue.halos import halo_catalogue
+from truesky.catalogue.halos import halo_catalogue, halos
 from truesky.catalogue.matter import boltzmann, convergence, density_box, linear_theory
 from truesky.cosmology import FIDUCIAL
 from truesky.numerics import cache
@@ -161,3 +163,15 @@ def test_halos_of_two_cosmologies_in_one_process():
             tables.append(halo_tables(cosmology)["bias"])
     assert np.array_equal(tables[0], tables[2])
     assert np.all(tables[1][0, 10:] > tables[0][0, 10:])
+
+
+def test_a_universe_that_is_too_large_for_identifiers_is_refused():
+    """The limit is that of `halos.model`: it accepts the largest universe that the check accepts."""
+    with pytest.raises(BadInput, match=r"universe.cosmology: the distance to z = 6.1 is \d+ Mpc/h, at most 6276 is"):
+        request_checks.check_cosmology(replace(FIDUCIAL, omega_m=0.236))
+    for omega_m in (0.238, 0.6):
+        cosmology = replace(FIDUCIAL, omega_m=omega_m)
+        request_checks.check_cosmology(cosmology)
+        cell = density_box.box_model(cosmology).cell
+        steps, _ = halos._radial_steps(cosmology, cell, float(cosmology.comoving_distance(1e-4)))
+        assert steps.z.size * 73 <= ids.BLOCK_COUNT
