@@ -25,7 +25,7 @@ from truesky.catalogue.galaxies import lensing
 from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.matter import density_box
 from truesky.catalogue.matter.density_box import Box
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.numerics import cache
 from truesky.request.schema import LENSING_NSIDES
 from truesky.validation import theory
@@ -67,7 +67,7 @@ def measure(quick: bool) -> list[Row]:
     reference, cells = (64, 64) if quick else (_REFERENCE, _BOX_CELLS)
     rows: dict[int, Row] = {nside: {"nside": float(nside)} for nside in (*nsides, reference)}
     for suffix, seed in _SEEDS.items():
-        box = gaussian_box(seed, cells)
+        box = gaussian_box(FIDUCIAL, seed, cells)
         fields = list(_draw_fields(seed, 4 if quick else _NUM_FIELDS, 500 if quick else _NUM_POSITIONS))
         true_shear = _shear_of_fields(box, reference, fields)
         true_xi = _correlations(fields, true_shear)
@@ -114,7 +114,7 @@ def _draw_fields(seed: int, number: int, positions: int) -> Iterator[tuple[Float
 def _shear_of_fields(box: Box, nside: int, fields: Sequence[tuple[Float, Float]]) -> Float:
     """Return gamma1 + i gamma2 of sources at z = 1, complex array of shape (fields, positions)."""
     kappa, gain = convergence_maps(box, nside, [_Z], int(lensing.settings().l_max * nside))
-    chi = np.atleast_1d(cosmology.comoving_distance(_Z))
+    chi = np.atleast_1d(FIDUCIAL.comoving_distance(_Z))
     planes = Planes(nside, chi, (lensing.maps_of_convergence(kappa[0], nside, gain[0]),))
     values = [lensing.interpolate(planes, ra, dec, np.full(ra.size, chi[0])) for ra, dec in fields]
     return np.array([row[lensing.GAMMA_1] + 1j * row[lensing.GAMMA_2] for row in values])
@@ -142,14 +142,14 @@ def _predict_correlation() -> Float:
     """Return xi+ of sources at z = 1 by non-linear theory in the bins of `EDGES`."""
     edges = np.array(EDGES) * _ARCMIN
     theta = 2.0 / 3.0 * (edges[1:] ** 3 - edges[:-1] ** 3) / (edges[1:] ** 2 - edges[:-1] ** 2)
-    power = theory.convergence_power(theory.ELL, np.atleast_1d(cosmology.comoving_distance(_Z)), np.ones(1))
+    power = theory.convergence_power(FIDUCIAL, theory.ELL, np.atleast_1d(FIDUCIAL.comoving_distance(_Z)), np.ones(1))
     return theory.shear_correlations(theta, theory.ELL, power)[0]
 
 
 def _measure_cost(cells: int, nside: int) -> Row:
     """Return the CPU seconds to make the maps of all source planes, and their size on disc in GB."""
     with cache.use_temporary_dir():
-        box = density_box.load(_SEEDS[""], cells)
+        box = density_box.load(_SEEDS[""], cells, FIDUCIAL)
         box_bytes = sum(path.stat().st_size for path in cache.cache_dir().rglob("*") if path.is_file())
         start = time.process_time()
         lensing.load(box, nside, with_far_planes=True)

@@ -15,7 +15,7 @@ from benchmarks._scenes import BINS, Scene
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from truesky.catalogue.halos import luminosity_function
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.render.drawing import transfer
 from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
@@ -211,10 +211,10 @@ def skypy_photometry(area: float, seed: int) -> float:
     np.random.seed(seed)  # noqa: NPY002
     ours, z = FlatLambdaCDM(67.0, 0.319), np.linspace(0.002, _MAX_REDSHIFT, 400)
     m_star, phi_star, alpha = luminosity_function.schechter().parameters_at(z)
-    scale = 5.0 * np.log10(cosmology.HUBBLE)
+    scale = 5.0 * np.log10(FIDUCIAL.h)
     start = time.process_time()
     redshift, m_r = schechter_lf(
-        z, m_star + scale, phi_star * cosmology.HUBBLE**3, float(alpha.mean()), 26.0, Quantity(area, "deg2"), ours
+        z, m_star + scale, phi_star * FIDUCIAL.h**3, float(alpha.mean()), 26.0, Quantity(area, "deg2"), ours
     )
     mix = dirichlet_coefficients(redshift, *_TEMPLATE_MIX[:2], weight=_TEMPLATE_MIX[2])
     mass = kcorrect.stellar_mass(mix, m_r, "sdss2010-r")

@@ -36,7 +36,7 @@ from lake_schema.tables.halos import HALOS
 from truesky.catalogue import build_galaxies
 from truesky.catalogue.galaxies import band_ratios, galaxies
 from truesky.catalogue.halos import matching, population
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes.libraries import templates
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
@@ -171,7 +171,7 @@ def photometry(count: int, settings: dict[str, object]) -> float:
     for cell in range(CELL << 6, (CELL << 6) + count):
         members = population.members(drawn, cell)
         selected = galaxies.select(universe, *galaxies._draw_candidates(SEED, universe, members))
-        reference_magnitude = selected.m_r + cosmology.distance_modulus(selected.z)
+        reference_magnitude = selected.m_r + FIDUCIAL.distance_modulus(selected.z)
         band_magnitudes = [reference_magnitude + band_ratios.offset(band, selected.z, selected.sed) for band in bands]
         number += np.stack(
             [members.ra[selected.row], members.dec[selected.row], selected.magnitude, *band_magnitudes]

@@ -13,6 +13,7 @@ from typing import Any
 
 from benchmarks import report
 from lake_schema.mission import configuration
+from truesky.cosmology import FIDUCIAL
 from truesky.numerics import cache
 
 # Bands whose passbands, flux tables and PSFs are made.
@@ -42,14 +43,14 @@ def products(quick: bool) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "stellar_library", templates.stellar_library
     yield "dust_map", lambda: dust_map.load(_SEED)
     for cells in _QUICK_CELLS if quick else _BOX_CELLS:
-        yield f"box_{cells}", lambda cells=cells: density_box.load(_SEED, cells)  # type: ignore[misc]
-        yield f"tides_{cells}", lambda cells=cells: density_box.tides(density_box.load(_SEED, cells))  # type: ignore[misc]
-    box = density_box.load(_SEED, (_QUICK_CELLS if quick else _BOX_CELLS)[0])
+        yield f"box_{cells}", lambda cells=cells: density_box.load(_SEED, cells, FIDUCIAL)  # type: ignore[misc]
+        yield f"tides_{cells}", lambda cells=cells: density_box.tides(density_box.load(_SEED, cells, FIDUCIAL))  # type: ignore[misc]
+    box = density_box.load(_SEED, (_QUICK_CELLS if quick else _BOX_CELLS)[0], FIDUCIAL)
     for nside in _QUICK_NSIDES if quick else _LENSING_NSIDES:
         yield f"lensing_{nside}", lambda nside=nside: lensing.load(box, nside, True)  # type: ignore[misc]
     if quick:
         return
-    yield "halo_tables", matching.masses
+    yield "halo_tables", lambda: matching.masses(FIDUCIAL)
     yield "halo_bias", lambda: density_box.biased_field(box.model, _unit_bias())
     yield "band_ratios", lambda: band_ratios.load(templates.galaxy_library(), _BAND, matching.Z_LAST, 0.8)
     yield from _flux_products()

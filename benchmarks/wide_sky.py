@@ -21,7 +21,7 @@ from truesky.catalogue.galaxies import galaxies
 from truesky.catalogue.halos import halos, luminosity_function, population
 from truesky.catalogue.halos.population import Population
 from truesky.catalogue.matter import density_box
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
 BLOCK_ORDER, PIXEL_ORDER = 4, 9
@@ -126,7 +126,7 @@ def luminosity_ratios(universe: Population, sky_sample: SkySample) -> dict[str, 
         faintest = _faintest_magnitude(universe, z_centre - half_width, z_centre + half_width)
         grid = np.linspace(z_centre - half_width, z_centre + half_width, 81)
         density = luminosity_function.number_density(law, faintest, grid)
-        shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2 * sky_sample.area
+        shells = FIDUCIAL.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2 * sky_sample.area
         expected = float(np.sum(0.5 * (density[1:] + density[:-1]) * shells))
         figures[f"luminosity_function_z{z_centre}"] = float(
             np.sum((np.abs(z - z_centre) < half_width) & (m < faintest)) / expected
@@ -216,7 +216,7 @@ def _limber_correlation(chi: Float, density: Float, bias_growth: Float) -> Float
     weight = weight / np.trapezoid(weight, chi)
     ell = np.geomspace(1.0, _MAX_MULTIPOLE, 500)
     k = (ell[:, None] + 0.5) / chi
-    power = density_box.linear_power(k.ravel()).reshape(k.shape)
+    power = density_box.linear_power(FIDUCIAL, k.ravel()).reshape(k.shape)
     c_l = np.trapezoid((weight * bias_growth / chi) ** 2 * power, chi, axis=1)
     fine = np.arange(1, _MAX_MULTIPOLE + 1)
     side = np.radians(np.sqrt(sky.cell_area(PIXEL_ORDER)))

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from truesky.catalogue.galaxies import emission_lines, galaxies
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 from truesky.validation.model import mean_sky
 
@@ -52,7 +52,7 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
     rows = mean_sky.rows(universe, 0, cells)
     z, flux = (rows[name].to_numpy().astype(float) for name in ("z_true", "flux_halpha"))
     shines = flux > 0.0
-    distance = cosmology.luminosity_distance(z[shines]) / cosmology.HUBBLE * CM_PER_MPC
+    distance = FIDUCIAL.luminosity_distance(z[shines]) / FIDUCIAL.h * CM_PER_MPC
     return z[shines], np.log10(flux[shines] * 4.0 * np.pi * distance**2)
 
 
@@ -82,7 +82,7 @@ def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
     for z_low, z_high in pairwise(EDGES):
         middle = 0.5 * (z_low + z_high)
         luminosities = np.sort(raw[(z > z_low) & (z < z_high)])
-        distance = float(cosmology.luminosity_distance(middle)) / cosmology.HUBBLE * CM_PER_MPC
+        distance = float(FIDUCIAL.luminosity_distance(middle)) / FIDUCIAL.h * CM_PER_MPC
         log_luminosity = np.linspace(38.0, 45.0, 281)
         counts = emission_lines.expected_counts(10.0**log_luminosity / (4 * np.pi * distance**2), z_low, z_high) * area
         above = luminosities.size - np.searchsorted(luminosities, LOG_L)

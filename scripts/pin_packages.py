@@ -26,6 +26,7 @@ DESCRIPTIONS = {
     "test": "Packages for the tests, in addition to run.txt.",
     "bench": "Packages for the benchmarks, in addition to run.txt.",
     "s3": "Packages for `truesky push`, in addition to run.txt.",
+    "camb": "Packages for linear power spectra of CAMB, in addition to run.txt.",
     "oldest": "Lowest versions that pyproject.toml allows, for `make test-oldest`.",
 }
 BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "wheel")
@@ -134,7 +135,7 @@ def main() -> None:
         constraints.write_text("\n".join(versions(all_pins)))
         run = compile_pins([project], constraints, "--extra", "page", "--extra", "reduction")
         lists = {"run": run, "build": compile_pins([builders], constraints)}
-        for extra in ("test", "bench", "s3"):
+        for extra in ("test", "bench", "s3", "camb"):
             extra_pins = compile_pins([project], constraints, "--extra", extra)
             # Leave out packages that run.txt contains in the same form. A package that run.txt requires only on some
             # platforms may be required on all platforms here, and then stays in the list.

@@ -47,6 +47,10 @@ SAMPLES: tuple[dict[str, Any], ...] = (
             "galaxy_limit": 24.0, "star_limit": 24.0, "z_max": 5.0, "box_cells": 192, "lensing_nside": 64,
             "high_redshift_boost": 1.0, "quasar_boost": 1.0, "lensing": {"g1": 0.0, "g2": 0.0}, "alignment": 1.0,
             "rotation": 0.0,
+            "cosmology": {
+                "omega_m": 0.3, "omega_b": 0.05, "h": 0.7, "sigma_8": 0.8, "n_s": 0.96, "w0": -0.9, "wa": 0.1,
+                "m_nu": 0.0,
+            },
         },
         "stars": {"brown_dwarf_boost": 1.0, "plane_limit": 20.0, "bright_limit": 10.0, "rows_a_file": 1000},
         "strong_lenses": {"boost": 1.0},

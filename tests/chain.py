@@ -20,7 +20,8 @@ import pyarrow as pa
 from lake_schema import sky
 from lake_schema.fits.images import read_images
 from lake_schema.store import layout, publish, read
-from truesky.fluxes import cosmology, integration, passbands
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.sources import galaxies_from_table
 from truesky.fluxes.tables import build_tables, settings
@@ -69,7 +70,7 @@ def quick():
     library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
     yield "line_table", build_tables.line_table(vis)[1]
     yield "integrated", integration.galaxy_fluxes(random_galaxies(20), [vis], library)
-    yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
+    yield "distances", FIDUCIAL.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
     yield "galactic", np.stack(sky.galactic(*rng.uniform(-80.0, 80.0, (2, 1000))))
     planes = euclid.vis_psf(fields.small("vis", "3-4"), vis, fields.MISSION, 4).planes
     yield "psf", planes.images

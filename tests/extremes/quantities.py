@@ -12,7 +12,8 @@ from lake_schema.mission.bounds import bounds_of_parameter
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue.external.mapping import GALAXY_BOUNDS
-from truesky.fluxes import cosmology, high_redshift, passbands
+from truesky.cosmology import Z_MAX
+from truesky.fluxes import high_redshift, passbands
 from truesky.fluxes.libraries import from_files, templates
 from truesky.fluxes.spectra import lines
 from truesky.request.schema import MAX_SHEAR
@@ -141,7 +142,7 @@ SUBJECTS = (
     ),
     Subject(
         "distance",
-        (Quantity("redshift", 0.0, cosmology.Z_MAX, log=True),),
+        (Quantity("redshift", 0.0, Z_MAX, log=True),),
         "SciPy: quad",
         1e-11,
         "of the distance",

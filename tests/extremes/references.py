@@ -24,7 +24,8 @@ from tests.extremes.test_stamps import source_of
 from tests.truesky.render.fields import psf_of, small
 from truesky.catalogue import given_sources
 from truesky.catalogue.galaxies import lensing, morphology
-from truesky.fluxes import band_fluxes, cosmology, high_redshift, passbands
+from truesky.cosmology import FIDUCIAL, HUBBLE_DISTANCE
+from truesky.fluxes import band_fluxes, high_redshift, passbands
 from truesky.fluxes.libraries import from_files, templates
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, lines
@@ -192,10 +193,10 @@ def distant_galaxy_in_one_sample(values):
 
 def distance(values):
     z = values["redshift"]
-    got = float(cosmology.luminosity_distance(z))
-    rate = lambda x: 1.0 / math.sqrt(cosmology.OMEGA_M * (1.0 + x) ** 3 + cosmology.OMEGA_LAMBDA)  # noqa: E731
-    expected = (1.0 + z) * cosmology.HUBBLE_DISTANCE * integrate.quad(rate, 0.0, z, epsabs=0.0, epsrel=1e-13)[0]
-    back = float(cosmology.redshift(got / (1.0 + z)))
+    got = float(FIDUCIAL.luminosity_distance(z))
+    rate = lambda x: 1.0 / math.sqrt(FIDUCIAL.omega_m * (1.0 + x) ** 3 + FIDUCIAL.omega_lambda)  # noqa: E731
+    expected = (1.0 + z) * HUBBLE_DISTANCE * integrate.quad(rate, 0.0, z, epsabs=0.0, epsrel=1e-13)[0]
+    back = float(FIDUCIAL.redshift(got / (1.0 + z)))
     return relative(got, expected, 1e-300) + 0.01 * relative(back, z, 1e-300)
 
 

@@ -20,7 +20,7 @@ from truesky.catalogue.external import mapping
 from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
 from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.stars import stars
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
 CELL = 303_117
@@ -101,7 +101,7 @@ def in_front(folder):
         "z_true": '"z"',
         "log_mass": '{"column": "mass", "log10": true, "unit": "Msun/h"}',
     }
-    cone = halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns))
+    cone = halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns, FIDUCIAL))
     universe = galaxies.model(SEED, Universe(galaxy_limit=23.0, z_max=1.0, **SMALL), cone)
     return universe, population.CellCache(universe.population), (ra, dec)
 
@@ -125,7 +125,7 @@ def lensed(heavy, ra, dec, chi):
 def test_heaviest_halo_deflects_and_shears_background_galaxies(heavy):
     """Deflections point away from its centre and are at most 1.5 arcmin; foreground galaxies stay in place."""
     ra, dec = heavy[2]
-    far, near = (float(cosmology.comoving_distance(z)) for z in (1.0, 0.03))
+    far, near = (float(FIDUCIAL.comoving_distance(z)) for z in (1.0, 0.03))
     east = ra + np.array([1.0, 3.0, 8.0]) / 60.0 / np.cos(np.radians(dec))
     behind, before = (lensed(heavy, east, np.full(3, dec), np.full(3, chi)) for chi in (far, near))
     for found in (behind, before):
@@ -142,7 +142,7 @@ def test_a_galaxy_exactly_behind_a_centre(heavy):
     """A galaxy at the centre of the halo stays in place with finite values; one next to it is deflected."""
     universe, cells, place = heavy
     around = halo_lensing.lens_of_cell(universe.lens, cells, CELL)
-    near, far = (np.full(2, float(cosmology.comoving_distance(z))) for z in (0.05, 1.0))
+    near, far = (np.full(2, float(FIDUCIAL.comoving_distance(z))) for z in (0.05, 1.0))
     centre = [np.full(2, angle) for angle in place]
     seen = lensing.displace(*centre, *lensing.interpolate(around.box, *centre, near)[3:])
     seen[1][1] += 5e-3

@@ -25,6 +25,7 @@ from tests.universe import plain_plan, plain_work
 from truesky.catalogue import dust_map
 from truesky.catalogue.external import mapping, reading
 from truesky.catalogue.stars import bright_stars, from_catalogue
+from truesky.cosmology import FIDUCIAL
 from truesky.explore import guard
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import from_files, stars_from_files
@@ -357,7 +358,7 @@ TARGETS = {
         lambda path: galaxy_stamps.read.__wrapped__(path, ""), ".fits",
     ),
     **table_targets("bodies", {**BODIES, "name": MANY["name"]}, lambda path: ephemerides.read.__wrapped__(path, "")),
-    **table_targets("catalogue", MANY, rows_of(mapping.halo_columns(HALOS)), units={"ra": "deg"}),
+    **table_targets("catalogue", MANY, rows_of(mapping.halo_columns(HALOS, FIDUCIAL)), units={"ra": "deg"}),
     "catalogue, Parquet": (
         lambda: [as_parquet(MANY, write_page_checksum=True), as_parquet(MANY, compression="zstd", row_group_size=20)],
         of_parquet, ".parquet", True,

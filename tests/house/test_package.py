@@ -137,7 +137,7 @@ def pinned(name: str) -> list[tuple[Requirement, list[str]]]:
     return found
 
 
-LISTS = ("build", "run", "test", "bench")
+LISTS = ("build", "run", "test", "bench", "camb")
 
 
 def pins() -> dict[str, str]:

@@ -20,6 +20,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from truesky.catalogue import given_sources, injected_rows
 from truesky.catalogue.stars import stars as star_rows
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import integration, passbands, sources
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
@@ -70,7 +71,7 @@ def is_added(numbers: Int) -> Bool:
 def _galaxies(
     user_sources: UserSources, columns: given_sources.SourceColumns, bands: Sequence[Passband], first: int
 ) -> _Rows:
-    model = given_sources.model(0, user_sources, columns, None, 0.0)
+    model = given_sources.model(0, user_sources, columns, FIDUCIAL, None, 0.0)
     drawn = [GALAXIES.empty(), *(given_sources.galaxies(cell, columns, model) for cell in _cells(columns.galaxies))]
     drawn_rows = pa.concat_tables([each.select(drawn[0].column_names) for each in drawn])
     order = np.argsort(columns.galaxies["origin_id"], kind="stable")

@@ -28,7 +28,8 @@ from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.nearest_sed import Training
 from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.halos.halo_catalogue import LightCone
-from truesky.catalogue.request_checks import check_band
+from truesky.catalogue.request_checks import check_band, check_cosmology
+from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import sources
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
@@ -36,7 +37,7 @@ from truesky.request.files import Catalogue, DustMap, Ingest, UserSources
 from truesky.request.schema import Request, Universe
 from truesky.running.submitted_job import Job, Step
 
-_HALO_FACTS = ("galaxy_limit", "z_max", "box_cells", "structure_below_cells")
+_HALO_FACTS = ("galaxy_limit", "z_max", "box_cells", "structure_below_cells", "cosmology")
 _LENS_FACTS = ("lensing", "rotation")
 _GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "alignment", *_LENS_FACTS, "high_redshift_boost", "quasar_boost")
 
@@ -89,10 +90,11 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
+    check_cosmology(request.universe.cosmology)
     # The user's training galaxies also change the table `halos`: their dust determines how faint galaxies must be
     # drawn, and therefore how light halos must be.
     external_facts = (
-        {"halos": _input_facts(user_inputs.halos, mapping.halo_columns(dict(user_inputs.halos.columns)))}
+        {"halos": _input_facts(user_inputs.halos, _halo_columns(user_inputs.halos, request.universe.cosmology))}
         if user_inputs.halos
         else {}
     )
@@ -249,6 +251,7 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
     settings: dict[str, Any] = {name: facts[name] for name in ("galaxy_band", *names)}
     if settings.get("lensing") is not None:
         settings["lensing"] = tuple(settings["lensing"])
+    settings["cosmology"] = from_facts(facts)
     return Universe(**settings)
 
 
@@ -256,7 +259,7 @@ def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone |
     """Return the user's halos and the user's training galaxies; each is None if the request names no files of them."""
     light_cone = training = None
     if user_inputs is not None and user_inputs.halos is not None:
-        columns = mapping.halo_columns(dict(user_inputs.halos.columns))
+        columns = _halo_columns(user_inputs.halos, from_facts(facts))
         files, _ = ingest.list_files(user_inputs.halos.files, columns)
         light_cone = halo_catalogue.load(files, facts["halos"]["sha256"], columns)
     if user_inputs is not None and user_inputs.training is not None:
@@ -266,17 +269,21 @@ def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone |
     return light_cone, training
 
 
+def _halo_columns(halos: Catalogue, cosmology: Cosmology) -> mapping.Columns:
+    return mapping.halo_columns(dict(halos.columns), cosmology)
+
+
 def _input_facts(catalogue: Catalogue, columns: mapping.Columns) -> Json:
     return {"sha256": ingest.files_with_checksums(catalogue.files, columns)[1], "columns": dict(catalogue.columns)}
 
 
 def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
-    columns = ingest.galaxy_columns(catalogue, request.universe.lensing is not None)
+    columns = ingest.galaxy_columns(catalogue, request.universe.lensing is not None, request.universe.cosmology)
     files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
     catalogue_facts = {"sha256": sha256, "format": catalogue.format, "columns": dict(catalogue.columns)}
     dust = request.ingest.dust
     universe = request.facts("universe")["universe"]
-    lens_facts = {name: universe[name] for name in _LENS_FACTS}
+    lens_facts = {name: universe[name] for name in (*_LENS_FACTS, "cosmology")}
     facts = {
         "seed": request.seed,
         "ingest": catalogue_facts,
@@ -292,9 +299,9 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
 
 def _given_step(request: Request, source_tables: UserSources) -> Step:
     universe = request.facts("universe")["universe"]
-    lens_facts = {name: universe[name] for name in _LENS_FACTS}
+    lens_facts = {name: universe[name] for name in (*_LENS_FACTS, "cosmology")}
     source_facts = source_tables.facts(request.area.bounding_circle())
-    given_sources.load(source_tables, request.area)
+    given_sources.load(source_tables, request.area, request.universe.cosmology)
     plan = Plan(
         GALAXIES,
         {"seed": request.seed, "sources": source_facts, **lens_facts, "code": code_version()},
@@ -322,8 +329,11 @@ def draw_given_galaxies(lake: Path, facts: Json, source_tables: UserSources, are
     Output
         Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
-    source_columns = given_sources.load(source_tables, area, facts["sources"])
-    model = given_sources.model(facts["seed"], source_tables, source_columns, _shear(facts), facts["rotation"])
+    cosmology = from_facts(facts)
+    source_columns = given_sources.load(source_tables, area, cosmology, facts["sources"])
+    model = given_sources.model(
+        facts["seed"], source_tables, source_columns, cosmology, _shear(facts), facts["rotation"]
+    )
     return _split_quarantine(
         facts, cells.draw_rows(facts, GALAXIES, lambda cell: given_sources.galaxies(cell, source_columns, model))
     )
@@ -352,7 +362,7 @@ def ingest_galaxies(lake: Path, facts: Json, catalogue: Catalogue, dust: DustMap
     Output
         Rows of table `galaxies`. Galaxies too close to a caustic are in an additional file for the table `quarantine`.
     """
-    columns = ingest.galaxy_columns(catalogue, facts["lensing"] is not None)
+    columns = ingest.galaxy_columns(catalogue, facts["lensing"] is not None, from_facts(facts))
     files, _ = ingest.list_files(catalogue.files, columns)
     split_catalogue = ingest.split_by_cell(files, facts["ingest"]["sha256"], columns)
     model = from_catalogue.model(facts["seed"], columns, split_catalogue, _shear(facts), facts["rotation"])

@@ -14,6 +14,7 @@ from lake_schema.store.provenance import code_version
 from lake_schema.tables.stars import STARS
 from truesky.catalogue import cells, dust_map, given_sources, request_checks
 from truesky.catalogue.stars import stars
+from truesky.cosmology import Cosmology
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
 from truesky.request.files import DustMap, UserSources
@@ -67,15 +68,19 @@ def _given_step(request: Request, source_tables: UserSources) -> Step:
         "sources": source_tables.facts(request.area.bounding_circle()),
         "code": code_version(),
     }
-    model = _given_model(source_tables, request.area)
+    cosmology = request.universe.cosmology
+    model = _given_model(source_tables, request.area, cosmology)
     generation_cells = request.area.cells()
     tasks = cells.tasks_by_row_count(
         generation_cells, stars.expected_counts(generation_cells, model), request.stars.rows_a_file, _MIN_FILE_ORDER
     )
-    return Step(Plan(STARS, facts, tasks), partial(draw_given_stars, source_tables=source_tables, area=request.area))
+    return Step(
+        Plan(STARS, facts, tasks),
+        partial(draw_given_stars, source_tables=source_tables, area=request.area, cosmology=cosmology),
+    )
 
 
-def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
+def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: Area, cosmology: Cosmology) -> Output:
     """Make the stars of one file for a request whose stars and galaxies are all listed in tables of the user.
 
     Parameters
@@ -88,22 +93,26 @@ def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: 
         The user's tables of stars and galaxies.
     area : Area
         Area of the request.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
     Output
         Rows of table `stars`.
     """
-    model, dust = _given_model(source_tables, area, facts["sources"]), np.zeros(12, np.float32)
+    model, dust = _given_model(source_tables, area, cosmology, facts["sources"]), np.zeros(12, np.float32)
     return Output(cells.draw_rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
-def _given_model(source_tables: UserSources, area: Area, planned: Json | None = None) -> stars.StarModel:
+def _given_model(
+    source_tables: UserSources, area: Area, cosmology: Cosmology, planned: Json | None = None
+) -> stars.StarModel:
     """Return a model that contains exactly the stars in the user's table, without any magnitude limit.
 
     `planned` are the checksums of the tables when the job began; None to skip this check.
     """
-    catalogue = given_sources.stars(given_sources.load(source_tables, area, planned), source_tables.band)
+    catalogue = given_sources.stars(given_sources.load(source_tables, area, cosmology, planned), source_tables.band)
     return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 

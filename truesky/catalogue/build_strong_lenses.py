@@ -16,6 +16,7 @@ from lake_schema.store.provenance import code_version
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from truesky.catalogue import cells
 from truesky.catalogue.galaxies import strong_lenses
+from truesky.cosmology import from_facts
 from truesky.request import universe
 from truesky.request.schema import Request
 from truesky.running.submitted_job import Job, Step
@@ -39,12 +40,13 @@ def draw_lenses(lake: Path, facts: Json) -> Output:
 
     Lens and source are galaxies whose observed positions are in the same generation cell (HEALPix cell of order 8).
     """
-    rows = read.version(lake, "galaxies", facts["galaxies"]).rows(strong_lenses.COLUMNS, [facts["part"]])
+    galaxies = read.version(lake, "galaxies", facts["galaxies"])
+    rows, cosmology = galaxies.rows(strong_lenses.COLUMNS, [facts["part"]]), from_facts(galaxies.manifest["facts"])
     index = rows["_healpix_29"].to_numpy()
 
     def draw(cell: int) -> pa.Table:
         first, last = np.searchsorted(index, sky.cell_range(GENERATION_ORDER, cell))
-        return strong_lenses.draw(cell, rows.slice(first, last - first), facts["seed"], facts["boost"])
+        return strong_lenses.draw(cell, rows.slice(first, last - first), facts["seed"], facts["boost"], cosmology)
 
     return Output(cells.draw_rows(facts, STRONG_LENSES, draw))
 

@@ -34,7 +34,8 @@ from truesky.catalogue.galaxies import band_ratios, from_catalogue, lensing
 from truesky.catalogue.galaxies.from_catalogue import IngestModel
 from truesky.catalogue.stars.from_catalogue import KEYS, StarCatalogue
 from truesky.catalogue.stars.stars import nearest_template
-from truesky.fluxes import cosmology, integration, passbands
+from truesky.cosmology import Cosmology
+from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import stellar, templates
 from truesky.fluxes.sources import Stars
 from truesky.request.area import Area
@@ -85,7 +86,7 @@ class SourceColumns:
     stars: Mapping[str, Array]
 
 
-def load(source_tables: UserSources, area: Area, planned: Json | None = None) -> SourceColumns:
+def load(source_tables: UserSources, area: Area, cosmology: Cosmology, planned: Json | None = None) -> SourceColumns:
     """Read and check the user's tables of stars and galaxies.
 
     Parameters
@@ -94,6 +95,8 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
         Files of the tables, band of the magnitudes, and spacing of the grid if sources are placed on one.
     area : Area
         Area of the request. The order-8 cells that it touches must contain all sources.
+    cosmology : Cosmology
+        Parameters of the universe.
     planned : dict, optional
         Checksums and settings of the tables when the job began, with which the files must still agree; None to skip
         this check.
@@ -117,7 +120,7 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
     tables = {}
     for name, file in (("galaxies", source_tables.galaxies), ("stars", source_tables.stars)):
         try:
-            tables[name] = _read(file, name, source_tables, None if messages else area)
+            tables[name] = _read(file, name, source_tables, cosmology, None if messages else area)
         except BadInput as error:
             key = f"sources.{name}"
             messages += [text if text.startswith(key) else f"{key}: {text}" for text in error.messages]
@@ -131,7 +134,12 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
 
 
 def model(
-    seed: int, source_tables: UserSources, sources: SourceColumns, lens: lensing.Shear | None, rotation: float
+    seed: int,
+    source_tables: UserSources,
+    sources: SourceColumns,
+    cosmology: Cosmology,
+    lens: lensing.Shear | None,
+    rotation: float,
 ) -> IngestModel:
     """Return the model from which properties that the table of galaxies does not contain are drawn.
 
@@ -143,6 +151,8 @@ def model(
         Settings of the user's tables, of which the band of the magnitudes is used.
     sources : SourceColumns
         The galaxies and stars, from `load`.
+    cosmology : Cosmology
+        Parameters of the universe.
     lens : lensing.Shear or None
         Uniform shear that replaces the lensing of the rows; None to use the lensing of the rows.
     rotation : float
@@ -153,7 +163,7 @@ def model(
     IngestModel
         The model.
     """
-    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band)
+    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band, cosmology=cosmology)
     return from_catalogue.model(seed, columns, _split(sources.galaxies), lens, rotation)
 
 
@@ -373,7 +383,9 @@ def find_columns(title: str, bounds: Container[str] = GIVEN_GALAXY_BOUNDS) -> li
     return synonyms.find_columns(title, ("given_galaxies", "galaxies", "stars"), bounds)
 
 
-def _read(file: Path | None, name: str, source_tables: UserSources, area: Area | None) -> dict[str, Array]:
+def _read(
+    file: Path | None, name: str, source_tables: UserSources, cosmology: Cosmology, area: Area | None
+) -> dict[str, Array]:
     """Read and check a table, and return its properties by name.
 
     If `file` is None, all properties are empty. Raises BadInput if a column is unknown or a required one is missing, if
@@ -396,7 +408,7 @@ def _read(file: Path | None, name: str, source_tables: UserSources, area: Area |
     if name == "galaxies":
         _add_caustics(file, values, mistakes)
         if area is not None:
-            _add_magnitudes(file, values, source_tables.band, mistakes)
+            _add_magnitudes(file, values, source_tables.band, cosmology, mistakes)
     mistakes.refuse()
     return values | {"origin_id": np.arange(1, count + 1)}
 
@@ -424,7 +436,9 @@ def _add_caustics(file: Path, values: Mapping[str, Array], mistakes: TableMistak
     mistakes.add_rows(file, 1, "kappa, gamma1 and gamma2", bad, "give an image near a caustic", allowed, "columns")
 
 
-def _add_magnitudes(file: Path, values: Mapping[str, Array], band: str, mistakes: TableMistakes) -> None:
+def _add_magnitudes(
+    file: Path, values: Mapping[str, Array], band: str, cosmology: Cosmology, mistakes: TableMistakes
+) -> None:
     """Add galaxies to `mistakes` whose magnitude, redshift and spectrum give an impossible absolute magnitude."""
     z = np.maximum(values["z_true"], reading.MIN_REDSHIFT)
     sed = band_ratios.sed_of_index(values["sed"], values["ext_law"], values["ebv"])

@@ -6,14 +6,17 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from lake_schema import user_files
+from lake_schema import ids, user_files
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.external import rows as external_rows
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
-from truesky.catalogue import dust_map, given_sources
+from truesky.catalogue import dust_map, given_sources, parameters
 from truesky.catalogue.external import ingest, mapping
+from truesky.catalogue.halos import matching
+from truesky.catalogue.matter import boltzmann, density_box
 from truesky.catalogue.stars import bright_stars, from_catalogue, stars
+from truesky.cosmology import Cosmology
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.request.files import SOURCES_KIND, Catalogue
@@ -32,8 +35,37 @@ def check_request(request: Request) -> None:
     stars. There is one message for each mistake, which names the key of the request, or the file, its column and row.
     """
     with Mistakes() as mistakes:
-        for check in (_check_dust, _check_sources, _check_galaxies, _check_halos, _check_training, _check_stars):
+        for check in (
+            _check_cosmology,
+            _check_dust,
+            _check_sources,
+            _check_galaxies,
+            _check_halos,
+            _check_training,
+            _check_stars,
+        ):
             mistakes.read(check, request)
+
+
+def _check_cosmology(request: Request) -> None:
+    if request.sources is None and request.ingest.galaxies is None:
+        check_cosmology(request.universe.cosmology)
+
+
+def check_cosmology(cosmology: Cosmology) -> None:
+    """Raise BadInput if galaxies cannot be drawn in this cosmology.
+
+    The package CAMB may be missing, or the universe may be so large that its steps in distance have no identifiers.
+    """
+    if cosmology.power == "camb":
+        boltzmann.check(cosmology)
+    law, cell = parameters.section("halos.toml", "mass_function"), density_box.box_model(cosmology).cell
+    # There are two more steps than the distance has cells: around its end, and at the start.
+    largest = (ids.BLOCK_COUNT // round((law["highest"] - law["lowest"]) / law["bin"]) - 2) * cell
+    distance = float(cosmology.comoving_distance(matching.Z_LAST))
+    if distance > largest:
+        problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
+        raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
 
 
 def _check_dust(request: Request) -> None:
@@ -47,16 +79,16 @@ def _check_sources(request: Request) -> None:
             for name, file in (("galaxies", request.sources.galaxies), ("stars", request.sources.stars)):
                 if file is not None:
                     mistakes.read(user_files.check_file, file, SOURCES_KIND, f"sources.{name}")
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, request.universe.cosmology)
 
 
 def _check_galaxies(request: Request) -> None:
     if request.sources is None:
         check_band(request)
     if (catalogue := request.ingest.galaxies) is not None:
-        replaces_lensing = request.universe.lensing is not None
+        settings = request.universe.lensing is not None, request.universe.cosmology
         columns = _with_existing_files(
-            "ingest.galaxies", catalogue, lambda: ingest.galaxy_columns(catalogue, replaces_lensing)
+            "ingest.galaxies", catalogue, lambda: ingest.galaxy_columns(catalogue, *settings)
         )
         files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
         split = ingest.split_by_cell(files, sha256, columns)
@@ -65,7 +97,8 @@ def _check_galaxies(request: Request) -> None:
 
 def _check_halos(request: Request) -> None:
     if (catalogue := request.ingest.halos) is not None:
-        columns = _with_existing_files("ingest.halos", catalogue, lambda: mapping.halo_columns(dict(catalogue.columns)))
+        entries, cosmology = dict(catalogue.columns), request.universe.cosmology
+        columns = _with_existing_files("ingest.halos", catalogue, lambda: mapping.halo_columns(entries, cosmology))
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns, request.area)
 
 

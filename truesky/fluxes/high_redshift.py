@@ -21,7 +21,8 @@ from lake_schema import units
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
-from truesky.fluxes import cosmology, passbands
+from truesky.cosmology import Cosmology
+from truesky.fluxes import passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import column, source_ids, table_magnification
@@ -58,6 +59,9 @@ LYMAN_ALPHA_WIDTHS = (0.0, 25.0, 50.0)
 # Gaussian sigma of Lyman alpha, A (adopted). Only the red half of the line is transmitted.
 _LYMAN_ALPHA_SIGMA = 1.0
 
+# Hubble parameter h for which the luminosity functions of quasars and high-redshift galaxies (absolute magnitudes, and
+# densities in Mpc^-3) are published. It defines their unit, whatever the h of the universe.
+HUBBLE = 0.67
 # Number of sources whose whole spectra are computed at a time.
 _BLOCK = 64
 
@@ -93,13 +97,26 @@ def high_redshift_library() -> Library:
     return Library(wavelength, np.stack(flux).astype(np.float32), tuple(names))
 
 
-def ultraviolet_magnitude(abs_mag: npt.ArrayLike, z: npt.ArrayLike) -> Float:
+def ultraviolet_magnitude(cosmology: Cosmology, abs_mag: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     """Return the apparent monochromatic AB magnitude at the redshifted wavelength, M_UV + DM - 2.5 log10(1 + z).
 
-    `abs_mag` is the absolute magnitude M_UV. It and the distance modulus DM are for h = 0.67. The result is stored in
-    the column mag_r01 of quasars and high-redshift galaxies.
+    The result is stored in the column mag_r01 of quasars and high-redshift galaxies.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    abs_mag : array_like
+        Absolute magnitude M_UV, for h = 0.67 as the distance modulus DM.
+    z : array_like
+        Redshift.
+
+    Returns
+    -------
+    float array
+        AB magnitude.
     """
-    distance = cosmology.distance_modulus(z) - 5.0 * np.log10(cosmology.HUBBLE)
+    distance = cosmology.distance_modulus(z) - 5.0 * np.log10(HUBBLE)
     return np.asarray(np.asarray(abs_mag, float) + distance - 2.5 * np.log10(1.0 + np.asarray(z, float)))
 
 

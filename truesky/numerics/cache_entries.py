@@ -32,7 +32,7 @@ MAKING, REMOVED = ".making-", ".gone-"
 # Kinds of entries, what they contain, and the pattern that the names of their folders match. An entry belongs to the
 # first kind that matches.
 KINDS = (
-    ("box", "simulated matter", r"box_\w+"),
+    ("box", "simulated matter", r"box_\w+|linear_power"),
     ("lensing", "lensing maps", r"lensing_\w+"),
     ("halos", "tables of halos", r"halo_\w+|halo_catalogue"),
     ("spectra", "libraries of spectra, isochrones", r"(galaxy|stellar|published)_library|published_stars|isochrones"),

@@ -28,31 +28,63 @@ def label_dust_map(seed: int) -> str:
     return content_key(code_key("truesky.catalogue.dust_map"), seed)
 
 
-def label_halo_tables() -> str:
-    """Return the label of the tables of the abundance, bias and concentration of halos."""
-    return content_key(code_key("truesky.catalogue.matter.linear_theory"))
+def label_halo_tables(cosmology: str) -> str:
+    """Return the label of the tables of halos (abundance, bias, concentration) in a cosmology, by its fingerprint."""
+    return content_key(code_key("truesky.catalogue.matter.linear_theory"), cosmology)
 
 
-def label_halo_bias() -> str:
-    """Return the label of the table of the halo bias of a log-normal density."""
-    return content_key("bias", code_key("truesky.catalogue.matter.density_box"))
+def label_halo_bias(cosmology: str) -> str:
+    """Return the label of the table of the halo bias of a log-normal density in a cosmology, by its fingerprint."""
+    return content_key("bias", code_key("truesky.catalogue.matter.density_box"), cosmology)
 
 
-def label_box(seed: int, cells: int) -> str:
-    """Return the label of the box of matter of a seed with `cells` cells per side."""
-    return content_key("box", code_key("truesky.catalogue.matter.density_box"), seed, cells)
+def label_box(cosmology: str, seed: int, cells: int) -> str:
+    """Return the label of the box of matter of a cosmology and a seed with `cells` cells per side.
+
+    Parameters
+    ----------
+    cosmology : str
+        Fingerprint of the cosmology.
+    seed : int
+        Seed of the box.
+    cells : int
+        Number of cells per side of the box.
+
+    Returns
+    -------
+    str
+        The label.
+    """
+    return content_key("box", code_key("truesky.catalogue.matter.density_box"), cosmology, seed, cells)
 
 
-def label_tides(seed: int, cells: int) -> str:
-    """Return the label of the tidal field of the box of matter of a seed with `cells` cells per side."""
-    return content_key("tides", code_key("truesky.catalogue.matter.density_box"), seed, cells)
+def label_tides(cosmology: str, seed: int, cells: int) -> str:
+    """Return the label of the tidal field of the box of matter with the same arguments of `label_box`.
+
+    Parameters
+    ----------
+    cosmology : str
+        Fingerprint of the cosmology.
+    seed : int
+        Seed of the box.
+    cells : int
+        Number of cells per side of the box.
+
+    Returns
+    -------
+    str
+        The label.
+    """
+    return content_key("tides", code_key("truesky.catalogue.matter.density_box"), cosmology, seed, cells)
 
 
-def label_lensing(seed: int, cells: int, nside: int, with_far_planes: bool) -> str:
+def label_lensing(cosmology: str, seed: int, cells: int, nside: int, with_far_planes: bool) -> str:
     """Return the label of the lensing maps of a box of matter.
 
     Parameters
     ----------
+    cosmology : str
+        Fingerprint of the cosmology.
     seed : int
         Seed of the box.
     cells : int
@@ -67,7 +99,8 @@ def label_lensing(seed: int, cells: int, nside: int, with_far_planes: bool) -> s
     str
         The label.
     """
-    return content_key(code_key("truesky.catalogue.galaxies.lensing"), seed, cells, nside, int(with_far_planes))
+    maps = nside, int(with_far_planes)
+    return content_key(code_key("truesky.catalogue.galaxies.lensing"), cosmology, seed, cells, *maps)
 
 
 def label_band_ratios(band: str) -> str:

@@ -10,8 +10,9 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from lake_schema.errors import BadInput, Mistakes, bad_input
+from lake_schema.errors import BadInput, Mistakes, OutOfRange, bad_input
 from lake_schema.tables.exposures import RENDERED_TYPES
+from truesky.cosmology import FIDUCIAL, LIMITS, POWERS, Cosmology
 from truesky.request import instruments
 from truesky.request.files import Ingest
 from truesky.request.schema import MissionChoice, Override, Request, Stars
@@ -234,3 +235,33 @@ def _requested_types(request: Request) -> Iterator[tuple[str, tuple[str, str]]]:
 
 def _is_rendered(kind: tuple[str, str]) -> bool:
     return kind[1] in RENDERED_TYPES.get(kind[0], ())
+
+
+def parse_cosmology(value: object) -> Cosmology:
+    """Read the section `universe.cosmology`; parameters that it does not contain have their fiducial values.
+
+    Raises BadInput if a value is not allowed, with one line for each.
+    """
+    path = "universe.cosmology"
+    table = as_table(value, path, Cosmology.__slots__)
+    with Mistakes() as mistakes:
+        values = {
+            name: mistakes.read(_parameter, table, f"{path}.{name}", *limits, getattr(FIDUCIAL, name))
+            for name, limits in LIMITS.items()
+        }
+        power = mistakes.read(string, table, f"{path}.power", POWERS, FIDUCIAL.power)
+    try:
+        return Cosmology(**values, power=power)
+    except BadInput as error:
+        raise error.with_prefix(path) from None
+
+
+def _parameter(table: Toml, path: str, lo: float, hi: float, default: float) -> float:
+    """Read a parameter of the cosmology; for h, ask whether the value is H0 in km/s/Mpc."""
+    try:
+        return number(table, path, lo, hi, default)
+    except OutOfRange as error:
+        h = table[path.rpartition(".")[2]]
+        if path.endswith(".h") and 100.0 * lo <= h <= 100.0 * hi:
+            raise error.with_question(f"h is H0 / (100 km/s/Mpc): did you mean {h / 100.0:g}?") from None
+        raise

@@ -13,6 +13,9 @@ All keys::
                    high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
                    rotation       deg, added to the position angle of every galaxy before lensing
+    [universe.cosmology]  omega_m, omega_b, h, sigma_8, n_s, w0, wa   flat universe, by default that of Flagship
+                   m_nu           sum of the masses of neutrinos, eV: only 0
+                   power = "eisenstein98" | "camb"   source of the linear power spectrum
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
                    bright_limit   H (Vega, as observed); brighter stars are omitted
     [ingest.galaxies]  files = [..]  finished catalogue that replaces ours: Parquet, FITS, CSV, HDF5, a HATS folder
@@ -406,6 +409,7 @@ def _universe(table: Toml, lensing_nside: int) -> Universe:
             lensing=read(_lensing, table.get("lensing", "box")),
             alignment=read(_number, table, "universe.alignment", 0.0, 10.0, default.alignment),
             rotation=read(_number, table, "universe.rotation", -360.0, 360.0, default.rotation, "deg"),
+            cosmology=read(checks.parse_cosmology, table.get("cosmology", {})),
         )
     return universe
 

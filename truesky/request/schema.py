@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
+from truesky.cosmology import FIDUCIAL, Cosmology
 from truesky.request.accuracy import Accuracy
 from truesky.request.area import Area
 from truesky.request.exposures.observations import Observation
@@ -88,6 +89,8 @@ class Universe:
         Angle in degrees added to the position angle of every galaxy before lensing.
     high_redshift_boost, quasar_boost : float
         Number density of high-redshift galaxies, and of quasars, relative to nature; 0 for none.
+    cosmology : Cosmology
+        Parameters of the cosmology.
     """
 
     galaxy_limit: float = 26.0
@@ -102,6 +105,7 @@ class Universe:
     rotation: float = 0.0
     high_redshift_boost: float = 1.0
     quasar_boost: float = 1.0
+    cosmology: Cosmology = FIDUCIAL
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 from lake_schema.errors import Mistakes
+from truesky.cosmology import LIMITS
 from truesky.request import instruments
 from truesky.request.files import UserSources
 from truesky.request.schema import EFFECTS, Stars, Universe
@@ -41,6 +42,7 @@ _PLACES: dict[str, str] = {
     **dict.fromkeys(EFFECTS, "the lists on and off of [effects]"),
     **{key: "[area]" for key in ("cone", "box", "polygon", "tile", "patches", "wide")},
     **{key: f"[{name}]" for name, keys in _SECTIONS.items() for key in keys if key not in _SECTIONS},
+    **dict.fromkeys((*LIMITS, "sigma8", "ns"), "[universe.cosmology]"),
 }
 # The same for keys in the section itself, whose other meanings are in other sections.
 _PLACES_IN: dict[str, dict[str, str]] = {

@@ -32,14 +32,15 @@ _SYNONYMS = {
     "pa": "position_angle", "filter": "band", "filters": "bands", "exptime": "exposure_time_s", "depth": "galaxy_limit",
     "mag_limit": "galaxy_limit", "instrument": "channel", "instruments": "channels",
     "date": "mjd", "date_obs": "mjd",
+    "sigma8": "sigma_8", "ns": "n_s", "om0": "omega_m", "ob0": "omega_b", "w": "w0", "mnu": "m_nu",
     "gamma1": "g1", "gamma2": "g2", "gamma_1": "g1", "gamma_2": "g2", "shear1": "g1", "shear2": "g2",
 }  # fmt: skip
 # Keys that users know from other programs and that a request does not have, with the reason.
 _FIXED = {
-    **dict.fromkeys(
-        ("h0", "hubble", "omega_m", "omega_b", "omega_lambda", "sigma_8", "sigma8", "n_s", "cosmology"),
-        "the cosmology is fixed: flat, H0 = 67, Omega_m = 0.319, Omega_b = 0.049, sigma_8 = 0.83, n_s = 0.96",
-    ),
+    **dict.fromkeys(("h0", "hubble"), "it is h = H0 / 100 in [universe.cosmology]"),
+    **dict.fromkeys(("omega_lambda", "omega_k"), "the universe is flat: give omega_m in [universe.cosmology]"),
+    "a_s": "the power spectrum is normalised by sigma_8 in [universe.cosmology]",
+    "omega_c": "give omega_m (all matter) and omega_b in [universe.cosmology]",
     **dict.fromkeys(("star_band", "stars_band"), "star_limit is always in H (Vega)"),
 }  # fmt: skip
 # Other names of values: ground cameras and surveys belong to one channel, cameras to a survey, and I_E is euclid_vis.

@@ -18,6 +18,7 @@ from lake_schema.external import rows as external_rows
 from lake_schema.store import read, request_links
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, file_sha256
+from truesky.cosmology import FIDUCIAL
 from truesky.request.files import Catalogue
 from truesky.request.schema import Request
 
@@ -74,8 +75,12 @@ def _difference(version: read.Version, request: Request) -> str:
     if canonical(facts.get("sources")) != canonical(source_facts):
         return "other sources than the request"
     # Compare only values that the manifest (JSON description) of the catalogue contains. For a user's catalogue, for
-    # example, the manifest has no limiting magnitude.
+    # example, the manifest has no limiting magnitude. Galaxies without a cosmology have the fiducial one, which was the
+    # only one when they were made.
+    facts = {"cosmology": asdict(FIDUCIAL), **facts} if version.table == "galaxies" else facts
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
+        if key == "cosmology" and (different := _different_parameter(facts[key], values[key])):
+            return different
         if canonical(facts.get(key)) != canonical(values[key]):
             remedy = " (by default from area and accuracy: set universe.lensing_nside)" * (key == "lensing_nside")
             return f"{key} {facts.get(key)}, the request {values[key]}{remedy}"
@@ -88,6 +93,14 @@ def _difference(version: read.Version, request: Request) -> str:
                     return f"{name} of {key} {facts[key][name] or 'none'}, the request {value or 'none'}"
             if not _is_same(facts[key], named):
                 return f"other files of {key} than the request"
+    return ""
+
+
+def _different_parameter(recorded: Mapping[str, Any], requested: Mapping[str, Any]) -> str:
+    """Describe the first parameter of two cosmologies that differs; "" if they are equal."""
+    for name, value in requested.items():
+        if recorded.get(name) != value:
+            return f"the cosmology {name} = {recorded.get(name)}, the request {name} = {value}"
     return ""
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import brentq
@@ -25,7 +25,7 @@ from scipy.special import j0, j1
 
 from lake_schema.arrays import Float
 from truesky.catalogue.matter import density_box
-from truesky.fluxes import cosmology
+from truesky.cosmology import HUBBLE_DISTANCE, Cosmology
 
 # Wavenumbers at which the linear power is tabulated, as ln(k / (h/Mpc)).
 _LN_K = np.linspace(np.log(1e-4), np.log(1e5), 4000)
@@ -35,15 +35,29 @@ _STEPS = 100
 _FINE = 40_000
 # Multipoles at which callers compute C_l before a Hankel transform.
 ELL = np.geomspace(1.0, 2e5, 160)
+# Function of (cosmology, k, z) that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
+PowerSpectrum = Callable[[Cosmology, Float, float], Float]
 
 
-def nonlinear_power(k: Float, z: float) -> Float:
-    """Return the non-linear matter power spectrum P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc.
+def nonlinear_power(cosmology: Cosmology, k: Float, z: float) -> Float:
+    """Return the non-linear matter power spectrum from the fitting formula halofit.
 
-    This is the fitting formula halofit with the coefficients of Takahashi et al. (2012).
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe; the terms of halofit for dark energy other than a constant are left out.
+    k : float array
+        Wave number, h/Mpc.
+    z : float
+        Redshift.
+
+    Returns
+    -------
+    float array
+        P(k) in (Mpc/h)^3, with the coefficients of Takahashi et al. (2012).
     """
-    nodes, today = np.exp(_LN_K), float(density_box.growth(z)) ** 2
-    delta = nodes**3 * _linear_power_today() * today / (2 * np.pi**2)
+    nodes, today = np.exp(_LN_K), float(cosmology.growth(z)) ** 2
+    delta = nodes**3 * _linear_power_today(cosmology) * today / (2 * np.pi**2)
 
     def sigma2(ln_r: float) -> float:
         return float(np.trapezoid(delta * np.exp(-((nodes * np.exp(ln_r)) ** 2)), _LN_K))
@@ -52,7 +66,7 @@ def nonlinear_power(k: Float, z: float) -> Float:
     y2 = (nodes * np.exp(ln_r)) ** 2
     first, second = (np.trapezoid(delta * part * np.exp(-y2), _LN_K) for part in (2 * y2, 4 * y2 - 4 * y2**2))
     n, c = first - 3.0, first**2 + second
-    om = cosmology.OMEGA_M * (1 + z) ** 3 / float(cosmology.expansion_rate(z)) ** 2
+    om = cosmology.omega_m * (1 + z) ** 3 / float(cosmology.expansion_rate(z)) ** 2
     a = 10 ** (1.5222 + 2.8553 * n + 2.3706 * n**2 + 0.9903 * n**3 + 0.2250 * n**4 - 0.6038 * c)
     b = 10 ** (-0.5642 + 0.5864 * n + 0.5716 * n**2 - 1.5474 * c)
     g = 10 ** (0.3698 + 2.0404 * n + 0.8161 * n**2 + 0.5869 * c)
@@ -61,31 +75,48 @@ def nonlinear_power(k: Float, z: float) -> Float:
     beta = 2.0379 - 0.7354 * n + 0.3157 * n**2 + 1.2490 * n**3 + 0.3980 * n**4 - 0.1682 * c
     nu = 10 ** (5.2105 + 3.6902 * n)
     f1, f2, f3 = om**-0.0307, om**-0.0585, om**0.0743
-    smooth = k**3 * today * np.exp(np.interp(np.log(k), _LN_K, np.log(_linear_power_today()))) / (2 * np.pi**2)
+    smooth = k**3 * today * np.exp(np.interp(np.log(k), _LN_K, np.log(_linear_power_today(cosmology)))) / (2 * np.pi**2)
     y = k * np.exp(ln_r)
     quasi = smooth * (1 + smooth) ** beta / (1 + alpha * smooth) * np.exp(-(y / 4 + y**2 / 8))
     halo = a * y ** (3 * f1) / (1 + b * y**f2 + (g * f3 * y) ** (3 - gamma)) / (1 + nu / y**2)
     return np.asarray(2 * np.pi**2 * (quasi + halo) / k**3)
 
 
-def linear_power(k: Float, z: float) -> Float:
-    """Return the linear matter power spectrum P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
-    return np.asarray(density_box.linear_power(k) * float(density_box.growth(z)) ** 2)
+def linear_power(cosmology: Cosmology, k: Float, z: float) -> Float:
+    """Return the linear matter power spectrum.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    k : float array
+        Wave number, h/Mpc.
+    z : float
+        Redshift.
+
+    Returns
+    -------
+    float array
+        P(k) in (Mpc/h)^3.
+    """
+    return np.asarray(density_box.linear_power(cosmology, k) * float(cosmology.growth(z)) ** 2)
 
 
-@cache
-def _linear_power_today() -> Float:
+@lru_cache(maxsize=4)
+def _linear_power_today(cosmology: Cosmology) -> Float:
     """Return the linear matter power in (Mpc/h)^3 at z = 0 for the wavenumbers exp(_LN_K), as a read-only array."""
-    spectrum = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
+    spectrum = np.asarray(density_box.linear_power(cosmology, np.exp(_LN_K)), float)
     spectrum.flags.writeable = False
     return spectrum
 
 
-def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
+def lensing_weight(cosmology: Cosmology, x: Float, chi: Float, weight: Float) -> Float:
     """Return the lensing efficiency: mean convergence of sources per Mpc/h of matter with an overdensity of 1.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     x : float array, shape (n,)
         Comoving distances of the matter, Mpc/h.
     chi : float array, shape (s,)
@@ -99,21 +130,24 @@ def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
         Convergence in h/Mpc; 0 for matter behind all sources.
     """
     efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
-    lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
+    lens = 1.5 * cosmology.omega_m / HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
     return np.asarray(lens * np.sum(efficiency * weight, axis=1) / weight.sum())
 
 
 def convergence_power(
+    cosmology: Cosmology,
     ell: Float,
     chi: Float,
     weight: Float,
-    power_spectrum: Callable[[Float, float], Float] = nonlinear_power,
+    power_spectrum: PowerSpectrum = nonlinear_power,
     x: Float | None = None,
 ) -> Float:
     """Return the angular power spectrum C_l of the convergence in Limber's approximation.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     ell : float array, shape (n,)
         Multipoles l.
     chi : float array, shape (s,)
@@ -121,7 +155,7 @@ def convergence_power(
     weight : float array, shape (s,)
         Relative number of sources at each distance.
     power_spectrum : callable
-        Function that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
+        Function of (cosmology, k, z) that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
     x : float array, shape (m,), optional
         Comoving distances at which the matter is evaluated, Mpc/h; by default 100 distances up to the farthest source.
 
@@ -131,8 +165,11 @@ def convergence_power(
         C_l at each multipole.
     """
     x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS) if x is None else x
-    z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(x, chi, weight)
-    rows = [(w / d) ** 2 * power_spectrum((ell + 0.5) / d, float(at)) for w, d, at in zip(lens, x, z, strict=True)]
+    z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(cosmology, x, chi, weight)
+    rows = [
+        (w / d) ** 2 * power_spectrum(cosmology, (ell + 0.5) / d, float(at))
+        for w, d, at in zip(lens, x, z, strict=True)
+    ]
     return np.asarray(np.trapezoid(np.array(rows), x, axis=0))
 
 
@@ -177,18 +214,20 @@ def shells(chi: Float, bias: Float, edges: Float) -> Shells:
 
 
 def galaxy_power(
-    ell: Float, tracers: Shells, power_spectrum: Callable[[Float, float], Float] = nonlinear_power
+    cosmology: Cosmology, ell: Float, tracers: Shells, power_spectrum: PowerSpectrum = nonlinear_power
 ) -> Float:
     """Return the angular power spectrum C_l of the density of galaxies in Limber's approximation, without shot noise.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     ell : float array, shape (n,)
         Multipoles l.
     tracers : Shells
         Distribution of the galaxies over distance, weighted with their bias.
     power_spectrum : callable
-        Function that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
+        Function of (cosmology, k, z) that returns the matter power P(k, z) in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
@@ -198,7 +237,11 @@ def galaxy_power(
     total = np.zeros(len(ell))
     for chi, width, weight in zip(tracers.chi, tracers.width, tracers.weight, strict=True):
         if weight > 0.0:
-            total += width * (weight / chi) ** 2 * power_spectrum((ell + 0.5) / chi, float(cosmology.redshift(chi)))
+            total += (
+                width
+                * (weight / chi) ** 2
+                * power_spectrum(cosmology, (ell + 0.5) / chi, float(cosmology.redshift(chi)))
+            )
     return total
 
 

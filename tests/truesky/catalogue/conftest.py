@@ -13,7 +13,8 @@ from truesky.catalogue import dust_map
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies
 from truesky.catalogue.halos import matching, population
 from truesky.catalogue.matter import density_box
-from truesky.fluxes import cosmology, passbands
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.request.schema import Universe
 from truesky.validation.model import mean_sky
@@ -48,7 +49,7 @@ def made():
 
 @pytest.fixture(scope="session")
 def box():
-    return density_box.load(SEED, BOX_CELLS)
+    return density_box.load(SEED, BOX_CELLS, FIDUCIAL)
 
 
 @pytest.fixture(scope="session")
@@ -91,7 +92,7 @@ def draw_sky():
     columns = {name: rows[name].to_numpy() for name in rows.column_names if not rows[name].null_count}
     z = columns["z_true"].astype(float)
     m_r = columns["abs_mag_r01"].astype(float)
-    distance_modulus = cosmology.distance_modulus(z)
+    distance_modulus = FIDUCIAL.distance_modulus(z)
     sed = band_ratios.Sed(*(columns[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
 
     def mag(band):

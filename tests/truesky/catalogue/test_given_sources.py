@@ -18,6 +18,7 @@ from lake_schema.tables.stars import STARS
 from tests import requests
 from tests.truesky import nightly
 from truesky.catalogue import build_galaxies, build_stars, given_sources
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.sources import galaxies_from_table, stars_from_table
@@ -187,7 +188,7 @@ def test_every_format_of_ingest_is_read_with_a_mapping(tmp_path, form):
     }  # fmt: skip
     written_as(form, tmp_path / f"theirs.{form}", columns)
     request = parse(requests.written(tmp_path, MAPPED.format(form), requests.FIELD.format(0.05)))
-    sources = given_sources.load(request.sources, request.area)
+    sources = given_sources.load(request.sources, request.area, FIDUCIAL)
     rows = {name: values[np.argsort(sources.galaxies["origin_id"])] for name, values in sources.galaxies.items()}
     assert len(sources.stars["mag"]) == 0
     assert rows["mag"] == pytest.approx([20.0, 24.5], abs=1e-10)
@@ -208,7 +209,7 @@ def test_all_mistakes_of_both_tables_are_reported_at_once(tmp_path):
         tmp_path, more='only = "table"\nband = "lsst_q"', galaxies=galaxies, stars=STAR.replace("4000", "4")
     )
     with pytest.raises(BadInput) as caught:
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
     lines = [line.replace(f"{tmp_path}/", "") for line in caught.value.messages]
     assert lines[0].startswith("sources.band = 'lsst_q' is not allowed: allowed with lsst: lsst_u, lsst_g, ")
     assert lines[1:] == [
@@ -243,13 +244,13 @@ def test_a_wrong_mapping_is_refused(tmp_path, columns, message):
     text = f'[sources]\nonly = "table"\n[sources.galaxies]\nfile = "galaxies.csv"\ncolumns = {{ {columns} }}\n'
     request = parse(requests.written(tmp_path, text, requests.FIELD.format(0.05)))
     with pytest.raises(BadInput, match=message):
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
 
 
 def test_a_column_of_another_name_is_one_line(tmp_path):
     request = asked(tmp_path, galaxies=TWO.replace("mag,", "MAG_AUTO,"), stars=None)
     with pytest.raises(BadInput) as caught:
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
     (line,) = caught.value.messages
     assert "galaxies.csv: column mag is missing; did you mean MAG_AUTO? Rename it to mag, or map all columns" in line
     assert 'columns = { mag = "MAG_AUTO", .. }' in line
@@ -258,7 +259,7 @@ def test_a_column_of_another_name_is_one_line(tmp_path):
 def test_a_longer_name_of_a_column_is_one_line(tmp_path):
     request = asked(tmp_path, galaxies=TWO.replace("mag,", "magnitude,"), stars=None)
     with pytest.raises(BadInput) as caught:
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
     (line,) = caught.value.messages
     assert "galaxies.csv: column mag is missing; did you mean magnitude? Rename it to mag" in line
 
@@ -267,7 +268,7 @@ def test_names_of_other_catalogues_are_answered_with_names_of_columns(tmp_path):
     text = "RAJ2000,DEJ2000,mag_r,r_e,n,foo\n53.1,-27.8,20,0.3,4,1\n"
     request = asked(tmp_path, galaxies=text, stars=None)
     with pytest.raises(BadInput) as caught:
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
     lines = [line.partition("galaxies.csv: ")[2].partition(", or map")[0] for line in caught.value.messages]
     assert lines[:3] == [
         "column ra is missing; did you mean RAJ2000? Rename it to ra",
@@ -290,7 +291,7 @@ def test_ellipticities_of_tables_in_memory_are_refused_with_the_remedy():
 def test_positions_in_radians_are_named(tmp_path):
     request = asked(tmp_path, galaxies="ra,dec,mag\n0.927,-0.485,24\n0.9271,-0.4851,24\n", stars=None)
     with pytest.raises(BadInput, match=r"of row 1 are 0.927 and -0.485 deg, .*in radians, convert .*\(1 more row\)"):
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
 
 
 def test_sizes_in_another_unit_are_converted_or_refused(tmp_path):
@@ -300,11 +301,11 @@ def test_sizes_in_another_unit_are_converted_or_refused(tmp_path):
         table["disk_half_light_radius"].unit = unit
         table.write(tmp_path / "sizes.fits", overwrite=True)
         if factor:
-            sources = given_sources.load(request.sources, request.area)
+            sources = given_sources.load(request.sources, request.area, FIDUCIAL)
             assert sources.galaxies["disk_half_light_radius"] == pytest.approx([0.01 * factor])
             continue
         with pytest.raises(BadInput, match="column disk_half_light_radius has the unit pix, but must be in arcsec or"):
-            given_sources.load(request.sources, request.area)
+            given_sources.load(request.sources, request.area, FIDUCIAL)
 
 
 def test_an_impossible_absolute_magnitude_is_named(tmp_path):
@@ -312,7 +313,7 @@ def test_an_impossible_absolute_magnitude_is_named(tmp_path):
     galaxies = "ra,dec,mag,z_true\n53.1,-27.8,24,0.2\n53.1,-27.8,28.5,0\n"
     request = asked(tmp_path, galaxies=galaxies, stars=None)
     with pytest.raises(BadInput, match=r"magnitude from columns mag and z_true of row 2 is 6\.\d+, but must be from"):
-        given_sources.load(request.sources, request.area)
+        given_sources.load(request.sources, request.area, FIDUCIAL)
 
 
 def test_a_table_that_changes_while_it_is_read_is_refused(tmp_path):

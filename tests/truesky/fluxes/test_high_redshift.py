@@ -6,7 +6,8 @@ import pytest
 
 from lake_schema import units
 from lake_schema.errors import BadInput, OutOfRange
-from truesky.fluxes import band_fluxes, cosmology, high_redshift, passbands
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import band_fluxes, high_redshift, passbands
 from truesky.fluxes.spectra import extinction
 from truesky.request.accuracy import SURVEY
 
@@ -114,9 +115,9 @@ def test_a_part_of_a_spectrum_has_the_same_numbers(distant, kind, first, last):
 
 def test_apparent_magnitude():
     # A flat f_nu keeps its magnitude at any wavelength: M + DM - 2.5 log10(1 + z), in h = 0.67.
-    distance_pc = float(cosmology.luminosity_distance(7.0)) / 0.67 * 1e6
+    distance_pc = float(FIDUCIAL.luminosity_distance(7.0)) / 0.67 * 1e6
     wanted = -21.0 + 5.0 * np.log10(distance_pc / 10.0) - 2.5 * np.log10(8.0)
-    assert float(high_redshift.ultraviolet_magnitude(-21.0, 7.0)) == pytest.approx(wanted, abs=1e-9)
+    assert float(high_redshift.ultraviolet_magnitude(FIDUCIAL, -21.0, 7.0)) == pytest.approx(wanted, abs=1e-9)
     assert wanted == pytest.approx(26.0, abs=0.2)
 
 

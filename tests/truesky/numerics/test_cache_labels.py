@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema.mission import configuration
+from truesky.cosmology import FIDUCIAL
 from truesky.numerics import cache, cache_labels
 
 
@@ -25,7 +26,7 @@ def test_a_label_finds_the_entry_that_was_made_or_used_with_it():
 
 
 def test_a_label_without_its_entry_finds_nothing():
-    label = cache_labels.label_halo_tables()
+    label = cache_labels.label_halo_tables(FIDUCIAL.fingerprint())
     cache.cached_arrays("some", "a", lambda: {"a": np.zeros(1)}, label)
     (entry,) = cache.cache_dir().glob("some-*")
     shutil.rmtree(entry)
@@ -37,20 +38,26 @@ def test_a_label_without_its_entry_finds_nothing():
 def test_a_cache_that_cannot_be_written_has_no_labels(monkeypatch):
     cache.cached_arrays("some", "a", lambda: {"a": np.zeros(1)})
     (cache.cache_dir() / "labels").write_text("in the way")
-    label = cache_labels.label_halo_bias()
+    label = cache_labels.label_halo_bias(FIDUCIAL.fingerprint())
     assert cache.cached_arrays("some", "a", lambda: {"a": np.zeros(1)}, label)["a"].size == 1
 
 
 def test_labels_differ():
     labels = [
-        cache_labels.label_box(1, 192),
-        cache_labels.label_box(1, 256),
-        cache_labels.label_box(2, 192),
-        cache_labels.label_tides(1, 192),
-        cache_labels.label_halo_bias(),
-        cache_labels.label_lensing(1, 192, 256, True),
-        cache_labels.label_lensing(1, 192, 256, False),
-        cache_labels.label_lensing(1, 192, 512, True),
+        cache_labels.label_box(FIDUCIAL.fingerprint(), 1, 192),
+        cache_labels.label_box(FIDUCIAL.fingerprint(), 1, 256),
+        cache_labels.label_box(FIDUCIAL.fingerprint(), 2, 192),
+        cache_labels.label_box("0123456789abcdef", 1, 192),
+        cache_labels.label_tides("0123456789abcdef", 1, 192),
+        cache_labels.label_halo_bias("0123456789abcdef"),
+        cache_labels.label_halo_tables(FIDUCIAL.fingerprint()),
+        cache_labels.label_halo_tables("0123456789abcdef"),
+        cache_labels.label_lensing("0123456789abcdef", 1, 192, 256, True),
+        cache_labels.label_tides(FIDUCIAL.fingerprint(), 1, 192),
+        cache_labels.label_halo_bias(FIDUCIAL.fingerprint()),
+        cache_labels.label_lensing(FIDUCIAL.fingerprint(), 1, 192, 256, True),
+        cache_labels.label_lensing(FIDUCIAL.fingerprint(), 1, 192, 256, False),
+        cache_labels.label_lensing(FIDUCIAL.fingerprint(), 1, 192, 512, True),
         cache_labels.label_galaxy_table("euclid_vis", 0.02, 3, 2),
         cache_labels.label_galaxy_table("euclid_vis", 0.02, 4, 3),
         cache_labels.label_star_table("euclid_vis"),

@@ -56,7 +56,7 @@ def test_a_byte_of_any_module_changes_the_key(name, monkeypatch):
         ("truesky.fluxes.libraries.templates", {"truesky.fluxes.libraries.vega", "truesky.fluxes.libraries.rest_grid"}),
         (
             "truesky.catalogue.matter.density_box",
-            {"truesky.catalogue.matter.linear_theory", "truesky.fluxes.cosmology"},
+            {"truesky.catalogue.matter.linear_theory", "truesky.cosmology"},
         ),
         (
             "truesky.catalogue.galaxies.lensing",

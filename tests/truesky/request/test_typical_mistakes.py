@@ -407,11 +407,27 @@ MISTAKES = {
         "universe.star_band is not a key of a request; star_limit is always in H (Vega); ",
         "allowed here: alignment, box_cells",
     ),
-    "another cosmology": (
+    "H0 in the universe": (
         section("universe", "H0 = 70"),
-        "universe.H0 is not a key of a request; the cosmology is fixed: flat, H0 = 67, ",
-        "Omega_m = 0.319",
+        "universe.H0 is not a key of a request; it is h = H0 / 100 in [universe.cosmology]; ",
+        "cosmology",
     ),
+    "a parameter of the cosmology in the universe": (
+        section("universe", "omega_m = 0.3"),
+        "universe.omega_m is not a key of a request; ",
+        "it belongs in [universe.cosmology]",
+    ),
+    "another name of sigma_8": (
+        section("universe.cosmology", "sigma8 = 0.8"),
+        "universe.cosmology.sigma8 is not a key of a request; ",
+        "did you mean sigma_8?",
+    ),
+    "a curved universe": (
+        section("universe.cosmology", "omega_lambda = 0.7"),
+        "universe.cosmology.omega_lambda is not a key of a request; ",
+        "the universe is flat: give omega_m",
+    ),
+    "H0 as h": (section("universe.cosmology", "h = 67.4"), "universe.cosmology.h = 67.4", "did you mean 0.674?"),
     "an unknown truth without brackets": (
         section("products", 'truth = "noiseless"'),
         "products.truth must be a list of texts such as ['noise_free'] (allowed: noise_free, ",

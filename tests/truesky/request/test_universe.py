@@ -61,6 +61,11 @@ def test_every_fact_of_a_catalogue_is_compared():
     [
         ("galaxies", wanted(seed=12), "table galaxies has seed 11, the request 12: run build_galaxies first"),
         ("galaxies", wanted(galaxy_limit=24.0), "table galaxies has galaxy_limit 26.0, the request 24.0"),
+        (
+            "galaxies",
+            wanted(cosmology={"w0": -0.9}),
+            "table galaxies has the cosmology w0 = -1.0, the request w0 = -0.9: run build_galaxies first",
+        ),
         ("stars", wanted(seed=12), "table stars has seed 11, the request 12: run build_stars first, then compute_fl"),
         ("stars", wanted(star_limit=20.0), "table stars has star_limit 26.0, the request 20.0"),
         (

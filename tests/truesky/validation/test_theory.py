@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import j0, jv
 
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.validation import theory
 
 ARCMIN = np.radians(1 / 60)
@@ -41,15 +41,16 @@ def test_a_power_law_has_the_correlation_that_it_must():
 def test_power_is_linear_where_structure_is():
     """Within halos it is at least eight times the linear power, according to the published fit."""
     k = np.array([0.01, 0.02, 5.0])
-    ratio = theory.nonlinear_power(k, 0.5) / theory.linear_power(k, 0.5)
+    ratio = theory.nonlinear_power(FIDUCIAL, k, 0.5) / theory.linear_power(FIDUCIAL, k, 0.5)
     assert ratio[:2] == pytest.approx(np.ones(2), abs=0.03)
     assert 8.0 < ratio[2] < 40.0
 
 
 def test_sources_at_two_distances_are_between_those_at_each():
-    chi, ell = np.asarray(cosmology.comoving_distance(np.array([0.8, 1.2]))), np.array([100.0, 1000.0])
+    chi, ell = np.asarray(FIDUCIAL.comoving_distance(np.array([0.8, 1.2]))), np.array([100.0, 1000.0])
     near, far, both = (
-        theory.convergence_power(ell, chi, np.array(weight)) for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
+        theory.convergence_power(FIDUCIAL, ell, chi, np.array(weight))
+        for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
     )
     assert np.all((near < both) & (both < far))
     # Both sources share matter, so the cross power is at least the geometric mean.
@@ -58,5 +59,5 @@ def test_sources_at_two_distances_are_between_those_at_each():
 
 def test_galaxies_of_twice_the_bias_cluster_four_times_as_much():
     chi, edges, ell = np.array([1510.0, 1620.0, 1690.0]), np.array([1500.0, 1600.0, 1700.0]), np.array([300.0])
-    one, two = (theory.galaxy_power(ell, theory.shells(chi, np.full(3, bias), edges)) for bias in (1.0, 2.0))
+    one, two = (theory.galaxy_power(FIDUCIAL, ell, theory.shells(chi, np.full(3, bias), edges)) for bias in (1.0, 2.0))
     assert two == pytest.approx(4 * one, rel=1e-12, abs=0.0)

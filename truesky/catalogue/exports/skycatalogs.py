@@ -26,7 +26,8 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout, read, request_links
 from lake_schema.units import LIGHT_KM_S, electron_rate
 from truesky.catalogue.exports import stellar_spectra, tophat
-from truesky.fluxes import bulges, cosmology, inputs, passbands
+from truesky.cosmology import Cosmology, from_facts
+from truesky.fluxes import bulges, inputs, passbands
 from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
 
 # HEALPix order of the pixels into which the files are divided (Nside 32).
@@ -107,7 +108,7 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
                 templates.update(np.unique(rows["sed"].to_numpy()).tolist())
             for name, maker in zip((f"{stem}_{number}", f"{stem}_flux_{number}"), makers, strict=True):
                 written.append(_parquet(folder / f"{name}.parquet", rows, maker))
-        object_types[kind] = _object_type(kind, stem)
+        object_types[kind] = _object_type(kind, stem, from_facts(catalogue.rows.manifest["facts"]))
     if "star" in catalogues:
         library = inputs.stellar_library_from_facts(lake, catalogues["star"].fluxes.manifest["facts"])
         written += stellar_spectra.write(folder, library, sorted(templates))
@@ -164,9 +165,10 @@ def _group_by_pixel(partitions: Iterable[str]) -> list[list[str]]:
 
 def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
     library = inputs.galaxy_library_from_facts(lake, catalogue.fluxes.manifest["facts"])
+    cosmology = from_facts(catalogue.rows.manifest["facts"])
 
     def rows(galaxies: pa.Table) -> pa.Table:
-        light = tophat.luminosities(galaxies, library)
+        light = tophat.luminosities(galaxies, library, cosmology)
         share = bulges.fractions_in_bins(galaxies, tophat.templates_in_bins(library), library)
         spectra = {"sed_val_bulge": _list_column(light * share), "sed_val_disk": _list_column(light * (1.0 - share))}
         return pa.table({**_shapes(galaxies), **spectra})
@@ -266,7 +268,7 @@ def _document(object_types: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _object_type(kind: str, stem: str) -> dict[str, Any]:
+def _object_type(kind: str, stem: str, cosmology: Cosmology) -> dict[str, Any]:
     common = {
         "file_template": rf"{stem}_(?P<healpix>\d+).parquet",
         "flux_file_template": rf"{stem}_flux_(?P<healpix>\d+).parquet",
@@ -284,11 +286,11 @@ def _object_type(kind: str, stem: str) -> dict[str, Any]:
         **common,
         "composite": {"bulge": "required", "disk": "required"},
         "Cosmology": {
-            "H0": 100.0 * cosmology.HUBBLE,
-            "Om0": cosmology.OMEGA_M,
-            "Ob0": cosmology.OMEGA_B,
-            "sigma8": cosmology.SIGMA_8,
-            "n_s": cosmology.SPECTRAL_INDEX,
+            "H0": 100.0 * cosmology.h,
+            "Om0": cosmology.omega_m,
+            "Ob0": cosmology.omega_b,
+            "sigma8": cosmology.sigma_8,
+            "n_s": cosmology.n_s,
         },
         "tophat": {"units": "angstrom", "bin_parameters": ["start", "width"], "bins": bins},
     }

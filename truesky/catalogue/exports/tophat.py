@@ -15,7 +15,8 @@ import pyarrow as pa
 
 from lake_schema.arrays import Float, Float32
 from lake_schema.units import LIGHT_ANGSTROM_S
-from truesky.fluxes import cosmology, high_redshift, passbands
+from truesky.cosmology import Cosmology
+from truesky.fluxes import high_redshift, passbands
 from truesky.fluxes.calibration import continuum_scale
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, column, galaxies_from_table
@@ -80,7 +81,7 @@ def edges() -> Float:
     return np.unique(np.floor(np.array(nodes)) + 0.5)
 
 
-def luminosities(galaxies: pa.Table, library: Library) -> Float:
+def luminosities(galaxies: pa.Table, library: Library, cosmology: Cosmology) -> Float:
     """Return the luminosities L_nu of galaxies in each wavelength bin, without magnification.
 
     Parameters
@@ -89,6 +90,8 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
         Rows of table `galaxies`, which may also contain quasars and galaxies beyond z = 6.
     library : Library
         Template spectra of the galaxies in halos.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
@@ -112,7 +115,7 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
         if not is_galaxy.all():
             f_lambda[~is_galaxy] = _high_redshift(rows.filter(pa.array(~is_galaxy)))
         f_lambda *= extinction.transmission(_extinction_excess(z), a_v[:, None])
-        out[start : start + _BLOCK] = f_lambda * _to_l_nu(z, column(rows, "z_true"))
+        out[start : start + _BLOCK] = f_lambda * _to_l_nu(cosmology, z, column(rows, "z_true"))
     return out
 
 
@@ -268,11 +271,11 @@ def _law_difference() -> tuple[Float, Float]:
     return grid, extinction.milky_way(grid) - np.asarray(curve(1e4 / grid / u.um), float)
 
 
-def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
+def _to_l_nu(cosmology: Cosmology, z_obs: Float, z_true: Float) -> Float:
     """Return the factors from observed f_lambda (erg s-1 cm-2 A-1) to L_nu (TOPHAT_W_HZ) in each bin, (n, bins)."""
     low, high = edges()[:-1], edges()[1:]
     width = (high - low) / (LIGHT_ANGSTROM_S * (1.0 / low - 1.0 / high))
-    distance = cosmology.luminosity_distance(np.maximum(z_true, MIN_REDSHIFT)) / cosmology.HUBBLE * _MPC_CM
+    distance = cosmology.luminosity_distance(np.maximum(z_true, MIN_REDSHIFT)) / cosmology.h * _MPC_CM
     dimming = 4.0 * np.pi * distance**2 * (1.0 + z_obs) / (_ERG_W * TOPHAT_W_HZ)
     return np.asarray(dimming[:, None] * width)
 

@@ -10,7 +10,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from lake_schema.store.provenance import file_sha256
 from truesky.catalogue.external import mapping, reading
 from truesky.catalogue.external.mapping import Columns
 from truesky.catalogue.external.reading import Rows
+from truesky.cosmology import Cosmology
 from truesky.fluxes.libraries import templates
 from truesky.numerics import cache, cache_entries
 from truesky.numerics.cache import cache_dir, content_key
@@ -70,13 +71,30 @@ class Split:
     ebv_max: float
 
 
-def galaxy_columns(catalogue: Catalogue, replaces_lensing: bool) -> Columns:
+def galaxy_columns(catalogue: Catalogue, replaces_lensing: bool, cosmology: Cosmology) -> Columns:
     """Return which columns of a user's catalogue give which properties of galaxies, for the built-in templates.
 
-    Columns with lensed positions are left out if the request replaces the lensing of the catalogue. Raises BadInput if
-    the mapping in the request is wrong.
+    Parameters
+    ----------
+    catalogue : Catalogue
+        Format and columns of the catalogue.
+    replaces_lensing : bool
+        True if the request replaces the lensing of the catalogue; columns with lensed positions are then left out.
+    cosmology : Cosmology
+        Parameters of the universe in which distances follow from redshifts.
+
+    Returns
+    -------
+    Columns
+        The mapping.
+
+    Raises
+    ------
+    BadInput
+        If the mapping in the request is wrong.
     """
     columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
+    columns = replace(columns, cosmology=cosmology)
     columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
     return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
@@ -286,7 +304,9 @@ def _content_key(sha256: Sequence[str], columns: Columns) -> str:
     fields = sorted((key, repr(field)) for key, field in columns.fields.items())
     settings = [columns.companion_prefixes, columns.ellipticity, columns.frame]
     bounds = sorted((key, *map(float, limits)) for key, limits in columns.bounds.items())
-    return content_key(code_key(__name__), json.dumps([fields, settings, bounds]), *sha256)
+    return content_key(
+        code_key(__name__), json.dumps([fields, settings, bounds]), columns.cosmology.fingerprint(), *sha256
+    )
 
 
 def _identifier_title(columns: Columns) -> str:

@@ -21,6 +21,7 @@ from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.texts import spelling, synonyms
 from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
+from truesky.cosmology import FIDUCIAL, Cosmology
 from truesky.fluxes import passbands
 
 Bounds = Mapping[str, tuple[float, float]]
@@ -161,6 +162,8 @@ class Columns:
         Axes of the ellipticities, one of `FRAMES` in ellipticity.py.
     path : str
         Key of the request that contains the mapping, for messages.
+    cosmology : Cosmology
+        Parameters of the universe in which distances follow from redshifts.
     """
 
     fields: Mapping[str, Field]
@@ -173,6 +176,7 @@ class Columns:
     ellipticity: str = ""
     frame: str = FRAMES[0]
     path: str = ""
+    cosmology: Cosmology = FIDUCIAL
 
     def titles(self, in_companion: bool) -> list[str]:
         """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).
@@ -350,15 +354,15 @@ def drop_lensed_positions(columns: Columns) -> Columns:
     return replace(columns, fields=fields)
 
 
-def halo_columns(entries: Mapping[str, str]) -> Columns:
+def halo_columns(entries: Mapping[str, str], cosmology: Cosmology) -> Columns:
     """Return which columns of a user's table of halos give which properties of halos, and with which conversion.
 
-    `entries` contains for each property that the request gives its column or value, as JSON text. Raises BadInput if
-    such a text is wrong, or if ra, dec, z_true or log_mass is missing.
+    `entries` contains for each property that the request gives its column or value, as JSON text. Distances follow from
+    redshifts in `cosmology`. Raises BadInput if such a text is wrong, or if ra, dec, z_true or log_mass is missing.
     """
     parsed = {key: json.loads(text) for key, text in entries.items()}
     required = ("ra",), ("dec",), ("z_true",), ("log_mass",)
-    return parse_columns(parsed, HALO_BOUNDS, "ingest.halos.columns", required)
+    return replace(parse_columns(parsed, HALO_BOUNDS, "ingest.halos.columns", required), cosmology=cosmology)
 
 
 def training_columns(entries: Mapping[str, str]) -> Columns:

@@ -26,7 +26,6 @@ from truesky.catalogue import parameters
 from truesky.catalogue.matter import density_box, lightcone
 from truesky.catalogue.matter.density_box import Box
 from truesky.catalogue.matter.lightcone import Replicas
-from truesky.fluxes import cosmology
 
 # Number of Newton steps that solve y + a sin(2 y) = x to floating-point precision for a < 1/2.
 _STEPS = 12
@@ -165,7 +164,8 @@ def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Floa
     numbers = alignments.numbers
     amplitude = numbers.amplitude * 10.0 ** (-0.4 * numbers.slope * (m_r - numbers.magnitude))
     amplitude = alignments.strength * amplitude * np.where(red, 1.0, numbers.blue)
-    return np.asarray(-amplitude * numbers.c1_rho_crit * cosmology.OMEGA_M * tide(alignments, ra, dec, chi))
+    omega_m = alignments.box.model.cosmology.omega_m
+    return np.asarray(-amplitude * numbers.c1_rho_crit * omega_m * tide(alignments, ra, dec, chi))
 
 
 def satellite_ellipticity(alignments: Alignments, direction: Float, distance: Float, red: Bool) -> Complex:

@@ -23,7 +23,8 @@ from lake_schema.arrays import Bool, Float
 from lake_schema.units import AB_CGS, LIGHT_KM_S
 from truesky.catalogue import parameters
 from truesky.catalogue.interpolation import bracket
-from truesky.fluxes import cosmology, passbands
+from truesky.cosmology import Cosmology
+from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, lines
 from truesky.randomness.per_source import AnyGenerator
@@ -328,7 +329,13 @@ def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> 
 
 
 def fluxes(
-    line_model: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: AnyGenerator
+    line_model: LineModel,
+    cosmology: Cosmology,
+    z: Float,
+    log_mass: Float,
+    log_sfr: Float,
+    red: Bool,
+    rng: AnyGenerator,
 ) -> dict[str, Float]:
     """Draw the emission line fluxes of galaxies: one flux per line, or per doublet the flux of its stronger line.
 
@@ -336,6 +343,8 @@ def fluxes(
     ----------
     line_model : LineModel
         Model of the emission lines.
+    cosmology : Cosmology
+        Parameters of the universe, for the distances.
     z : float array, shape (n,)
         True redshift.
     log_mass : float array, shape (n,)
@@ -358,7 +367,8 @@ def fluxes(
     observed = match_abundance(line_model, z, raw_halpha(line_model.halpha, log_sfr, a_halpha, normals[1]))
     excess = metallicity(line_model.metals, log_mass, log_sfr, normals[2]) - line_model.metals.sun
     log_l = _luminosities(line_model, z, observed + 0.4 * a_halpha, excess, normals[3:])
-    area = np.log10(4.0 * np.pi) + 2.0 * np.log10(cosmology.luminosity_distance(z) / cosmology.HUBBLE * _CM_PER_MPC)
+    distance = cosmology.luminosity_distance(z) / cosmology.h * _CM_PER_MPC
+    area = np.log10(4.0 * np.pi) + 2.0 * np.log10(distance)
     log_dilution = np.where(has_lines(line_model.halpha, log_sfr, red), -area, -np.inf)
     return {
         column: 10.0 ** (log_l[column] - 0.4 * k * a_halpha + log_dilution) for column, k in line_model.dust.items()

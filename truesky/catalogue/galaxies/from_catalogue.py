@@ -34,7 +34,7 @@ from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.morphology import Shapes
 from truesky.catalogue.galaxies.sequences import Colour, ColourLimits, Colours
 from truesky.catalogue.halos.population import SATELLITE
-from truesky.fluxes import cosmology, sources
+from truesky.fluxes import sources
 from truesky.fluxes.libraries import templates
 from truesky.randomness.rng import stream
 
@@ -54,7 +54,7 @@ class IngestModel:
     seed : int
         Seed of the random numbers.
     columns : Columns
-        Mapping from the columns of the catalogue to the properties of galaxies.
+        Mapping from the columns of the catalogue to the properties of galaxies, and the cosmology.
     lens : Shear or None
         Uniform shear that replaces the catalogue's lensing; None to keep the lensing of the catalogue.
     rotation : float
@@ -189,14 +189,14 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
     m_r, colour, sed, law_2, ebv_2 = _light(
         catalogue, universe, z, kind, _intrinsic_mag(catalogue, universe, lens, a_v), rng
     )
+    cosmology = universe.columns.cosmology
     reference_mag = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
-    log_mass = _value_or_computed(
-        catalogue, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour.colour, z)
-    )
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, cosmology.h, m_r, colour.colour, z)
+    log_mass = _value_or_computed(catalogue, "log_stellar_mass", log_mass)
     log_sfr = _value_or_computed(
         catalogue, "log_sfr", _star_formation(universe.star_formation, z, log_mass, colour, rng)
     )
-    line_fluxes = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
+    line_fluxes = emission_lines.fluxes(universe.lines, cosmology, z, log_mass, log_sfr, colour.red, rng("lines"))
     _refuse_impossible_magnitudes(catalogue, z, m_r, catalogue.get("mag_r01", reference_mag))
     columns: dict[str, Any] = {
         **_identity(catalogue, cell, kind),
@@ -218,7 +218,7 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
             name: _column_or_nan(catalogue, name, n) if _has_lines(catalogue) else values
             for name, values in line_fluxes.items()
         },
-        **_shapes(catalogue, universe.shapes, z, log_mass, colour.red, rng("shape")),
+        **_shapes(catalogue, universe, z, log_mass, colour.red, rng("shape")),
         "a_v": a_v,
     }
     if "origin_id" in catalogue:
@@ -342,7 +342,8 @@ def _light(
     m_r = catalogue.get("abs_mag_r01")
     # Without an absolute magnitude, estimate it for a spectrum with constant f_lambda, in order to draw a colour.
     apparent = catalogue.get("mag_r01", intrinsic_mag)
-    guess = m_r if m_r is not None else np.asarray(apparent) - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    distance_modulus = universe.columns.cosmology.distance_modulus(z)
+    guess = m_r if m_r is not None else np.asarray(apparent) - distance_modulus - 2.5 * np.log10(1.0 + z)
     fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
     drawn_colour = sequences.draw(universe.colours, universe.colour_limits, guess, z, fraction, rng("colour"))
     if "color_gr_01" in catalogue:
@@ -365,7 +366,7 @@ def _light(
         table = (
             universe.reference if "mag_r01" in catalogue or universe.observed_band is None else universe.observed_band
         )
-        m_r = np.asarray(apparent) - cosmology.distance_modulus(z) - band_ratios.offset(table, z, sed)
+        m_r = np.asarray(apparent) - distance_modulus - band_ratios.offset(table, z, sed)
     return m_r, drawn_colour, sed, catalogue.get("ext_law_2", sed.law), catalogue.get("ebv_2", sed.ebv)
 
 
@@ -381,10 +382,10 @@ def _spectra(catalogue: CatalogueColumns) -> Sed:
 
 
 def _shapes(
-    catalogue: CatalogueColumns, shapes: Shapes, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
+    catalogue: CatalogueColumns, universe: IngestModel, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
 ) -> dict[str, Float]:
-    n = z.size
-    radius = morphology.half_light_radius(shapes.size, z, log_mass, red, cosmology.kpc_per_arcsec(z), rng)
+    n, shapes, scale = z.size, universe.shapes, universe.columns.cosmology.kpc_per_arcsec(z)
+    radius = morphology.half_light_radius(shapes.size, z, log_mass, red, scale, rng)
     fraction = catalogue.get("bulge_fraction", morphology.bulge_fraction(shapes.bulge, log_mass, red, rng))
     sersic = catalogue.get("bulge_sersic_index", morphology.sersic_index(shapes.bulge, red, rng))
     ratio = morphology.radius_ratio(shapes.bulge, red, rng)

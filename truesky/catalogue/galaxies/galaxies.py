@@ -46,7 +46,7 @@ from truesky.catalogue.halos import luminosity_function, matching, population, q
 from truesky.catalogue.halos.halo_catalogue import LightCone
 from truesky.catalogue.halos.luminosity_function import Inverse, Schechter
 from truesky.catalogue.halos.population import CellCache, Members, Population
-from truesky.fluxes import cosmology, passbands
+from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
 from truesky.randomness.per_source import PerSourceGenerator
@@ -192,7 +192,7 @@ def model(
     dustiest = float(selection.ebv[-1])
     halo_population = halos_and_galaxies(seed, requested, light_cone, training)
     boosts = requested.high_redshift_boost, requested.quasar_boost
-    distant = high_redshift.model(*boosts, requested.galaxy_limit, requested.z_max)
+    distant = high_redshift.model(requested.cosmology, *boosts, requested.galaxy_limit, requested.z_max)
     colour = band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return GalaxyModel(
         limit=requested.galaxy_limit,
@@ -241,7 +241,7 @@ def halos_and_galaxies(
         The population. It is complete for galaxies brighter than the magnitude limit, whatever their spectrum.
     """
     # Only these settings matter, so that the tables `halos` and `galaxies` share the population.
-    names = ("galaxy_band", "galaxy_limit", "z_max", "box_cells", "structure_below_cells")
+    names = ("galaxy_band", "galaxy_limit", "z_max", "box_cells", "structure_below_cells", "cosmology")
     settings = {name: getattr(requested, name) for name in names}
     return _population(seed, Universe(**settings), light_cone, training)
 
@@ -251,15 +251,12 @@ def _population(seed: int, requested: Universe, light_cone: LightCone | None, tr
     nodes, brightest = band_ratios.brightest_offset(_selection(requested, training))
 
     def faintest(z: Float) -> Float:
-        return (
-            requested.galaxy_limit + _CANDIDATE_MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
-        )
+        distance_modulus = requested.cosmology.distance_modulus(z)
+        return requested.galaxy_limit + _CANDIDATE_MARGIN - distance_modulus - np.interp(z, nodes, brightest)
 
     volume = luminosity_function.volume(requested.z_max)
-    fine = requested.structure_below_cells
-    return population.model(
-        seed, requested.box_cells, volume, _inverse(), faintest, light_cone, structure_below_cells=fine
-    )
+    box, fine = (seed, requested.cosmology, requested.box_cells), requested.structure_below_cells
+    return population.model(*box, volume, _inverse(), faintest, light_cone, structure_below_cells=fine)
 
 
 @cache
@@ -339,7 +336,7 @@ def draw_members(
     drawn, physical = _bright(
         universe, members, select(universe, *_draw_candidates(seed, universe, members), _LINE_MARGIN)
     )
-    distance_modulus = cosmology.distance_modulus(drawn.z)
+    distance_modulus = universe.population.cosmology.distance_modulus(drawn.z)
     columns = {
         **_position_columns(lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
@@ -444,12 +441,13 @@ def _bright(
     of emission lines (erg s-1 cm-2).
     """
     seed, source_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
-    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
+    cosmology = universe.population.cosmology
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, cosmology.h, drawn.m_r, colour.colour, drawn.z)
     main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
     rng = PerSourceGenerator(source_ids, seed, "galaxies.star_formation")
     log_sfr = stellar_mass.log_sfr(universe.star_formation, main, colour.sequence, colour.deviate, rng)
     rng = PerSourceGenerator(source_ids, seed, "galaxies.lines")
-    fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, colour.red, rng)
+    fluxes = emission_lines.fluxes(universe.lines, cosmology, drawn.z, log_mass, log_sfr, colour.red, rng)
     light = emission_lines.mean_line_flux(universe.band, members.z_obs[drawn.row], fluxes)
     is_bright = emission_lines.magnitude_with_light(drawn.magnitude, light) < universe.limit
     columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}
@@ -479,7 +477,7 @@ def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) ->
     -----
     The error is below 0.001 mag (tests/truesky/catalogue/galaxies/test_band_ratios.py).
     """
-    return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
+    return m_r + universe.population.cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
 def _draw_candidates(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
@@ -522,7 +520,7 @@ def _shape_columns(
     universe: GalaxyModel, members: Members, drawn: SelectedGalaxies, log_mass: Float
 ) -> dict[str, npt.NDArray[np.generic]]:
     source, seed, shapes = members.id[drawn.row], universe.population.seed, universe.shapes
-    scale = cosmology.kpc_per_arcsec(drawn.z)
+    scale = universe.population.cosmology.kpc_per_arcsec(drawn.z)
     rng = PerSourceGenerator(source, seed, "galaxies.size")
     radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.colour.red, scale, rng)
     rng = PerSourceGenerator(source, seed, "galaxies.bulge")

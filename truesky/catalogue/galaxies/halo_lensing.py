@@ -34,7 +34,8 @@ from truesky.catalogue.halos import lens_halos
 from truesky.catalogue.halos.halos import LEVELS, Halos
 from truesky.catalogue.halos.lens_halos import Settings
 from truesky.catalogue.halos.population import CellCache, Population
-from truesky.fluxes import cosmology, sources
+from truesky.cosmology import Cosmology
+from truesky.fluxes import sources
 
 # All sources in one HEALPix cell of this order are compared with the same halos.
 _SOURCE_ORDER = 11
@@ -129,7 +130,8 @@ def lens_of_cell(
     halos, identifiers = halos[:, reaching], identifiers[reaching]
     halos = halos[:, np.lexsort((identifiers, halos[_MASS], halos[_CHI]))]
     table = np.concatenate([_stereographic(frame, halos[:3].T), halos[_CHI:_MASS]])
-    return Neighbourhood(lens, settings, frame, table, *_grid(settings, table), _max_deflection(table))
+    grid = _grid(cells.population.cosmology, settings, table)
+    return Neighbourhood(lens, settings, frame, table, *grid, _max_deflection(table))
 
 
 def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
@@ -264,9 +266,9 @@ def _cached_lenses(
     """
     cache, key, full_key = cells.lenses, (order, cell, min_mass), (order, cell, settings.lowest)
     if key not in cache:
-        max_distance = (
-            settings.max_distance if min_mass == settings.lowest else min(settings.max_distance, settings.wide_distance)
-        )
+        max_distance = settings.max_distance(cells.population.cosmology)
+        if min_mass != settings.lowest:
+            max_distance = min(max_distance, settings.wide_distance)
         if full_key in cache:
             table, source = cache[full_key]
             selected = (table[_MASS] >= min_mass) & (table[_CHI] < max_distance)
@@ -326,7 +328,7 @@ def _max_enclosed_ratio() -> tuple[Float, Float]:
     return nodes, np.array(enclosed)
 
 
-def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
+def _grid(cosmology: Cosmology, settings: Settings, halos: Float) -> tuple[Float, Float]:
     """Return the slowly varying part of the lensing by halos on a grid around the centre of an order-8 cell.
 
     Return the inverse comoving distances of the planes, shape (p,), h/Mpc, and the lensing of sources at the nodes:

@@ -27,10 +27,11 @@ from truesky.catalogue import dust_map, parameters
 from truesky.catalogue.galaxies import halo_lensing, morphology
 from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.galaxies.lensing import Lens
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.fluxes.high_redshift import (
     HIGH_REDSHIFT,
     HIGH_REDSHIFT_SLOPES,
+    HUBBLE,
     LYMAN_ALPHA_WIDTHS,
     QUASAR,
     QUASAR_OFFSETS,
@@ -60,6 +61,8 @@ class Kind:
 
     Attributes
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     code : int
         Kind of the objects: HIGH_REDSHIFT or QUASAR.
     numbers : dict
@@ -82,6 +85,7 @@ class Kind:
         For each array of `cells`, the cumulative sum of the natural number of objects per deg2.
     """
 
+    cosmology: Cosmology
     code: int
     numbers: dict[str, Any]
     boost: float
@@ -102,7 +106,8 @@ class Kind:
         number = 0.0
         for cells, counts in zip(self.cells, self.counts, strict=True):
             z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
-            is_observable = ultraviolet_magnitude(m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP) < self.limit
+            apparent = ultraviolet_magnitude(self.cosmology, m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP)
+            is_observable = apparent < self.limit
             selected = (
                 (z > z_min - 1e-6)
                 & (z < z_max - 1e-6)
@@ -114,12 +119,18 @@ class Kind:
 
 
 def model(
-    galaxy_boost: float = 1.0, quasar_boost: float = 1.0, limit: float = 26.0, z_end: float = 6.0
+    cosmology: Cosmology,
+    galaxy_boost: float = 1.0,
+    quasar_boost: float = 1.0,
+    limit: float = 26.0,
+    z_end: float = 6.0,
 ) -> tuple[Kind, ...]:
     """Return the luminosity functions of the objects to draw: galaxies beyond redshift 6, and quasars.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     galaxy_boost, quasar_boost : float
         Ratio of the drawn to the natural number density; with 0, these objects are left out.
     limit : float
@@ -134,7 +145,7 @@ def model(
     """
     kinds = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
     included = ((code, parameters.section(_FILE, name), boost) for code, name, boost in kinds if boost > 0.0)
-    return tuple(_tabulate_kind(*arguments, limit, z_end) for arguments in included)
+    return tuple(_tabulate_kind(cosmology, *arguments, limit, z_end) for arguments in included)
 
 
 def draw(
@@ -169,7 +180,7 @@ def draw(
     """
     samples = [_draw_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
     z, m, ra, dec = (np.concatenate(column) for column in zip(*samples, strict=True))
-    selected = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _LIGHTCONE_END))
+    selected = (ultraviolet_magnitude(kind.cosmology, m, z) < kind.limit) & ((z < kind.z_end) | (z >= _LIGHTCONE_END))
     if position_filter is not None:
         selected &= position_filter(ra, dec)
     # The numbers in the identifiers count all drawn objects, so an identifier does not depend on the selection.
@@ -178,7 +189,7 @@ def draw(
     source = ids.source_id(np.full(numbers.size, kind.code), cell, numbers)
     rng = PerSourceGenerator(source, seed, _STREAM[kind.code])
     zeros = np.zeros(numbers.size)
-    places = halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z))
+    places = halo_lensing.columns(lens, ra, dec, kind.cosmology.comoving_distance(z))
     columns = {
         "id": source,
         "halo_id": ids.halo_from_id(source),
@@ -187,8 +198,8 @@ def draw(
         "density_boost": np.full(numbers.size, kind.boost),
         "z_true": z,
         "z_obs": z,
-        "abs_mag_r01": m - 5.0 * np.log10(cosmology.HUBBLE),
-        "mag_r01": ultraviolet_magnitude(m, z),
+        "abs_mag_r01": m - 5.0 * np.log10(HUBBLE),
+        "mag_r01": ultraviolet_magnitude(kind.cosmology, m, z),
         "sed_1": _templates(kind, m, rng),
         "frac_1": zeros + 1.0,
         "sed_2": zeros.astype(int),
@@ -263,20 +274,22 @@ def _double_power(phi: Float, numbers: dict[str, Any], brighter: Float) -> Float
     return np.asarray(phi / (10.0 ** ((numbers["faint"] + 1.0) * x) + 10.0 ** ((numbers["bright"] + 1.0) * x)))
 
 
-def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float) -> Kind:
+def _tabulate_kind(
+    cosmology: Cosmology, code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float
+) -> Kind:
     z_first = parameters.section(_FILE, "near_quasars")["z_min"] if code == QUASAR else _LIGHTCONE_END
     z = np.arange(z_first, numbers["z_max"] - 1e-9, _Z_STEP)
     m = np.arange(_M_BRIGHTEST, -12.0, _M_STEP)
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
-    volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
+    volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / HUBBLE**3
     counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
     # Group the cells by apparent magnitude rounded down. The last group may contain cells beyond the limit, because
     # `draw` draws whole groups and selects by the exact limit.
-    mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
+    mag = np.floor(ultraviolet_magnitude(cosmology, middle_m, middle_z))
     last = int(np.ceil(limit + 2.0 * _M_STEP))
     cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
     cumulative = tuple(np.cumsum(counts.ravel()[place]) for place in cells)
-    return Kind(code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, cumulative)
+    return Kind(cosmology, code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, cumulative)
 
 
 def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
@@ -309,7 +322,7 @@ def _shapes(kind: Kind, z: Float, m: Float, rng: AnyGenerator) -> dict[str, npt.
     else:
         mean = law["radius"] * ((1.0 + z) / 7.0) ** law["radius_z"] * 10.0 ** (-0.4 * law["radius_m"] * (m + 21.0))
         kpc = mean * 10.0 ** (law["radius_scatter"] * rng.standard_normal(n))
-        radius, sersic = kpc / cosmology.kpc_per_arcsec(z), law["sersic"]
+        radius, sersic = kpc / kind.cosmology.kpc_per_arcsec(z), law["sersic"]
         ratio = law["axis_ratio"][0] + (law["axis_ratio"][1] - law["axis_ratio"][0]) * rng.random(n)
     return {
         "bulge_half_light_radius": radius,

@@ -29,7 +29,7 @@ from lake_schema.errors import BadInput
 from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue import parameters
 from truesky.catalogue.matter.density_box import Box
-from truesky.fluxes import cosmology, sources
+from truesky.fluxes import sources
 from truesky.numerics import activity
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.cache_labels import label_lensing
@@ -122,14 +122,14 @@ def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
     chosen = settings()
     z = np.array(chosen.planes + (chosen.far_planes if with_far_planes else ()))
     numbers = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
-    key = content_key(
-        code_key(__name__), box.seed, box.n, *map(float, np.concatenate(numbers)), nside, int(with_far_planes)
-    )
+    cosmology, maps = box.model.cosmology, (nside, int(with_far_planes))
+    numbers_of_box = box.seed, box.n, cosmology.fingerprint()
+    key = content_key(code_key(__name__), *numbers_of_box, *map(float, np.concatenate(numbers)), *maps)
     chi = cosmology.comoving_distance(z)
     name = f"lensing_{nside}"
     summed = cached_arrays(f"{name}_kappa", key, lambda: _convergence_maps(box, nside, chi, chosen))
     # The label is that of the last map, which is made after all others.
-    labels = [""] * (z.size - 1) + [label_lensing(box.seed, box.n, nside, with_far_planes)]
+    labels = [""] * (z.size - 1) + [label_lensing(cosmology.fingerprint(), box.seed, box.n, nside, with_far_planes)]
 
     def plane(i: int) -> Array:
         make = _plane_of(summed["kappa"][i], nside, summed["transfer"][i])

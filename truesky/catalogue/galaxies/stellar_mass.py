@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lake_schema.arrays import Float, Int
+from truesky import cosmology
 from truesky.catalogue import parameters
 from truesky.catalogue.galaxies.sequences import GREEN, RED
-from truesky.fluxes import cosmology
 from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "stellar_mass.toml"
@@ -70,13 +70,15 @@ def star_formation() -> StarFormation:
     return StarFormation(**parameters.section(_FILE, "star_formation"))
 
 
-def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> Float:
+def log_stellar_mass(law: MassToLight, hubble: float, m_r: Float, colour: Float, z: Float) -> Float:
     """Return the stellar mass from luminosity, colour and redshift.
 
     Parameters
     ----------
     law : MassToLight
         Parameters of the relation.
+    hubble : float
+        Hubble parameter h of the universe.
     m_r : float array, shape (n,)
         Absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1, mag.
     colour : float array, shape (n,)
@@ -87,7 +89,7 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> F
     Returns
     -------
     float array, shape (n,)
-        log10 of the stellar mass in Msun, for h = 0.67 and the initial mass function of Chabrier 2003.
+        log10 of the stellar mass in Msun (not Msun/h), for the initial mass function of Chabrier 2003.
 
     References
     ----------
@@ -96,7 +98,7 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> F
     g_r = np.clip(colour - law.to_rest, *law.limits)
     log_1pz = np.log10(1.0 + np.minimum(z, law.z_last))
     zero = law.intercept + law.intercept_l * log_1pz + law.intercept_l2 * log_1pz**2
-    light = -0.4 * (m_r + 5.0 * np.log10(cosmology.HUBBLE) - law.sun)
+    light = -0.4 * (m_r + 5.0 * np.log10(hubble) - law.sun)
     return np.asarray(light + zero + (law.slope + law.slope_l * log_1pz) * g_r)
 
 

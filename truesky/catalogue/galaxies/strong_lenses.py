@@ -32,7 +32,7 @@ from lake_schema.units import LIGHT_KM_S
 from truesky.catalogue import parameters
 from truesky.catalogue.galaxies import lens_pairs
 from truesky.catalogue.halos import luminosity_function
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.randomness import per_source
 from truesky.randomness.per_source import PerSourceGenerator
 
@@ -161,7 +161,7 @@ def stamps() -> Stamps:
     return Stamps(**parameters.section(_FILE, "stamp"))
 
 
-def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
+def draw(cell: int, galaxies: pa.Table, seed: int, boost: float, cosmology: Cosmology) -> pa.Table:
     """Draw the rows of table `strong_lenses` in one order-8 cell.
 
     Parameters
@@ -174,6 +174,8 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
         Seed of the request.
     boost : float
         Ratio of the drawn to the natural number density of strong lenses.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
@@ -189,7 +191,8 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     law, stamp_settings = laws(), stamps()
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
     rows = []
-    for pair in _pairs(law, columns, boost, sky.cell_area(GENERATION_ORDER) * 3600.0**2, seed):
+    area = sky.cell_area(GENERATION_ORDER) * 3600.0**2
+    for pair in _pairs(law, cosmology, columns, boost, area, seed):
         system = _system(law, columns, pair)
         side = _side(stamp_settings, *system)
         # An image with one ray per pixel takes little time, and excludes most lenses whose magnification is too small.
@@ -205,11 +208,15 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     return _table(cell, columns, rows, boost)
 
 
-def einstein_radius(sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.ArrayLike) -> Float:
+def einstein_radius(
+    cosmology: Cosmology, sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.ArrayLike
+) -> Float:
     """Return the Einstein radius of singular isothermal lenses in a flat universe.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     sigma : float array, shape (n,)
         Velocity dispersion of the lens, km/s.
     z_lens, z_source : float array, shape (n,)
@@ -361,7 +368,9 @@ def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> F
     return picture
 
 
-def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed: int) -> list[Pair]:
+def _pairs(
+    law: Laws, cosmology: Cosmology, columns: dict[str, Array], boost: float, area: float, seed: int
+) -> list[Pair]:
     """Draw pairs of a lens and a source from the galaxies of a cell with an area in arcsec2.
 
     Each pair is drawn independently of all other pairs. A deeper catalogue therefore contains the same pairs and more.
@@ -387,7 +396,7 @@ def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed
     out = _allocate(0)
     while (count := lens_pairs.find_pairs(lenses, sources, law.least_z_apart, out)) > out[0].size:
         out = _allocate(count)
-    radius = einstein_radius(sigma[out[0]], z_lens[out[0]], columns["z_true"][source[out[1]]])
+    radius = einstein_radius(cosmology, sigma[out[0]], z_lens[out[0]], columns["z_true"][source[out[1]]])
     selected = (out[3][:, 0] * max_radius[out[0]] ** 2 < radius**2) & (radius > law.least_radius)
     return [
         Pair(

@@ -23,7 +23,6 @@ from truesky.catalogue.external.mapping import Columns
 from truesky.catalogue.halos import halos
 from truesky.catalogue.halos.halos import HaloModel, Halos
 from truesky.catalogue.halos.matching import Masses
-from truesky.fluxes import cosmology
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.per_source import PerSourceGenerator
@@ -61,7 +60,7 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
     sha256 : sequence of str
         SHA-256 of each file, by which the cache recognises the files.
     columns : Columns
-        Mapping from the columns of the files to the properties of halos.
+        Mapping from the columns of the files to the properties of halos, and the cosmology.
 
     Returns
     -------
@@ -75,9 +74,8 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
         the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
-    arrays = cached_arrays(
-        "halo_light_cone", content_key(code_key(__name__), columns_json, *sha256), lambda: _read(files, columns)
-    )
+    key = content_key(code_key(__name__), columns_json, columns.cosmology.fingerprint(), *sha256)
+    arrays = cached_arrays("halo_light_cone", key, lambda: _read(files, columns))
     return LightCone(**arrays)
 
 
@@ -131,7 +129,7 @@ def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
     ra, dec = sky.check_positions(values["ra"], values["dec"])
     index, z = sky.healpix_29(ra, dec), values["z_true"]
-    chi = cosmology.comoving_distance(z)
+    chi = columns.cosmology.comoving_distance(z)
     if "origin_id" in values:
         _refuse_duplicates(pieces, columns.fields["origin_id"].column)
     velocity = values.get("velocity", np.zeros(z.size))

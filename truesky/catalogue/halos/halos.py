@@ -33,7 +33,7 @@ from truesky.catalogue.matter import density_box, fine_structure, lightcone
 from truesky.catalogue.matter.density_box import Box
 from truesky.catalogue.matter.fine_structure import FineStructure
 from truesky.catalogue.matter.lightcone import Distances, Replicas, Steps, Voxels
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.randomness import per_source
 
 # HEALPix orders of the cells in which halos are drawn, from small to large cells.
@@ -212,7 +212,8 @@ def model(
     BadInput
         If there are more combinations of step and mass bin than identifiers can contain.
     """
-    steps, distances = _radial_steps(box.model.cell, float(cosmology.comoving_distance(volume.z_min)))
+    cosmology = box.model.cosmology
+    steps, distances = _radial_steps(cosmology, box.model.cell, float(cosmology.comoving_distance(volume.z_min)))
     law = parameters.section("halos.toml", "mass_function")
     bins = round((law["highest"] - law["lowest"]) / law["bin"])
     edge = law["lowest"] + law["bin"] * np.arange(bins + 1)
@@ -225,7 +226,7 @@ def model(
     ratio = np.maximum(np.log(np.maximum(at_edge[:, :-1], 1e-300) / np.maximum(at_edge[:, 1:], 1e-300)), 1e-6)
     number = law["bin"] * (at_edge[:, :-1] - at_edge[:, 1:]) / ratio
     x = masses.interpolate(masses.bias, steps.z, edge[:-1] + 0.5 * law["bin"])
-    x = x * density_box.growth(steps.z)[:, None]
+    x = x * cosmology.growth(steps.z)[:, None]
     field, amplitude = density_box.biased_field(box.model, x)
     return HaloModel(
         box=box,
@@ -246,14 +247,14 @@ def model(
     )
 
 
-def _radial_steps(cell: float, start: float) -> tuple[Steps, Distances]:
+def _radial_steps(cosmology: Cosmology, cell: float, start: float) -> tuple[Steps, Distances]:
     """Return the steps in comoving distance, and a table of redshift by distance.
 
     `cell` is the depth of a step, that is the side of a cell of the box, and `start` the inner edge of the first step
     (both Mpc/h). The steps end behind the last redshift of the halo tables.
     """
     last = (np.ceil(float(cosmology.comoving_distance(Z_LAST)) / cell) + 1.0) * cell
-    table = lightcone.distance_table(float(cosmology.redshift(last)) + 1e-6)
+    table = lightcone.distance_table(cosmology, float(cosmology.redshift(last)) + 1e-6)
     return lightcone.radial_steps(cell, start, float(last), table), table
 
 

@@ -18,7 +18,7 @@ from truesky.catalogue.halos import halo_catalogue, halos
 from truesky.catalogue.halos.halos import Halos
 from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.halos.population import Population
-from truesky.fluxes import cosmology
+from truesky.cosmology import HUBBLE_DISTANCE, Cosmology
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +45,7 @@ class Settings:
     repeat_threshold: float
     least_determinant: float
 
-    @property
-    def max_distance(self) -> float:
+    def max_distance(self, cosmology: Cosmology) -> float:
         """Return the largest comoving distance of halos that lens, Mpc/h."""
         return float(cosmology.comoving_distance(self.z_max))
 
@@ -128,7 +127,7 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
     not change and there is no lensing beyond.
     """
     # c^2 / (4 pi G) in Msun / Mpc, from the critical density of `masses`.
-    bending = masses.shape.critical_density * cosmology.HUBBLE_DISTANCE**2 / 1.5
+    bending = masses.shape.critical_density * HUBBLE_DISTANCE**2 / 1.5
     amplitude = 10.0**log_mass * (1.0 + z) / (np.pi * chi * bending)
     radius = masses.radius(log_mass) / chi
     wide, close = np.radians([chosen.wide / 60.0, chosen.close / 60.0])

@@ -22,7 +22,7 @@ from truesky.catalogue import parameters
 from truesky.catalogue.halos import luminosity_function
 from truesky.catalogue.halos.luminosity_function import Inverse
 from truesky.catalogue.matter import linear_theory
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.numerics import matrices
 
 # Last redshift of all tables by redshift; galaxies in halos end at z = 6.
@@ -84,6 +84,8 @@ class Masses:
         Concentration c_200m at fewer redshifts, also uniform in ln(1 + z) over the same range.
     shape : HaloShape
         Parameters of radius and velocity dispersion.
+    cosmology : Cosmology
+        Parameters of the universe.
     """
 
     log_mass: Float
@@ -92,6 +94,7 @@ class Masses:
     bias: Float
     concentration: Float
     shape: HaloShape
+    cosmology: Cosmology
 
     def interpolate(self, table: Float, z: Float, log_mass: Float) -> Float:
         """Interpolate one of the tables at all combinations of redshifts and masses, linearly in ln(1 + z) and log10 M.
@@ -136,7 +139,7 @@ class Masses:
 
     def radius(self, log_mass: Float) -> Float:
         """Return the halo radius R_200m in comoving Mpc/h, from log10 of M_200m in Msun/h."""
-        density = self.shape.overdensity * cosmology.OMEGA_M * self.shape.critical_density
+        density = self.shape.overdensity * self.cosmology.omega_m * self.shape.critical_density
         return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
 
     def dispersion(self, log_mass: Float, z: Float) -> Float:
@@ -146,7 +149,7 @@ class Masses:
         ----------
         Evrard et al. 2008
         """
-        mass = self.shape.critical * cosmology.expansion_rate(z) * 10.0 ** (log_mass - 15.0)
+        mass = self.shape.critical * self.cosmology.expansion_rate(z) * 10.0 ** (log_mass - 15.0)
         return np.asarray(self.shape.sigma_15 * mass**self.shape.slope)
 
 
@@ -189,13 +192,13 @@ class Matching:
         return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
 
 
-def masses() -> Masses:
-    """Return the tables of halo abundance, bias and concentration in the built-in cosmology, for z = 0 to 6.1."""
+def masses(cosmology: Cosmology) -> Masses:
+    """Return the tables of halo abundance, bias and concentration in a cosmology, for z = 0 to 6.1."""
     z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
-    tables = linear_theory.halo_tables(_LOG_MASS, z)
+    tables = linear_theory.halo_tables(cosmology, _LOG_MASS, z)
     shape = HaloShape(**parameters.section("halos.toml", "halo"))
     density = np.log(np.maximum(tables["density"], 1e-300))
-    return Masses(_LOG_MASS, z, density, tables["bias"], tables["concentration"], shape)
+    return Masses(_LOG_MASS, z, density, tables["bias"], tables["concentration"], shape, cosmology)
 
 
 def match_luminosities(halos: Masses, luminosities: Inverse) -> Matching:

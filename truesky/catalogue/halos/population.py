@@ -26,6 +26,7 @@ from truesky.catalogue.halos.luminosity_function import Inverse, Volume
 from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.halos.satellites import Satellites
 from truesky.catalogue.matter import density_box, fine_structure
+from truesky.cosmology import Cosmology
 
 CENTRAL, SATELLITE = 0, 1
 # Largest number of HEALPix cells whose halos are kept in memory, enough for neighbouring cells drawn one after another.
@@ -52,6 +53,11 @@ class Population:
     halos: HaloModel
     masses: Masses
     light_cone: LightCone | None = None
+
+    @property
+    def cosmology(self) -> Cosmology:
+        """Return the parameters of the universe."""
+        return self.masses.cosmology
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,6 +157,7 @@ class CellCache:
 
 def model(
     seed: int,
+    cosmology: Cosmology,
     box_cells: int,
     volume: Volume,
     luminosities: Inverse,
@@ -165,6 +172,8 @@ def model(
     ----------
     seed : int
         Seed of the simulated matter and of all halos and galaxies.
+    cosmology : Cosmology
+        Parameters of the universe.
     box_cells : int
         Cells per side of the box of simulated matter, an even number.
     volume : Volume
@@ -184,13 +193,13 @@ def model(
     Population
         The model.
     """
-    masses = matching.masses()
+    masses = matching.masses(cosmology)
     matched = matching.match_luminosities(masses, luminosities)
 
     def faintest_drawn(z: Float) -> Float:
         return np.minimum(faintest(z), volume.m_faintest)
 
-    box = density_box.load(seed, box_cells)
+    box = density_box.load(seed, box_cells, cosmology)
     fine = fine_structure.model(seed) if structure_below_cells else None
     halo_model = halos.model(box, volume, masses, matched, faintest_drawn, fine)
     return Population(seed, halo_model, masses, light_cone)

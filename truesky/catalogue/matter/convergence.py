@@ -25,7 +25,7 @@ import numpy as np
 from lake_schema.arrays import Float, Float32, Int
 from truesky.catalogue.matter import density_box, lightcone
 from truesky.catalogue.matter.density_box import Box, BoxModel
-from truesky.fluxes import cosmology
+from truesky.cosmology import HUBBLE_DISTANCE
 from truesky.numerics import activity, matrices
 from truesky.numerics.compiling import exact_jit
 
@@ -177,14 +177,15 @@ def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: 
         factor.append(cells)
         at += cells * box.model.cell
     chi, thick = np.array(middle), np.array(factor)
-    table = lightcone.distance_table(_Z_LAST)
+    cosmology = box.model.cosmology
+    table = lightcone.distance_table(cosmology, _Z_LAST)
     number = (chi / stretch).astype(np.int64)
-    growth = density_box.growth(table.redshift((number + 0.5) * stretch))
+    growth = cosmology.growth(table.redshift((number + 0.5) * stretch))
     z = table.redshift(chi)
-    growth_here = density_box.growth(z)
-    nodes = np.linspace(float(density_box.growth(table.z[-1])), 1.0, _GAIN_NODES)
+    growth_here = cosmology.growth(z)
+    nodes = np.linspace(float(cosmology.growth(table.z[-1])), 1.0, _GAIN_NODES)
     gain = np.interp(growth_here, nodes, density_box.matter_gain(box.model, nodes))
-    weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
+    weight = 1.5 * cosmology.omega_m / HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
     return Layers(chi, thick, number, growth, growth_here, gain, weight)
 
 
@@ -219,7 +220,7 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
     ell = np.unique(np.concatenate([np.arange(32), np.geomspace(32, l_max, _ELL_NODES).astype(int)]))
     k = (ell[:, None] + 0.5) / slabs.middle
-    linear = density_box.linear_power(k.ravel()).reshape(k.shape)
+    linear = density_box.linear_power(box.model.cosmology, k.ravel()).reshape(k.shape)
     box_power = linear * _sampled_power_ratio(box.model, slabs, k)
     rows = []
     for source_chi in chi:
@@ -242,20 +243,20 @@ def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
     ratio = np.empty(k.shape)
     for factor in np.unique(slabs.factor).tolist():
         selected = slabs.factor == factor
-        ratio[:, selected] = np.interp(k[:, selected], nodes, window(model.cell, factor, nodes))
+        ratio[:, selected] = np.interp(k[:, selected], nodes, window(model, factor, nodes))
     for s, growth_here in enumerate(slabs.growth_here):
         by_k = [np.interp(growth_here, growths, column) for column in share.T]
         ratio[:, s] *= slabs.gain[s] ** 2 * np.interp(k[:, s], at, by_k)
     return ratio
 
 
-def window(cell: float, factor: int, k: Float) -> Float:
+def window(model: BoxModel, factor: int, k: Float) -> Float:
     """Return the power of a density that is averaged over cubes of cells, relative to the linear power.
 
     Parameters
     ----------
-    cell : float
-        Side of a cell, Mpc/h.
+    model : BoxModel
+        Parameters of the box.
     factor : int
         Number of cells per side of a cube.
     k : float array, shape (n,)
@@ -271,6 +272,7 @@ def window(cell: float, factor: int, k: Float) -> Float:
     The density is constant within each cube, so the modes of the lattice of cells (up to its Nyquist wave number) also
     appear as aliased images at higher wave numbers. The ratio includes them.
     """
+    cell, cosmology = model.cell, model.cosmology
     wide = cell * factor
     number = np.arange(_DIRECTIONS) + 0.5
     up, turn = 1.0 - 2.0 * number / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * number
@@ -279,7 +281,7 @@ def window(cell: float, factor: int, k: Float) -> Float:
     order = np.arange(-_IMAGES, _IMAGES + 1) * 2.0 * np.pi / wide
     image = np.stack(np.meshgrid(order, order, order, indexing="ij"), -1).reshape(-1, 3)
     ln_k = np.linspace(np.log(1e-4), np.log(np.sqrt(3.0) * np.pi / cell), 400)
-    ln_power = np.log(density_box.linear_power(np.exp(ln_k)))
+    ln_power = np.log(density_box.linear_power(cosmology, np.exp(ln_k)))
     mean = np.empty(k.size)
     for i, size in enumerate(k):
         wave = size * direction
@@ -291,7 +293,7 @@ def window(cell: float, factor: int, k: Float) -> Float:
         power = np.where(in_lattice, np.exp(np.interp(np.log(np.maximum(length, 1e-4)), ln_k, ln_power)), 0.0)
         damping = np.prod(np.sinc(wave * wide / (2.0 * np.pi)) ** 2, -1)
         mean[i] = np.mean(damping * np.sum(power * np.prod(average**2, -1), 1))
-    return mean / density_box.linear_power(k)
+    return mean / density_box.linear_power(cosmology, k)
 
 
 def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache, partial
 
 import numpy as np
@@ -34,7 +34,7 @@ from lake_schema.arrays import Complex64, Float, Float32, Int
 from lake_schema.errors import BadInput
 from truesky.catalogue import parameters
 from truesky.catalogue.matter import linear_theory
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.cache_labels import label_box, label_halo_bias, label_tides
 from truesky.numerics.code_fingerprints import code_key
@@ -55,7 +55,7 @@ _MAX_WORKERS = 8
 
 @dataclass(frozen=True, slots=True)
 class BoxModel:
-    """Parameters of the box of simulated matter; explained in density_box.toml, [box]."""
+    """Parameters of the box of simulated matter, explained in density_box.toml, [box], and its cosmology."""
 
     cell: float
     smoothing: tuple[float, ...]
@@ -66,6 +66,13 @@ class BoxModel:
     bias_hold: float
     growth_index: float
     gain_band: tuple[float, ...]
+    cosmology: Cosmology
+
+    def key_parts(self) -> list[float | str]:
+        """Return the values that identify the model in the key of a cached result."""
+        names = [field.name for field in fields(self) if field.name != "cosmology"]
+        numbers = [float(value) for name in names for value in np.atleast_1d(getattr(self, name))]
+        return [*numbers, self.cosmology.fingerprint()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,28 +108,44 @@ class Box:
         return self.n * self.model.cell
 
 
-def box_model() -> BoxModel:
-    """Return the built-in parameters of the box of simulated matter."""
-    return BoxModel(**parameters.section(_FILE, "box"))
+def box_model(cosmology: Cosmology) -> BoxModel:
+    """Return the built-in parameters of the box of simulated matter, for a cosmology."""
+    return BoxModel(**parameters.section(_FILE, "box"), cosmology=cosmology)
 
 
-def load(seed: int, n: int) -> Box:
+def load(seed: int, n: int, cosmology: Cosmology) -> Box:
     """Return the box of simulated matter for a seed with n cells per side, from the disc cache or made now.
 
-    Making it takes 6 s and 0.6 GB of memory for n = 256, because the fields are made and stored one at a time. Raises
-    BadInput if n is not an even number of at least 2.
+    Parameters
+    ----------
+    seed : int
+        Seed of the random numbers.
+    n : int
+        Number of cells per side.
+    cosmology : Cosmology
+        Parameters of the universe.
+
+    Returns
+    -------
+    Box
+        The box. Making it takes 6 s and 0.6 GB of memory for n = 256, because the fields are made and stored one at a
+        time.
+
+    Raises
+    ------
+    BadInput
+        If n is not an even number of at least 2.
     """
     if n < 2 or n % 2:
         raise BadInput(f"a box must have an even number of cells per side, got {n}")
-    model = box_model()
-    numbers = [value for field in fields(model) for value in np.atleast_1d(getattr(model, field.name))]
-    key = content_key(code_key(__name__), seed, n, *map(float, numbers))
+    model = box_model(cosmology)
+    key = content_key(code_key(__name__), seed, n, *model.key_parts())
     cached = partial(_cached_field, key)
     # Transforms that several fields share are made once, and only if one of these fields is not in the disc cache.
     modes = cache(lambda: scipy.fft.rfftn(g))
-    linear_modes = cache(lambda: _linear_modes(g, model.cell))
+    linear_modes = cache(lambda: _linear_modes(model, g))
     with scipy.fft.set_workers(min(os.cpu_count() or 1, _MAX_WORKERS)):
-        g = cached("box_g", lambda: _gaussian(seed, n, model.cell))
+        g = cached("box_g", lambda: _gaussian(model, seed, n))
         smooth = [
             cached(f"box_g{i}", partial(_smooth, modes, model.cell, radius)) if radius else g
             for i, radius in enumerate(model.smoothing)
@@ -131,7 +154,7 @@ def load(seed: int, n: int) -> Box:
         velocity = tuple(
             cached(f"box_u{axis}", partial(_displacement, linear_modes, model.cell, axis)) for axis in range(3)
         )
-    label = label_box(seed, n)
+    label = label_box(cosmology.fingerprint(), seed, n)
     variance = cached("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]), label)
     return Box(model, n, seed, tuple(smooth), np.asarray(variance, float), velocity)
 
@@ -144,30 +167,15 @@ def tides(box: Box) -> tuple[Float32, ...]:
 
         T_ij = (d_i d_j / nabla^2 - delta_ij / 3) delta
     """
-    key = content_key(code_key(__name__), box.seed, box.n, box.model.cell)
-    linear_modes, tide_fields = cache(lambda: _linear_modes(box.smoothed[0], box.model.cell)), []
+    cosmology = box.model.cosmology.fingerprint()
+    key = content_key(code_key(__name__), box.seed, box.n, box.model.cell, cosmology)
+    linear_modes, tide_fields = cache(lambda: _linear_modes(box.model, box.smoothed[0])), []
+    label = label_tides(cosmology, box.seed, box.n)
     with scipy.fft.set_workers(min(os.cpu_count() or 1, _MAX_WORKERS)):
         for name, axis_1, axis_2 in (("xx", 0, 0), ("yy", 1, 1), ("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2)):
             make_tide = partial(_tide, linear_modes, box.model.cell, axis_1, axis_2)
-            tide_fields.append(_cached_field(key, f"box_t{name}", make_tide, label_tides(box.seed, box.n)))
+            tide_fields.append(_cached_field(key, f"box_t{name}", make_tide, label))
     return tuple(tide_fields)
-
-
-def growth(z: npt.ArrayLike) -> Float:
-    """Return the linear growth D(z) of the flat universe with a cosmological constant, D(0) = 1.
-
-    References
-    ----------
-    Carroll, Press & Turner 1992, ARA&A 30, 499 (its hypergeometric form)
-    """
-    a = 1.0 / (1.0 + np.asarray(z, float))
-    return np.asarray(a * _growth_integral(a) / _growth_integral(np.ones(())))
-
-
-def growth_rate(z: npt.ArrayLike, index: float) -> Float:
-    """Return the growth rate f = dlnD / dlna = Omega_m(z)^index (error 0.3 %)."""
-    a = 1.0 + np.asarray(z, float)
-    return np.asarray((cosmology.OMEGA_M * a**3 / cosmology.expansion_rate(z) ** 2) ** index)
 
 
 def velocity_factor(model: BoxModel, z: npt.ArrayLike) -> Float:
@@ -175,8 +183,9 @@ def velocity_factor(model: BoxModel, z: npt.ArrayLike) -> Float:
 
     a is the scale factor, H the Hubble rate, f the growth rate and D the linear growth.
     """
+    cosmology = model.cosmology
     rate = 100.0 * cosmology.expansion_rate(z) / (1.0 + np.asarray(z, float))
-    return np.asarray(rate * growth_rate(z, model.growth_index) * growth(z))
+    return np.asarray(rate * cosmology.growth_rate(z, model.growth_index) * cosmology.growth(z))
 
 
 def overdensity(box: Box, index: Int, growths: npt.ArrayLike) -> Float:
@@ -222,9 +231,8 @@ def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
     x^2 P_linear(z = 0) in the range of k that `bias_band` of `model` gives (h/Mpc). A = x would be wrong by up to a
     factor of 1.5. The bias is accurate within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests).
     """
-    names = [float(value) for name in astuple(model) for value in np.atleast_1d(name)]
-    key = content_key(code_key(__name__), *names)
-    table = cached_arrays("halo_bias", key, lambda: _bias_table(model), label_halo_bias())
+    key, label = content_key(code_key(__name__), *model.key_parts()), label_halo_bias(model.cosmology.fingerprint())
+    table = cached_arrays("halo_bias", key, lambda: _bias_table(model), label)
     place = np.searchsorted(np.array(model.bias_edges), x)
     amplitude = np.empty(x.shape)
     for i in range(len(model.bias_field)):
@@ -253,7 +261,7 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
         Power of the overdensity / (D^2 times the linear power at z = 0).
     """
     n, cell = _GAIN_CELLS, model.cell
-    power = _power_on_modes(n, cell)
+    power = _power_on_modes(model, n)
     k = np.sqrt(_k_squared(n, cell))
     place = np.digitize(k.ravel(), edges)
 
@@ -266,9 +274,9 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
     return bin_modes(k) / bin_modes(np.ones_like(k)), np.array(powers) / (growths[:, None] ** 2 * linear)
 
 
-def linear_power(k: npt.ArrayLike) -> Float:
+def linear_power(cosmology: Cosmology, k: npt.ArrayLike) -> Float:
     """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
-    return linear_theory.power(np.asarray(k, float))
+    return linear_theory.power(cosmology, np.asarray(k, float))
 
 
 def _bias_table(model: BoxModel) -> dict[str, Float]:
@@ -278,12 +286,12 @@ def _bias_table(model: BoxModel) -> dict[str, Float]:
     relative to matter at z = 0. It includes that a halo has a random position within its voxel (small piece of volume).
     """
     n, cell = _GAIN_CELLS, model.cell
-    power, k_squared = _power_on_modes(n, cell), _k_squared(n, cell)
+    power, k_squared = _power_on_modes(model, n), _k_squared(n, cell)
     band = (k_squared > model.bias_band[0] ** 2) & (k_squared < model.bias_band[1] ** 2)
     # Give each interval of ln k the same weight, so that the many modes on small scales do not dominate.
     weight = k_squared[band].astype(float) ** -1.5 / power[band]
     linear_sum, damped_weight = np.sum(weight * power[band]), weight * np.exp(-(model.bias_hold**2) * k_squared[band])
-    log_power, edge = _log_power(n, cell), (0.0, *model.bias_edges, model.bias_most)
+    log_power, edge = _log_power(model, n), (0.0, *model.bias_edges, model.bias_most)
     amplitude, bias = np.empty((2, len(model.bias_field), _BIAS_NODES))
     for i, field in enumerate(model.bias_field):
         radius = model.smoothing[field]
@@ -296,17 +304,11 @@ def _bias_table(model: BoxModel) -> dict[str, Float]:
     return {"bias": bias, "amplitude": amplitude}
 
 
-def _growth_integral(a: Float) -> Float:
-    return np.asarray(
-        scipy.special.hyp2f1(1.0 / 3.0, 1.0, 11.0 / 6.0, -(a**3) * cosmology.OMEGA_LAMBDA / cosmology.OMEGA_M)
-    )
-
-
 def _cached_field(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]], label: str = "") -> Float32:
     return np.asarray(cached_arrays(name, key, lambda: {"field": make()}, label)["field"])
 
 
-def _gaussian(seed: int, n: int, cell: float) -> Float32:
+def _gaussian(model: BoxModel, seed: int, n: int) -> Float32:
     """Return the Gaussian field g, float32 (n, n, n), for which exp(g) has the linear power spectrum at z = 0."""
     noise = np.empty((n, n, n), np.float32)
     for x in range(n):
@@ -314,29 +316,30 @@ def _gaussian(seed: int, n: int, cell: float) -> Float32:
         noise[x] = stream(seed, "box", x).standard_normal((n, n), np.float32)
     modes = scipy.fft.rfftn(noise, overwrite_x=True)
     del noise
-    modes *= np.sqrt(_log_power(n, cell) / np.float32(cell**3))
+    modes *= np.sqrt(_log_power(model, n) / np.float32(model.cell**3))
     return _to_real(modes, n)
 
 
-def _log_power(n: int, cell: float) -> Float32:
+def _log_power(model: BoxModel, n: int) -> Float32:
     """Return the power of the Gaussian field g on the Fourier modes of the box, (Mpc/h)^3.
 
     It is the Fourier transform of the correlation function ln(1 + xi), where xi is the linear one. Negative values are
     set to 0.
     """
-    power = _power_on_modes(n, cell)
+    power, cell = _power_on_modes(model, n), model.cell
     correlation = scipy.fft.irfftn(power, (n, n, n), overwrite_x=True) / np.float32(cell**3)
     transformed = scipy.fft.rfftn(np.log1p(correlation), overwrite_x=True).real * np.float32(cell**3)
     transformed[0, 0, 0] = 0.0
     return np.asarray(np.maximum(transformed, np.float32(0.0)))
 
 
-def _power_on_modes(n: int, cell: float) -> Float32:
+def _power_on_modes(model: BoxModel, n: int) -> Float32:
     """Return the linear power at z = 0 on the Fourier modes of the box, (Mpc/h)^3; 0 at k = 0."""
+    cell = model.cell
     k = np.sqrt(_k_squared(n, cell))
     largest = np.sqrt(3.0) * np.pi / cell
     ln_k = np.linspace(np.log(np.pi / (n * cell)), np.log(1.01 * largest), _K_NODES)
-    ln_power = np.log(linear_power(np.exp(ln_k)))
+    ln_power = np.log(linear_power(model.cosmology, np.exp(ln_k)))
     np.log(np.maximum(k, np.exp(ln_k[0]), out=k), out=k)
     power = np.exp(np.interp(k, ln_k, ln_power).astype(np.float32))
     power[0, 0, 0] = 0.0
@@ -364,16 +367,16 @@ def _tide(linear_modes: Callable[[], tuple[Complex64, Float32]], cell: float, ax
     return _to_real(modes * (product - (axis_1 == axis_2) / 3.0).astype(np.float32), n)
 
 
-def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
+def _linear_modes(model: BoxModel, g: Float32) -> tuple[Complex64, Float32]:
     """Return the Fourier modes of the linear density at z = 0, and k^2 of the modes.
 
     The modes have the phases of g. k^2 is set to 1 at k = 0, so that a division is possible.
     """
-    n = g.shape[0]
+    n, cell = g.shape[0], model.cell
     modes = scipy.fft.rfftn(g)
-    log_power = _log_power(n, cell)
+    log_power = _log_power(model, n)
     empty = np.zeros(modes.shape, np.float32)
-    modes *= np.sqrt(np.divide(_power_on_modes(n, cell), log_power, out=empty, where=log_power > 0.0))
+    modes *= np.sqrt(np.divide(_power_on_modes(model, n), log_power, out=empty, where=log_power > 0.0))
     k_squared = _k_squared(n, cell)
     k_squared[0, 0, 0] = 1.0
     return modes, k_squared

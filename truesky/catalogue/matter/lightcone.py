@@ -17,7 +17,7 @@ import numpy.typing as npt
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue.matter.density_box import Box
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.randomness.rng import stream
 
 # Side of a HEALPix cell in rad, times nside.
@@ -117,7 +117,7 @@ class Distances:
         return np.asarray(low + (at - node) * (self.z[node + 1] - low))
 
 
-def distance_table(z_max: float) -> Distances:
+def distance_table(cosmology: Cosmology, z_max: float) -> Distances:
     """Return the table of redshift by comoving distance from 0 to z_max, or up to one step farther."""
     steps = int(np.ceil(float(cosmology.comoving_distance(z_max)) / _CHI_STEP))
     chi = np.asarray(_CHI_STEP * np.arange(steps + 1), float)

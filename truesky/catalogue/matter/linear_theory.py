@@ -1,6 +1,7 @@
-"""Linear power spectrum, and halo abundance, bias and concentration in the built-in cosmology, computed with colossus.
+"""Linear power spectrum, and halo abundance, bias and concentration in a cosmology, computed with colossus.
 
-Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky.
+Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky. Colossus has
+one current cosmology per process, which is set before each use.
 
 References
 ----------
@@ -10,13 +11,17 @@ Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 
 
 from __future__ import annotations
 
-from functools import cache
+import tempfile
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lake_schema.arrays import Float
-from truesky.fluxes import cosmology
+from truesky.catalogue.matter import boltzmann
+from truesky.cosmology import Cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
 from truesky.numerics.cache_labels import label_halo_tables
 from truesky.numerics.code_fingerprints import code_key
@@ -24,63 +29,118 @@ from truesky.numerics.code_fingerprints import code_key
 # Halo masses are M_200m, as colossus calls them.
 MASS_DEFINITION = "200m"
 # Colossus models of the linear power spectrum, the halo mass function, the halo bias and the concentration.
-_POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
+_MASS_FUNCTION, _BIAS, _CONCENTRATION = "tinker08", "tinker10", "diemer19"
+# Model of colossus for the power spectrum: the fitting formula of Eisenstein & Hu, without massive neutrinos.
+_FIT = "eisenstein98"
+# log10 of the wave numbers (h/Mpc) at which colossus gets the power spectrum of CAMB, beyond all halos of the tables.
+_LOG_K = np.linspace(-5.0, 5.0, 2001)
 # Number of redshifts of the table of concentrations. It is small, because a concentration takes 0.1 s to compute.
 _Z_COARSE = 10
 # Concentrations are computed only for every 20th mass, and interpolated between these masses.
 _COARSE = 20
 
 
-def power(k: Float) -> Float:
-    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
-    return np.asarray(_power_cosmology().matterPowerSpectrum(k, 0.0, model=_POWER), float)
+def power(cosmology: Cosmology, k: Float) -> Float:
+    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc.
+
+    For `cosmology.power` = "camb", the spectrum of CAMB is continued beyond 1e-4 < k < 100 h/Mpc with the shape of the
+    fitting formula. Raises BadInput if CAMB is required and not installed.
+    """
+    fit = np.asarray(_power_cosmology(cosmology).matterPowerSpectrum(k, 0.0, model=_FIT), float)
+    if cosmology.power == _FIT:
+        return fit
+    ends = np.array(boltzmann.K_RANGE)
+    first, last = boltzmann.power(cosmology, ends) / power(replace(cosmology, power=_FIT), ends)
+    inside = (k >= ends[0]) & (k <= ends[1])
+    return np.where(inside, boltzmann.power(cosmology, k), fit * np.where(k < ends[0], first, last))
 
 
-def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
+def halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
     """Return tables of halo properties by redshift and log10 M_200m (Msun/h), by name.
 
-    The tables are the abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m),
-    and the `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range. They are
-    read from the disc cache if they have been computed before.
+    They are read from the disc cache if they have been computed before.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    log_mass : float array, shape (m,)
+        log10 M_200m / (Msun/h).
+    z : float array, shape (z,)
+        Redshift.
+
+    Returns
+    -------
+    dict of str to float array
+        The abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m), and the
+        `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range.
     """
-    numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
-    key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
-    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z), label_halo_tables())
+    key = content_key(code_key(__name__), cosmology.fingerprint(), log_mass, z)
+    label = label_halo_tables(cosmology.fingerprint())
+    return cached_arrays("halo_tables", key, lambda: _halo_tables(cosmology, log_mass, z), label)
 
 
-def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
-    _set_cosmology()
+def _halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Float]:
+    with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
+        return _colossus_tables(cosmology, log_mass, z, _spectrum(cosmology, Path(folder)))
+
+
+def _spectrum(cosmology: Cosmology, folder: Path) -> dict[str, str | None]:
+    """Return the arguments that tell colossus the power spectrum; the one of CAMB is written to a file in `folder`."""
+    if cosmology.power == _FIT:
+        return {"model": _FIT, "path": None}
+    path = folder / "linear_power.txt"
+    np.savetxt(path, np.stack([_LOG_K, np.log10(power(cosmology, 10.0**_LOG_K))], 1))
+    return {"model": f"truesky_{cosmology.fingerprint()}", "path": str(path)}
+
+
+def _colossus_tables(
+    cosmology: Cosmology, log_mass: Float, z: Float, spectrum: dict[str, str | None]
+) -> dict[str, Float]:
+    _set_cosmology(cosmology, reads_files=spectrum["path"] is not None)
     from colossus.halo import concentration
-    from colossus.lss import bias, mass_function
+    from colossus.lss import bias, mass_function, peaks
 
-    mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION}
+    mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION, "ps_args": spectrum}
     rows = [mass_function.massFunction(mass, at, model=_MASS_FUNCTION, q_out="dndlnM", **args) for at in z]
-    biases = [bias.haloBias(mass, at, model=_BIAS, **args) for at in z]
+    biases = [
+        bias.haloBiasFromNu(peaks.peakHeight(mass, at, ps_args=spectrum), z=at, mdef=MASS_DEFINITION, model=_BIAS)
+        for at in z
+    ]
     coarse_mass, coarse_z = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
-    c = [concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse_z]
+    c = [
+        concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION, ps_args=spectrum)
+        for at in coarse_z
+    ]
     concentrations = np.array([np.exp(np.interp(log_mass, coarse_mass, np.log(row))) for row in c])
     return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": concentrations}
 
 
-@cache
-def _power_cosmology() -> Any:
+@lru_cache(maxsize=4)
+def _power_cosmology(cosmology: Cosmology) -> Any:
     """Return the colossus cosmology for `power`; it is cached, because a new one computes its power spectrum again."""
-    return _set_cosmology()
+    return _set_cosmology(cosmology)
 
 
-def _set_cosmology() -> Any:
-    """Set the cosmology of colossus to truesky's built-in cosmology, and return it; colossus must not write files."""
+def _set_cosmology(cosmology: Cosmology, reads_files: bool = False) -> Any:
+    """Set the cosmology of colossus, which is global in a process, and return it; colossus must not write files.
+
+    If `reads_files` is True, colossus may read a power spectrum from a file.
+    """
     from colossus import settings
     from colossus.cosmology import cosmology as colossus
 
     settings.BASE_DIR, settings.PERSISTENCE = str(cache_dir() / "colossus"), ""
-    numbers = {
+    numbers: dict[str, Any] = {
         "flat": True,
-        "H0": 100.0 * cosmology.HUBBLE,
-        "Om0": cosmology.OMEGA_M,
-        "Ob0": cosmology.OMEGA_B,
-        "sigma8": cosmology.SIGMA_8,
-        "ns": cosmology.SPECTRAL_INDEX,
+        "H0": 100.0 * cosmology.h,
+        "Om0": cosmology.omega_m,
+        "Ob0": cosmology.omega_b,
+        "sigma8": cosmology.sigma_8,
+        "ns": cosmology.n_s,
         "relspecies": False,
     }
-    return colossus.setCosmology("truesky", numbers, persistence="")
+    if not cosmology.has_constant_dark_energy:
+        numbers |= {"de_model": "w0wa", "w0": cosmology.w0, "wa": cosmology.wa}
+    name = f"truesky_{cosmology.fingerprint()}"
+    return colossus.setCosmology(name, numbers, persistence="r" if reads_files else "")

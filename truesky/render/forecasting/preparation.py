@@ -127,18 +127,18 @@ def _catalogue_items(request: Request) -> Iterator[Item]:
         yield _item("dust_map", "dust map", [cache_labels.label_dust_map(seed)])
     if request.sources is not None or request.ingest.galaxies is not None:
         return
-    cells = universe.box_cells
+    cells, cosmology = universe.box_cells, universe.cosmology.fingerprint()
     bands = dict.fromkeys((universe.galaxy_band, *_COLOUR_BANDS))
     yield _item("band_ratios", "colours of galaxies", [cache_labels.label_band_ratios(band) for band in bands])
-    yield _item("halo_tables", "halo abundance", [cache_labels.label_halo_tables()])
-    yield _item("halo_bias", "halo bias", [cache_labels.label_halo_bias()])
-    yield _item("box", f"matter in {cells}^3 cells", [cache_labels.label_box(seed, cells)], cells**3)
+    yield _item("halo_tables", "halo abundance", [cache_labels.label_halo_tables(cosmology)])
+    yield _item("halo_bias", "halo bias", [cache_labels.label_halo_bias(cosmology)])
+    yield _item("box", f"matter in {cells}^3 cells", [cache_labels.label_box(cosmology, seed, cells)], cells**3)
     if universe.alignment:
-        yield _item("tides", f"tides in {cells}^3 cells", [cache_labels.label_tides(seed, cells)], cells**3)
+        yield _item("tides", f"tides in {cells}^3 cells", [cache_labels.label_tides(cosmology, seed, cells)], cells**3)
     if universe.lensing is None:
         with_far_planes = max(universe.high_redshift_boost, universe.quasar_boost) > 0.0
         nside = universe.lensing_nside
-        label = cache_labels.label_lensing(seed, cells, nside, with_far_planes)
+        label = cache_labels.label_lensing(cosmology, seed, cells, nside, with_far_planes)
         pixels = 12 * nside**2 * (LENSING_PLANES + with_far_planes * FAR_PLANES)
         # Spherical harmonics take a time proportional to N_side^3, everything else to the number of pixels.
         slower = 1.0 + nside * float(costs()["lensing"]["nside_share"])

@@ -18,7 +18,7 @@ from lake_schema.ids import GENERATION_ORDER
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
 from truesky.catalogue.galaxies.galaxies import GalaxyModel
 from truesky.catalogue.halos import luminosity_function, matching, population
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes.libraries import templates
 from truesky.validation.model import observed
 
@@ -169,7 +169,7 @@ def magnitudes(rows: Mapping[str, Array], library: templates.Library, z_max: flo
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
     sed = band_ratios.Sed(*(rows[name] for name in names))
     z = rows["z_true"].astype(float)
-    plain = rows["abs_mag_r01"] + cosmology.distance_modulus(z)
+    plain = rows["abs_mag_r01"] + FIDUCIAL.distance_modulus(z)
     return {
         band: (plain + band_ratios.offset(band_ratios.load(library, band, z_max, 0.5), z, sed)).astype(np.float32)
         for band in BANDS
@@ -316,7 +316,7 @@ def luminosities(census: Census, law: luminosity_function.Schechter, z_min: floa
     for at, half, reddest in SHELLS:
         if not z_min < at < z_max:
             continue
-        faintest = min(census.limit - float(cosmology.distance_modulus(at + half)) - reddest, -16.0)
+        faintest = min(census.limit - float(FIDUCIAL.distance_modulus(at + half)) - reddest, -16.0)
         number = per_deg2(lambda shell, m=faintest: luminosity_function.number_density(law, m, shell), at, half)  # type: ignore[misc]
         ratios[f"luminosity_function_z{at}"] = census.per_deg2((np.abs(z - at) < half) & (m < faintest)) / number
     return _with_errors(ratios)
@@ -339,7 +339,7 @@ def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float
     """
     grid = np.linspace(at - half, at + half, 41)
     value = density(grid)
-    shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2
+    shells = FIDUCIAL.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2
     return float(np.sum(0.5 * (value[1:] + value[:-1]) * shells))
 
 
@@ -352,7 +352,7 @@ def halos(census: Census, published: Callable[[float, float], float]) -> dict[st
     z, mass = census.halos["z_true"], census.halos["log_mass"]
     ratios = {}
     for at, half in HALO_SHELLS:
-        volume = float(cosmology.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2
+        volume = float(FIDUCIAL.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2
         for min_log_mass in HALO_MASSES:
             selected = (np.abs(z - at) < half) & (mass > min_log_mass)
             each = np.bincount(census.halo_block[selected], minlength=census.blocks) * (census.blocks / census.area)

@@ -27,8 +27,9 @@ from truesky.catalogue.halos import halos, luminosity_function, matching, popula
 from truesky.catalogue.halos.luminosity_function import Volume
 from truesky.catalogue.halos.population import Population
 from truesky.catalogue.matter import convergence, density_box, lightcone
-from truesky.catalogue.matter.density_box import Box
-from truesky.fluxes import cosmology
+from truesky.catalogue.matter.density_box import Box, BoxModel
+from truesky.cosmology import Cosmology
+from truesky.request.schema import Universe
 from truesky.validation import pairs, theory
 from truesky.validation.theory import Shells
 
@@ -93,20 +94,20 @@ def concatenate(parts: Sequence[Tracers]) -> Tracers:
     return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
 
 
-def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
+def _power_ratio(field: npt.NDArray[np.floating], model: BoxModel, edges: Float) -> Float:
     """Return the power spectrum of a periodic cube divided by the linear power at z = 0, in bins of wavenumber.
 
-    `field` has the overdensity (or the density divided by its mean) in cubic cells of side `cell` (Mpc/h). `edges` are
-    the edges of the bins in h/Mpc.
+    `field` has the overdensity (or the density divided by its mean) in the cells of a box with the parameters `model`.
+    `edges` are the edges of the bins in h/Mpc.
     """
-    n = field.shape[0]
+    n, cell = field.shape[0], model.cell
     power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
     axis, half = 2 * np.pi * fft.fftfreq(n, cell), 2 * np.pi * fft.rfftfreq(n, cell)
     k = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + half**2)
     weight = np.full(k.shape, 2.0)
     weight[..., 0] = weight[..., -1] = 1.0
     place = np.digitize(k.ravel(), edges)
-    linear = density_box.linear_power(np.maximum(k.ravel(), 1e-4))
+    linear = density_box.linear_power(model.cosmology, np.maximum(k.ravel(), 1e-4))
     total = [np.bincount(place, weight.ravel() * value, edges.size + 1)[1:-1] for value in (power, linear)]
     return np.asarray(total[0] / total[1])
 
@@ -116,7 +117,7 @@ def box_power(box: Box, edges: Float) -> Float:
 
     `edges`, shape (bins + 1,), are the edges of the wavenumber bins in h/Mpc.
     """
-    return _power_ratio(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
+    return _power_ratio(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model, edges)
 
 
 def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
@@ -141,7 +142,7 @@ def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
     rows = []
     for i, times in zip(field.tolist(), amplitude.tolist(), strict=True):
         number = np.exp(np.float32(times) * box.smoothed[i] - np.float32(0.5 * times**2 * box.variance[i]))
-        rows.append(np.sqrt(_power_ratio(number, box.model.cell, edges) / matter))
+        rows.append(np.sqrt(_power_ratio(number, box.model, edges) / matter))
     return np.asarray(np.array(rows) / np.array(x)[:, None])
 
 
@@ -153,7 +154,7 @@ def velocity_rms(box: Box, x: float) -> float:
     return float(density_box.velocity_factor(box.model, 0.0) * np.sqrt(np.mean(square)))
 
 
-def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_mass: float) -> Population:
+def population_above(seed: int, settings: Universe, z_min: float, z_max: float, log_mass: float) -> Population:
     """Return a model of the halos and galaxies above a mass and between two redshifts.
 
     Galaxies are limited by their proxy mass (halo or subhalo mass with scatter, which determines the luminosity).
@@ -162,8 +163,8 @@ def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_
     ----------
     seed : int
         Seed of the universe's periodic box of matter.
-    box_cells : int
-        Number of cells along each side of the box.
+    settings : Universe
+        Cosmology, and number of cells along each side of the box.
     z_min, z_max : float
         Redshift range.
     log_mass : float
@@ -174,12 +175,12 @@ def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_
     Population
         Model, from which `draw_tracers` draws halos and galaxies.
     """
-    table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    table = matching.masses(settings.cosmology)
+    inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     matched = matching.match_luminosities(table, inverse)
     volume = Volume(z_min, z_max, 0.0)
-    return population.model(
-        seed, box_cells, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass))
-    )
+    box = seed, settings.cosmology, settings.box_cells
+    return population.model(*box, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass)))
 
 
 def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
@@ -208,7 +209,8 @@ def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
             members = satellites.draw(universe.halos, universe.masses, hosts, universe.seed)
             ra, dec = sky.positions_of_indices(hosts.index)
             z = universe.halos.distances.redshift(hosts.chi)
-            x = universe.masses.interpolate_pairs(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)
+            x = universe.masses.interpolate_pairs(universe.masses.bias, z, hosts.log_mass)
+            x = x * universe.cosmology.growth(z)
             is_satellite = np.repeat([False, True], [ra.size, members.ra.size])
             host = np.concatenate([np.arange(ra.size), members.host])
             pairs = ((ra, members.ra), (dec, members.dec), (hosts.chi, members.chi), (hosts.proxy, members.proxy))
@@ -357,11 +359,13 @@ def _vectors(order: int, cell: int) -> Float:
     return sky.unit_vectors(*sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH)))
 
 
-def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
+def shells(cosmology: Cosmology, tracers: Tracers, z_min: float, z_max: float) -> Shells:
     """Return the distribution of tracers over shells of comoving distance, weighted with bias times growth factor.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     tracers : Tracers
         Halos or galaxies; those outside the redshift range are ignored.
     z_min, z_max : float
@@ -377,17 +381,21 @@ def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
     return theory.shells(tracers.chi, tracers.bias_growth, edges)
 
 
-def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
+def limber(
+    cosmology: Cosmology, tracer_shells: Shells, measured: Correlation, power: Callable[[Cosmology, Float], Float]
+) -> tuple[Float, Float]:
     """Predict the angular correlation function w from a power spectrum in Limber's approximation.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     tracer_shells : Shells
         Distribution of the tracers over distance, weighted with bias times growth factor.
     measured : Correlation
         Measurement for whose separation bins w is predicted.
     power : callable
-        Function that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
+        Function of (cosmology, k) that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
@@ -395,7 +403,7 @@ def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float]
         Predicted w in each bin, and the w that is measured if densities are relative to the mean of each block.
     """
     ell = np.geomspace(1.0, _ELL_MAX, 400)
-    c_l = theory.galaxy_power(ell, tracer_shells, lambda k, _: power(k))
+    c_l = theory.galaxy_power(cosmology, ell, tracer_shells, lambda universe, k, _: power(universe, k))
     multipoles = np.arange(1, _ELL_MAX + 1)
     # Cut off high multipoles smoothly: a sharp cutoff would cause oscillations at small separations.
     weight = (2 * multipoles + 1) / (4 * np.pi) * np.interp(np.log(multipoles), np.log(ell), c_l)
@@ -435,20 +443,21 @@ def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> F
     return total
 
 
-def gaussian_power(k: Float) -> Float:
+def gaussian_power(cosmology: Cosmology, k: Float) -> Float:
     """Return the power spectrum P(k) in (Mpc/h)^3 of the simulated Gaussian field, for k in h/Mpc.
 
     It includes the effect of finite cells, in which the field is constant, and is 0 for k of 1.2 h/Mpc or more.
     """
-    cell = density_box.box_model().cell
-    on_modes = density_box._log_power(_MODES, cell).ravel()
+    model = density_box.box_model(cosmology)
+    cell = model.cell
+    on_modes = density_box._log_power(model, _MODES).ravel()
     length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()
     edges = np.concatenate([[0.0], (np.arange(8) + 0.5) * 2 * np.pi / (_MODES * cell), np.geomspace(0.12, 1.3, 40)])
     place = np.digitize(length[1:], edges)
     number = np.maximum(np.bincount(place), 1)
     at, share = (np.bincount(place, value) / number for value in (length[1:], on_modes[1:]))
     is_filled = at > 0
-    ratio = np.interp(k, at[is_filled], share[is_filled] / density_box.linear_power(at[is_filled]))
+    ratio = np.interp(k, at[is_filled], share[is_filled] / density_box.linear_power(cosmology, at[is_filled]))
     nodes = np.geomspace(1e-3, 1.2, 40)
-    ratio *= np.interp(k, nodes, convergence.window(cell, 1, nodes))
-    return np.where(k < 1.2, density_box.linear_power(k) * ratio, 0.0)
+    ratio *= np.interp(k, nodes, convergence.window(model, 1, nodes))
+    return np.where(k < 1.2, density_box.linear_power(cosmology, k) * ratio, 0.0)

@@ -21,7 +21,8 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.catalogue.galaxies import band_ratios
 from truesky.catalogue.halos import matching
-from truesky.fluxes import cosmology, passbands
+from truesky.cosmology import FIDUCIAL, Cosmology, from_facts
+from truesky.fluxes import passbands
 from truesky.fluxes.high_redshift import QUASAR
 from truesky.fluxes.libraries import templates
 
@@ -71,6 +72,8 @@ class GalaxySample:
         Absolute AB magnitude at 1500 A (rest frame), for h = 0.67.
     area : float
         Area of the sky, deg2.
+    cosmology : Cosmology
+        Parameters of the universe.
     quasars : float, optional
         Number of quasars per deg2 with r < 22.5; None if not known.
     """
@@ -79,6 +82,7 @@ class GalaxySample:
     mags: Mapping[str, Float]
     ultraviolet: Float
     area: float
+    cosmology: Cosmology
     quasars: float | None = None
 
     def __getitem__(self, name: str) -> Float:
@@ -91,7 +95,7 @@ class GalaxySample:
     def volume(self, z_min: float, z_max: float) -> float:
         """Return the comoving volume between two redshifts in the sample's area of the sky, Mpc^3 (for h = 0.67)."""
         steradian = self.area * np.radians(1.0) ** 2
-        return float(cosmology.comoving_volume(z_min, z_max) * steradian / cosmology.HUBBLE**3)
+        return float(self.cosmology.comoving_volume(z_min, z_max) * steradian / FIDUCIAL.h**3)
 
 
 # Columns of the table `galaxies` that the measurements require.
@@ -113,16 +117,30 @@ def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
     cell = table["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     drawn = [cell for part in galaxies.manifest["parts"] for cell in part["facts"].get("generation_cells", ())]
     number = len(set(drawn)) or np.unique(cell).size
-    return from_table(table, number * sky.cell_area(GENERATION_ORDER)), cell[table["kind"].to_numpy() < 2]
+    area, cosmology = number * sky.cell_area(GENERATION_ORDER), from_facts(galaxies.manifest.get("facts", {}))
+    return from_table(table, area, cosmology), cell[table["kind"].to_numpy() < 2]
 
 
-def from_table(table: pa.Table, area: float) -> GalaxySample:
-    """Return a sample from the table `galaxies` with the columns COLUMNS, for an area of the sky in deg2.
+def from_table(table: pa.Table, area: float, cosmology: Cosmology) -> GalaxySample:
+    """Return a sample from the table `galaxies`.
 
-    Central and satellite galaxies are kept, quasars are counted, and other kinds of sources are ignored.
+    Parameters
+    ----------
+    table : Table
+        Rows with the columns COLUMNS. Central and satellite galaxies are kept, quasars are counted, and other kinds of
+        sources are ignored.
+    area : float
+        Area of the sky, deg2.
+    cosmology : Cosmology
+        Parameters of the universe.
+
+    Returns
+    -------
+    GalaxySample
+        The sample.
     """
     galaxies = table.filter(pa.array(table["kind"].to_numpy() < 2))
-    sample = from_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
+    sample = from_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area, cosmology)
     quasars = table.filter(pa.array(table["kind"].to_numpy() == QUASAR))
     mag, z, boost = (quasars[name].to_numpy().astype(float) for name in ("mag_r01", "z_true", "density_boost"))
     # Convert mag_r01, which for quasars is the magnitude at 1450 A in the rest frame, to the centre of r, for the
@@ -131,7 +149,9 @@ def from_table(table: pa.Table, area: float) -> GalaxySample:
     return replace(sample, quasars=float(np.sum((red < 22.5) / boost)) / area)
 
 
-def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> GalaxySample:
+def from_columns(
+    rows: Mapping[str, Array], area: float, cosmology: Cosmology, z_max: float = matching.Z_LAST
+) -> GalaxySample:
     """Return a sample of central and satellite galaxies that are given as columns, and compute their magnitudes.
 
     Parameters
@@ -140,6 +160,8 @@ def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching
         COLUMNS of the table `galaxies`, for central and satellite galaxies only.
     area : float
         Area of the sky, deg2.
+    cosmology : Cosmology
+        Parameters of the universe.
     z_max : float
         Largest redshift of the cached tables of flux ratios between bands; at least that of all galaxies.
 
@@ -152,15 +174,17 @@ def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching
     sed = _spectra(rows)
     z, m_r = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
     dustiest = _dustiest(sed)
-    mags = {band: apparent_magnitudes(rows, band, z_max) for band in BANDS}
+    mags = {band: apparent_magnitudes(rows, band, cosmology, z_max) for band in BANDS}
     band_table = band_ratios.load(library, _ULTRAVIOLET_BAND, z_max, dustiest)
     curve = passbands.load(_ULTRAVIOLET_BAND)
     from_z = passbands.pivot_wavelength(curve) / _ULTRAVIOLET_AT - 1.0
     rest = m_r + band_ratios.offset(band_table, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
-    return GalaxySample(rows, mags, rest + 5.0 * np.log10(cosmology.HUBBLE), area)
+    return GalaxySample(rows, mags, rest + 5.0 * np.log10(FIDUCIAL.h), area, cosmology)
 
 
-def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
+def apparent_magnitudes(
+    rows: Mapping[str, Array], band: str, cosmology: Cosmology, z_max: float = matching.Z_LAST
+) -> Float:
     """Compute apparent AB magnitudes of galaxies in a band from their redshift, absolute magnitude and spectrum.
 
     Emission lines, lensing magnification and extinction by the Milky Way are not included.
@@ -171,6 +195,8 @@ def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = mat
         Columns of the table `galaxies`: z_true, abs_mag_r01 and the description of the spectrum (sed_1, frac_1, ...).
     band : str
         Name of the band, such as "euclid_vis".
+    cosmology : Cosmology
+        Parameters of the universe.
     z_max : float
         Largest redshift of the cached table of flux ratios; at least that of all galaxies.
 
@@ -329,7 +355,7 @@ def _continuum(sample: GalaxySample, selected: Bool) -> Float:
     at = passbands.pivot_wavelength(passbands.load(_NEAR_INFRARED)) / _HALPHA - 1.0
     table = band_ratios.load(library, _NEAR_INFRARED, matching.Z_LAST, _dustiest(sed))
     rest = rows["abs_mag_r01"] + band_ratios.offset(table, np.full(z.size, at), sed) + 2.5 * np.log10(1.0 + at)
-    apparent_mag = rest + cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    apparent_mag = rest + sample.cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     f_nu = 10.0 ** (-0.4 * (apparent_mag + units.AB_CGS))
     return np.asarray(f_nu * units.LIGHT_ANGSTROM_S / (_HALPHA * (1.0 + z)) ** 2)
 

@@ -11,7 +11,7 @@ import numpy as np
 from lake_schema import user_files
 from lake_schema.arrays import Float
 from truesky.catalogue.halos import luminosity_function
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.validation.model import census
 
 # Observed numbers of galaxies per arcmin^2 brighter than a magnitude i (key): GAMA and zCOSMOS (Driver et al. 2016),
@@ -82,10 +82,10 @@ def _plot_luminosities(ax: Any, sample: census.Census, figures: Mapping[str, flo
     law, edges = luminosity_function.schechter(), np.arange(-24.5, -15.9, 0.5)
     for at, half, reddest in census.SHELLS[:3]:
         z, m = sample.rows["z_true"], sample.rows["abs_mag_r01"]
-        volume = float(cosmology.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2 * sample.area
+        volume = float(FIDUCIAL.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2 * sample.area
         middle = 0.5 * (edges[1:] + edges[:-1])
         density = np.histogram(m[np.abs(z - at) < half], edges)[0] / volume / 0.5
-        limit = sample.limit - float(cosmology.distance_modulus(at + half)) - reddest
+        limit = sample.limit - float(FIDUCIAL.distance_modulus(at + half)) - reddest
         (line,) = ax.plot(middle, luminosity_function.density(law, middle, at), label=f"z = {at}")
         is_complete = edges[1:] <= limit
         for mask, style in ((is_complete, "o"), (~is_complete, "x")):

@@ -15,7 +15,7 @@ from truesky.catalogue.galaxies import lensing
 from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.matter import convergence, density_box, lightcone
 from truesky.catalogue.matter.density_box import Box
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.validation import theory as theories
 from truesky.validation.model.clustering import Tracers
 
@@ -31,12 +31,25 @@ RINGS = (0.1, 0.2, 0.4, 0.8)
 _DIRECTIONS = 8
 
 
-def linear_theory(ell: Float, chi: float) -> Float:
-    """Return C_l of the convergence at multipoles `ell` from linear theory in Limber's approximation.
+def linear_theory(cosmology: Cosmology, ell: Float, chi: float) -> Float:
+    """Return C_l of the convergence from linear theory in Limber's approximation.
 
-    All sources are at the comoving distance `chi` (Mpc/h).
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    ell : float array, shape (n,)
+        Multipoles l.
+    chi : float
+        Comoving distance of all sources, Mpc/h.
+
+    Returns
+    -------
+    float array, shape (n,)
+        C_l at each multipole.
     """
-    return theories.convergence_power(ell, np.array([chi]), np.ones(1), theories.linear_power, _distances(chi))
+    weight = np.ones(1)
+    return theories.convergence_power(cosmology, ell, np.array([chi]), weight, theories.linear_power, _distances(chi))
 
 
 def _distances(chi: float) -> Float:
@@ -44,11 +57,13 @@ def _distances(chi: float) -> Float:
     return np.linspace(2.0, chi - 0.5, _STEPS)
 
 
-def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
+def band_ratio(cosmology: Cosmology, power: Float, chi: float, edges: Sequence[int]) -> Float:
     """Return measured C_l of the convergence divided by linear theory, averaged in bands of l.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     power : float array, shape (l_max + 1,)
         Measured C_l, beginning at l = 0, at least up to the last edge.
     chi : float
@@ -63,7 +78,7 @@ def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
     """
     ell = np.arange(edges[0], edges[-1] + 1)
     nodes = np.unique(np.geomspace(edges[0], edges[-1], 60).astype(int))
-    expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
+    expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(cosmology, nodes.astype(float), chi))))
     ratio = (2 * ell + 1) * power[ell] / expected
     modes = 2.0 * ell + 1.0
     place = np.digitize(ell, edges) - 1
@@ -96,7 +111,7 @@ def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: in
     """
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
-    chi = np.asarray(cosmology.comoving_distance(np.array(redshifts)))
+    chi = np.asarray(box.model.cosmology.comoving_distance(np.array(redshifts)))
     width, step_settings = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
     return (
         convergence.convergence(box, direction, width, chi, *step_settings),
@@ -104,25 +119,37 @@ def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: in
     )
 
 
-def gaussian_box(seed: int, n: int) -> Box:
+def gaussian_box(cosmology: Cosmology, seed: int, n: int) -> Box:
     """Return a box of matter with `n` cells per side that has only the density field, for lensing.
 
     Smoothed fields and velocities are left out, and the box is not stored in the disc cache.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    seed : int
+        Seed of the random numbers.
+    n : int
+        Number of cells along each side of the box.
+
+    Returns
+    -------
+    Box
+        The box.
     """
-    model = density_box.box_model()
-    g = density_box._gaussian(seed, n, model.cell)
+    model = density_box.box_model(cosmology)
+    g = density_box._gaussian(model, seed, n)
     return Box(model, n, seed, (g,), np.array([g.var(dtype=float)]), ())
 
 
-def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
+def power_of_box(box: Box, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
     """Return C_l of the convergence divided by linear theory, for the lensing maps of a universe with another seed.
 
     Parameters
     ----------
-    seed : int
-        Seed of the box of matter.
-    n : int
-        Number of cells along each side of the box.
+    box : Box
+        The box of matter of this universe, from `gaussian_box`.
     nside : int
         HEALPix resolution of the maps.
     redshifts : sequence of float
@@ -135,19 +162,22 @@ def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edge
     float array, shape (planes, bands)
         Mean ratio to linear theory in each band.
     """
-    kappa, gain = convergence_maps(gaussian_box(seed, n), nside, redshifts, edges[-1])
-    rows = []
+    kappa, gain = convergence_maps(box, nside, redshifts, edges[-1])
+    rows, cosmology = [], box.model.cosmology
     for plane, z in enumerate(redshifts):
         power = hp.anafast(hp.reorder(kappa[plane].astype(float), n2r=True), lmax=edges[-1], iter=0)
-        rows.append(band_ratio(power * gain[plane] ** 2, float(cosmology.comoving_distance(z)), edges))
+        chi = float(cosmology.comoving_distance(z))
+        rows.append(band_ratio(cosmology, power * gain[plane] ** 2, chi, edges))
     return np.array(rows)
 
 
-def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
+def power_of_maps(cosmology: Cosmology, planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
     """Return C_l of the convergence divided by linear theory, for the lensing maps of the catalogue.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     planes : Planes
         Lensing maps for sources at several distances (planes).
     numbers : sequence of int
@@ -163,7 +193,8 @@ def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) 
     rows = []
     for number in numbers:
         ring = hp.reorder(planes.maps[number][:, lensing.KAPPA].astype(float), n2r=True)
-        rows.append(band_ratio(hp.anafast(ring, lmax=edges[-1], iter=0), float(planes.chi[number]), edges))
+        power = hp.anafast(ring, lmax=edges[-1], iter=0)
+        rows.append(band_ratio(cosmology, power, float(planes.chi[number]), edges))
     return np.array(rows)
 
 
@@ -173,17 +204,17 @@ def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float,
     Each pair has the rms that is measured with rays through the box (with its finite cells), and the rms predicted for
     the same cells.
     """
-    chosen, chi = lensing.settings(), np.asarray(cosmology.comoving_distance(np.array(redshifts)))
+    chosen, cosmology = lensing.settings(), box.model.cosmology
+    chi = np.asarray(cosmology.comoving_distance(np.array(redshifts)))
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE, np.arange(12 * _SIGHT_NSIDE**2), nest=True)).astype(np.float32)
     kappa = convergence.convergence(box, direction, hp.nside2resol(_SIGHT_NSIDE), chi, 1, chosen.stretch)
     k = np.geomspace(1e-3, 2.0 * np.pi, 300)
-    power = density_box.linear_power(k) * convergence.window(box.model.cell, 1, k)
+    power = density_box.linear_power(cosmology, k) * convergence.window(box.model, 1, k)
     inside, rms_values = np.trapezoid(k * power / (2 * np.pi), k), []
     for plane, source_chi in zip(kappa, chi, strict=True):
         x = _distances(float(source_chi))
-        weight = theories.lensing_weight(x, np.array([source_chi]), np.ones(1)) * density_box.growth(
-            cosmology.redshift(x)
-        )
+        weight = theories.lensing_weight(cosmology, x, np.array([source_chi]), np.ones(1))
+        weight = weight * cosmology.growth(cosmology.redshift(x))
         rms_values.append((float(plane.std(dtype=float)), float(np.sqrt(np.trapezoid(weight**2, x) * inside))))
     return rms_values
 
@@ -207,34 +238,49 @@ def skipping_rms(box: Box, redshift: float, step: float) -> float:
     float
         rms of the convergence.
     """
+    cosmology = box.model.cosmology
     source_chi, width = float(cosmology.comoving_distance(redshift)), 0.5 * step
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE // 2, np.arange(3 * _SIGHT_NSIDE**2), nest=True), 1)
     box_replicas, kappa = lightcone.draw_replicas(box, source_chi), np.zeros(len(direction))
     for chi in np.arange(width, source_chi, step):
         z = cosmology.redshift(chi)
-        growths = np.full(len(direction), density_box.growth(z))
+        growths = np.full(len(direction), cosmology.growth(z))
         place, _ = lightcone.box_cells(box, box_replicas, direction, np.full(len(direction), chi))
-        lens = float(theories.lensing_weight(np.array([chi]), np.array([source_chi]), np.ones(1))[0])
+        lens = float(theories.lensing_weight(cosmology, np.array([chi]), np.array([source_chi]), np.ones(1))[0])
         kappa += step * lens * density_box.overdensity(box, place, growths)
     return float(kappa.std())
 
 
-def map_rms(chi: float, l_max: int) -> float:
-    """Return the rms that linear theory predicts for a convergence map with multipoles from 2 to `l_max`.
+def map_rms(cosmology: Cosmology, chi: float, l_max: int) -> float:
+    """Return the rms that linear theory predicts for a map of the convergence.
 
-    All sources are at the comoving distance `chi` (Mpc/h).
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    chi : float
+        Comoving distance of all sources, Mpc/h.
+    l_max : int
+        Highest multipole; the lowest is 2.
+
+    Returns
+    -------
+    float
+        The rms.
     """
     ell = np.arange(2, l_max + 1)
     nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
-    power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
+    power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(cosmology, nodes.astype(float), chi))))
     return float(np.sqrt(np.sum((2 * ell + 1) / (4 * np.pi) * power)))
 
 
-def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
+def map_statistics(cosmology: Cosmology, planes: Planes, number: int, name: str) -> dict[str, float]:
     """Measure means, rms values and the B-mode fraction of the lensing maps for sources at one distance.
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     planes : Planes
         Lensing maps for sources at several distances (planes).
     number : int
@@ -257,7 +303,7 @@ def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
     return {
         f"kappa_mean_{name}_in_errors": float(patches.mean() / (patches.std(ddof=1) / np.sqrt(patches.size))),
         f"kappa_rms_{name}": float(kappa.std()),
-        f"kappa_rms_{name}_to_theory": float(kappa.std() / map_rms(chi, l_max)),
+        f"kappa_rms_{name}_to_theory": float(kappa.std() / map_rms(cosmology, chi, l_max)),
         f"gamma_rms_{name}": float(np.std(gamma[0])),
         f"b_modes_{name}": float(np.sum(np.abs(b_mode) ** 2) / np.sum(np.abs(e_mode) ** 2)),
         f"deflection_rms_arcmin_{name}": float(60 * np.degrees(np.sqrt(np.mean(bend**2)))),

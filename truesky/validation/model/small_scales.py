@@ -24,8 +24,8 @@ from lake_schema.arrays import Float
 from truesky.catalogue.halos import luminosity_function, matching, population
 from truesky.catalogue.halos.luminosity_function import Volume
 from truesky.catalogue.halos.population import Population
-from truesky.fluxes import cosmology
 from truesky.randomness.rng import stream
+from truesky.request.schema import Universe
 from truesky.validation import pairs
 from truesky.validation.model import clustering
 
@@ -49,14 +49,15 @@ _RANDOM = 20_000
 _BINS = 40
 
 
-def galaxy_population(seed: int, box_cells: int) -> Population:
+def galaxy_population(seed: int, settings: Universe) -> Population:
     """Return a model of the halos that host galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6.
 
-    `seed` and `box_cells` (cells per side) define the periodic box of matter of the universe.
+    `seed`, and the cosmology and the cells per side in `settings`, define the periodic box of matter of the universe.
     """
     matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     space = Volume(Z_MIN - 0.05, Z_MAX + 0.05, MAX_ABS_MAG)
-    return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
+    box = seed, settings.cosmology, settings.box_cells
+    return population.model(*box, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
 
 
 def figures(universe: Population, count: int) -> dict[str, float]:
@@ -66,7 +67,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
     distributed over the sky. Names of the results contain the lower edge of the bin in Mpc/h; errors are from the
     scatter between cells.
     """
-    low, high = (float(cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
+    low, high = (float(universe.cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
     cells = ((np.arange(count) + 0.31) * (12 << 2 * ORDER) / count).astype(int).tolist()
     pair_counts, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []

@@ -24,7 +24,7 @@ from truesky.catalogue.halos import luminosity_function, matching
 from truesky.catalogue.matter import density_box
 from truesky.catalogue.stars import gaia
 from truesky.catalogue.stars import stars as milky_way_stars
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology
 from truesky.fluxes.libraries import rest_grid, templates
 from truesky.numerics import cache
 from truesky.request.schema import Universe
@@ -114,7 +114,7 @@ FULL = SampleSize(Universe(), 160, 0, 8, 20, 3, 16, (8, 9), 12)
 QUICK = SampleSize(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, (), 0)
 
 
-def theory() -> dict[str, float]:
+def theory(cosmology: Cosmology) -> dict[str, float]:
     """Compute sigma_8, the comoving distance to z = 2.3 (Mpc/h), and offsets from published K-corrections.
 
     For each band and galaxy template, the offset (mag) with the largest absolute value over all redshifts is returned.
@@ -122,7 +122,7 @@ def theory() -> dict[str, float]:
     k = np.geomspace(1e-4, 50.0, 20_000)
     x = 8.0 * k
     window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
-    variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
+    variance = np.trapezoid(density_box.linear_power(cosmology, k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
     figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
     wavelength, template_numbers = rest_grid.rest_grid(), list(K_CORRECTIONS["sdss_r01"])
     # Do not remove weak emission lines from the templates (as the library usually does): the published numbers include
@@ -145,9 +145,9 @@ def matter(size: SampleSize) -> dict[str, float]:
     Power spectrum and bias are relative to theory; the rms velocity of halos of 10^12 Msun/h is in km/s. The power
     spectrum is left out without further random seeds.
     """
-    cells = size.settings.box_cells
-    box = density_box.load(SEED, cells)
-    boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.box_seeds)]
+    cells, cosmology = size.settings.box_cells, size.settings.cosmology
+    box = density_box.load(SEED, cells, cosmology)
+    boxes = [box, *(shear.gaussian_box(cosmology, seed, cells) for seed in size.box_seeds)]
     figures = {}
     if size.box_seeds:
         power = np.array([clustering.box_power(box, POWER_EDGES) for box in boxes])
@@ -156,7 +156,7 @@ def matter(size: SampleSize) -> dict[str, float]:
         )
     bias = clustering.halo_bias(box, BIASES, BIAS_EDGES)[:, 0]
     figures |= {f"halo_bias_x{x}": float(value) for x, value in zip(BIASES, bias, strict=True)}
-    masses = matching.masses()
+    masses = matching.masses(cosmology)
     of_12 = float(masses.interpolate_pairs(masses.bias, np.zeros(1), np.full(1, 12.0))[0])
     return figures | {"velocity_rms": clustering.velocity_rms(box, of_12)}
 
@@ -167,13 +167,13 @@ def _figures_by_edge(pattern: str, edges: Sequence[float] | Float, values: Float
     return figures | {f"{name}_error": float(value) for name, value in zip(names, errors, strict=True)}
 
 
-def mass_function() -> Callable[[float, float], float]:
+def mass_function(cosmology: Cosmology) -> Callable[[float, float], float]:
     """Return the theoretical cumulative mass function of halos as a function of (log_mass, z).
 
     The function returns the number density in (Mpc/h)^-3 of halos above a mass, given as log10 of Msun/h, at redshift
     z.
     """
-    masses = matching.masses()
+    masses = matching.masses(cosmology)
 
     def number(min_log_mass: float, z: float) -> float:
         log_mass = np.linspace(min_log_mass, 16.0, 501)
@@ -193,8 +193,8 @@ def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
     sample = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
     figures = {"galaxies": float(sample.block.size), "galaxies_deg2": sample.area}
     figures |= census.counts(sample) | census.colours(sample) | census.sizes(sample) | census.halpha(sample)
-    figures |= observed.figures(observed.from_columns(sample.rows, sample.area))
-    figures |= census.halos(sample, mass_function()) | census.luminosities(sample, law, 0.0, 1.5)
+    figures |= observed.figures(observed.from_columns(sample.rows, sample.area, size.settings.cosmology))
+    figures |= census.halos(sample, mass_function(size.settings.cosmology)) | census.luminosities(sample, law, 0.0, 1.5)
     if size.deep_blocks:
         deep = galaxies.model(SEED, replace(size.settings, galaxy_limit=28.0))
         deep_sample = census.draw(deep, dust, census.blocks(size.deep_blocks, 0))
@@ -203,7 +203,10 @@ def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
 
 
 def compare_with_limber(
-    measured: clustering.Correlation, tracer_shells: Shells, power: Callable[[Float], Float]
+    cosmology: Cosmology,
+    measured: clustering.Correlation,
+    tracer_shells: Shells,
+    power: Callable[[Cosmology, Float], Float],
 ) -> tuple[Float, Float, Float, Float]:
     """Correct a measured w for the finite size of the blocks, and predict w in Limber's approximation.
 
@@ -212,19 +215,21 @@ def compare_with_limber(
 
     Parameters
     ----------
+    cosmology : Cosmology
+        Parameters of the universe.
     measured : Correlation
         Measured angular correlation function w, relative to the mean density of each block.
     tracer_shells : Shells
         Distribution of the tracers over distance, weighted with bias times growth factor.
     power : callable
-        Function that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
+        Function of (cosmology, k) that returns the matter power P(k) at z = 0 in (Mpc/h)^3 for k in h/Mpc.
 
     Returns
     -------
     theta, w, error, expected : float array, shape (bins,)
         Separation in deg, corrected w and its standard error, and predicted w.
     """
-    expected, mean_subtracted = clustering.limber(tracer_shells, measured, power)
+    expected, mean_subtracted = clustering.limber(cosmology, tracer_shells, measured, power)
     return measured.theta, measured.w + expected - mean_subtracted, measured.error, expected
 
 
@@ -238,10 +243,11 @@ def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, An
     cells = ((np.arange(size.wide_blocks) + 0.37) * n_blocks / size.wide_blocks).astype(int).tolist()
     wide_samples, narrow_samples, curves = [], [], {}
     figures: dict[str, float] = {}
+    cosmology = size.settings.cosmology
     for seed in seeds:
         # Store boxes of other seeds in a temporary folder, so that they do not fill the disc cache.
         with nullcontext() if seed == SEED else cache.use_temporary_dir():
-            universe = clustering.population_above(seed, size.settings.box_cells, Z_MIN, Z_MAX, MIN_LOG_MASS)
+            universe = clustering.population_above(seed, size.settings, Z_MIN, Z_MAX, MIN_LOG_MASS)
             for cell in cells:
                 sample = clustering.draw_tracers(universe, clustering.BLOCK_ORDER, cell)
                 samples = (
@@ -251,7 +257,7 @@ def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, An
                 wide_samples.append((cell, samples))
                 narrow_samples.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), samples))
     shells_by_kind = [
-        clustering.shells(clustering.concatenate([samples[i] for _, samples in wide_samples]), Z_MIN, Z_MAX)
+        clustering.shells(cosmology, clustering.concatenate([samples[i] for _, samples in wide_samples]), Z_MIN, Z_MAX)
         for i in range(2)
     ]
     for samples_by_cell, order, edges in (
@@ -261,18 +267,20 @@ def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, An
         for name, tracer_shells, measured in zip(
             TRACERS, shells_by_kind, clustering.correlation(samples_by_cell, order, edges), strict=True
         ):
-            theta, w, error, expected = compare_with_limber(measured, tracer_shells, density_box.linear_power)
+            theta, w, error, expected = compare_with_limber(
+                cosmology, measured, tracer_shells, density_box.linear_power
+            )
             curves[f"{name}_{'wide' if edges is WIDE_EDGES else 'narrow'}"] = (theta, w, error, expected)
             figures |= _figures_by_edge(f"w_{name}_{{:g}}", edges, w / expected, error / expected)
     maps = []
     for seed in seeds:
-        box = shear.gaussian_box(seed, size.settings.box_cells)
+        box = shear.gaussian_box(cosmology, seed, size.settings.box_cells)
         maps += [
             (cell, (clustering.projected_field(box, clustering.BLOCK_ORDER, cell, shells_by_kind[0]),))
             for cell in cells
         ]
     (measured,) = clustering.correlation(maps, clustering.BLOCK_ORDER, WIDE_EDGES)
-    _, w, error, expected = compare_with_limber(measured, shells_by_kind[0], clustering.gaussian_power)
+    _, w, error, expected = compare_with_limber(cosmology, measured, shells_by_kind[0], clustering.gaussian_power)
     figures |= _figures_by_edge("w_structure_{:g}", WIDE_EDGES, w / expected, error / expected)
     for name in TRACERS:
         for edge in WIDE_EDGES[:-1]:
@@ -288,16 +296,14 @@ def abundances(size: SampleSize) -> dict[str, float]:
     Halos are simulated in HEALPix cells of order 5; errors are computed from the scatter between these cells.
     """
     number, cells = (
-        mass_function(),
+        mass_function(size.settings.cosmology),
         ((np.arange(size.halo_cells) + 0.43) * (12 << 10) / size.halo_cells).astype(int).tolist(),
     )
     figures, area = {}, sky.cell_area(5) * np.radians(1.0) ** 2
     for at, half in census.HALO_SHELLS:
-        universe = clustering.population_above(
-            SEED, size.settings.box_cells, at - half, at + half, census.HALO_MASSES[0]
-        )
+        universe = clustering.population_above(SEED, size.settings, at - half, at + half, census.HALO_MASSES[0])
         samples = [clustering.draw_tracers(universe, 5, cell) for cell in cells]
-        volume = float(cosmology.comoving_volume(at - half, at + half)) * area
+        volume = float(size.settings.cosmology.comoving_volume(at - half, at + half)) * area
         for min_log_mass in census.HALO_MASSES:
             each = [
                 np.sum(~sample.satellite & (sample.log_mass > min_log_mass)) / volume / number(min_log_mass, at)
@@ -316,7 +322,7 @@ def nearby_satellites(size: SampleSize) -> dict[str, float]:
 
     The result also has the number of these galaxies.
     """
-    universe = clustering.population_above(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
+    universe = clustering.population_above(SEED, size.settings, 0.05, 0.15, 11.8)
     cells = ((np.arange(size.nearby_blocks) + 0.4) * 192 / size.nearby_blocks).astype(int).tolist()
     sample = clustering.concatenate([clustering.draw_tracers(universe, 2, cell) for cell in cells])
     z = universe.halos.distances.redshift(sample.chi)
@@ -331,12 +337,12 @@ def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[s
     Returns the measured values by name, and C_l of the convergence divided by linear theory, shape (planes, bands).
     Without further random seeds, the power spectrum is not measured and this array is empty.
     """
-    cells, nside = size.settings.box_cells, size.settings.lensing_nside
-    box = density_box.load(SEED, cells)
+    cells, nside, cosmology = size.settings.box_cells, size.settings.lensing_nside, size.settings.cosmology
+    box = density_box.load(SEED, cells, cosmology)
     planes = lensing.load(box, nside, with_far_planes=True)
     figures: dict[str, float] = {}
     for number, z in PLANES:
-        figures |= shear.map_statistics(planes, number, f"z{z}")
+        figures |= shear.map_statistics(cosmology, planes, number, f"z{z}")
     heavy = halos.select(halos.log_mass > 13.5)
     mean, error = shear.tangential_shear(planes, heavy, float(cosmology.comoving_distance(1.2)))
     for radius, value, value_error in zip(shear.RINGS, mean, error, strict=True):
@@ -350,8 +356,11 @@ def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[s
         figures |= {f"kappa_sight_rms_z{z}": rms, f"kappa_sight_rms_z{z}_to_theory": rms / linear}
         figures[f"kappa_skipping_rms_z{z}"] = shear.skipping_rms(box, z, SKIPPING)
     ratios = np.stack(
-        [shear.power_of_maps(planes, [number for number, _ in PLANES], BANDS)]
-        + [shear.power_of_box(seed, cells, nside, [z for _, z in PLANES], BANDS) for seed in size.box_seeds]
+        [shear.power_of_maps(cosmology, planes, [number for number, _ in PLANES], BANDS)]
+        + [
+            shear.power_of_box(shear.gaussian_box(cosmology, seed, cells), nside, [z for _, z in PLANES], BANDS)
+            for seed in size.box_seeds
+        ]
     )
     for plane, (_, z) in enumerate(PLANES):
         error = ratios[:, plane].std(0, ddof=1) / np.sqrt(len(ratios))
@@ -383,14 +392,14 @@ def run(size: SampleSize, folder: Path | None = None) -> dict[str, float]:
     started = time.process_time()
     figures, sample = count_galaxies(size)
     new_figures, curves, halos = measure_clustering(size)
-    figures |= theory() | matter(size) | new_figures
+    figures |= theory(size.settings.cosmology) | matter(size) | new_figures
     new_figures, power = measure_lensing(size, halos)
     figures |= new_figures
     if size.nearby_blocks:
         figures |= nearby_satellites(size)
     if size.halo_cells:
         figures |= abundances(size)
-        bright = small_scales.galaxy_population(SEED, size.settings.box_cells)
+        bright = small_scales.galaxy_population(SEED, size.settings)
         figures |= small_scales.figures(bright, 4 * size.halo_cells)
     if size.star_cells:
         figures |= milky_way(size)

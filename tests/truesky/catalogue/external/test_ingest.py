@@ -17,7 +17,8 @@ from tests.truesky import nightly
 from tests.truesky.catalogue import synthetic
 from truesky.catalogue import build_galaxies
 from truesky.catalogue.external import mapping
-from truesky.fluxes import band_fluxes, cosmology, sources
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import band_fluxes, sources
 from truesky.fluxes.libraries import templates
 from truesky.request.from_toml import parse
 from truesky.running import submitted_job
@@ -117,7 +118,7 @@ def test_observed_magnitudes_are_corrected_for_dust_and_lensing(tmp_path):
     sed = band_ratios.Sed(*(by_origin(rows, name) for name in names))
     z = by_origin(rows, "z_true").astype(float)
     table = band_ratios.load(templates.galaxy_library(), "lsst_r", 2.3, 0.5)
-    found = by_origin(rows, "abs_mag_r01") + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
+    found = by_origin(rows, "abs_mag_r01") + FIDUCIAL.distance_modulus(z) + band_ratios.offset(table, z, sed)
     kappa, gamma1, gamma2, a_v = (values[name][order] for name in ("kappa", "gamma1", "gamma2", "a_v"))
     found = found + 2.70 / 3.1 * a_v + 2.5 * np.log10((1 - kappa) ** 2 - gamma1**2 - gamma2**2)
     assert found == pytest.approx(values["mag"][order], abs=2e-3)
@@ -276,7 +277,7 @@ def test_a_diffsky_mock_comes_through(tmp_path):
     found = rows.sort_by("origin_id")
     assert found["origin_id"].to_pylist() == given["gal_id"][order].tolist()
     z = given["redshift_true"][order]
-    arcsec = given["r50_disk_2d"][order] / cosmology.kpc_per_arcsec(z)
+    arcsec = given["r50_disk_2d"][order] / FIDUCIAL.kpc_per_arcsec(z)
     for name, wanted in {
         "ra": given["ra"][order],
         "z_obs": given["redshift_obs"][order],

@@ -10,6 +10,7 @@ import pytest
 from lake_schema.errors import BadInput
 from tests.truesky import nightly
 from truesky.catalogue.external import ingest, mapping, reading
+from truesky.cosmology import FIDUCIAL
 from truesky.request.area import Area
 
 GALAXIES = {"ra": "RA", "dec": "DEC", "z_true": "Z", "mag": "MAG", "band": "euclid_vis", "origin_id": "ID"}
@@ -38,7 +39,7 @@ def galaxies(entries=GALAXIES, **more):
 
 
 def halos():
-    return mapping.halo_columns({key: json.dumps(value) for key, value in HALOS.items()})
+    return mapping.halo_columns({key: json.dumps(value) for key, value in HALOS.items()}, FIDUCIAL)
 
 
 def written(folder, *tables):
@@ -88,7 +89,7 @@ def test_known_names_of_missing_columns_are_suggested(tmp_path):
 
 def test_a_property_that_is_suggested_is_not_missing():
     with pytest.raises(BadInput) as caught:
-        mapping.halo_columns(dict.fromkeys(("RAJ2000", "dec", "z_tru", "log_mass"), json.dumps("a")))
+        mapping.halo_columns(dict.fromkeys(("RAJ2000", "dec", "z_tru", "log_mass"), json.dumps("a")), FIDUCIAL)
     assert caught.value.messages == (
         "ingest.halos.columns.RAJ2000 is not a known property: did you mean ra?",
         "ingest.halos.columns.z_tru is not a known property: did you mean z_true? allowed: ra, dec, z_true, z_obs, "

@@ -51,7 +51,7 @@ def test_directions_are_uniform_without_a_mean_or_alignments(own, rng):
 def test_the_tide_is_that_of_the_linear_density(box):
     """For density variance s^2, <T_xx^2> = 4 s^2 / 45 and <T_xy^2> = s^2 / 15, except for the corners of a cube."""
     xx, yy, *mixed = density_box.tides(box)
-    modes, _ = density_box._linear_modes(box.smoothed[0], box.model.cell)
+    modes, _ = density_box._linear_modes(box.model, box.smoothed[0])
     density = density_box._to_real(modes, box.n)
     for one in (xx, yy, xx + yy):
         assert np.mean(one.astype(float) ** 2) == pytest.approx(4 / 45 * density.var(), rel=0.12)

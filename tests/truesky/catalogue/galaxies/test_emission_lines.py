@@ -7,7 +7,8 @@ import pytest
 
 from lake_schema.units import AB_CGS
 from truesky.catalogue.galaxies import emission_lines, stellar_mass
-from truesky.fluxes import cosmology, passbands
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import passbands
 from truesky.fluxes.spectra import lines as line_list
 
 FLUXES = np.array([5e-17, 1e-16, 2e-16, 3e-16])
@@ -38,7 +39,7 @@ def fluxes(n, z, log_mass, rng, lines=PLAIN, log_sfr=None):
     """Draw line fluxes of galaxies on the main sequence."""
     at, mass = np.full(n, z), np.full(n, log_mass)
     rate = stellar_mass.main_sequence(stellar_mass.star_formation(), mass, at) if log_sfr is None else log_sfr
-    return emission_lines.fluxes(lines, at, mass, rate + np.zeros(n), np.zeros(n, bool), rng)
+    return emission_lines.fluxes(lines, FIDUCIAL, at, mass, rate + np.zeros(n), np.zeros(n, bool), rng)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_flux_of_a_luminosity(rng):
     plain = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), min_attenuation=0.0))
     plain = replace(plain, halpha=replace(plain.halpha, scatter=0.0))
     flux = fluxes(1, 1.0, 10.0, rng, plain, log_sfr=1.0)["flux_halpha"]
-    distance = float(cosmology.luminosity_distance(1.0)) / 0.67 * 3.0856775814913673e24
+    distance = float(FIDUCIAL.luminosity_distance(1.0)) / 0.67 * 3.0856775814913673e24
     assert flux == pytest.approx(10.0**42.27 / (4 * np.pi * distance**2), rel=1e-9, abs=0.0)
 
 

@@ -19,7 +19,7 @@ from truesky.catalogue import build_galaxies, dust_map
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, observed_cells
 from truesky.catalogue.halos import luminosity_function, population
 from truesky.catalogue.matter import lightcone
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
 NEARBY = {"high_redshift_boost": 0.0, "quasar_boost": 0.0}
@@ -71,7 +71,7 @@ def expected_number(lf, near, far, faintest, area):
     """Galaxies brighter than `faintest` between two redshifts, from the luminosity function."""
     grid = np.linspace(near, far, 41)
     density = luminosity_function.number_density(lf, faintest, grid)
-    shells = cosmology.comoving_volume(grid[:-1], grid[1:])
+    shells = FIDUCIAL.comoving_volume(grid[:-1], grid[1:])
     return float(np.sum(0.5 * (density[1:] + density[:-1]) * shells) * area * np.radians(1.0) ** 2)
 
 
@@ -98,7 +98,7 @@ def richness(universe, places, near, far, log_mass):
 def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, mass, within):
     """Counted where even the reddest spectrum is brighter than the limit, relative to the richness of the box."""
     near, far = z - half, z + half
-    faintest = min(26.0 - float(cosmology.distance_modulus(far)) - reddest, -16.0)
+    faintest = min(26.0 - float(FIDUCIAL.distance_modulus(far)) - reddest, -16.0)
     found = np.sum((drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest))
     expected = expected_number(universe.luminosities, near, far, faintest, drawn.area)
     expected *= richness(universe, drawn.places, near, far, mass)
@@ -112,7 +112,7 @@ def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
     drawn, cells = population.CellCache(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
     rows = pa.concat_tables([galaxies.draw(cell, deep, drawn, dust) for cell in cells])
     z, m_r = rows["z_true"].to_numpy(), rows["abs_mag_r01"].to_numpy()
-    faintest = 28.0 - float(cosmology.distance_modulus(2.15)) - 4.0
+    faintest = 28.0 - float(FIDUCIAL.distance_modulus(2.15)) - 4.0
     found = np.sum((z > 1.85) & (z < 2.15) & (m_r < faintest))
     area = len(cells) * sky.cell_area(ids.GENERATION_ORDER)
     expected = expected_number(deep.luminosities, 1.85, 2.15, faintest, area)
@@ -124,7 +124,7 @@ def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
 def test_cosmic_star_formation(drawn, z):
     """Madau & Dickinson 2014, eq. 15, times 0.63 from Salpeter to Chabrier; galaxies below the limit are missing."""
     inside = np.abs(drawn.z - z) < 0.2
-    volume = drawn.area * np.radians(1.0) ** 2 * float(cosmology.comoving_volume(z - 0.2, z + 0.2)) / 0.67**3
+    volume = drawn.area * np.radians(1.0) ** 2 * float(FIDUCIAL.comoving_volume(z - 0.2, z + 0.2)) / 0.67**3
     found = np.log10(np.sum(10.0 ** drawn.columns["log_sfr"][inside].astype(float)) / volume)
     assert found == pytest.approx(np.log10(0.63 * 0.015 * (1 + z) ** 2.7 / (1 + ((1 + z) / 2.9) ** 5.6)), abs=0.2)
 

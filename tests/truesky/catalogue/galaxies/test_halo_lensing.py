@@ -14,11 +14,12 @@ from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.halos import lens_halos, projected_nfw
 from truesky.catalogue.halos.halo_catalogue import LightCone
 from truesky.catalogue.halos.population import CellCache
-from truesky.fluxes import cosmology, sources
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import sources
 from truesky.request.schema import Universe
 
 CELL = 303_117
-CHI, FROM, TO = (float(cosmology.comoving_distance(z)) for z in (1.0, 0.2, 0.6))
+CHI, FROM, TO = (float(FIDUCIAL.comoving_distance(z)) for z in (1.0, 0.2, 0.6))
 ARCMIN = np.radians(1 / 60)
 
 
@@ -45,7 +46,7 @@ def lone(box, ra, dec, chi=800.0, amplitude=3e-9, size=2 * ARCMIN):
     halo = np.array([0, 0, chi, amplitude, size, max(size, 10 * ARCMIN), max(size, 25 * ARCMIN), 6.0])[:, None]
     empty = replace(box, maps=tuple(np.zeros_like(one) for one in box.maps))
     frame = halo_lensing._frames(np.array([ra]), np.array([dec]))[0]
-    return Neighbourhood(empty, chosen, frame, halo, *halo_lensing._grid(chosen, halo), np.inf)
+    return Neighbourhood(empty, chosen, frame, halo, *halo_lensing._grid(FIDUCIAL, chosen, halo), np.inf)
 
 
 @pytest.mark.parametrize(("ra", "dec"), [(40.0, 20.0), (0.0, -1.0), (359.9999, 60.0), (123.0, 89.5), (10.0, -89.9)])
@@ -191,7 +192,7 @@ def test_the_table_of_galaxies_has_the_lensing_of_halos(universe, cells, dust, m
 def test_no_cell_misses_a_monster(universe):
     """A halo of 10^15.5 Msun/h at z = 0.05: its lensing spans degrees, and ends where its mass is compensated."""
     ra, dec = 217.0, 33.0
-    index, chi = sky.healpix_29([ra], [dec]), cosmology.comoving_distance(np.array([0.05]))
+    index, chi = sky.healpix_29([ra], [dec]), FIDUCIAL.comoving_distance(np.array([0.05]))
     cone = LightCone(index, chi, np.array([15.5]), np.zeros(1))
     cells = CellCache(replace(universe.population, light_cone=cone))
     seen = {}
@@ -209,7 +210,7 @@ def test_no_cell_misses_a_monster(universe):
 
 def test_what_is_right_behind_a_cluster_is_set_apart(universe):
     """A galaxy exactly behind the centre of a halo of 10^15 Msun/h at z = 0.3 belongs in the quarantine."""
-    index, chi = sky.healpix_29([217.0], [33.0]), cosmology.comoving_distance(np.array([0.3]))
+    index, chi = sky.healpix_29([217.0], [33.0]), FIDUCIAL.comoving_distance(np.array([0.3]))
     cells = CellCache(replace(universe.population, light_cone=LightCone(index, chi, np.array([15.0]), np.zeros(1))))
     empty = replace(universe.lens, maps=tuple(np.zeros_like(one) for one in universe.lens.maps))
     cell = int(index[0] >> 2 * (29 - GENERATION_ORDER))

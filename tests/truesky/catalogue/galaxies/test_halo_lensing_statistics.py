@@ -17,13 +17,14 @@ from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
 from truesky.catalogue.halos import lens_halos, matching
 from truesky.catalogue.halos.population import CellCache
 from truesky.catalogue.matter import density_box
-from truesky.fluxes import cosmology, sources
+from truesky.cosmology import FIDUCIAL, HUBBLE_DISTANCE
+from truesky.fluxes import sources
 from truesky.request.schema import Universe
 from truesky.validation import theory
 
 pytestmark = pytest.mark.nightly
 
-NSIDE, CHI, ARCMIN = 1024, float(cosmology.comoving_distance(1.0)), np.radians(1 / 60)
+NSIDE, CHI, ARCMIN = 1024, float(FIDUCIAL.comoving_distance(1.0)), np.radians(1 / 60)
 # One cell of order 2 (215 deg2) with this number of sources in each generation cell: 3 per arcmin2.
 FIRST, CELLS, SOURCES = 40 << 12, 1 << 12, 560
 RINGS = np.array([0.5, 1.0, 2.0, 4.0, 7.0, 10.0])
@@ -86,10 +87,12 @@ def test_mean_convergence_and_its_least(sample):
 
 def with_neighbours(theta, z, log_mass):
     """Return the mean tangential shear of the linear matter around halos at theta (rad)."""
-    ell, chi = np.geomspace(5, 1e5, 3000), float(cosmology.comoving_distance(z))
-    bias = matching.masses().interpolate_pairs(matching.masses().bias, np.array([z]), np.array([log_mass]))[0]
-    power = density_box.linear_power((ell + 0.5) / chi) * float(density_box.growth(z)) ** 2
-    lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * (1 + z) * (1 - chi / CHI) / chi
+    ell, chi = np.geomspace(5, 1e5, 3000), float(FIDUCIAL.comoving_distance(z))
+    bias = matching.masses(FIDUCIAL).interpolate_pairs(
+        matching.masses(FIDUCIAL).bias, np.array([z]), np.array([log_mass])
+    )[0]
+    power = density_box.linear_power(FIDUCIAL, (ell + 0.5) / chi) * float(FIDUCIAL.growth(z)) ** 2
+    lens = 1.5 * FIDUCIAL.omega_m / HUBBLE_DISTANCE**2 * (1 + z) * (1 - chi / CHI) / chi
     c_l = lens * bias * power * np.exp(-((ell / 5e4) ** 2))
     return np.array([np.trapezoid(ell**2 * c_l * jv(2, ell * t), np.log(ell)) / (2 * np.pi) for t in theta])
 
@@ -97,7 +100,7 @@ def with_neighbours(theta, z, log_mass):
 @pytest.mark.parametrize(("low", "high"), [(13.4, 13.6), (13.75, 14.25), (14.25, 15.0)])
 def test_shear_about_halos(sample, low, high):
     """Shear around the box images of halos at 0.2 < z < 0.6: 10 % to 4 arcmin, 30 % to 10 arcmin; no cross shear."""
-    near, far = (float(cosmology.comoving_distance(z)) for z in (0.2, 0.6))
+    near, far = (float(FIDUCIAL.comoving_distance(z)) for z in (0.2, 0.6))
     halos, mass = sample.halos, sample.halos[9]
     halos = halos[:, (halos[3] > near) & (halos[3] < far) & (mass > low) & (mass < high)]
     gamma, tree, total = sample.by_box + sample.by_halos, cKDTree(sample.frame[:, 2]), np.zeros((4, RINGS.size - 1))
@@ -112,7 +115,7 @@ def test_shear_about_halos(sample, low, high):
         total += [np.bincount(ring[ring >= 0], value, RINGS.size - 1) for value in values]
     tangential, across, own, _ = total / total[3]
     middle = np.sqrt(0.5 * (RINGS[1:] ** 2 + RINGS[:-1] ** 2)) * ARCMIN
-    z = float(np.median(cosmology.redshift(halos[3])))
+    z = float(np.median(FIDUCIAL.redshift(halos[3])))
     expected = own + with_neighbours(middle, z, float(np.median(halos[9])))
     assert halos.shape[1] > 100
     assert (tangential / expected)[:3] == pytest.approx(np.ones(3), abs=0.10)
@@ -189,7 +192,7 @@ def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
     )
     ell = np.unique(np.geomspace(5, 3e5, 500))
     linear, whole_power = (
-        theory.convergence_power(ell, np.array([CHI]), np.ones(1), of)
+        theory.convergence_power(FIDUCIAL, ell, np.array([CHI]), np.ones(1), of)
         for of in (theory.linear_power, theory.nonlinear_power)
     )
     box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, whole_power)

@@ -13,7 +13,8 @@ from lake_schema import sky
 from lake_schema.errors import BadInput
 from truesky.catalogue.galaxies import galaxies, lensing
 from truesky.catalogue.matter import density_box
-from truesky.fluxes import cosmology, sources
+from truesky.cosmology import FIDUCIAL
+from truesky.fluxes import sources
 from truesky.render.sources import galaxy_shapes
 from truesky.request.schema import MAX_SHEAR
 
@@ -100,10 +101,10 @@ def test_interpolation_in_distance(bump):
 def limber(ell, chi):
     """C_l of kappa, linear theory, one source plane."""
     x = np.linspace(5.0, chi - 1.0, 1000)
-    z = cosmology.redshift(x)
-    weight = 1.5 * 0.319 / 2997.92458**2 * x * (chi - x) / chi * (1 + z) * density_box.growth(z)
+    z = FIDUCIAL.redshift(x)
+    weight = 1.5 * 0.319 / 2997.92458**2 * x * (chi - x) / chi * (1 + z) * FIDUCIAL.growth(z)
     k = (np.asarray(ell)[:, None] + 0.5) / x
-    power = density_box.linear_power(k.ravel()).reshape(k.shape) * (k < np.pi / 4.0 * 1.5)
+    power = density_box.linear_power(FIDUCIAL, k.ravel()).reshape(k.shape) * (k < np.pi / 4.0 * 1.5)
     return np.trapezoid((weight / x) ** 2 * power, x, axis=1)
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from truesky.catalogue.galaxies import stellar_mass
 from truesky.catalogue.galaxies.sequences import BLUE, GREEN, RED
+from truesky.cosmology import FIDUCIAL
 
 MASSES, RATES = stellar_mass.mass_to_light(), stellar_mass.star_formation()
 AGES = {0.4: 9.2, 1.0: 5.75, 2.0: 3.22}
@@ -13,14 +14,16 @@ AGES = {0.4: 9.2, 1.0: 5.75, 2.0: 3.22}
 def test_a_solar_galaxy():
     """At the Sun's M_r = 4.76 and g - r = 0.5 there is one Sun of light: the ratio is that of the relation at z = 0."""
     m_r = np.array([4.76 - 5 * np.log10(0.67)])
-    log_mass = stellar_mass.log_stellar_mass(MASSES, m_r, np.array([0.5 + 0.16]), np.zeros(1))
+    log_mass = stellar_mass.log_stellar_mass(MASSES, FIDUCIAL.h, m_r, np.array([0.5 + 0.16]), np.zeros(1))
     assert log_mass == pytest.approx(-0.759 + 1.697 * 0.5, abs=1e-12)
 
 
 @pytest.mark.parametrize("z", [0.0, 1.0, 3.0])
 def test_mass_follows_light_and_colour(z):
     def mass(m_r, colour):
-        return float(stellar_mass.log_stellar_mass(MASSES, np.array([m_r]), np.array([colour]), np.array([z]))[0])
+        return float(
+            stellar_mass.log_stellar_mass(MASSES, FIDUCIAL.h, np.array([m_r]), np.array([colour]), np.array([z]))[0]
+        )
 
     assert mass(-22.5, 0.6) - mass(-20.0, 0.6) == pytest.approx(1.0)
     assert mass(-20.0, 0.9) - mass(-20.0, 0.3) == pytest.approx(0.6 * (1.697 - 0.947 * np.log10(1 + z)))

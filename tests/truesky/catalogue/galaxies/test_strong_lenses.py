@@ -21,7 +21,7 @@ from truesky.catalogue import build_strong_lenses
 from truesky.catalogue.galaxies import strong_lenses
 from truesky.catalogue.galaxies.strong_lenses import Disc, Lens
 from truesky.catalogue.halos import luminosity_function
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.from_toml import parse
 
 STAMPS = strong_lenses.stamps()
@@ -105,8 +105,8 @@ def test_magnification_is_1_far_from_the_lens():
 
 def test_einstein_radius_of_a_massive_galaxy():
     """1.154 arcsec of an infinitely far source; D_ls / D_s = 0.632 (Omega_m = 0.319)."""
-    assert strong_lenses.einstein_radius(200.0, 0.5, 2.0) == pytest.approx(1.154 * 0.632, abs=0.005)
-    assert strong_lenses.einstein_radius(200.0, 0.5, 0.4) == 0.0
+    assert strong_lenses.einstein_radius(FIDUCIAL, 200.0, 0.5, 2.0) == pytest.approx(1.154 * 0.632, abs=0.005)
+    assert strong_lenses.einstein_radius(FIDUCIAL, 200.0, 0.5, 0.4) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def draw_systems(drawn, count):
     """Draw many more lenses than in nature in some of the cells that were drawn."""
     index = drawn.rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - 8)
     found = [
-        strong_lenses.draw(cell, drawn.rows.filter(pa.array(index == cell)), SEED, BOOST)
+        strong_lenses.draw(cell, drawn.rows.filter(pa.array(index == cell)), SEED, BOOST, FIDUCIAL)
         for cell in drawn.places[:count]
     ]
     return pa.concat_tables(found), count * sky.cell_area(8)
@@ -137,7 +137,7 @@ def test_dispersions_are_those_of_nearby_galaxies(flat_sky):
     near = (z > 0.1) & (z < 0.7) & (colour > law.reddest_blue)
     m_star, _, _ = luminosity_function.schechter().parameters_at(z[near])
     fourth = 10.0 ** (0.4 * (m_star - m_r[near])) * np.exp(8.0 * (law.scatter * np.log(10.0)) ** 2)
-    volume = float(cosmology.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * FLAT_CELLS * sky.cell_area(8)
+    volume = float(FIDUCIAL.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * FLAT_CELLS * sky.cell_area(8)
     assert law.sigma_star == 161.0
     assert fourth.sum() / volume == pytest.approx(expected, rel=0.15)
 
@@ -175,7 +175,7 @@ def test_there_are_as_many_as_expected(drawn):
 
 
 def test_an_empty_cell_has_none():
-    rows = strong_lenses.draw(7, GALAXIES.empty(), SEED, 1.0)
+    rows = strong_lenses.draw(7, GALAXIES.empty(), SEED, 1.0, FIDUCIAL)
     assert rows.num_rows == 0
     assert validate.find_violations(rows, STRONG_LENSES) == []
 
@@ -207,4 +207,4 @@ def test_a_published_table(tmp_path, drawn):
     publish.make_version(tmp_path, step.plan, step.run_task)
     rows = read.version(tmp_path, "strong_lenses").rows()
     assert rows.num_rows > 0
-    assert rows.equals(strong_lenses.draw(cell, own, 7, 3.0))
+    assert rows.equals(strong_lenses.draw(cell, own, 7, 3.0, FIDUCIAL))

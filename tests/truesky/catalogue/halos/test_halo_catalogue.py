@@ -13,7 +13,7 @@ from tests.truesky.catalogue.conftest import BOX_CELLS, SEED
 from truesky.catalogue.external import mapping
 from truesky.catalogue.galaxies import galaxies
 from truesky.catalogue.halos import halo_catalogue, population
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
 CELL = 303_117
@@ -58,7 +58,7 @@ def write(path, values):
 
 
 def loaded(path, columns=COLUMNS):
-    return halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns))
+    return halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns, FIDUCIAL))
 
 
 @pytest.mark.parametrize("ending", ["parquet", "fits", "csv"])
@@ -68,8 +68,8 @@ def test_the_halos_of_a_cell_are_those_of_the_file(tmp_path, ending):
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=24.5, box_cells=BOX_CELLS), cone)
     rows = galaxies.halo_table(CELL, universe, population.CellCache(universe))
     inside = sky.cell_at(values["ra"], values["dec"], ids.GENERATION_ORDER) == CELL
-    bright = inside & (np.log10(values["mass"]) > universe.halos.mass_limit(cosmology.comoving_distance(values["z"])))
-    there = universe.halos.mass_limit(cosmology.comoving_distance(rows["z_true"].to_numpy().astype(float)))
+    bright = inside & (np.log10(values["mass"]) > universe.halos.mass_limit(FIDUCIAL.comoving_distance(values["z"])))
+    there = universe.halos.mass_limit(FIDUCIAL.comoving_distance(rows["z_true"].to_numpy().astype(float)))
     found = rows.filter(pa.array(rows["log_mass"].to_numpy() > there))
     assert found.num_rows == bright.sum() > 50
     assert np.sort(found["log_mass"].to_numpy()) == pytest.approx(np.sort(np.log10(values["mass"][bright])), abs=1e-5)

@@ -14,7 +14,7 @@ from tests.truesky.catalogue.conftest import BOX_CELLS, SEED
 from truesky.catalogue.galaxies import galaxies
 from truesky.catalogue.halos import halos
 from truesky.catalogue.matter import fine_structure, lightcone
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
 
@@ -103,7 +103,7 @@ def test_the_nearest_halos_are_the_same_to_any_redshift(seed):
         requested = Universe(galaxy_limit=24.5, z_max=z_max, box_cells=BOX_CELLS, structure_below_cells=True)
         whole = dataclasses.replace(galaxies.halos_and_galaxies(SEED, requested).halos, fine=fine_structure.model(seed))
         cells = [halos.draw(whole, seed, order, 7 >> 2 * (8 - order)) for order in halos.LEVELS]
-        near = [found.select(found.chi < float(cosmology.comoving_distance(0.01))) for found in cells]
+        near = [found.select(found.chi < float(FIDUCIAL.comoving_distance(0.01))) for found in cells]
         drawn.append([getattr(found, name).tobytes() for found in near for name in found.__slots__])
     assert sum(found.id.size for found in near) > 0
     assert drawn[0] == drawn[1]
@@ -200,10 +200,9 @@ def test_mass_function_comes_out(model, drawn):
 def test_bias_of_the_field_that_halos_follow(model, low, high, redshift, low_k):
     """On large scales the power of exp(x g - ...) is x^2 / D^2 times that of the matter."""
     from tests.truesky.catalogue.matter.test_density_box import spectrum
-    from truesky.catalogue.matter import density_box
 
     box, step = model.box, int(np.searchsorted(model.steps.z, max(redshift, 0.003)))
-    growth = float(density_box.growth(redshift))
+    growth = float(FIDUCIAL.growth(redshift))
     for column in (np.searchsorted(model.log_mass, low), np.searchsorted(model.log_mass, high)):
         x, field, amplitude = (float(table[step, column]) for table in (model.x, model.field, model.amplitude))
         smooth, variance = box.smoothed[int(field)], box.variance[int(field)]

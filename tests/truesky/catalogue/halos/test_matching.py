@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from truesky.catalogue.halos import luminosity_function, matching
+from truesky.cosmology import FIDUCIAL
 
-HALOS = matching.masses()
+HALOS = matching.masses(FIDUCIAL)
 LF = luminosity_function.schechter()
 MATCHED = matching.match_luminosities(HALOS, luminosity_function.inverse(LF, matching.Z_LAST))
 

@@ -8,9 +8,10 @@ import pytest
 from truesky.catalogue.galaxies import sequences
 from truesky.catalogue.halos import luminosity_function, matching, quenching
 from truesky.catalogue.halos.population import SATELLITE
+from truesky.cosmology import FIDUCIAL
 
 MODEL = sequences.model()
-MASSES = matching.masses()
+MASSES = matching.masses(FIDUCIAL)
 MATCHED = matching.match_luminosities(
     MASSES, luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
 )

@@ -7,6 +7,7 @@ from scipy import fft
 from lake_schema.errors import BadInput
 from tests.truesky import nightly
 from truesky.catalogue.matter import density_box
+from truesky.cosmology import FIDUCIAL
 
 
 def spectrum(field, cell):
@@ -24,7 +25,7 @@ def test_sigma_8():
     k = np.geomspace(1e-4, 50.0, 20_000)
     x = 8.0 * k
     window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
-    variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
+    variance = np.trapezoid(density_box.linear_power(FIDUCIAL, k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
     assert np.sqrt(variance) == pytest.approx(0.83, rel=0.01)
 
 
@@ -33,7 +34,7 @@ def test_the_box_has_the_linear_power(box, low, high, within):
     delta = density_box.overdensity(box, np.arange(box.n**3), 1.0).reshape((box.n,) * 3)
     k, power, weight = spectrum(delta, box.model.cell)
     inside = (k > low) & (k < high)
-    linear = density_box.linear_power(k[inside])
+    linear = density_box.linear_power(FIDUCIAL, k[inside])
     assert np.sum(weight[inside] * power[inside]) / np.sum(weight[inside] * linear) == pytest.approx(1.0, abs=within)
     assert delta.min() >= -1.0
     assert delta.mean() == pytest.approx(0.0, abs=0.01)
@@ -46,10 +47,10 @@ def test_growth():
     rate = np.sqrt(0.319 / a**3 + 0.681)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(a) * ((a * rate)[1:] ** -3 + (a * rate)[:-1] ** -3))])
     expected = np.interp(1 / (1 + z), a, rate * integral)
-    assert density_box.growth(z) == pytest.approx(expected / expected[0], rel=1e-3)
+    assert FIDUCIAL.growth(z) == pytest.approx(expected / expected[0], rel=1e-3)
     step = 1e-4
-    slope = -(1 + z) * (np.log(density_box.growth(z + step)) - np.log(density_box.growth(z))) / step
-    assert density_box.growth_rate(z, 0.55) == pytest.approx(slope, rel=0.01)
+    slope = -(1 + z) * (np.log(FIDUCIAL.growth(z + step)) - np.log(FIDUCIAL.growth(z))) / step
+    assert FIDUCIAL.growth_rate(z, 0.55) == pytest.approx(slope, rel=0.01)
 
 
 def test_velocities_are_those_of_linear_theory(box):
@@ -69,14 +70,14 @@ def test_smoothing_takes_variance(box):
 
 
 def test_the_gain_is_one_today_and_larger_before():
-    gain = density_box.matter_gain(density_box.box_model(), np.array([0.4, 0.7, 1.0]))
+    gain = density_box.matter_gain(density_box.box_model(FIDUCIAL), np.array([0.4, 0.7, 1.0]))
     assert gain[-1] == pytest.approx(1.0, abs=1e-4)
     assert 1.25 > gain[0] > gain[1] > 1.0
 
 
 def test_odd_boxes_are_refused():
     with pytest.raises(BadInput, match="even number"):
-        density_box.load(1, 3)
+        density_box.load(1, 3, FIDUCIAL)
 
 
 def test_colossus_writes_nothing_at_home(tmp_path):
@@ -87,7 +88,8 @@ def test_colossus_writes_nothing_at_home(tmp_path):
 
     code = (
         "import numpy as np; from truesky.catalogue.matter import linear_theory as t;"
-        "t.halo_tables(np.linspace(9, 15, 41), np.array([0.0, 1.0])); t.power(np.ones(1))"
+        "from truesky.cosmology import FIDUCIAL as c;"
+        "t.halo_tables(c, np.linspace(9, 15, 41), np.array([0.0, 1.0])); t.power(c, np.ones(1))"
     )
     environment = {**os.environ, "HOME": str(tmp_path), "TRUESKY_CACHE": str(tmp_path / "cache")}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)

@@ -6,19 +6,19 @@ import pytest
 
 from lake_schema import sky
 from truesky.catalogue.matter import lightcone
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 
 
 def test_distance_and_redshift(rng):
-    table = lightcone.distance_table(2.3)
+    table = lightcone.distance_table(FIDUCIAL, 2.3)
     assert table.chi[-1] == pytest.approx(3844.0, rel=1e-3)
     z = 2.3 * rng.random(1000)
-    assert table.redshift(cosmology.comoving_distance(z)) == pytest.approx(z, abs=1e-7)
+    assert table.redshift(FIDUCIAL.comoving_distance(z)) == pytest.approx(z, abs=1e-7)
 
 
 def test_voxels_fill_the_cell(box):
     """Every voxel lies in the cell, and together they have its volume."""
-    table = lightcone.distance_table(2.3)
+    table = lightcone.distance_table(FIDUCIAL, 2.3)
     line = lightcone.radial_steps(box.model.cell, 6.0, float(table.chi[-1]), table)
     turned = lightcone.draw_replicas(box, float(table.chi[-1]))
     used = np.ones(line.z.size, bool)
@@ -48,7 +48,7 @@ def test_replicas_are_turns_of_one_box(box):
 
 def test_nothing_lies_across_the_edge_of_the_box(box):
     """Steps end where a replica does; positions a side apart are one cell, also where a side ends."""
-    table = lightcone.distance_table(2.3)
+    table = lightcone.distance_table(FIDUCIAL, 2.3)
     line = lightcone.radial_steps(box.model.cell, 6.0, float(table.chi[-1]), table)
     edges = box.length * np.arange(1, int(table.chi[-1] // box.length) + 1)
     assert edges.size == 5

@@ -11,6 +11,7 @@ from tests.truesky import nightly
 from truesky.catalogue import dust_map
 from truesky.catalogue.galaxies import band_ratios, lensing
 from truesky.catalogue.matter import density_box
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.tables import build_tables, flux_tables
@@ -105,7 +106,7 @@ def test_costs_scale_with_the_speed_of_the_machine(empty_cache):
 def test_products_have_the_labels_for_which_forecasts_look(empty_cache):
     """Small products of every kind, in an empty cache."""
     mission, band = configuration.resolve(), passbands.load("euclid_vis")
-    box = density_box.load(3, 32)
+    box = density_box.load(3, 32, FIDUCIAL)
     density_box.tides(box)
     lensing.load(box, 16)
     sersic.table()
@@ -117,9 +118,9 @@ def test_products_have_the_labels_for_which_forecasts_look(empty_cache):
     build_tables.galaxy_table(band, galaxies, setting, build_tables.library_key(galaxies))
     band_ratios.load(galaxies, "euclid_vis", 0.0, 0.8)
     for label in (
-        cache_labels.label_box(3, 32),
-        cache_labels.label_tides(3, 32),
-        cache_labels.label_lensing(3, 32, 16, False),
+        cache_labels.label_box(FIDUCIAL.fingerprint(), 3, 32),
+        cache_labels.label_tides(FIDUCIAL.fingerprint(), 3, 32),
+        cache_labels.label_lensing(FIDUCIAL.fingerprint(), 3, 32, 16, False),
         cache_labels.label_profiles(),
         cache_labels.label_psf("vis", vis.name, "euclid_vis", 1, mission.parameters),
         cache_labels.label_psf("nisp", nisp.name, "spectra", 1, mission.parameters),

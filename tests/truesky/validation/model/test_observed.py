@@ -17,6 +17,7 @@ from tests.truesky import nightly
 from tests.truesky.catalogue.conftest import FLAT_CELLS, made
 from truesky.catalogue.galaxies import high_redshift
 from truesky.catalogue.halos import quenching
+from truesky.cosmology import FIDUCIAL
 from truesky.validation import __main__, checks
 from truesky.validation.lake.catalogues import observed_sky
 from truesky.validation.model import mean_sky, observed
@@ -28,7 +29,7 @@ FEW = 4
 
 
 def seen(rows, cells):
-    return observed.from_table(rows, cells * sky.cell_area(GENERATION_ORDER))
+    return observed.from_table(rows, cells * sky.cell_area(GENERATION_ORDER), FIDUCIAL)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
     publish.make_version(tmp_path, plan, lambda root, facts: Output(rows))
     seen, _ = observed.from_version(read.version(tmp_path, "galaxies"))
     found = observed.figures(seen)
-    assert found == observed.figures(observed.from_table(rows, sky.cell_area(GENERATION_ORDER)))
+    assert found == observed.figures(observed.from_table(rows, sky.cell_area(GENERATION_ORDER), FIDUCIAL))
     status = __main__.main(["--lake", str(tmp_path)])
     table = [row for row in read.version(tmp_path, "validation").rows().to_pylist() if row["check_name"] == "observed"]
     assert {row["quantity"]: row["value"] for row in table if row["value"] is not None} == {
@@ -188,7 +189,7 @@ def hole(flat):
 
 def far_quasars(flat):
     """Remove galaxies beyond z = 6, and quasars between z = 0.3 and 6."""
-    return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
+    return replace(flat, distant=high_redshift.model(FIDUCIAL, 0.0, 1.0, 26.0, 0.3))
 
 
 @nightly.parametrize(

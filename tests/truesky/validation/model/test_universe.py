@@ -13,7 +13,7 @@ from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from tests.truesky.catalogue.galaxies.test_lensing import limber
 from truesky.catalogue.halos import luminosity_function
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.validation import __main__, checks
 from truesky.validation.model import census, clustering, shear
 from truesky.validation.model import universe as measured
@@ -58,7 +58,7 @@ def test_halpha(seen):
 
 
 def test_halos(seen):
-    assert failed(census.halos(seen, measured.mass_function())) == []
+    assert failed(census.halos(seen, measured.mass_function(FIDUCIAL))) == []
 
 
 def test_luminosities(seen):
@@ -136,10 +136,10 @@ def test_points_of_a_dense_half_are_correlated(coarse, rng):
 def test_theory_agrees_with_lensing_sums():
     """C_l agrees with the sums of the lensing tests, and the ratio of theory to itself is 1."""
     ell = np.array([50.0, 200.0, 400.0])
-    chi = float(cosmology.comoving_distance(1.0))
-    assert shear.linear_theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
-    power = np.concatenate([np.zeros(30), shear.linear_theory(np.arange(30.0, 129.0), chi)])
-    assert shear.band_ratio(power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
+    chi = float(FIDUCIAL.comoving_distance(1.0))
+    assert shear.linear_theory(FIDUCIAL, ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
+    power = np.concatenate([np.zeros(30), shear.linear_theory(FIDUCIAL, np.arange(30.0, 129.0), chi)])
+    assert shear.band_ratio(FIDUCIAL, power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
 
 
 @pytest.mark.nightly

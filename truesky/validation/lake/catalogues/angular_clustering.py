@@ -21,7 +21,7 @@ import numpy as np
 from lake_schema.arrays import Array, Bool, Float
 from lake_schema.store import read
 from truesky.catalogue.halos import matching
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology, from_facts
 from truesky.validation import checks, theory, two_points
 from truesky.validation import field as fields
 from truesky.validation.field import Field
@@ -78,15 +78,30 @@ def measure(galaxies: read.Version) -> Result:
     index, bright = table["_healpix_29"].to_numpy(), table["mag_r01"].to_numpy() < max(LIMITS) + _REDDEST
     field = fields.from_version(galaxies, index)
     bright &= table["kind"].to_numpy() < 2
-    return compare({name: table[name].to_numpy()[bright] for name in COLUMNS}, field)
+    return compare(
+        {name: table[name].to_numpy()[bright] for name in COLUMNS},
+        field,
+        from_facts(galaxies.manifest.get("facts", {})),
+    )
 
 
-def compare(columns: Mapping[str, Array], field: Field) -> Result:
+def compare(columns: Mapping[str, Array], field: Field, cosmology: Cosmology) -> Result:
     """Check the angular clustering of galaxies in a field.
 
-    `columns` are the COLUMNS of central and satellite galaxies, complete to the faintest limit in I_E if possible. The
-    rows are measured w divided by expected w in bins of separation, with verdicts. Limits that the catalogue does not
-    reach, samples with fewer than 200 galaxies and too small fields give rows "not_applicable".
+    Parameters
+    ----------
+    columns : mapping of str to array, shape (n,)
+        COLUMNS of central and satellite galaxies, complete to the faintest limit in I_E if possible.
+    field : Field
+        Area of the sky that contains the galaxies.
+    cosmology : Cosmology
+        Parameters of the universe.
+
+    Returns
+    -------
+    Result
+        Measured w divided by expected w in bins of separation, with verdicts. Limits that the catalogue does not reach,
+        samples with fewer than 200 galaxies and too small fields give rows "not_applicable".
     """
     if len(columns["id"]) < _MIN_GALAXIES:
         return _no_result(
@@ -95,7 +110,7 @@ def compare(columns: Mapping[str, Array], field: Field) -> Result:
     edges = EDGES[60.0 * field.patch_side * (1 + 1e-9) >= EDGES]
     if len(edges) < 3:
         return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide, which is too small")
-    mag = observed.apparent_magnitudes(columns, BAND)
+    mag = observed.apparent_magnitudes(columns, BAND, cosmology)
     deepest, rows, series = float(np.percentile(mag, 99.5)), [], {}
     for limit in LIMITS:
         brighter = mag < limit
@@ -109,14 +124,14 @@ def compare(columns: Mapping[str, Array], field: Field) -> Result:
             why = "the masses of the halos, and thus the bias of the galaxies, are not known"
             rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
             continue
-        curve, w_theory = expected_correlation(columns, with_halo, field, correlation)
+        curve, w_theory = expected_correlation(columns, with_halo, field, correlation, cosmology)
         note = f"{np.count_nonzero(brighter)} galaxies with I_E < {limit:g}, {field.area:.3g} deg2"
         rows += _rows(f"w_vis_{limit:g}", correlation, w_theory, note)
         series[f"w_{limit:g}"] = np.stack(
             [correlation.theta / ARCMIN, correlation.value[0], correlation.error[0], w_theory]
         )
         series[f"w_theory_{limit:g}"] = np.stack(curve)
-    rows += _luminous_rows(columns, field, deepest)
+    rows += _luminous_rows(columns, field, deepest, cosmology)
     return Result(Place(), rows, series)
 
 
@@ -140,7 +155,7 @@ def _rows(name: str, correlation: TwoPointFunction, w_theory: Float, note: str) 
 
 
 def expected_correlation(
-    columns: Mapping[str, Array], selected: Bool, field: Field, correlation: TwoPointFunction
+    columns: Mapping[str, Array], selected: Bool, field: Field, correlation: TwoPointFunction, cosmology: Cosmology
 ) -> tuple[tuple[Float, Float], Float]:
     """Return the expected angular correlation function w of galaxies in a field.
 
@@ -156,6 +171,8 @@ def expected_correlation(
         Area of the sky that contains the galaxies.
     correlation : TwoPointFunction
         Measured w, which defines the separation bins.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
@@ -165,10 +182,10 @@ def expected_correlation(
         Expected w in each bin.
     """
     z, mass = columns["z_true"][selected].astype(float), columns["log_halo_mass"][selected].astype(float)
-    chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
+    chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses(cosmology)
     bias = halos.interpolate_pairs(halos.bias, z, mass)
     edges = np.arange(chi.min() * 0.999, chi.max() + _SHELL, _SHELL)
-    c_l = theory.galaxy_power(theory.ELL, theory.shells(chi, bias, edges))
+    c_l = theory.galaxy_power(cosmology, theory.ELL, theory.shells(chi, bias, edges))
     curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
     w = theory.correlation(curve, theory.ELL, c_l)
     # Subtract the mean of w over all pairs: w was measured relative to the mean density of this field.
@@ -177,7 +194,7 @@ def expected_correlation(
     return (curve[in_range] / ARCMIN, w[in_range] - field_mean), np.interp(correlation.theta, curve, w) - field_mean
 
 
-def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
+def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float, cosmology: Cosmology) -> list[Row]:
     """Check w of galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6, divided by the w of the observed power law.
 
     `deepest` is the depth of the catalogue in I_E (AB mag). Returns one row with its verdict for each separation bin

@@ -22,6 +22,7 @@ import numpy as np
 
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.store import read
+from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import band_fluxes, passbands, sources
 from truesky.randomness import rng
 from truesky.validation import field as fields
@@ -97,10 +98,11 @@ def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
     at = np.minimum(np.searchsorted(flux_ids[order], columns["id"]), max(len(flux_ids) - 1, 0))
     if len(selected) and (not len(flux_ids) or (flux_ids[order][at] != columns["id"]).any()):
         return _no_result("table galaxy_fluxes lacks galaxies of table galaxies: select one request with --name")
-    return compare(columns, {band: light[_FLUX + band].to_numpy()[order[at]] for band in bands}, field)
+    by_band = {band: light[_FLUX + band].to_numpy()[order[at]] for band in bands}
+    return compare(columns, by_band, field, from_facts(galaxies.manifest.get("facts", {})))
 
 
-def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field) -> Result:
+def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field, cosmology: Cosmology) -> Result:
     """Check the fluxes of galaxies in several bands against their spectra.
 
     Parameters
@@ -111,6 +113,8 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
         Fluxes of the same galaxies by band, uJy.
     field : Field
         Area of the sky that contains the galaxies, with jackknife patches for errors.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
@@ -133,7 +137,7 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
     rows, tolerance = [], _TOLERANCE + _PER_DUST * float(np.median(columns["a_v"]))
     for band, magnitudes in mag.items():
         dust = _transmission(band, columns["a_v"].astype(float))
-        offset = magnitudes - observed.apparent_magnitudes(columns, band) + 2.5 * np.log10(magnified * dust)
+        offset = magnitudes - observed.apparent_magnitudes(columns, band, cosmology) + 2.5 * np.log10(magnified * dust)
         # Count galaxies without flux in the band as infinitely faint, so that many of them make the check fail.
         offset = np.where(np.isfinite(offset), offset, np.inf)
         value, error = _median(offset, patch, field.n_patches)

@@ -21,7 +21,7 @@ import numpy as np
 
 from lake_schema.arrays import Array, Float
 from lake_schema.store import read
-from truesky.fluxes import cosmology
+from truesky.cosmology import Cosmology, from_facts
 from truesky.validation import field as fields
 from truesky.validation import theory, two_points
 from truesky.validation.field import Field
@@ -87,10 +87,11 @@ def measure(galaxies: read.Version) -> Result:
     table = galaxies.rows(list(COLUMNS))
     columns = {name: table[name].to_numpy() for name in COLUMNS}
     field = fields.from_version(galaxies, columns["_healpix_29"])
-    return compare(columns, field, int(galaxies.manifest.get("facts", {}).get("lensing_nside", _NSIDE)))
+    facts = galaxies.manifest.get("facts", {})
+    return compare(columns, field, from_facts(facts), int(facts.get("lensing_nside", _NSIDE)))
 
 
-def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Result:
+def compare(columns: dict[str, Array], field: Field, cosmology: Cosmology, nside: int = _NSIDE) -> Result:
     """Check the gravitational shear of galaxies at 0.8 < z < 1.2 in a field.
 
     Parameters
@@ -99,6 +100,8 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
         COLUMNS of the table `galaxies`.
     field : Field
         Area of the sky that contains the galaxies, with jackknife patches for errors.
+    cosmology : Cosmology
+        Parameters of the universe.
     nside : int
         HEALPix resolution of the lensing maps from which the shear was interpolated. Below 1024, differences from
         theory count as known failures.
@@ -130,7 +133,7 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
     )
     wide = [edge for edge in wide if edge > _FROM * (1 - 1e-9)]
     coarse = two_points.rebin(fine, np.array(wide) * ARCMIN)
-    c_l = expected_power(z[indices])
+    c_l = expected_power(cosmology, z[indices])
     plus, minus = theory.shear_correlations(coarse.theta, theory.ELL, c_l)
     note = f"{len(indices)} galaxies at {Z_MIN:g} < z < {Z_MAX:g}, {field.area:.3g} deg2"
     angles = np.geomspace(_FIRST * ARCMIN, np.radians(20.0), _NODES)
@@ -155,10 +158,10 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
     return Result(Place(), rows, series)
 
 
-def expected_power(z: Float) -> Float:
+def expected_power(cosmology: Cosmology, z: Float) -> Float:
     """Return the expected C_l of the convergence of galaxies with redshifts `z`, at the multipoles theory.ELL."""
     number, edge = np.histogram(np.asarray(cosmology.comoving_distance(z)), _SHELLS)
-    return theory.convergence_power(theory.ELL, 0.5 * (edge[1:] + edge[:-1]), number.astype(float))
+    return theory.convergence_power(cosmology, theory.ELL, 0.5 * (edge[1:] + edge[:-1]), number.astype(float))
 
 
 def _theory_rows(

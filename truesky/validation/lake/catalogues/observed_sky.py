@@ -154,7 +154,8 @@ def _errors(sample: GalaxySample, cell: Int) -> dict[str, float]:
         part = GalaxySample(
             {name: values[remaining] for name, values in sample.rows.items()},
             {band: values[remaining] for band, values in sample.mags.items()},
-            sample.ultraviolet[remaining], sample.area * (1.0 - len(group) / len(cells)), sample.quasars,
+            sample.ultraviolet[remaining], sample.area * (1.0 - len(group) / len(cells)), sample.cosmology,
+            sample.quasars,
         )  # fmt: skip
         figures.append(observed.figures(part))
     errors = {

@@ -4,7 +4,7 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from truesky.fluxes import cosmology
+from truesky.cosmology import FIDUCIAL
 from truesky.validation import field as fields
 from truesky.validation import theory
 
@@ -37,7 +37,7 @@ def sheared(seed=1, n=8000):
     """Columns of galaxies at z = 1 whose shear and convergence are derivatives of one potential."""
     rng = np.random.default_rng(seed)
     index, ra, dec = scattered(rng, n)
-    c_l = theory.convergence_power(theory.ELL, cosmology.comoving_distance(np.ones(1)), np.ones(1))
+    c_l = theory.convergence_power(FIDUCIAL, theory.ELL, FIDUCIAL.comoving_distance(np.ones(1)), np.ones(1))
     ell, variance, (kx, ky), phase = waves(rng, c_l)
     east, north = plane(ra, dec)
     # psi = sum of -2 kappa / l^2 cos(k x + phase): kappa = (psi_xx + psi_yy) / 2.
@@ -60,10 +60,10 @@ def clustered(seed=1, n=6000, log_mass=12.5):
         "frac_2": np.full(len(ra), 0.5), "ext_law_1": np.zeros(len(ra), np.int8), "ebv_1": np.zeros(len(ra)),
         "id": np.arange(len(ra)), "ra": ra, "dec": dec, "_healpix_29": index,
     }  # fmt: skip
-    edges = np.asarray(cosmology.comoving_distance(np.array([0.6, 0.65, 0.7, 0.75, 0.8])))
+    edges = np.asarray(FIDUCIAL.comoving_distance(np.array([0.6, 0.65, 0.7, 0.75, 0.8])))
     wide = np.diff(edges)
     shells = theory.Shells(0.5 * (edges[1:] + edges[:-1]), wide, 0.25 / wide * bias(log_mass))
-    c_l = theory.galaxy_power(theory.ELL, shells)
+    c_l = theory.galaxy_power(FIDUCIAL, theory.ELL, shells)
     ell, variance, (kx, ky), phase = waves(rng, c_l)
     east, north = plane(ra, dec)
     g = np.cos(np.outer(east, kx) + np.outer(north, ky) + phase) * np.sqrt(2 * variance)
@@ -76,5 +76,5 @@ def bias(log_mass):
     """Bias of halos at z = 0.7 from the formula of Tinker et al. 2010 for an overdensity of 200 times the mean."""
     from colossus.lss import bias as halo_bias
 
-    theory.linear_power(np.ones(1), 0.0)
+    theory.linear_power(FIDUCIAL, np.ones(1), 0.0)
     return float(halo_bias.haloBias(10.0**log_mass, 0.7, mdef="200m", model="tinker10"))

@@ -7,6 +7,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from tests.truesky.validation.lake.catalogues import mocks
 from tests.truesky.validation.lake.catalogues.test_faults import Version
 from tests.universe import rows_of
+from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import band_fluxes
 from truesky.fluxes.libraries import templates
 from truesky.validation.lake.catalogues import colours
@@ -36,7 +37,7 @@ def tables():
         "gamma2": rng.normal(0, 0.02, N), "color_gr_01": np.full(N, 0.5),
     }  # fmt: skip
     columns["sed_2"] = np.minimum(columns["sed_1"] + 1, 30)
-    columns["mag_r01"] = observed.apparent_magnitudes(columns, "sdss_r01")
+    columns["mag_r01"] = observed.apparent_magnitudes(columns, "sdss_r01", FIDUCIAL)
     found = band_fluxes.fluxes_with_settings(
         GALAXIES.build(columns), band_fluxes._load_passbands(BANDS), [None] * len(BANDS), library
     )

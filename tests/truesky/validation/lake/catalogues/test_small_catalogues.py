@@ -8,6 +8,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from tests.truesky.validation.lake.catalogues import mocks
 from tests.truesky.validation.lake.catalogues.test_faults import Version
 from tests.universe import rows_of
+from truesky.cosmology import FIDUCIAL
 from truesky.validation import __main__
 from truesky.validation import field as fields
 from truesky.validation.lake.catalogues import colours, cosmic_shear, observed_sky
@@ -56,7 +57,7 @@ def test_shear_in_one_cell():
     columns = mocks.sheared(n=30_000)
     selected = columns["_healpix_29"] >> 2 * (29 - GENERATION_ORDER) == mocks.CELLS[0]
     one_cell = {name: values[selected] for name, values in columns.items()}
-    result = cosmic_shear.compare(one_cell, fields.from_cells(GENERATION_ORDER, mocks.CELLS[:1]))
+    result = cosmic_shear.compare(one_cell, fields.from_cells(GENERATION_ORDER, mocks.CELLS[:1]), FIDUCIAL)
     unknown = [row for row in result.rows if not np.isfinite([row.value, row.error]).all()]
     assert all(row.note.startswith(("too few pairs of galaxies", str(selected.sum()))) for row in unknown)
     assert reasons(result.rows) or not unknown

@@ -1,0 +1,74 @@
+"""Print distances, growth and power of several cosmologies from CCL and CAMB, with which the tests compare truesky.
+
+    python -m scripts.cosmology_references > tests/truesky/cosmology_references.csv
+
+The packages pyccl and camb must be installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import astuple, fields, replace
+
+import numpy as np
+
+from truesky.cosmology import FIDUCIAL, Cosmology
+
+COSMOLOGIES = (
+    FIDUCIAL,
+    Cosmology(omega_m=0.31, omega_b=0.049, h=0.677, sigma_8=0.81, n_s=0.966),
+    replace(FIDUCIAL, w0=-0.9),
+    replace(FIDUCIAL, w0=-0.9, wa=0.3),
+    Cosmology(omega_m=0.26, omega_b=0.045, h=0.73, sigma_8=0.78, n_s=0.95, w0=-1.1, wa=-0.4),
+)
+# Redshifts of distances and growth, redshifts of sigma_8, and wave numbers (h/Mpc) of the power spectrum. CAMB includes
+# radiation, which changes sigma_8(z) / sigma_8(0) by more than 1e-3 beyond z = 2.
+REDSHIFTS, SIGMA_REDSHIFTS, WAVE_NUMBERS = (0.5, 1.0, 2.0, 5.0, 10.0), (0.5, 1.0, 2.0), (0.01, 0.1, 1.0)
+
+
+def rows() -> Iterator[str]:
+    """Yield the lines of the file: parameters of the cosmology, name of the quantity, its argument, and its value."""
+    yield ",".join([*(field.name for field in fields(Cosmology) if field.name != "power"), "quantity", "at", "value"])
+    for cosmology in COSMOLOGIES:
+        numbers = ",".join(f"{value:g}" for value in astuple(cosmology)[:-1])
+        for quantity, at, value in (*_values_of_ccl(cosmology), *_values_of_camb(cosmology)):
+            yield f"{numbers},{quantity},{at:g},{value:.8g}"
+
+
+def _values_of_ccl(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    import pyccl
+
+    arguments = {
+        "Omega_c": cosmology.omega_m - cosmology.omega_b, "Omega_b": cosmology.omega_b, "h": cosmology.h,
+        "sigma8": cosmology.sigma_8, "n_s": cosmology.n_s, "w0": cosmology.w0, "wa": cosmology.wa, "Neff": 0.0,
+        "transfer_function": "eisenstein_hu", "matter_power_spectrum": "linear",
+    }  # fmt: skip
+    # A cold microwave background has no radiation, and one of 2.7255 K is needed for the fitting formula of the power.
+    cold, warm = (pyccl.Cosmology(**arguments, T_CMB=temperature) for temperature in (1e-3, 2.7255))
+    for z in REDSHIFTS:
+        a = 1.0 / (1.0 + z)
+        yield "chi", z, float(pyccl.comoving_radial_distance(cold, a)) * cosmology.h
+        yield "growth", z, float(pyccl.growth_factor(cold, a))
+        yield "growth_rate", z, float(pyccl.growth_rate(cold, a))
+    for k in WAVE_NUMBERS:
+        yield "power", k, float(pyccl.linear_matter_power(warm, k * cosmology.h, 1.0)) * cosmology.h**3
+
+
+def _values_of_camb(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    import camb
+
+    h = cosmology.h
+    settings = camb.set_params(
+        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_m - cosmology.omega_b) * h**2, mnu=0.0,
+        num_massive_neutrinos=0, ns=cosmology.n_s, As=2e-9, w=cosmology.w0, wa=cosmology.wa, dark_energy_model="ppf",
+    )  # fmt: skip
+    settings.set_matter_power(redshifts=[*SIGMA_REDSHIFTS, 0.0], kmax=5.0, silent=True)
+    results = camb.get_results(settings)
+    sigma = np.sort(np.asarray(results.get_sigma8()))[::-1]
+    for z, value in zip(SIGMA_REDSHIFTS, sigma[1:], strict=True):
+        yield "sigma_8", z, cosmology.sigma_8 * float(value / sigma[0])
+        yield "chi_with_radiation", z, float(results.comoving_radial_distance(z)) * h
+
+
+if __name__ == "__main__":
+    print("\n".join(rows()))

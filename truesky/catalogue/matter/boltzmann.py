@@ -1,0 +1,113 @@
+"""Linear power spectrum of matter from CAMB, which solves the Boltzmann equations: a shipped table, or computed now.
+
+The table linear_power.toml contains the spectrum of the fiducial cosmology, and is written by
+scripts/linear_power_table.py. For other cosmologies, the optional package CAMB must be installed.
+
+References
+----------
+Lewis, Challinor & Lasenby 2000, ApJ 538, 473 (CAMB)
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+import scipy
+
+from lake_schema.arrays import Array, Float
+from lake_schema.errors import BadInput
+from truesky.catalogue import parameters
+from truesky.cosmology import FIDUCIAL, Cosmology
+from truesky.numerics.cache import cached_arrays, content_key
+from truesky.numerics.code_fingerprints import code_key
+
+_FILE = "linear_power.toml"
+# First and last wave number (h/Mpc) of a table, and number of wave numbers, which are uniform in ln k. The
+# interpolation between them has a relative error of 1e-5.
+K_RANGE, K_NODES = (1e-4, 100.0), 700
+# Number of wave numbers at which the integrand of sigma_8 is evaluated.
+_SIGMA_NODES = 20_000
+# Amplitude of the primordial power for which CAMB computes the spectrum, before it is scaled to sigma_8.
+_AMPLITUDE = 2e-9
+# Density of radiation: temperature of the microwave background (K), and effective number of massless neutrinos.
+_T_CMB, _NEUTRINOS = 2.7255, 3.044
+
+
+def wave_numbers() -> Float:
+    """Return the wave numbers k of a table, h/Mpc."""
+    return np.geomspace(*K_RANGE, K_NODES)
+
+
+def power(cosmology: Cosmology, k: Float) -> Float:
+    """Interpolate the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc from 1e-4 to 100; 0 elsewhere.
+
+    Raises BadInput for a cosmology other than the fiducial one if the package CAMB is not installed.
+    """
+    ln_k = np.log(wave_numbers())
+    spline = scipy.interpolate.CubicSpline(ln_k, np.log(_table(cosmology)))
+    at = np.log(np.asarray(k, float))
+    # The rounding errors of the ends of a range of k do not matter.
+    inside = (at > ln_k[0] - 1e-9) & (at < ln_k[-1] + 1e-9)
+    return np.where(inside, np.exp(spline(np.clip(at, ln_k[0], ln_k[-1]))), 0.0)
+
+
+def check(cosmology: Cosmology) -> None:
+    """Raise BadInput if the spectrum of this cosmology is not in the shipped table and CAMB is not installed."""
+    if not _is_shipped(cosmology):
+        _import_camb()
+
+
+def compute(cosmology: Cosmology) -> dict[str, Array]:
+    """Compute the spectrum with CAMB at the wave numbers of a table, scaled to sigma_8, as the array "power".
+
+    It takes 3 CPU s. The radiation, which distances neglect, is included. Raises BadInput if CAMB is not installed.
+    """
+    camb = _import_camb()
+    h = cosmology.h
+    settings = camb.set_params(
+        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_m - cosmology.omega_b) * h**2, omk=0.0,
+        mnu=0.0, num_massive_neutrinos=0, nnu=_NEUTRINOS, TCMB=_T_CMB, ns=cosmology.n_s, As=_AMPLITUDE,
+        w=cosmology.w0, wa=cosmology.wa, dark_energy_model="ppf",
+    )  # fmt: skip
+    settings.WantCls = False
+    settings.NonLinear = camb.model.NonLinear_none
+    settings.set_matter_power(redshifts=[0.0], kmax=1.2 * K_RANGE[1] * h, k_per_logint=0, silent=True)
+    results = camb.get_results(settings)
+    interpolator = results.get_matter_power_interpolator(nonlinear=False, hubble_units=True, k_hunit=True)
+    spectrum = np.asarray(interpolator.P(0.0, wave_numbers()), float)
+    return {"power": spectrum * (cosmology.sigma_8 / _sigma_8(spectrum)) ** 2}
+
+
+def _sigma_8(spectrum: Float) -> float:
+    """Return the rms of the overdensity in spheres of 8 Mpc/h for a table of P(k), with a relative error of 1e-5."""
+    ln_k = np.log(wave_numbers())
+    fine = np.linspace(ln_k[0], ln_k[-1], _SIGMA_NODES)
+    k, values = np.exp(fine), np.exp(scipy.interpolate.CubicSpline(ln_k, np.log(spectrum))(fine))
+    x = 8.0 * k
+    window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
+    return float(np.sqrt(np.trapezoid(values * window**2 * k**3 / (2.0 * np.pi**2), fine)))
+
+
+def _table(cosmology: Cosmology) -> Float:
+    if _is_shipped(cosmology):
+        return np.array(parameters.section(_FILE, "camb")["power"])
+    key = content_key(code_key(__name__), cosmology.fingerprint())
+    return cached_arrays("linear_power", key, lambda: compute(cosmology))["power"]
+
+
+def _is_shipped(cosmology: Cosmology) -> bool:
+    """Return True if the shipped table is for this cosmology, the fiducial one."""
+    return astuple(cosmology)[:-1] == astuple(FIDUCIAL)[:-1]
+
+
+def _import_camb() -> Any:
+    try:
+        import camb
+    except ModuleNotFoundError:
+        raise BadInput(
+            'universe.cosmology: power = "camb" requires the package camb, which is not installed: '
+            "pip install 'truesky[camb]', or camb alone"
+        ) from None
+    return camb
