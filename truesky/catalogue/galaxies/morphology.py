@@ -503,8 +503,8 @@ def _bulge_quantiles(shape: BulgeShape) -> Float:
     low, high = scipy.special.ndtr((np.array(shape.thickness_limits) - shape.thickness_mean) / shape.thickness_scatter)
     thickness = scipy.special.ndtri(low + (high - low) * _middles(_THICKNESS_NODES))
     thickness = shape.thickness_mean + shape.thickness_scatter * thickness
-    most = scipy.special.ndtr((np.log(shape.most_elongated) - shape.elongation_log) / shape.elongation_scatter)
-    elongation = scipy.special.ndtri(most * _middles(_ELONGATION_NODES))
+    truncation = scipy.special.ndtr((np.log(shape.most_elongated) - shape.elongation_log) / shape.elongation_scatter)
+    elongation = scipy.special.ndtri(truncation * _middles(_ELONGATION_NODES))
     elongation = np.exp(shape.elongation_log + shape.elongation_scatter * elongation)
     axes = thickness, 1.0 - elongation, _middles(_COSINE_NODES), 0.5 * np.pi * _middles(_AZIMUTH_NODES)
     thickness, middle, cosine, azimuth = np.meshgrid(*axes, indexing="ij")
