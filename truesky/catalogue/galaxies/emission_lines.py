@@ -81,6 +81,8 @@ class Ratios:
     """Parameters of the line ratios by metallicity; explained in emission_lines.toml, [ratios]."""
 
     n2: tuple[float, ...]
+    n2_z: float
+    n2_z_limits: tuple[float, float]
     n2_scatter: float
     r3: tuple[float, ...]
     r3_z: float
@@ -464,6 +466,7 @@ def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float,
     ratios, other_lines = line_model.ratios, line_model.other_lines
     n2, r3, r2, s2 = (_ratio(numbers, excess) for numbers in (ratios.n2, ratios.r3, ratios.r2, ratios.s2))
     hbeta = halpha - np.log10(line_model.hydrogen["halpha"])
+    n2 = n2 + ratios.n2_z * (np.clip(z, *ratios.n2_z_limits) - ratios.n2_z_limits[0]) + ratios.n2_scatter * normals[0]
     r3 = r3 + ratios.r3_z * np.minimum(z, ratios.r3_z_last) + ratios.r3_scatter * normals[1]
     r2 = r2 + ratios.r2_r3 * normals[1] + ratios.r2_scatter * normals[2]
     sii = halpha + s2 + ratios.s2_scatter * normals[3]
@@ -476,7 +479,7 @@ def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float,
         # are equal in this model, and the stronger line of [O III], [N II] and [S III].
         "flux_oii": hbeta + r2 + np.log10(0.5),
         "flux_oiii": hbeta + r3,
-        "flux_nii": halpha + n2 + ratios.n2_scatter * normals[0],
+        "flux_nii": halpha + n2,
         "flux_sii": sii + np.log10(0.5),
         "flux_siii": siii + np.log10(other_lines.siii_pair / (1.0 + other_lines.siii_pair)),
         "flux_hei": helium + np.log10(other_lines.hei),

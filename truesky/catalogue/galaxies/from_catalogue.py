@@ -402,7 +402,7 @@ def _shapes(
         "disk_half_light_radius": catalogue.get("disk_half_light_radius", disc),
         "bulge_fraction": fraction,
         "bulge_sersic_index": sersic,
-        "bulge_axis_ratio": catalogue.get("bulge_axis_ratio", morphology.bulge_axis_ratio(shapes.bulge, n, rng)),
+        "bulge_axis_ratio": catalogue.get("bulge_axis_ratio", morphology.bulge_axis_ratio(shapes, n, rng)),
         "disk_axis_ratio": disc_ratio,
         "inclination": catalogue.get("inclination", morphology.inclination(disc_ratio, shapes.scale_height)),
         "position_angle": sky.wrap_position_angle(catalogue.get("position_angle", morphology.position_angle(n, rng))),

@@ -539,7 +539,7 @@ def _shape_columns(
         "bulge_fraction": fraction,
         "bulge_color": colour,
         "bulge_sersic_index": sersic,
-        "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes.bulge, drawn.z.size, rng),
+        "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes, drawn.z.size, rng),
         "disk_axis_ratio": disc_ratio,
         "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
         "position_angle": alignments.position_angles(

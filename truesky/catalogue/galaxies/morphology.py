@@ -37,13 +37,16 @@ class Size:
     pivot: float
     knee: float
     knee_slope: float
+    compact_mass: tuple[float, ...]
+    compact_share: tuple[float, ...]
+    compact_z: tuple[float, float]
     smallest: float
     largest: float
 
 
 @dataclass(frozen=True, slots=True)
 class Bulge:
-    """Parameters of the distributions of bulge fraction, radius, shape and colour; see morphology.toml, [bulge]."""
+    """Parameters of the distributions of bulge fraction, radius and colour; see morphology.toml, [bulge]."""
 
     early_a: float
     early_b: float
@@ -60,12 +63,21 @@ class Bulge:
     late_log_ratio: float
     log_ratio_scatter: float
     ratio_limits: tuple[float, float]
-    axis_ratio_mean: float
-    axis_ratio_scatter: float
-    axis_ratio_limits: tuple[float, float]
     colour_mean: float
     colour_scatter: float
     colour_limits: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class BulgeShape:
+    """Parameters of the axis ratios of triaxial bulges; explained in morphology.toml, [bulge_shape]."""
+
+    thickness_mean: float
+    thickness_scatter: float
+    thickness_limits: tuple[float, float]
+    elongation_log: float
+    elongation_scatter: float
+    most_elongated: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +92,8 @@ class Shapes:
         Scale height of discs in units of the scale length.
     disc_e, disc_cdf : float array, shape (m,)
         Apparent ellipticity (a - b) / (a + b) of discs, and the cumulative distribution at these values.
+    bulge_ratio : float array, shape (k,)
+        Apparent axis ratio of bulges at equidistant values of the cumulative distribution, from 0 to 1.
     fraction, ln_ratio, ln_sersic : float array, shape (f,), (r,), (s,)
         Axes of `ln_disc`: bulge fraction, ln(bulge radius / disc radius), ln of the bulge's Sersic index.
     ln_disc : float array, shape (f, r, s)
@@ -91,6 +105,7 @@ class Shapes:
     scale_height: float
     disc_e: Float
     disc_cdf: Float
+    bulge_ratio: Float
     fraction: Float
     ln_ratio: Float
     ln_sersic: Float
@@ -101,7 +116,7 @@ class Shapes:
 def shapes() -> Shapes:
     """Return the built-in parameters and tables of sizes and shapes.
 
-    The first call in a process makes the tables in 0.2 s; later calls return the same object.
+    The first call in a process makes the tables in 0.3 s; later calls return the same object.
     """
     bulge = Bulge(**parameters.section("morphology.toml", "bulge"))
     e, cdf = _disc_distribution(**parameters.section("morphology.toml", "disc"))
@@ -115,6 +130,7 @@ def shapes() -> Shapes:
         scale_height=DISK_SCALE_HEIGHT,
         disc_e=e,
         disc_cdf=cdf,
+        bulge_ratio=_bulge_quantiles(BulgeShape(**parameters.section("morphology.toml", "bulge_shape"))),
         fraction=fraction,
         ln_ratio=ln_ratio,
         ln_sersic=ln_sersic,
@@ -150,7 +166,7 @@ def half_light_radius(
     kpc_per_arcsec : float array, shape (n,)
         Proper length per angle at the redshift, kpc/arcsec.
     rng : AnyGenerator
-        Random numbers of the scatter.
+        Random numbers: first those of the scatter, then those that select compact late types.
 
     Returns
     -------
@@ -168,9 +184,18 @@ def half_light_radius(
     )
     early += size.knee_slope * np.minimum(log_mass - knee, 0.0)
     late = _at_redshift(size, size.late_norm, z) + _at_redshift(size, size.late_slope, z) * log_mass
-    scatter = np.where(red, _at_redshift(size, size.early_scatter, z), _at_redshift(size, size.late_scatter, z))
-    log_kpc = np.where(red, early, late) + scatter * rng.standard_normal(z.size)
+    normal = rng.standard_normal(z.size)
+    small = red | (rng.random(z.size) < compact_share(size, z, log_stellar_mass))
+    scatter = np.where(small, _at_redshift(size, size.early_scatter, z), _at_redshift(size, size.late_scatter, z))
+    log_kpc = np.where(small, early, late) + scatter * normal
     return np.asarray(np.clip(10.0**log_kpc / kpc_per_arcsec, size.smallest, size.largest))
+
+
+def compact_share(size: Size, z: Float, log_stellar_mass: Float) -> Float:
+    """Return the share of late types that are as small as early types, 0 to 1, by redshift and log10 of mass (Msun)."""
+    start, end = size.compact_z
+    ramp = np.clip((z - start) / (end - start), 0.0, 1.0)
+    return np.asarray(np.interp(log_stellar_mass, size.compact_mass, size.compact_share) * ramp)
 
 
 def _at_redshift(size: Size, values: tuple[float, ...], z: Float) -> Float:
@@ -385,27 +410,53 @@ def disc_axis_ratio(model: Shapes, n: int, rng: AnyGenerator) -> Float:
     return (1.0 - e) / (1.0 + e)
 
 
-def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
-    """Draw the axis ratio (minor / major) of bulges from a truncated normal distribution, by inversion.
+def bulge_axis_ratio(model: Shapes, n: int, rng: AnyGenerator) -> Float:
+    """Draw the apparent axis ratio (minor / major) of triaxial bulges in random directions.
 
     Parameters
     ----------
-    bulge : Bulge
-        Parameters of the distribution.
+    model : Shapes
+        Distribution of the apparent axis ratio.
     n : int
         Number of galaxies.
     rng : AnyGenerator
-        Random numbers.
+        Random numbers, one per galaxy.
 
     Returns
     -------
     float array, shape (n,)
         Axis ratio.
     """
-    limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
-    low, high = scipy.special.ndtr(limits)
-    q = bulge.axis_ratio_mean + bulge.axis_ratio_scatter * scipy.special.ndtri(low + (high - low) * rng.random(n))
-    return np.asarray(np.clip(q, *bulge.axis_ratio_limits))
+    return np.interp(rng.random(n), np.linspace(0.0, 1.0, model.bulge_ratio.size), model.bulge_ratio)
+
+
+def project_ellipsoid(middle: Float, minor: Float, cosine: Float, azimuth: Float) -> Float:
+    """Return the apparent axis ratio of ellipsoids with the major axis 1.
+
+    Parameters
+    ----------
+    middle, minor : float array, any shape
+        Middle and minor axis, 0 < minor <= middle <= 1.
+    cosine : float array, any shape
+        Cosine of the angle between the line of sight and the minor axis.
+    azimuth : float array, any shape
+        Angle of the line of sight around the minor axis, from the major axis, rad.
+
+    Returns
+    -------
+    float array, broadcast shape of the arguments
+        Minor / major axis of the projected ellipse.
+
+    References
+    ----------
+    Binney 1985, MNRAS 212, 767
+    """
+    across, along = np.sin(azimuth) ** 2, np.cos(azimuth) ** 2
+    a = (cosine / minor) ** 2 * (across + along / middle**2) + (1.0 - cosine**2) / middle**2
+    b = cosine * np.sin(2.0 * azimuth) * (1.0 - 1.0 / middle**2) / minor**2
+    c = (across / middle**2 + along) / minor**2
+    difference = np.sqrt((a - c) ** 2 + b**2)
+    return np.asarray(np.sqrt(np.maximum(a + c - difference, 0.0) / (a + c + difference)))
 
 
 def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
@@ -444,5 +495,30 @@ def _disc_distribution(e_max: float, e_fall: float, e_core: float) -> tuple[Floa
     return e, cdf / cdf[-1]
 
 
+def _bulge_quantiles(shape: BulgeShape) -> Float:
+    """Return the apparent axis ratio of bulges at `_RATIO_QUANTILES` equidistant values of its cumulative distribution.
+
+    All combinations of some axes and directions, which have equal probabilities, are projected and sorted.
+    """
+    low, high = scipy.special.ndtr((np.array(shape.thickness_limits) - shape.thickness_mean) / shape.thickness_scatter)
+    thickness = scipy.special.ndtri(low + (high - low) * _middles(_THICKNESS_NODES))
+    thickness = shape.thickness_mean + shape.thickness_scatter * thickness
+    truncation = scipy.special.ndtr((np.log(shape.most_elongated) - shape.elongation_log) / shape.elongation_scatter)
+    elongation = scipy.special.ndtri(truncation * _middles(_ELONGATION_NODES))
+    elongation = np.exp(shape.elongation_log + shape.elongation_scatter * elongation)
+    axes = thickness, 1.0 - elongation, _middles(_COSINE_NODES), 0.5 * np.pi * _middles(_AZIMUTH_NODES)
+    thickness, middle, cosine, azimuth = np.meshgrid(*axes, indexing="ij")
+    ratio = np.sort(project_ellipsoid(middle, thickness * middle, cosine, azimuth).ravel())
+    return np.interp(np.linspace(0.0, 1.0, _RATIO_QUANTILES), _middles(ratio.size), ratio)
+
+
+def _middles(number: int) -> Float:
+    """Return the middles of `number` equal intervals from 0 to 1."""
+    return (np.arange(number) + 0.5) / number
+
+
 # Number of ellipticities at which the cumulative distribution of the discs' ellipticity is tabulated.
 _E_NODES = 2001
+# Number of axes and directions from which the apparent axis ratio of bulges is tabulated, and number of quantiles.
+_THICKNESS_NODES, _ELONGATION_NODES, _COSINE_NODES, _AZIMUTH_NODES = 32, 32, 24, 16
+_RATIO_QUANTILES = 1001

@@ -68,7 +68,7 @@ class Green:
     usual: float
     z_ramp: tuple[float, float]
     max_share: float
-    redder: float
+    offset: float
     scatter: float
     ebv: float
 
@@ -113,7 +113,8 @@ class Dust:
     far_z_range: float
     highest: float
     lowest: float
-    prevot_colour: float
+    prevot_colour: tuple[float, float]
+    prevot_z: tuple[float, float]
     calzetti_odds: tuple[float, ...]
 
 
@@ -326,7 +327,7 @@ def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> 
     blue_mean = blue_mean - law.far_z_rate * np.clip(z - law.far_z, 0.0, law.far_z_range)
     red_scatter = np.clip(law.red_scatter + law.red_scatter_rate * x, *law.red_scatter_limits)
     blue_scatter = np.clip(law.blue_scatter + law.blue_scatter_rate * x, *law.blue_scatter_limits)
-    green = 0.5 * (red_mean + blue_mean) + colours.green.redder
+    green = 0.5 * (red_mean + blue_mean) + colours.green.offset
     mean = np.where(sequence == RED, red_mean, np.where(sequence == GREEN, green, blue_mean))
     return mean, np.where(
         sequence == RED, red_scatter, np.where(sequence == GREEN, colours.green.scatter, blue_scatter)
@@ -392,7 +393,7 @@ def draw_dust(
     law = colours.dust
     amount, odds = rng.random(z.size), np.cumsum(law.calzetti_odds)
     calzetti = CALZETTI + np.searchsorted(odds[:-1], rng.random(z.size) * odds[-1], side="right")
-    curve = np.where(colour.colour > law.prevot_colour, PREVOT, calzetti)
+    curve = np.where(colour.colour > np.interp(z, law.prevot_z, law.prevot_colour), PREVOT, calzetti)
     green = colour.sequence == GREEN
     curve = np.where(green, CALZETTI, curve)
     mean = np.clip(law.mean + law.mean_rate * (m_r - law.pivot), *law.mean_limits)

@@ -31,7 +31,7 @@ BANDS = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "
 # Columns of the simulated table `galaxies` that a Census keeps.
 COLUMNS = (
     *observed.COLUMNS, "ra", "dec", "z_obs", "bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction",
-    "bulge_sersic_index",
+    "bulge_sersic_index", "bulge_axis_ratio",
 )  # fmt: skip
 # Columns of the simulated table `halos` that a Census keeps.
 HALO_COLUMNS = ("z_true", "log_mass")
@@ -41,6 +41,11 @@ HALPHA_LIMITS = (5e-17, 1e-16, 2e-16, 3e-16)
 HALPHA_SHELLS = ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
 # Ranges of I_E (AB mag) in which the median size is measured.
 SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
+# Redshifts at which the sizes of galaxies with 10^10.75 Msun are measured, half width of the bins in redshift and log10
+# of mass, and the smallest number of galaxies.
+SIZE_SHELLS, SIZE_HALF, SIZE_NUMBER = (0.75, 1.25, 1.75, 2.25, 2.75), 0.25, 20
+# Smallest bulge fraction of galaxies whose ellipticity is compared with that of early types.
+EARLY_BULGE = 0.6
 # Redshift shells for the luminosity function: centre, half width, and the largest I_E - M_r - DM of any galaxy in the
 # shell. The last number gives the faintest M_r to which a sample limited in I_E is complete.
 SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
@@ -273,6 +278,28 @@ def sizes(census: Census) -> dict[str, float]:
     radii = morphology.component_radii(shapes, radius, fraction, ratio, index)
     figures["half_light_worst"] = float(np.abs(half_light_radius(*radii, fraction, index) / radius - 1.0).max())
     return figures
+
+
+def sizes_by_mass(census: Census) -> dict[str, float]:
+    """Measure the 16th and 50th percentiles of log10 of half-light radii (kpc) of galaxies with 10^10.75 Msun.
+
+    Redshifts with fewer than SIZE_NUMBER galaxies are left out. The sample should be complete to I_E = 26.
+    """
+    z, mass, figures = census.rows["z_true"].astype(float), census.rows["log_stellar_mass"], {}
+    for at in SIZE_SHELLS:
+        row = np.flatnonzero((np.abs(z - at) < SIZE_HALF) & (np.abs(mass - 10.75) < SIZE_HALF))
+        if row.size >= SIZE_NUMBER:
+            kpc = half_light_of_rows(census.rows, row) * cosmology.kpc_per_arcsec(z[row])
+            low, median = np.percentile(np.log10(kpc), (16, 50)).tolist()
+            figures |= {f"log_size_p16_z{at}": low, f"log_size_median_z{at}": median}
+    return figures
+
+
+def ellipticities(census: Census) -> dict[str, float]:
+    """Return the quartiles of (1 - q^2) / (1 + q^2) of the bulges of galaxies that are mostly bulge, by name."""
+    q = census.rows["bulge_axis_ratio"][census.rows["bulge_fraction"] > EARLY_BULGE].astype(float)
+    quartiles = np.percentile((1.0 - q**2) / (1.0 + q**2), (25, 50, 75))
+    return {f"early_ellipticity_p{at}": float(value) for at, value in zip((25, 50, 75), quartiles, strict=True)}
 
 
 def halpha(census: Census) -> dict[str, float]:

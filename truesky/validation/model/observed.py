@@ -8,6 +8,7 @@ name, and Poisson errors of log10 of number densities under name + "_error".
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,7 +28,9 @@ from truesky.fluxes.high_redshift import QUASAR
 from truesky.fluxes.libraries import templates
 
 # Bands in which galaxies are counted.
-BANDS = ("euclid_vis", "lsst_r", "lsst_i")
+BANDS = ("euclid_vis", "lsst_r", "lsst_i", "hsc_g", "hsc_r", "hsc_i", "hsc_z", "hsc_y")
+# Limits in magnitude at which the counts in other bands of Hyper Suprime-Cam are divided by the counts in i.
+HSC_LIMITS = (22, 23, 24)
 # Number of arcmin^2 in a deg^2.
 ARCMIN2 = 3600.0
 # Redshift ranges of the stellar mass function; the keys are the redshifts in the names of measured values.
@@ -231,13 +234,18 @@ def figures(sample: GalaxySample) -> dict[str, float]:
 def counts(sample: GalaxySample) -> dict[str, float]:
     """Measure the numbers of galaxies brighter than limits in i and I_E (per arcmin2) and in r (per deg2).
 
-    The result also has log10 of the differential counts in i (per mag and deg2), and median redshifts.
+    The result also has log10 of the differential counts in i (per mag and deg2), median redshifts, and the counts in
+    the bands g, r, z and y of Hyper Suprime-Cam divided by the count in its band i.
     """
     i_band, r_band, vis, z = sample.mags["lsst_i"], sample.mags["lsst_r"], sample.mags["euclid_vis"], sample["z_true"]
     values = {f"i_{limit}": sample.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
     for at in 19.25 + 0.5 * np.arange(11):
         values |= _log_density(f"log_i_{at:g}", np.count_nonzero(np.abs(i_band - at) < 0.25), 0.5 * sample.area)
     values |= {f"r_{limit:g}": sample.per_deg2(r_band < limit) for limit in (17.77, 19.5, 19.8, 20.175)}
+    for band, limit in itertools.product("grzy", HSC_LIMITS):
+        number = np.count_nonzero(sample.mags["hsc_i"] < limit)
+        ratio = np.count_nonzero(sample.mags[f"hsc_{band}"] < limit) / number if number else np.nan
+        values[f"hsc_{band}_per_i_{limit}"] = ratio
     values["vis_24.5"] = sample.per_deg2(vis < 24.5) / ARCMIN2
     return values | {"z_vis_24.5": _median(z[vis < 24.5]), "z_i_22.5": _median(z[i_band < 22.5])}
 

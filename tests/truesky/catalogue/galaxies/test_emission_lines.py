@@ -73,6 +73,21 @@ def test_nitrogen_and_oxygen_lie_on_the_sequence_of_star_forming_galaxies(rng):
         assert o3 == pytest.approx(0.61 / (n2 + 0.08) + 1.1, abs=0.3)
 
 
+def test_nitrogen_is_stronger_at_high_redshift(rng):
+    """Galaxies of one mass and star formation rate: 0.092 dex per unit of redshift from z = 0.3 to 2."""
+    law = replace(PLAIN, ratios=replace(PLAIN.ratios, n2_scatter=0.0), metals=replace(PLAIN.metals, scatter=0.0))
+    law = replace(law, gas=replace(law.gas, scatter=0.0))
+    n, rate = 50, np.full(50, 1.0)
+    blue = np.zeros(n, bool)
+
+    def ratio(z):
+        found = emission_lines.fluxes(law, np.full(n, z), np.full(n, 10.0), rate, blue, rng)
+        return np.log10(found["flux_nii"] / found["flux_halpha"])
+
+    assert ratio(1.3) - ratio(0.2) == pytest.approx(np.full(n, 0.092), abs=1e-9)
+    assert ratio(4.0) == pytest.approx(ratio(2.0), abs=1e-9)
+
+
 def test_hydrogen_is_case_b_behind_the_dust_of_the_gas(rng):
     """All ratios to H beta give the same A(H alpha) with Calzetti's law; it is larger for massive galaxies."""
     clear = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), min_attenuation=0.0))

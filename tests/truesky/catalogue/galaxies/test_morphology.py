@@ -59,6 +59,29 @@ def test_small_early_types_are_on_a_flatter_relation(rng):
     assert np.log10(size(2e11) / size(2e10)) == pytest.approx(0.75, abs=0.01)
 
 
+def test_some_late_types_are_compact_at_high_redshift_only(rng):
+    """The share of compact galaxies, and the percentiles of a mixture of the late and the early relation."""
+    n, pivot = 40_000, np.log10(5e10)
+
+    def sizes(z, log_mass):
+        arguments = np.full(n, z), np.full(n, log_mass), np.zeros(n, bool), np.full(n, 10.0)
+        return np.log10(10.0 * morphology.half_light_radius(SHAPES.size, *arguments, rng))
+
+    def share(z, log_mass):
+        return morphology.compact_share(SHAPES.size, np.array([z]), np.array([log_mass]))[0]
+
+    assert share(1.25, 10.8) == 0.0
+    assert share(1.425, 10.8) == pytest.approx(0.20)
+    assert share(2.0, 10.8) == pytest.approx(0.40)
+    assert share(2.0, 11.5) == 0.0
+    assert np.std(sizes(1.25, pivot)) == pytest.approx(0.17, rel=0.03)
+    small = share(2.25, pivot)
+    found = sizes(2.25, pivot)
+    for size in (0.0, 0.25, 0.55):
+        wanted = small * stats.norm(-0.05, 0.14).cdf(size) + (1 - small) * stats.norm(0.55, 0.19).cdf(size)
+        assert np.mean(found < size) == pytest.approx(wanted, abs=0.01)
+
+
 @given(st.floats(5.0, 13.0), st.floats(0.0, 3.0), st.booleans(), st.floats(1e-3, 10.0))
 def test_sizes_stay_inside_their_limits(log_mass, z, red, scale):
     arguments = (np.array([value]) for value in (z, log_mass, red, scale))
@@ -101,11 +124,48 @@ def test_disc_ellipticities_are_miller_s(rng):
     assert e.max() <= 0.804
 
 
-def test_bulge_axis_ratios_are_a_truncated_normal(rng):
-    """Sample of 20,000 ratios; significance 1e-3 (Kolmogorov-Smirnov)."""
-    q = morphology.bulge_axis_ratio(SHAPES.bulge, 20_000, rng)
-    truncated = stats.truncnorm((0.3 - 0.75) / 0.15, (1.0 - 0.75) / 0.15, 0.75, 0.15)
-    assert stats.kstest(q, truncated.cdf).pvalue > 1e-3
+def projected_by_rotation(middle, minor, cosine, azimuth):
+    """Project an ellipsoid by its matrix: the shadow of x M x = 1 has the inverse of a block of the inverse of M."""
+    sine = np.sqrt(1 - cosine**2)
+    sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
+    across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    plane = np.stack([across, np.cross(sight, across)])
+    shadow = plane @ np.diag([1.0, middle**2, minor**2]) @ plane.T
+    low, high = np.sqrt(np.linalg.eigvalsh(shadow))
+    return low / high
+
+
+@given(st.floats(0.3, 1.0), st.floats(0.3, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 6.28))
+def test_ellipsoids_are_projected_as_their_matrix_is(middle, thickness, cosine, azimuth):
+    ratio = morphology.project_ellipsoid(middle, thickness * middle, cosine, azimuth)
+    # The root of a difference of nearly equal numbers: round ellipsoids lose half of the digits.
+    assert ratio == pytest.approx(projected_by_rotation(middle, thickness * middle, cosine, azimuth), abs=1e-6)
+
+
+def test_ellipsoids_along_their_axes_show_the_other_two():
+    assert morphology.project_ellipsoid(0.8, 0.5, 1.0, 0.3) == pytest.approx(0.8)
+    assert morphology.project_ellipsoid(0.8, 0.5, 0.0, 0.0) == pytest.approx(0.5 / 0.8)
+    assert morphology.project_ellipsoid(0.8, 0.5, 0.0, np.pi / 2) == pytest.approx(0.5)
+
+
+def test_bulge_axis_ratios_are_those_of_ellipsoids_in_random_directions(rng):
+    """Two samples of 20,000 ratios; significance 1e-3 (Kolmogorov-Smirnov)."""
+    n = 20_000
+    thickness = stats.truncnorm((0.3 - 0.908) / 0.138, (1.0 - 0.908) / 0.138, 0.908, 0.138).rvs(n, random_state=rng)
+    elongation = np.exp(stats.truncnorm(-np.inf, (np.log(0.7) + 2.3) / 0.8, -2.3, 0.8).rvs(n, random_state=rng))
+    middle = 1.0 - elongation
+    slow = morphology.project_ellipsoid(middle, thickness * middle, rng.random(n), 2 * np.pi * rng.random(n))
+    found = morphology.bulge_axis_ratio(SHAPES, n, rng)
+    assert stats.ks_2samp(found, slow).pvalue > 1e-3
+    assert found.min() > 0.05
+    assert found.max() <= 1.0
+
+
+def test_bulges_are_as_round_as_early_types(rng):
+    """Joachimi et al. 2013, early types of COSMOS: quartiles of (1 - q^2) / (1 + q^2)."""
+    q = morphology.bulge_axis_ratio(SHAPES, 100_000, rng)
+    ellipticity = (1 - q**2) / (1 + q**2)
+    assert np.percentile(ellipticity, (25, 50, 75)) == pytest.approx([0.088, 0.155, 0.255], rel=0.05)
 
 
 def test_position_angles_are_uniform(rng):

@@ -42,30 +42,33 @@ def test_red_galaxies_are_bright_satellites_and_late_in_time():
     def share(m_r, z=0.1, kind=0):
         return float(sequences.red_fraction(MODEL.fraction, np.array([m_r]), np.array([z]), np.array([kind]))[0])
 
-    # x = M_r + 20: 1 - (0.46 + 0.07 x), times 0.9 for centrals and the evolution at z = 0.1, M_r = -21.
-    assert share(-21.0) == pytest.approx(0.9 * (1 - (0.46 - 0.07)) * (0.913 - 0.0387 * (1 + 0.314 * 0.5)))
+    # x = M_r + 20: 1 - (0.48 + 0.07 x), times 0.9 for centrals and the evolution at z = 0.1, M_r = -21.
+    assert share(-21.0) == pytest.approx(0.9 * (1 - (0.48 - 0.07)) * (0.913 - 0.0387 * (1 + 0.314 * 0.5)))
     assert share(-22.0) > share(-20.0) > share(-18.0) > share(-16.0)
     assert share(-20.0, kind=1) / share(-20.0) == pytest.approx(1.25 / 0.9)
     assert share(-20.0, z=1.0) < share(-20.0, z=0.5) < share(-20.0)
     # Bright galaxies grew red first.
     assert share(-22.5, z=1.0) / share(-22.5) > share(-19.5, z=1.0) / share(-19.5)
-    assert share(-16.0) / share(-18.0) == pytest.approx((1 - (0.46 + 0.28)) / (1 - (0.46 + 0.14)) * 10**-0.5, rel=0.05)
+    assert share(-16.0) / share(-18.0) == pytest.approx((1 - (0.48 + 0.28)) / (1 - (0.48 + 0.14)) * 10**-0.5, rel=0.05)
 
 
 def test_colours_are_sequences(ends, rng):
-    """Means and scatters of Skibba & Sheth 2009 at M_r = -20.5, z = 0.1; the reddest template cuts the red one off."""
+    """Means and scatters at M_r = -20.5, z = 0.1; the reddest template cuts the red one off.
+
+    Those of Skibba & Sheth 2009 are 0.944 and 0.065 (red), and 0.675 and 0.11 (blue).
+    """
     found = drawn(ends, rng, -20.5, 0.1)
     assert found.red.mean() == pytest.approx(
         float(sequences.red_fraction(MODEL.fraction, np.array([-20.5]), np.array([0.1]), np.zeros(1))[0]), abs=0.01
     )
     red = found.colour[found.red]
-    cut = stats.truncnorm(-np.inf, (ends.reddest - 0.002 - 0.944) / 0.065, 0.944, 0.065)
+    cut = stats.truncnorm(-np.inf, (ends.reddest - 0.002 - 0.937) / 0.065, 0.937, 0.065)
     assert np.percentile(red, (16, 50, 84)) == pytest.approx(cut.ppf((0.16, 0.5, 0.84)), abs=0.003)
     blue = found.colour[found.sequence == BLUE]
-    assert np.mean(blue) == pytest.approx(0.62 + 0.055, abs=0.004)
-    assert np.std(blue) == pytest.approx(0.11, abs=0.003)
+    assert np.mean(blue) == pytest.approx(0.605 + 0.055, abs=0.004)
+    assert np.std(blue) == pytest.approx(0.10, abs=0.003)
     green = found.colour[found.sequence == GREEN]
-    assert np.mean(green) == pytest.approx(0.5 * (0.944 + 0.675) + 0.05, abs=0.01)
+    assert np.mean(green) == pytest.approx(0.5 * (0.937 + 0.660) - 0.01, abs=0.01)
 
 
 def test_the_deviate_ranks_the_colours_of_a_sequence(ends, rng):
@@ -121,12 +124,21 @@ def test_dust_is_in_galaxies_that_are_not_red(ends, rng):
     assert ebv[dusty].min() >= MODEL.dust.lowest
     assert ebv.max() <= MODEL.dust.highest
     assert np.all(law[dusty & ~blue] == CALZETTI)
-    assert np.all((law[dusty & blue] == PREVOT) == (colour[dusty & blue] > MODEL.dust.prevot_colour))
-    odds = np.bincount(law[dusty & blue & (colour <= 0.55)], minlength=5)[2:]
+    assert np.all((law[dusty & blue] == PREVOT) == (colour[dusty & blue] > MODEL.dust.prevot_colour[0]))
+    odds = np.bincount(law[dusty & blue & (colour <= 0.42)], minlength=5)[2:]
     assert odds / odds.sum() == pytest.approx((0.5, 0.25, 0.25), abs=0.02)
     # Gamma(1.6) of mean 0.12, of red colours, which the bluest template behind 0.5 mag leaves room for.
     assert np.mean(ebv[blue & (colour > 0.75)]) == pytest.approx(0.119, abs=0.004)
     assert np.mean(ebv[found.sequence == GREEN]) > 1.6 * np.mean(ebv[blue])
+
+
+def test_the_law_of_the_dust_depends_on_redshift(ends, rng):
+    """Galaxies of one colour have Prevot's law at low redshift and Calzetti's at high redshift."""
+    n = 1000
+    found = sequences.Colour(np.full(n, BLUE), np.full(n, 0.5), np.zeros(n))
+    for z, law in ((0.5, {PREVOT}), (3.0, {CALZETTI, CALZETTI + 1, CALZETTI + 2})):
+        curve, _ = sequences.draw_dust(MODEL, ends, np.full(n, -19.5), np.full(n, z), found, rng)
+        assert set(curve.tolist()) - {0} == law
 
 
 def test_dust_leaves_room_for_the_bluest_colours(ends, rng):
@@ -141,7 +153,7 @@ def test_dust_leaves_room_for_the_bluest_colours(ends, rng):
 
 def test_galaxies_of_other_catalogues_have_places_on_the_sequences():
     found = sequences.place_on_sequence(
-        MODEL, np.full(3, -20.0), np.full(3, 0.1), np.array([0.62, 0.74, 5.0]), np.zeros(3, bool)
+        MODEL, np.full(3, -20.0), np.full(3, 0.1), np.array([0.605, 0.715, 5.0]), np.zeros(3, bool)
     )
     assert found.deviate == pytest.approx([0.0, 1.0, 3.0])
 

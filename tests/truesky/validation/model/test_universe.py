@@ -4,6 +4,7 @@ A few cells contain few structures, so tolerances are the values of the list plu
 """
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -51,6 +52,33 @@ def test_colours(seen):
 
 def test_sizes(seen):
     assert failed(census.sizes(seen)) == []
+
+
+def test_sizes_by_mass(seen):
+    figures = census.sizes_by_mass(seen)
+    assert len(figures) == 10
+    assert failed(figures) == []
+
+
+def test_galaxies_without_compact_ones_are_too_large(seen):
+    """Remove the smaller half at z > 1.5: no galaxy of 10^10.75 Msun is as small as an early type."""
+    rows = dict(seen.rows)
+    small = (rows["bulge_half_light_radius"] < 0.2) & (rows["z_true"] > 1.5)
+    rows = {name: values[~small] for name, values in rows.items()}
+    off = {name for name, _ in failed(census.sizes_by_mass(replace(seen, rows=rows)))}
+    assert {"log_size_p16_z1.75", "log_size_p16_z2.25", "log_size_p16_z2.75"} <= off
+
+
+def test_ellipticities(seen):
+    figures = census.ellipticities(seen)
+    assert len(figures) == 3
+    assert failed(figures) == []
+
+
+def test_flat_bulges_are_noticed(seen):
+    """A normal distribution of mean 0.75 and scatter 0.15, as flat as discs are thick."""
+    ratio = np.clip(np.random.default_rng(1).normal(0.75, 0.15, seen.block.size), 0.3, 1.0)
+    assert len(failed(census.ellipticities(replace(seen, rows={**seen.rows, "bulge_axis_ratio": ratio})))) == 3
 
 
 def test_halpha(seen):
