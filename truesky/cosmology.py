@@ -51,7 +51,7 @@ LIMITS = {
 MAX_EARLY_W = -0.1
 # Sources of the linear power spectrum, and the one that is used by default. A change of the default changes all skies.
 POWERS = ("eisenstein98", "camb")
-DEFAULT_POWER = "eisenstein98"
+DEFAULT_POWER = "camb"
 
 # Nodes and weights of the quadrature. With 24 nodes the relative error of a distance up to z = 20 is 1e-12 for a
 # cosmological constant, and 1e-10 for other dark energy.

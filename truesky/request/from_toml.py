@@ -15,7 +15,7 @@ All keys::
                    rotation       deg, added to the position angle of every galaxy before lensing
     [universe.cosmology]  omega_m, omega_b, h, sigma_8, n_s, w0, wa   flat universe, by default that of Flagship
                    m_nu           sum of the masses of neutrinos, eV: only 0
-                   power = "eisenstein98" | "camb"   source of the linear power spectrum
+                   power = "camb" | "eisenstein98"   source of the linear power spectrum
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
                    bright_limit   H (Vega, as observed); brighter stars are omitted
     [ingest.galaxies]  files = [..]  finished catalogue that replaces ours: Parquet, FITS, CSV, HDF5, a HATS folder

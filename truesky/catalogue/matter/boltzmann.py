@@ -1,7 +1,8 @@
 """Linear power spectrum of matter from CAMB, which solves the Boltzmann equations: a shipped table, or computed now.
 
 The table linear_power.toml contains the spectrum of the fiducial cosmology, and is written by
-scripts/linear_power_table.py. For other cosmologies, the optional package CAMB must be installed.
+scripts/linear_power_table.py. It is scaled for other values of sigma_8. For other cosmologies, the optional package
+CAMB must be installed.
 
 References
 ----------
@@ -10,7 +11,7 @@ Lewis, Challinor & Lasenby 2000, ApJ 538, 473 (CAMB)
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,8 @@ def wave_numbers() -> Float:
 def power(cosmology: Cosmology, k: Float) -> Float:
     """Interpolate the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc from 1e-4 to 100; 0 elsewhere.
 
-    Raises BadInput for a cosmology other than the fiducial one if the package CAMB is not installed.
+    Raises BadInput for a cosmology that differs from the fiducial one in more than sigma_8 if the package CAMB is not
+    installed.
     """
     ln_k = np.log(wave_numbers())
     spline = scipy.interpolate.CubicSpline(ln_k, np.log(_table(cosmology)))
@@ -92,14 +94,15 @@ def _sigma_8(spectrum: Float) -> float:
 
 def _table(cosmology: Cosmology) -> Float:
     if _is_shipped(cosmology):
-        return np.array(parameters.section(_FILE, "camb")["power"])
+        scale = (cosmology.sigma_8 / FIDUCIAL.sigma_8) ** 2
+        return np.array(parameters.section(_FILE, "camb")["power"]) * scale
     key = content_key(code_key(__name__), cosmology.fingerprint())
     return cached_arrays("linear_power", key, lambda: compute(cosmology))["power"]
 
 
 def _is_shipped(cosmology: Cosmology) -> bool:
-    """Return True if the shipped table is for this cosmology, the fiducial one."""
-    return astuple(cosmology)[:-1] == astuple(FIDUCIAL)[:-1]
+    """Return True if the shipped table is for this cosmology: it differs from the fiducial one in sigma_8 at most."""
+    return replace(cosmology, sigma_8=FIDUCIAL.sigma_8, power=FIDUCIAL.power) == FIDUCIAL
 
 
 def _import_camb() -> Any:

@@ -18,7 +18,7 @@ from lake_schema.ids import GENERATION_ORDER
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
 from truesky.catalogue.galaxies.galaxies import GalaxyModel
 from truesky.catalogue.halos import luminosity_function, matching, population
-from truesky.cosmology import FIDUCIAL
+from truesky.cosmology import FIDUCIAL, Cosmology
 from truesky.fluxes.libraries import templates
 from truesky.validation.model import observed
 
@@ -280,12 +280,13 @@ def sizes(census: Census) -> dict[str, float]:
     return figures
 
 
-def sizes_by_mass(census: Census) -> dict[str, float]:
+def sizes_by_mass(census: Census, cosmology: Cosmology) -> dict[str, float]:
     """Measure the 16th and 50th percentiles of log10 of half-light radii (kpc) of galaxies with 10^10.75 Msun.
 
     Redshifts with fewer than SIZE_NUMBER galaxies are left out. The sample should be complete to I_E = 26.
     """
-    z, mass, figures = census.rows["z_true"].astype(float), census.rows["log_stellar_mass"], {}
+    z, mass = census.rows["z_true"].astype(float), census.rows["log_stellar_mass"]
+    figures: dict[str, float] = {}
     for at in SIZE_SHELLS:
         row = np.flatnonzero((np.abs(z - at) < SIZE_HALF) & (np.abs(mass - 10.75) < SIZE_HALF))
         if row.size >= SIZE_NUMBER:

@@ -193,7 +193,7 @@ def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
     sample = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
     figures = {"galaxies": float(sample.block.size), "galaxies_deg2": sample.area}
     figures |= census.counts(sample) | census.colours(sample) | census.sizes(sample) | census.halpha(sample)
-    figures |= census.sizes_by_mass(sample) | census.ellipticities(sample)
+    figures |= census.sizes_by_mass(sample, size.settings.cosmology) | census.ellipticities(sample)
     figures |= observed.figures(observed.from_columns(sample.rows, sample.area, size.settings.cosmology))
     figures |= census.halos(sample, mass_function(size.settings.cosmology)) | census.luminosities(sample, law, 0.0, 1.5)
     if size.deep_blocks:

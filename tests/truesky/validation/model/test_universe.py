@@ -55,7 +55,7 @@ def test_sizes(seen):
 
 
 def test_sizes_by_mass(seen):
-    figures = census.sizes_by_mass(seen)
+    figures = census.sizes_by_mass(seen, FIDUCIAL)
     assert len(figures) == 10
     assert failed(figures) == []
 
@@ -65,7 +65,7 @@ def test_galaxies_without_compact_ones_are_too_large(seen):
     rows = dict(seen.rows)
     small = (rows["bulge_half_light_radius"] < 0.2) & (rows["z_true"] > 1.5)
     rows = {name: values[~small] for name, values in rows.items()}
-    off = {name for name, _ in failed(census.sizes_by_mass(replace(seen, rows=rows)))}
+    off = {name for name, _ in failed(census.sizes_by_mass(replace(seen, rows=rows), FIDUCIAL))}
     assert {"log_size_p16_z1.75", "log_size_p16_z2.25", "log_size_p16_z2.75"} <= off
 
 
