@@ -153,6 +153,8 @@ def measure_rendering(root: Path, lake_request: Request, name: str) -> dict[str,
             for part, (result, seconds, peak) in zip(
                 parts, pool.map(partial(_measure_task, function), parts), strict=True
             ):
+                if "error" in result:
+                    raise SystemExit(f"benchmarks.planner: {name}, {result['part']}: {result['error']}")
                 task = tasks[part.facts["exposure_id"], part.facts["detector"]]
                 key = f"{name}_{task['channel']}_{image_types[part.facts['exposure_id']]}".lower().replace(
                     "_science", ""

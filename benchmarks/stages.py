@@ -256,6 +256,9 @@ def draw_picture(figures: Mapping[str, Any], file: Path) -> None:
             if f"{scene}_{peer}_s" in peers:
                 bottom.axhline(peers[f"{scene}_{peer}_s"], color=f"C{number + 3}", ls=":", label=f"drawing by {label}")
         bottom.set(xlabel="fraction of light in another pixel", ylabel="CPU s of a detector")
+        bottom.set(xlim=(1e-4, 1e-1), ylim=(1.0, 120.0))
+        bottom.set_yticks((ticks := [1, 2, 5, 10, 20, 50, 100]), [str(tick) for tick in ticks])
+        bottom.minorticks_off()
         bottom.grid(alpha=0.3)
         bottom.legend(fontsize=8)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(STAGES))

@@ -7,6 +7,7 @@ the settings of accuracy, and the Python interface.
 from __future__ import annotations
 
 import inspect
+import json
 import pkgutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import effects as scene_of_effects
+from benchmarks import stages
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from scripts import request_keys
@@ -333,9 +335,9 @@ def _draw_figure(path: Path, input_frame: Frame, output_frame: Frame, name: str)
 
 
 def accuracy_page(into: Path) -> str:
-    """Return the Markdown page about the errors and the CPU time of drawing sources for each setting of accuracy.
+    """Return the Markdown page about errors and CPU time, of drawing sources and of each stage of a rendered detector.
 
-    The figure is written to accuracy.png in the existing folder `into`.
+    The figures are written to accuracy.png and stages.png in the existing folder `into`.
     """
     rows = sorted(accuracy.rows(), key=lambda row: row["seconds"])
     titles = {
@@ -371,9 +373,39 @@ def accuracy_page(into: Path) -> str:
         lines.append(f"| {preset} | {allowed} | {reached} | {row['seconds']:.2f} |")
     lines += [
         "",
+        *_stages_section(into),
+        "",
         "[Speed for accuracy](tutorials/02_speed_for_accuracy.md) shows the same for fluxes and for each effect.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _stages_section(into: Path) -> list[str]:
+    """Return the lines of Markdown about the stages of a rendered detector; the figure is stages.png in `into`."""
+    figures = json.loads(stages.RESULTS.read_text(encoding="utf-8"))
+    stages.draw_picture(figures, into / "stages.png")
+    lines = [
+        "## Whole detectors, stage by stage",
+        "",
+        "The accuracy also selects the effects of the detector: those that change an image noticeably. The table has",
+        f"CPU seconds on {figures['machine']}. The sky error is the largest difference of a pixel of the sky from",
+        "reference accuracy, in units of its noise. Scenes contain stars brighter than the 14.5 mag of the sources",
+        "above. Misplaced light is in another pixel than at reference accuracy.",
+        "",
+        "![CPU seconds of each stage, and error, by accuracy](stages.png)",
+        "",
+        "| camera | accuracy | "
+        + " | ".join(stages.STAGES)
+        + " | all | sky error, σ | misplaced light | effects left out |",
+        "|---" * (len(stages.STAGES) + 6) + "|",
+    ]
+    for scene in stages.SCENES:
+        for preset in accuracy.PRESETS:
+            values = {key: figures[f"{scene}_{preset}_{key}"] for key in ("s", "sky_sigma", "misplaced", "left_out")}
+            parts = " | ".join(f"{figures[f'{scene}_{preset}_{stage}_s']:.2f}" for stage in stages.STAGES)
+            errors = f"{values['sky_sigma']:.2g} | {values['misplaced']:.1e} | {values['left_out']}"
+            lines.append(f"| {scene} | {preset} | {parts} | {values['s']:.2f} | {errors} |")
+    return lines
 
 
 def api_page() -> str:

@@ -9,7 +9,7 @@ from tests.truesky import nightly
 from tests.truesky.render.dispersing.made import DETECTOR, FIRST, LAST, MISSION, order, psf
 from truesky.render.camera import traces
 from truesky.render.dispersing import draw, kernels
-from truesky.request.accuracy import DRAFT, REFERENCE, SURVEY
+from truesky.request.accuracy import DRAFT, QUICKLOOK, REFERENCE, SURVEY
 
 # The limit of `survey` was lowered until this sample passed; sources of a simulated sky had half of its largest error.
 COUNT, SHAPE, NOISE, SEED = LAST - FIRST + 1, (80, 720), 28.0, 77_031
@@ -57,7 +57,9 @@ def at_the_limit(sources, orders, spectra, settings):
     return replace(sources, electrons=electrons)
 
 
-@nightly.parametrize(("accuracy", "tilt"), [(SURVEY, 0.0), (SURVEY, -4.0), (DRAFT, 4.0), (REFERENCE, 4.0)], (0, 2))
+@nightly.parametrize(
+    ("accuracy", "tilt"), [(SURVEY, 0.0), (SURVEY, -4.0), (DRAFT, 4.0), (REFERENCE, 4.0), (QUICKLOOK, 4.0)], (0, 4)
+)
 def test_errors_are_below_those_that_are_allowed(accuracy, tilt):
     """The largest error of a pixel is below `allowed`, even for lines in the brightest spectra of this kind."""
     settings = draw.settings_for(accuracy)
