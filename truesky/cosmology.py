@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -260,14 +260,16 @@ class Cosmology:
 # Parameters of the Flagship simulation (Potter, Stadel & Teyssier 2017; Serrano et al. 2024, section 4.1), which has no
 # radiation and no massive neutrinos.
 FIDUCIAL = Cosmology(omega_m=0.319, omega_b=0.049, h=0.67, sigma_8=0.83, n_s=0.96)
+# Cosmology of lakes that do not name one.
+UNNAMED = replace(FIDUCIAL, power="eisenstein98")
 
 
 def from_facts(facts: Mapping[str, Any]) -> Cosmology:
     """Return the cosmology of a version of a table in a lake, from the facts in its manifest.
 
-    Lakes that do not name a cosmology have the fiducial one: it was the only one when they were written.
+    Lakes that do not name a cosmology have UNNAMED, the only one when they were written.
     """
-    return Cosmology(**facts["cosmology"]) if "cosmology" in facts else FIDUCIAL
+    return Cosmology(**facts["cosmology"]) if "cosmology" in facts else UNNAMED
 
 
 @lru_cache(maxsize=8)

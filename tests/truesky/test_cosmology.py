@@ -170,7 +170,8 @@ def test_other_programs_have_the_same_values(quantity):
     rows = [row for row in REFERENCES if row["quantity"] == quantity]
     assert len({tuple(row[name] for name in LIMITS) for row in rows}) == 5
     for row in rows:
-        cosmology, at = Cosmology(**{name: float(row[name]) for name in LIMITS}), float(row["at"])
+        values, at = {name: float(row[name]) for name in LIMITS}, float(row["at"])
+        cosmology = Cosmology(**values, power="eisenstein98")
         value = {
             "chi": cosmology.comoving_distance,
             "chi_with_radiation": cosmology.comoving_distance,
@@ -192,8 +193,8 @@ def test_the_fingerprint_depends_on_every_bit(name):
 
 
 def test_fingerprints_are_the_same_everywhere():
-    assert FIDUCIAL.fingerprint() == replace(FIDUCIAL, h=0.67).fingerprint() == "4a471b5f35627fcb"
-    assert replace(FIDUCIAL, power="camb").fingerprint() != FIDUCIAL.fingerprint()
+    assert FIDUCIAL.fingerprint() == replace(FIDUCIAL, h=0.67).fingerprint() == "fcc45824086d29a1"
+    assert replace(FIDUCIAL, power="eisenstein98").fingerprint() != FIDUCIAL.fingerprint()
 
 
 @pytest.mark.parametrize(
@@ -216,4 +217,4 @@ def test_impossible_parameters_are_refused(values, message):
 
 def test_facts_of_a_lake_name_its_cosmology():
     assert from_facts({"cosmology": asdict(OTHERS[1]), "seed": 1}) == OTHERS[1]
-    assert from_facts({"seed": 1}) == FIDUCIAL
+    assert from_facts({"seed": 1}) == replace(FIDUCIAL, power="eisenstein98")

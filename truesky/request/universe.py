@@ -18,7 +18,7 @@ from lake_schema.external import rows as external_rows
 from lake_schema.store import read, request_links
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, file_sha256
-from truesky.cosmology import FIDUCIAL
+from truesky.cosmology import UNNAMED
 from truesky.request.files import Catalogue
 from truesky.request.schema import Request
 
@@ -75,9 +75,9 @@ def _difference(version: read.Version, request: Request) -> str:
     if canonical(facts.get("sources")) != canonical(source_facts):
         return "other sources than the request"
     # Compare only values that the manifest (JSON description) of the catalogue contains. For a user's catalogue, for
-    # example, the manifest has no limiting magnitude. Galaxies without a cosmology have the fiducial one, which was the
-    # only one when they were made.
-    facts = {"cosmology": asdict(FIDUCIAL), **facts} if version.table == "galaxies" else facts
+    # example, the manifest has no limiting magnitude. Galaxies without a cosmology have the only one when they were
+    # made.
+    facts = {"cosmology": asdict(UNNAMED), **facts} if version.table == "galaxies" else facts
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if key == "cosmology" and (different := _different_parameter(facts[key], values[key])):
             return different

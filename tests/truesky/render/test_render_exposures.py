@@ -476,7 +476,7 @@ def test_another_mission_changes_all_keys(rendered):
         assert ("noise_free" in path) or data != before[path]
 
 
-def two_lenses(cell, galaxies, seed, boost):
+def two_lenses(cell, galaxies, seed, boost, cosmology):
     """Replace ray shooting: use the two galaxies of a cell that are closest to the pointing."""
     away = sky.separation(*(galaxies[name].to_numpy() for name in ("ra", "dec")), 53.117, -27.808)
     rows = galaxies.take(np.argsort(away)[:2])

@@ -192,7 +192,22 @@ def half_light_radius(
 
 
 def compact_share(size: Size, z: Float, log_stellar_mass: Float) -> Float:
-    """Return the share of late types that are as small as early types, 0 to 1, by redshift and log10 of mass (Msun)."""
+    """Return the share of late types that are as small as early types.
+
+    Parameters
+    ----------
+    size : Size
+        Parameters of sizes.
+    z : float array, shape (n,)
+        Redshifts.
+    log_stellar_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Shares, 0 to 1.
+    """
     start, end = size.compact_z
     ramp = np.clip((z - start) / (end - start), 0.0, 1.0)
     return np.asarray(np.interp(log_stellar_mass, size.compact_mass, size.compact_share) * ramp)

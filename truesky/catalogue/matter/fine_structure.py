@@ -37,6 +37,7 @@ from truesky.catalogue import parameters
 from truesky.catalogue.matter import compiled_fine_structure as compiled
 from truesky.catalogue.matter import lightcone
 from truesky.catalogue.matter.lightcone import Steps, Voxels
+from truesky.numerics import matrices
 from truesky.randomness import per_source
 
 # Number of nodes per axis of the quadrature over positions in a lattice cell; the norms have a relative error of 1e-8.
@@ -130,7 +131,7 @@ def mean_exponential(scatter: Float, amplitude: Float) -> Float:
     a lattice cell the mean is a product over the eight lattice points around it. It is integrated over the cell by
     Gauss-Legendre quadrature.
     """
-    node, node_weight = np.polynomial.legendre.leggauss(_NODES)
+    node, node_weight = matrices.gauss_legendre(_NODES)
     # By symmetry one half of each axis is sufficient: positions 0 to 0.5 of the lattice step.
     low = 0.25 * (node + 1.0)
     share = np.stack([1.0 - low, low]) / np.sqrt(1.0 - 2.0 * low * (1.0 - low))

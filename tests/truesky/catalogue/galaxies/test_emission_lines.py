@@ -81,7 +81,7 @@ def test_nitrogen_is_stronger_at_high_redshift(rng):
     blue = np.zeros(n, bool)
 
     def ratio(z):
-        found = emission_lines.fluxes(law, np.full(n, z), np.full(n, 10.0), rate, blue, rng)
+        found = emission_lines.fluxes(law, FIDUCIAL, np.full(n, z), np.full(n, 10.0), rate, blue, rng)
         return np.log10(found["flux_nii"] / found["flux_halpha"])
 
     assert ratio(1.3) - ratio(0.2) == pytest.approx(np.full(n, 0.092), abs=1e-9)

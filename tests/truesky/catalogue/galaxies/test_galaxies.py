@@ -18,7 +18,7 @@ from tests.truesky.catalogue.conftest import SEED, SMALL
 from truesky.catalogue import build_galaxies, dust_map
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, observed_cells
 from truesky.catalogue.halos import luminosity_function, population
-from truesky.catalogue.matter import lightcone
+from truesky.catalogue.matter import fine_structure, lightcone
 from truesky.cosmology import FIDUCIAL
 from truesky.request.schema import Universe
 
@@ -86,7 +86,8 @@ def richness(universe, places, near, far, log_mass):
         amplitude, field = model.amplitude[found.step, column], model.field[found.step, column]
         g = np.stack([smooth.ravel()[found.box] for smooth in model.box.smoothed], 1)[np.arange(field.size), field]
         volume = model.steps.volume[found.step] / 4.0**found.order
-        density = np.exp(amplitude * g - 0.5 * amplitude**2 * model.box.variance[field])
+        weight = fine_structure.divide(model.fine, model.steps, found).weight[np.arange(field.size), field]
+        density = weight * np.exp(amplitude * g - 0.5 * amplitude**2 * model.box.variance[field])
         total.append([np.sum(volume * density), np.sum(volume)])
     return float(np.divide(*np.sum(total, 0)))
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from truesky.catalogue.matter import fine_structure, lightcone
+from truesky.cosmology import FIDUCIAL
 from truesky.randomness import rng as random_bits
 
 SEED = 7
@@ -144,7 +145,7 @@ def test_the_norm_is_the_mean_of_the_exponential(rng):
 @pytest.fixture(scope="module")
 def divided(box):
     """Voxels of an order-8 cell and their subvoxels."""
-    table = lightcone.distance_table(3.0)
+    table = lightcone.distance_table(FIDUCIAL, 3.0)
     steps = lightcone.radial_steps(box.model.cell, 6.0, float(table.chi[-1]), table)
     used = np.arange(steps.z.size) % 7 == 0
     voxels = lightcone.voxels(box, lightcone.draw_replicas(box, float(table.chi[-1])), steps, 8, 5000, used)
@@ -171,7 +172,7 @@ def test_weights_are_means_over_the_subvoxels(divided):
 
 
 def test_the_mean_weight_is_1(divided):
-    """Significance 6e-7 (5 standard errors), from the scatter between the means of steps, which are 28 Mpc/h apart."""
+    """Sample of steps that are 28 Mpc/h apart, whose means scatter; significance 6e-7 (5 standard errors)."""
     _, _, voxels, subvoxels = divided
     number = np.bincount(voxels.step)
     for weight in subvoxels.weight.T:

@@ -8,6 +8,7 @@ from scipy.integrate import quad
 
 from tests.truesky.catalogue.conftest import BOX_CELLS, SEED
 from truesky.catalogue.halos import matching
+from truesky.request.schema import Universe
 from truesky.validation import checks
 from truesky.validation.model import small_scales
 
@@ -35,7 +36,7 @@ def test_the_power_law_is_the_integral_along_the_line_of_sight():
 
 @pytest.fixture(scope="module")
 def found():
-    return small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)
+    return small_scales.figures(small_scales.galaxy_population(SEED, Universe(box_cells=BOX_CELLS)), CELLS)
 
 
 def test_galaxies_cluster_as_observed(found):
@@ -48,7 +49,7 @@ def test_galaxies_cluster_as_observed(found):
 @pytest.mark.nightly
 def test_galaxies_cluster_less_with_satellites_of_today(found, monkeypatch):
     monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))
-    fewer = small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)
+    fewer = small_scales.figures(small_scales.galaxy_population(SEED, Universe(box_cells=BOX_CELLS)), CELLS)
     assert fewer["w_m20_0.04"] < 0.85 * found["w_m20_0.04"]
 
 
