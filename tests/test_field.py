@@ -145,10 +145,10 @@ def field(demo):
 
 # Of the small field.
 SMALL_DIGESTS = {
-    "halos": "8c01d32e33e2fede4a8c2dbcd9fab24126a103b5e061ea755c51536227b0adf0",
-    "galaxies": "38b219888197fce4691db92245187ea1c348123abbd5b39b876221b81981771d",
+    "halos": "b5c47ba858fff8a53213a5c9e389efddd5867433a6e2bfd90a3af5cd693b7444",
+    "galaxies": "af0789be5b915129d7023e79a5081afe8851e9e5f6c159b8da0f894c98f80039",
     "stars": "9a32733575d38388edc939bcd158f2ad9d04cca842e6db791e8f7d71abc3090f",
-    "galaxy_fluxes": "277f7ad8b0a9d687769d9e8fa7f0c12e8824a2014115cd034fea67a784304161",
+    "galaxy_fluxes": "edf2444a4fe0d2dde7537e5ed771692efb27d099aecb8f57116ecd2a5c322c53",
     "star_fluxes": "f9df21235aab21a247f81524452b6c3acd781b152897398c46f32ef0b5f7cd09",
 }
 
