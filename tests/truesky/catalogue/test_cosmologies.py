@@ -34,7 +34,6 @@ WITH_DEFAULT = {
     "truesky/cosmology.py",
     "truesky/request/checks.py",
     "truesky/request/schema.py",
-    "truesky/request/universe.py",
     # Rows of tables in memory, in which no distance follows from a redshift.
     "truesky/catalogue/added_sources.py",
     "truesky/catalogue/external/mapping.py",

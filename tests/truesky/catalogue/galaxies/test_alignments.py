@@ -31,7 +31,7 @@ def ellipticity(rows):
     return size * np.exp(2j * np.radians(90.0 - angle))
 
 
-@given(size=st.floats(0.0, 0.09), angle=st.floats(-3.1, 3.1))
+@given(size=st.floats(0.0, 0.08), angle=st.floats(-3.1, 3.1))
 def test_the_drawn_mean_equals_the_requested_mean(own, size, angle):
     """A uniform sequence of numbers has no noise, so the law is tested directly."""
     n = 2000

@@ -170,7 +170,7 @@ def test_no_halo_is_missed_that_reaches_a_cell(universe, near, monkeypatch):
 
 def test_the_smooth_part_of_halos_is_that_of_a_direct_sum(universe, cells, near, behind, monkeypatch):
     chosen = lens_halos.settings()
-    monkeypatch.setattr(lens_halos, "settings", lambda: replace(chosen, close=180.0))
+    monkeypatch.setattr(lens_halos, "settings", lambda: replace(chosen, close=1000.0))
     direct = halo_lensing.lens_of_cell(universe.lens, CellCache(universe.population), CELL)
     once = [replace(one, settings=replace(one.settings, repeat_threshold=np.inf)) for one in (near, direct)]
     split, whole = (halo_lensing.lensing_at_images(one, *behind) for one in once)
