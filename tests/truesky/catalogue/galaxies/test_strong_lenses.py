@@ -201,7 +201,11 @@ def test_a_published_table(tmp_path, drawn):
     own = drawn.rows.filter(pa.array(index >> 2 * (sky.MAX_ORDER - 8) == cell))
     name = f"Norder=5/Dir=0/Npix={cell >> 6}.parquet"
     part = plan.Task(name, {"generation_cells": [cell]})
-    publish.make_version(tmp_path, plan.Plan(GALAXIES, {"seed": 7, "cosmology": asdict(FIDUCIAL)}, (part,)), lambda lake, facts: plan.Output(own))
+    publish.make_version(
+        tmp_path,
+        plan.Plan(GALAXIES, {"seed": 7, "cosmology": asdict(FIDUCIAL)}, (part,)),
+        lambda lake, facts: plan.Output(own),
+    )
     path = requests.written(tmp_path, "[strong_lenses]\nboost = 3.0\n", seed=7)
     (step,) = build_strong_lenses.steps(tmp_path, parse(path))
     publish.make_version(tmp_path, step.plan, step.run_task)

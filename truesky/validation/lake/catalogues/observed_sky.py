@@ -99,8 +99,8 @@ def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
 def compare(sample: GalaxySample, cell: Int) -> list[Row]:
     """Check a sample of galaxies against observed.csv, and return one row with a verdict for each quantity.
 
-    `cell` is the number of the HEALPix cell (order 8) of each galaxy, for jackknife errors. Quantities for which the
-    catalogue is not deep enough, and those in which the model is known to differ, get the verdict "not_applicable".
+    `cell` is the number of the HEALPix cell (order 8) of each galaxy, for jackknife errors. The verdict is
+    "not_applicable" if the catalogue is not deep enough for a quantity, or if the model is known to differ in it.
     """
     figures = observed.figures(sample)
     errors = _errors(sample, cell)
