@@ -76,8 +76,11 @@ def _difference(version: read.Version, request: Request) -> str:
         return "other sources than the request"
     # Compare only values that the manifest (JSON description) of the catalogue contains. For a user's catalogue, for
     # example, the manifest has no limiting magnitude. Galaxies without a cosmology have the only one when they were
-    # made.
-    facts = {"cosmology": asdict(UNNAMED), **facts} if version.table == "galaxies" else facts
+    # made, and drawn ones had no structure below the cells of the box then.
+    if version.table == "galaxies":
+        facts = {"cosmology": asdict(UNNAMED), **facts}
+    if "box_cells" in facts:
+        facts = {"structure_below_cells": False, **facts}
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if key == "cosmology" and (different := _different_parameter(facts[key], values[key])):
             return different

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -80,6 +81,16 @@ def test_message_names_the_difference_between_universes(lake, table, other, word
     universe.check_catalogues([version], wanted())
     with pytest.raises(BadInput, match=words):
         universe.check_catalogues([version], other)
+
+
+def test_galaxies_of_earlier_versions_are_another_universe():
+    """They name neither the cosmology nor the structure below the cells of the box, which they did not have."""
+    old = SimpleNamespace(table="galaxies", manifest={"facts": {"seed": 11, "box_cells": wanted().universe.box_cells}})
+    with pytest.raises(BadInput, match="table galaxies has structure_below_cells False, the request True"):
+        universe.check_catalogues([old], wanted())
+    with pytest.raises(BadInput, match="has the cosmology power = eisenstein98, the request power = camb"):
+        universe.check_catalogues([old], wanted(structure_below_cells=False))
+    universe.check_catalogues([old], wanted(cosmology={"power": "eisenstein98"}, structure_below_cells=False))
 
 
 def test_differences_of_the_other_catalogue_are_ignored(lake):

@@ -91,12 +91,18 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     Raises
     ------
     BadInput
-        If the lake has no table `galaxies`, or if the tables of fluxes are missing, have no LSST band or belong to
-        other rows.
+        If the lake has no table `galaxies`, if the tables of fluxes are missing, have no LSST band or belong to other
+        rows, or if the dark energy of the lake is not a cosmological constant.
     """
     catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
     if "galaxy" not in catalogues:
         raise BadInput(f"lake {lake} has no table galaxies")
+    cosmology = from_facts(catalogues["galaxy"].rows.manifest["facts"])
+    if not cosmology.has_constant_dark_energy:
+        # skyCatalogs computes distances with w = -1, so that fluxes would be wrong.
+        raise BadInput(
+            f"lake {lake}: w0 = {cosmology.w0:g}, wa = {cosmology.wa:g}; skyCatalogs knows w0 = -1, wa = 0 only"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     written, object_types, templates = [], {}, set[int]()
     for kind, catalogue in catalogues.items():

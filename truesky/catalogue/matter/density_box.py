@@ -16,7 +16,7 @@ exclusion. The structure of the halo density below the cell size of 4 Mpc/h is i
 
 References
 ----------
-Coles & Jones 1991, MNRAS 248, 1; Eisenstein & Hu 1998, ApJ 496, 605
+Coles & Jones 1991, MNRAS 248, 1
 """
 
 from __future__ import annotations
@@ -283,7 +283,8 @@ def _bias_table(model: BoxModel) -> dict[str, Float]:
     """Return the arrays "amplitude" and "bias", shape (smoothed fields, m) each.
 
     Halos with a density ~ exp(A g_R), with the amplitude A and the smoothed Gaussian field g_R, have the bias in "bias"
-    relative to matter at z = 0. It includes that a halo has a random position within its voxel (small piece of volume).
+    relative to matter at z = 0. It includes that a halo has a random position within its voxel (small piece of volume),
+    which holds on average over the structure below the cells of the box.
     """
     n, cell = _GAIN_CELLS, model.cell
     power, k_squared = _power_on_modes(model, n), _k_squared(n, cell)

@@ -6,8 +6,9 @@ position x relative to the observer::
     n(x) = n_voxel exp(B G(x)) / <exp(B G)>
 
 G is Gaussian to a good approximation, with mean 0 and variance 1: a sum of octaves of lattice noise. It has no
-correlation at separations above two lattice steps, so the clustering on larger scales does not change. B depends on the
-bias of the halos. The parameters are in fine_structure.toml.
+correlation between positions that differ by more than two lattice steps along any axis of the lattice, so the
+clustering on larger scales does not change. The amplitude B depends on the bias of the halos; fine_structure.toml lists
+the amplitudes.
 
 Each voxel (small piece of volume) is divided into subvoxels. The mean of exp(B G) at their centres multiplies the
 number of halos of the voxel. A halo is in one of the subvoxels, chosen by weight, and there at one of several candidate
@@ -16,7 +17,7 @@ positions, also chosen by weight. All choices are made with hashes of the random
 Notes
 -----
 Two populations of halos with amplitudes B_1 and B_2 have 1 + xi = (1 + xi_voxels) exp(B_1 B_2 C(r)), where C(r) is the
-correlation function of G.
+correlation function of G, averaged over directions.
 
 References
 ----------

@@ -180,7 +180,13 @@ def population_above(seed: int, settings: Universe, z_min: float, z_max: float, 
     matched = matching.match_luminosities(table, inverse)
     volume = Volume(z_min, z_max, 0.0)
     box = seed, settings.cosmology, settings.box_cells
-    return population.model(*box, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass)))
+    return population.model(
+        *box,
+        volume,
+        inverse,
+        lambda z: matched.magnitude(z, np.full(np.size(z), log_mass)),
+        structure_below_cells=settings.structure_below_cells,
+    )
 
 
 def draw_tracers(universe: Population, order: int, block: int) -> Tracers:

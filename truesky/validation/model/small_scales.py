@@ -52,12 +52,18 @@ _BINS = 40
 def galaxy_population(seed: int, settings: Universe) -> Population:
     """Return a model of the halos that host galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6.
 
-    `seed`, and the cosmology and the cells per side in `settings`, define the periodic box of matter of the universe.
+    `seed` and `settings` define the periodic box of matter of the universe, and the structure below its cells.
     """
     matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     space = Volume(Z_MIN - 0.05, Z_MAX + 0.05, MAX_ABS_MAG)
     box = seed, settings.cosmology, settings.box_cells
-    return population.model(*box, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
+    return population.model(
+        *box,
+        space,
+        matched,
+        lambda z: np.full(np.size(z), MAX_ABS_MAG),
+        structure_below_cells=settings.structure_below_cells,
+    )
 
 
 def figures(universe: Population, count: int) -> dict[str, float]:
