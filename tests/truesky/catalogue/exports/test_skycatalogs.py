@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import venv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ import pytest
 import yaml
 
 from lake_schema import sky
+from lake_schema.errors import BadInput
 from lake_schema.store import read
 from tests.truesky.catalogue.exports.conftest import BANDS, CELL, DRAWN, STRAYS, bands
 from truesky.catalogue import export_galaxies
-from truesky.catalogue.exports import stellar_spectra, tophat
+from truesky.catalogue.exports import skycatalogs, stellar_spectra, tophat
 from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
@@ -55,6 +57,14 @@ def seen(band, edges, f_lambda, a_v):
 
 
 # ------------------------------------------------------------------------------------------------ without the package
+
+
+def test_other_dark_energy_is_refused(lake, tmp_path, monkeypatch):
+    """The package computes distances with a cosmological constant."""
+    monkeypatch.setattr(skycatalogs, "from_facts", lambda facts: replace(FIDUCIAL, w0=-0.9))
+    with pytest.raises(BadInput, match=r"w0 = -0\.9, wa = 0; skyCatalogs knows w0 = -1, wa = 0 only"):
+        export_galaxies.export(lake, tmp_path / "set", "skycatalogs")
+    assert not list(tmp_path.rglob("*.parquet"))
 
 
 def test_the_yaml_file_lists_all_files_without_local_paths(written):
