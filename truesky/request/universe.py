@@ -82,8 +82,10 @@ def _difference(version: read.Version, request: Request) -> str:
     if "box_cells" in facts:
         facts = {"structure_below_cells": False, **facts}
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
-        if key == "cosmology" and (different := _different_parameter(facts[key], values[key])):
-            return different
+        if key == "cosmology":
+            if different := _different_parameter(facts[key], values[key], is_drawn="box_cells" in facts):
+                return different
+            continue
         if canonical(facts.get(key)) != canonical(values[key]):
             remedy = " (by default from area and accuracy: set universe.lensing_nside)" * (key == "lensing_nside")
             return f"{key} {facts.get(key)}, the request {values[key]}{remedy}"
@@ -99,10 +101,13 @@ def _difference(version: read.Version, request: Request) -> str:
     return ""
 
 
-def _different_parameter(recorded: Mapping[str, Any], requested: Mapping[str, Any]) -> str:
-    """Describe the first parameter of two cosmologies that differs; "" if they are equal."""
+def _different_parameter(recorded: Mapping[str, Any], requested: Mapping[str, Any], is_drawn: bool) -> str:
+    """Describe the first parameter of two cosmologies that differs; "" if they are equal.
+
+    A user's galaxies, for which `is_drawn` is False, do not depend on the power spectrum.
+    """
     for name, value in requested.items():
-        if recorded.get(name) != value:
+        if recorded.get(name) != value and (is_drawn or name != "power"):
             return f"the cosmology {name} = {recorded.get(name)}, the request {name} = {value}"
     return ""
 

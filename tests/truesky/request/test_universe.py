@@ -91,6 +91,11 @@ def test_galaxies_of_earlier_versions_are_another_universe():
     with pytest.raises(BadInput, match="has the cosmology power = eisenstein98, the request power = camb"):
         universe.check_catalogues([old], wanted(structure_below_cells=False))
     universe.check_catalogues([old], wanted(cosmology={"power": "eisenstein98"}, structure_below_cells=False))
+    # A user's galaxies depend on distances only.
+    given = SimpleNamespace(table="galaxies", manifest={"facts": {"seed": 11}})
+    universe.check_catalogues([given], wanted())
+    with pytest.raises(BadInput, match=r"has the cosmology h = 0\.67, the request h = 0\.7"):
+        universe.check_catalogues([given], wanted(cosmology={"h": 0.7, "power": "eisenstein98"}))
 
 
 def test_differences_of_the_other_catalogue_are_ignored(lake):

@@ -141,7 +141,7 @@ def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
 
 def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one():
     few, many = (tables(limit, 2.3, CELLS[0])[0] for limit in (23.0, 24.0))
-    some, every = (strong_lenses.draw(CELLS[0], rows, SEED, 2000.0, FIDUCIAL) for rows in (few, many))
+    some, every = (strong_lenses.draw(CELLS[0], rows, SEED, 1000.0, FIDUCIAL) for rows in (few, many))
     assert 5 < some.num_rows < every.num_rows
     same(some, of(every, some))
     lost = ~np.isin(every["id"].to_numpy(), some["id"].to_numpy())
