@@ -397,7 +397,9 @@ def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2
     float array
         Distances in deg, of the broadcast shape; NaN if a coordinate is NaN.
     """
-    lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
+    # The remainder is exact, whereas the conversion of many turns to radians loses digits.
+    lon1, lon2 = (np.radians(np.fmod(np.asarray(x, float), 360.0)) for x in (ra1, ra2))
+    lat1, lat2 = (np.radians(np.asarray(x, float)) for x in (dec1, dec2))
     dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
     haversine = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
     # `complement` equals 1 - haversine. This formula has no rounding error near a separation of 180 deg, where the
@@ -424,7 +426,7 @@ def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[
     angle = np.hypot(east, north)
     # sin(angle) / angle; np.sinc returns 1 for angle = 0.
     ratio = np.sinc(angle / np.pi)
-    lat, lon = np.radians(dec), np.radians(ra)
+    lat, lon = np.radians(dec), np.radians(np.fmod(ra, 360.0))
     forward = np.cos(angle) * np.cos(lat) - ratio * north * np.sin(lat)
     up = np.cos(angle) * np.sin(lat) + ratio * north * np.cos(lat)
     sideways = ratio * east

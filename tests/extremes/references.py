@@ -264,9 +264,7 @@ def position_on_the_sky(values):
     found = float(sky.separation(ra, dec, *np.degrees([lon, lat])))
     expected = np.degrees(angular_separation(turned, np.radians(dec), lon, lat))
     assert 0.0 <= moved[0][0] < 360.0
-    # A right ascension of many turns has fewer digits.
-    error = max(np.degrees(apart), abs(found - expected), distance_to_cell(ra, dec, order, cell))
-    return max(error - np.spacing(abs(ra)), 0.0)
+    return max(np.degrees(apart), abs(found - expected), distance_to_cell(ra, dec, order, cell))
 
 
 def distance_to_cell(ra, dec, order, cell):

@@ -57,6 +57,10 @@ def is_refused(subject, values):
             return True
         first, last = (values["wavelength"] + 0.5 * sign * values["width"] for sign in (-1.0, 1.0))
         limit = next(one for one in subject.quantities if one.name == "wavelength")
+        # The last hundredth of the width of a triangle has 2e-4 of its area, and the last tenth 2e-2.
+        beyond = (last - limit.hi) / values["width"]
+        if beyond > 0.01:
+            return True if beyond > 0.1 else None
         return None if last - first <= 2.0 or first < limit.lo or last / first > 1.2 else False
     if subject.name == "seeing through turbulent air":
         return None if values["seeing"] < 1.5 or not 10.0 <= values["outer_scale"] <= 500.0 else False

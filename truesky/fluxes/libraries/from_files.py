@@ -35,6 +35,8 @@ _RED_SLOPE = -3.2
 
 # Largest k = A / E(B-V) that is accepted in an extinction law; the steepest law has about 25 at 912 A.
 _MAX_EXTINCTION = 100.0
+# Largest fraction of the photons that a passband may detect at wavelengths without spectra.
+_MAX_LOST_PHOTONS = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +178,8 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     Raises
     ------
     BadInput
-        If the medium is unknown, the file cannot be read, or the curve is not valid, is outside 600 to 24000 A, or is 0
-        at all whole angstroms.
+        If the medium is unknown, the file cannot be read, or the curve is not valid, detects more than
+        `_MAX_LOST_PHOTONS` of its photons outside 600 to 24000 A, or is 0 at all whole angstroms.
     """
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
@@ -188,7 +190,22 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
         raise BadInput(f"{path}: the passband is outside {first} .. {last} A, or between two whole angstroms")
     if not response.any():
         raise BadInput(f"{path}: the passband is 0 at all whole angstroms: it must be wider than 1 A")
+    lost = _lost_photons(curve)
+    if lost > _MAX_LOST_PHOTONS:
+        first, last = passbands.GRID_FIRST, passbands.GRID_LAST
+        raise BadInput(f"{path}: {lost:.1%} of the photons are outside {first} .. {last} A, where there are no spectra")
     return Passband(name, wavelength, response, medium)
+
+
+def _lost_photons(curve: Curve) -> float:
+    """Return the fraction of the photons of a flat spectrum that a passband detects beyond the grid of spectra."""
+    edges = np.clip([passbands.GRID_FIRST, passbands.GRID_LAST], curve.wavelength[0], curve.wavelength[-1])
+    # The edges become points of the curve, so that trapezoids end there.
+    wavelength = np.union1d(curve.wavelength, edges)
+    photons = np.interp(wavelength, curve.wavelength, curve.value) * wavelength
+    each = 0.5 * (photons[1:] + photons[:-1]) * np.diff(wavelength)
+    inside = (wavelength[:-1] >= edges[0]) & (wavelength[1:] <= edges[1])
+    return float(each[~inside].sum() / each.sum())
 
 
 def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:

@@ -134,6 +134,21 @@ def test_wrong_filters_are_refused_with_file_and_row(tmp_path, name, message, fo
         from_files.passband(path, "mine", "air", form)
 
 
+@pytest.mark.parametrize(
+    ("centre", "message"),
+    [(23_000.0, None), (23_960.0, None), (24_500.0, "is outside 600 .. 24000 A"), (23_990.0, r"28.1% of the photons")],
+)
+def test_a_passband_that_detects_light_beyond_the_spectra_is_refused(tmp_path, centre, message):
+    """Such a band once lost the light beyond 24000 A without a message."""
+    path = ascii_file(tmp_path / "band", centre + 40.0 * np.linspace(-1.0, 1.0, 5), np.array([0.0, 0.5, 1.0, 0.5, 0.0]))
+    if message is None:
+        band = from_files.passband(path, "mine", "air", "passband_ascii")
+        assert passbands.pivot_wavelength(band) == pytest.approx(centre, abs=0.5)
+    else:
+        with pytest.raises(BadInput, match=message):
+            from_files.passband(path, "mine", "air", "passband_ascii")
+
+
 @pytest.mark.parametrize("scale", [0.1, 1e-4])
 def test_a_spectrum_in_another_unit_is_refused(tmp_path, scale):
     with pytest.raises(BadInput, match="is the unit right"):
