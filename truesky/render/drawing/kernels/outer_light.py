@@ -32,6 +32,8 @@ STEP = 1.0 / 16.0
 NEGLIGIBLE = 1e-4
 # Largest error of the light by interpolation in the middle of a cell between four nodes, as a fraction of the light.
 _INTERPOLATED = 1e-4
+# The same for the light of copies. It is subtracted, so that its error remains also where the galaxy has no light.
+_INTERPOLATED_COPIES = 1e-5
 
 
 @jit
@@ -177,6 +179,7 @@ def sample_copies(
                 total += _light_at(light, disk, across, x - copies[i, 0], y - copies[i, 1])
             nodes[r, c] = total
     weights = np.array([-0.0625, 0.5625, 0.5625, -0.0625])
+    allowed = _INTERPOLATED if len(copies) == 1 else _INTERPOLATED_COPIES
     for r in range(direct.shape[0]):
         for c in range(direct.shape[1]):
             x, y = step * (first_node[0] + c + 1.5), step * (first_node[1] + r + 1.5)
@@ -190,7 +193,7 @@ def sample_copies(
             for j in range(4):
                 for k in range(4):
                     interpolated += weights[j] * weights[k] * nodes[r + j, c + k]
-            direct[r, c] = abs(interpolated - total) > NEGLIGIBLE + _INTERPOLATED * total
+            direct[r, c] = abs(interpolated - total) > NEGLIGIBLE + allowed * total
     # The change by the PSF is added last, without a check: it is itself interpolated between nodes.
     for r in range(nodes.shape[0]):
         for c in range(nodes.shape[1]):
