@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import astuple, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,10 @@ COSMOLOGIES = (
     replace(FIDUCIAL, w0=-0.9, wa=0.3),
     Cosmology(omega_m=0.26, omega_b=0.045, h=0.73, sigma_8=0.78, n_s=0.95, w0=-1.1, wa=-0.4),
 )
+# Universes with massive neutrinos, for which only CAMB has values.
+WITH_NEUTRINOS = tuple(
+    replace(cosmology, m_nu=m_nu) for cosmology in (FIDUCIAL, COSMOLOGIES[3], COSMOLOGIES[4]) for m_nu in (0.06, 0.5)
+)
 # Redshifts of distances and growth, redshifts of sigma_8, and wave numbers (h/Mpc) of the power spectrum. CAMB includes
 # radiation, which changes sigma_8(z) / sigma_8(0) by more than 1e-3 beyond z = 2.
 REDSHIFTS, SIGMA_REDSHIFTS, WAVE_NUMBERS = (0.5, 1.0, 2.0, 5.0, 10.0), (0.5, 1.0, 2.0), (0.01, 0.1, 1.0)
@@ -32,6 +37,10 @@ def rows() -> Iterator[str]:
     for cosmology in COSMOLOGIES:
         numbers = ",".join(f"{value:g}" for value in astuple(cosmology)[:-1])
         for quantity, at, value in (*_values_of_ccl(cosmology), *_values_of_camb(cosmology)):
+            yield f"{numbers},{quantity},{at:g},{value:.8g}"
+    for cosmology in WITH_NEUTRINOS:
+        numbers = ",".join(f"{value:g}" for value in astuple(cosmology)[:-1])
+        for quantity, at, value in _values_with_neutrinos(cosmology):
             yield f"{numbers},{quantity},{at:g},{value:.8g}"
 
 
@@ -54,16 +63,35 @@ def _values_of_ccl(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
         yield "power", k, float(pyccl.linear_matter_power(warm, k * cosmology.h, 1.0)) * cosmology.h**3
 
 
-def _values_of_camb(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+def _results_of_camb(cosmology: Cosmology, redshifts: tuple[float, ...]) -> Any:
     import camb
 
-    h = cosmology.h
+    h, is_massive = cosmology.h, cosmology.m_nu > 0.0
+    cold = (cosmology.omega_m - cosmology.omega_b) * h**2 - cosmology.m_nu / 93.14
     settings = camb.set_params(
-        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_m - cosmology.omega_b) * h**2, mnu=0.0,
-        num_massive_neutrinos=0, ns=cosmology.n_s, As=2e-9, w=cosmology.w0, wa=cosmology.wa, dark_energy_model="ppf",
+        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=cold, mnu=cosmology.m_nu, neutrino_hierarchy="degenerate",
+        num_massive_neutrinos=3 if is_massive else 0, ns=cosmology.n_s, As=2e-9, w=cosmology.w0, wa=cosmology.wa,
+        dark_energy_model="ppf",
     )  # fmt: skip
-    settings.set_matter_power(redshifts=[*SIGMA_REDSHIFTS, 0.0], kmax=5.0, silent=True)
-    results = camb.get_results(settings)
+    settings.omnuh2 = cosmology.m_nu / 93.14
+    settings.set_matter_power(redshifts=[*redshifts, 0.0], kmax=5.0, silent=True)
+    return camb.get_results(settings)
+
+
+def _values_with_neutrinos(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    results = _results_of_camb(cosmology, REDSHIFTS)
+    matter, cold = (
+        np.sort(results.get_sigmaR(8.0, var1=kind, var2=kind))[::-1] for kind in ("delta_tot", "delta_nonu")
+    )
+    yield "sigma_8_of_cold_matter", 0.0, cosmology.sigma_8 * float(cold[0] / matter[0])
+    for z, value, total in zip(REDSHIFTS, cold[1:], matter[1:], strict=True):
+        yield "growth_of_cold_matter", z, float(value / cold[0])
+        yield "growth_of_all_matter", z, float(total / matter[0])
+        yield "chi_with_neutrinos", z, float(results.comoving_radial_distance(z)) * cosmology.h
+
+
+def _values_of_camb(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    results, h = _results_of_camb(cosmology, SIGMA_REDSHIFTS), cosmology.h
     sigma = np.sort(np.asarray(results.get_sigma8()))[::-1]
     for z, value in zip(SIGMA_REDSHIFTS, sigma[1:], strict=True):
         yield "sigma_8", z, cosmology.sigma_8 * float(value / sigma[0])

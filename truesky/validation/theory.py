@@ -130,7 +130,8 @@ def lensing_weight(cosmology: Cosmology, x: Float, chi: Float, weight: Float) ->
         Convergence in h/Mpc; 0 for matter behind all sources.
     """
     efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
-    lens = 1.5 * cosmology.omega_m / HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
+    # Massive neutrinos hardly cluster.
+    lens = 1.5 * cosmology.omega_cold / HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
     return np.asarray(lens * np.sum(efficiency * weight, axis=1) / weight.sum())
 
 
