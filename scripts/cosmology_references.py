@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import astuple, fields, replace
+from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +23,12 @@ COSMOLOGIES = (
     replace(FIDUCIAL, w0=-0.9, wa=0.3),
     Cosmology(omega_m=0.26, omega_b=0.045, h=0.73, sigma_8=0.78, n_s=0.95, w0=-1.1, wa=-0.4),
 )
+# Universes with massive neutrinos, for which only CAMB has values.
+WITH_NEUTRINOS = tuple(
+    replace(cosmology, m_nu=m_nu) for cosmology in (FIDUCIAL, COSMOLOGIES[3], COSMOLOGIES[4]) for m_nu in (0.06, 0.5)
+)
+# Universes for which CAMB computes the non-linear power with halofit.
+WITH_HALOFIT = (FIDUCIAL, replace(FIDUCIAL, w0=-0.9, wa=0.1))
 # Redshifts of distances and growth, redshifts of sigma_8, and wave numbers (h/Mpc) of the power spectrum. CAMB includes
 # radiation, which changes sigma_8(z) / sigma_8(0) by more than 1e-3 beyond z = 2.
 REDSHIFTS, SIGMA_REDSHIFTS, WAVE_NUMBERS = (0.5, 1.0, 2.0, 5.0, 10.0), (0.5, 1.0, 2.0), (0.01, 0.1, 1.0)
@@ -29,10 +37,16 @@ REDSHIFTS, SIGMA_REDSHIFTS, WAVE_NUMBERS = (0.5, 1.0, 2.0, 5.0, 10.0), (0.5, 1.0
 def rows() -> Iterator[str]:
     """Yield the lines of the file: parameters of the cosmology, name of the quantity, its argument, and its value."""
     yield ",".join([*(field.name for field in fields(Cosmology) if field.name != "power"), "quantity", "at", "value"])
-    for cosmology in COSMOLOGIES:
-        numbers = ",".join(f"{value:g}" for value in astuple(cosmology)[:-1])
-        for quantity, at, value in (*_values_of_ccl(cosmology), *_values_of_camb(cosmology)):
-            yield f"{numbers},{quantity},{at:g},{value:.8g}"
+    groups = (
+        (COSMOLOGIES, (_values_of_ccl, _values_of_camb)),
+        (WITH_NEUTRINOS, (_values_with_neutrinos,)),
+        (WITH_HALOFIT, (_values_of_halofit,)),
+    )
+    for cosmologies, functions in groups:
+        for cosmology in cosmologies:
+            numbers = ",".join(f"{value:g}" for value in astuple(cosmology)[:-1])
+            for quantity, at, value in chain.from_iterable(values(cosmology) for values in functions):
+                yield f"{numbers},{quantity},{at:g},{value:.8g}"
 
 
 def _values_of_ccl(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
@@ -54,16 +68,45 @@ def _values_of_ccl(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
         yield "power", k, float(pyccl.linear_matter_power(warm, k * cosmology.h, 1.0)) * cosmology.h**3
 
 
-def _values_of_camb(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+def _results_of_camb(cosmology: Cosmology, redshifts: tuple[float, ...], amplitude: float = 2e-9) -> Any:
     import camb
 
-    h = cosmology.h
+    h, is_massive = cosmology.h, cosmology.m_nu > 0.0
+    cold = (cosmology.omega_m - cosmology.omega_b) * h**2 - cosmology.m_nu / 93.14
     settings = camb.set_params(
-        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_m - cosmology.omega_b) * h**2, mnu=0.0,
-        num_massive_neutrinos=0, ns=cosmology.n_s, As=2e-9, w=cosmology.w0, wa=cosmology.wa, dark_energy_model="ppf",
+        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=cold, mnu=cosmology.m_nu, neutrino_hierarchy="degenerate",
+        num_massive_neutrinos=3 if is_massive else 0, ns=cosmology.n_s, As=amplitude, w=cosmology.w0, wa=cosmology.wa,
+        dark_energy_model="ppf", halofit_version="takahashi",
     )  # fmt: skip
-    settings.set_matter_power(redshifts=[*SIGMA_REDSHIFTS, 0.0], kmax=5.0, silent=True)
-    results = camb.get_results(settings)
+    settings.omnuh2 = cosmology.m_nu / 93.14
+    settings.set_matter_power(redshifts=[*redshifts, 0.0], kmax=5.0, silent=True)
+    return camb.get_results(settings)
+
+
+def _values_with_neutrinos(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    results = _results_of_camb(cosmology, REDSHIFTS)
+    matter, cold = (
+        np.sort(results.get_sigmaR(8.0, var1=kind, var2=kind))[::-1] for kind in ("delta_tot", "delta_nonu")
+    )
+    yield "sigma_8_of_cold_matter", 0.0, cosmology.sigma_8 * float(cold[0] / matter[0])
+    for z, value, total in zip(REDSHIFTS, cold[1:], matter[1:], strict=True):
+        yield "growth_of_cold_matter", z, float(value / cold[0])
+        yield "growth_of_all_matter", z, float(total / matter[0])
+        yield "chi_with_neutrinos", z, float(results.comoving_radial_distance(z)) * cosmology.h
+
+
+def _values_of_halofit(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    linear = _results_of_camb(cosmology, SIGMA_REDSHIFTS)
+    amplitude = 2e-9 * (cosmology.sigma_8 / float(np.max(linear.get_sigma8()))) ** 2
+    results = _results_of_camb(cosmology, SIGMA_REDSHIFTS, amplitude)
+    power = results.get_matter_power_interpolator(nonlinear=True)
+    for z in (0.0, *SIGMA_REDSHIFTS):
+        for k in WAVE_NUMBERS:
+            yield f"halofit_z{z:g}", k, float(power.P(z, k))
+
+
+def _values_of_camb(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
+    results, h = _results_of_camb(cosmology, SIGMA_REDSHIFTS), cosmology.h
     sigma = np.sort(np.asarray(results.get_sigma8()))[::-1]
     for z, value in zip(SIGMA_REDSHIFTS, sigma[1:], strict=True):
         yield "sigma_8", z, cosmology.sigma_8 * float(value / sigma[0])

@@ -10,6 +10,9 @@ Notes
 -----
 There is no radiation: with it, distances would be smaller by 1e-4 up to z = 1, and by 4e-4 up to z = 5.
 
+Massive neutrinos are matter for distances and the expansion rate. Up to z = 10 distances exceed those of CAMB by at
+most 4e-4, because photons are missing. The growth with massive neutrinos is explained in `_neutrino_growth_terms`.
+
 References
 ----------
 Chevallier & Polarski 2001, IJMPD 10, 213; Linder 2003, PRL 90, 091301 (dark energy)
@@ -56,6 +59,16 @@ DEFAULT_POWER = "camb"
 # Nodes and weights of the quadrature. With 24 nodes the relative error of a distance up to z = 20 is 1e-12 for a
 # cosmological constant, and 1e-10 for other dark energy.
 _NODES, _WEIGHTS = matrices.gauss_legendre(24)
+# Sum of the masses of neutrinos for which their density parameter is 1 / h^2, eV (Mangano et al. 2005, Nucl. Phys. B
+# 729, 221).
+_NEUTRINO_MASS = 93.14
+# Density parameter of photons times h^2, for a temperature of 2.7255 K (Fixsen 2009, ApJ 707, 916), and density of
+# three neutrinos without mass relative to it, with an effective number of 3.044.
+_PHOTONS, _NEUTRINOS_TO_PHOTONS = 2.47282e-5, 3.044 * 7.0 / 8.0 * (4.0 / 11.0) ** (4.0 / 3.0)
+# Wave number of free streaming, h/Mpc, of neutrinos with 1 eV each for a = omega_m = 1 (Ringwald & Wong 2004).
+_FREE_STREAMING = 1.5
+# Wave number, h/Mpc, at which the growth of cold matter is closest to CAMB's sigma_8(z) / sigma_8(0) of cold matter.
+_SIGMA_8_K = 0.145
 # Hubble time for h = 1, 1 / (100 km/s/Mpc), in Gyr.
 _HUBBLE_TIME_GYR = 9.777922
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -71,7 +84,7 @@ class Cosmology:
     Attributes
     ----------
     omega_m, omega_b : float
-        Density parameters of all matter and of baryons today.
+        Density parameters of all matter, with massive neutrinos, and of baryons today.
     h : float
         Hubble parameter, H0 / (100 km/s/Mpc).
     sigma_8 : float
@@ -81,15 +94,15 @@ class Cosmology:
     w0, wa : float
         Equation of state of dark energy, w = w0 + wa z / (1 + z); -1 and 0 for a cosmological constant.
     m_nu : float
-        Sum of the masses of neutrinos, eV; only 0 is possible.
+        Sum of the masses of neutrinos, eV. Above 0 there are three neutrinos of equal mass.
     power : str
         Source of the linear power spectrum, one of POWERS: the fitting formula of Eisenstein & Hu 1998, or CAMB.
 
     Raises
     ------
     BadInput
-        If a parameter is not within its LIMITS, baryons are not less than all matter, or dark energy would not be
-        negligible at high redshifts.
+        If a parameter is not within its LIMITS, baryons and neutrinos are not less than all matter, dark energy would
+        not be negligible at high redshifts, or neutrinos have a mass and the power spectrum is not that of CAMB.
     """
 
     omega_m: float
@@ -107,20 +120,32 @@ class Cosmology:
             value = getattr(self, name)
             if not lo <= value <= hi:
                 raise OutOfRange(name, value, lo, hi)
-        if self.omega_b >= self.omega_m:
-            raise BadInput(f"omega_b = {self.omega_b:g} must be smaller than omega_m = {self.omega_m:g}, all matter")
+        if self.omega_b >= self.omega_cold:
+            neutrinos = f", less neutrinos, {self.omega_nu:.3g}" if self.m_nu > 0.0 else ""
+            problem = f"omega_b = {self.omega_b:g} must be smaller than omega_m = {self.omega_m:g}"
+            raise BadInput(f"{problem}, all matter{neutrinos}")
         if not self.w0 + self.wa <= MAX_EARLY_W:
             problem = f"w0 + wa = {self.w0 + self.wa:g} must be at most {MAX_EARLY_W:g}"
             raise BadInput(f"{problem}: dark energy would matter at high redshifts")
-        if self.m_nu > 0.0:
-            raise BadInput(f"m_nu = {self.m_nu:g} is not possible: massive neutrinos are not simulated, only 0 is")
         if self.power not in POWERS:
             raise BadInput(f"power = {self.power!r} is not one of {', '.join(POWERS)}")
+        if self.m_nu > 0.0 and self.power != "camb":
+            raise BadInput(f'm_nu = {self.m_nu:g} requires power = "camb": {self.power} has no massive neutrinos')
 
     @property
     def omega_lambda(self) -> float:
         """Return the density parameter of dark energy today."""
         return 1.0 - self.omega_m
+
+    @property
+    def omega_nu(self) -> float:
+        """Return the density parameter of massive neutrinos today, a part of `omega_m`."""
+        return self.m_nu / (_NEUTRINO_MASS * self.h**2)
+
+    @property
+    def omega_cold(self) -> float:
+        """Return the density parameter of cold matter today: dark matter and baryons, without massive neutrinos."""
+        return self.omega_m - self.omega_nu
 
     def fingerprint(self) -> str:
         """Return 16 hexadecimal digits that identify the exact values of all parameters.
@@ -210,25 +235,26 @@ class Cosmology:
         return angular * (1000.0 / self.h * _ARCSEC)
 
     def growth(self, z: npt.ArrayLike) -> Float:
-        """Return the linear growth D(z) of matter, D(0) = 1.
+        """Return the linear growth D(z) of cold matter, D(0) = 1.
 
-        Raises OutOfRange if dark energy is not constant, and z is NaN or not in 0 to 20.
+        Raises OutOfRange if z is NaN or not in 0 to 20, and dark energy is not constant or neutrinos have a mass.
 
         References
         ----------
         Carroll, Press & Turner 1992, ARA&A 30, 499 (hypergeometric form for a cosmological constant)
         """
-        if self.has_constant_dark_energy:
+        if self._has_closed_growth:
             a = 1.0 / (1.0 + np.asarray(z, float))
             return np.asarray(a * self._growth_integral(a) / self._growth_integral(np.ones(())))
         return np.asarray(np.exp(_growth_spline(self)(-np.log1p(_check_redshift("z", z)))))
 
     def growth_rate(self, z: npt.ArrayLike, index: float) -> Float:
-        """Return the growth rate f = dlnD / dlna; for a cosmological constant it is Omega_m(z)^index (error 0.5 %).
+        """Return the growth rate f = dlnD / dlna of cold matter.
 
-        Raises OutOfRange if dark energy is not constant, and z is NaN or not in 0 to 20.
+        For a cosmological constant and neutrinos without mass it is Omega_m(z)^index (error 0.5 %). Raises OutOfRange
+        in other universes if z is NaN or not in 0 to 20.
         """
-        if not self.has_constant_dark_energy:
+        if not self._has_closed_growth:
             return np.asarray(_growth_spline(self)(-np.log1p(_check_redshift("z", z)), 1))
         a = 1.0 + np.asarray(z, float)
         return np.asarray((self.omega_m * a**3 / self.expansion_rate(z) ** 2) ** index)
@@ -237,6 +263,10 @@ class Cosmology:
     def has_constant_dark_energy(self) -> bool:
         """Return True for a cosmological constant."""
         return self.w0 == -1.0 and self.wa == 0.0
+
+    @property
+    def _has_closed_growth(self) -> bool:
+        return self.has_constant_dark_energy and self.m_nu == 0.0
 
     def _expansion_rate(self, a: Float) -> Float:
         """Return E as a function of `a`, which is 1 + z, or 1 / (scale factor)."""
@@ -277,16 +307,13 @@ def _growth_spline(cosmology: Cosmology) -> Any:
     """Return ln D as a function of ln a: the cubic spline through the solution of its differential equation.
 
     The growth rate f = dlnD / dlna follows df/dlna = 3/2 Om(a) - f^2 - (2 + dlnE/dlna) f. It is integrated by the
-    classical Runge-Kutta method.
+    classical Runge-Kutta method. With massive neutrinos, Om(a) is the density of the matter that clusters.
     """
     from scipy.interpolate import CubicHermiteSpline
 
     ln_a = np.linspace(_LN_A_FIRST, 0.0, 2 * _GROWTH_STEPS + 1)
-    a = np.exp(-ln_a)
-    share = cosmology._dark_energy(a) / cosmology._expansion_rate(a) ** 2
-    pressure = cosmology.w0 + cosmology.wa * (1.0 - np.exp(ln_a))
-    source = (1.5 * (1.0 - share)).tolist()
-    friction = (2.0 - 1.5 * (1.0 + pressure * share)).tolist()
+    make_terms = _neutrino_growth_terms if cosmology.m_nu > 0.0 else _growth_terms
+    source, friction = (values.tolist() for values in make_terms(cosmology, ln_a))
     step = -_LN_A_FIRST / _GROWTH_STEPS
 
     def slope(node: int, rate: float) -> float:
@@ -305,6 +332,43 @@ def _growth_spline(cosmology: Cosmology) -> Any:
         rates.append(rate)
         growths.append(ln_d)
     return CubicHermiteSpline(ln_a[::2], np.array(growths) - ln_d, rates)
+
+
+def _growth_terms(cosmology: Cosmology, ln_a: Float) -> tuple[Float, Float]:
+    """Return 3/2 Om(a) and 2 + dlnE/dlna for each ln a, without radiation."""
+    a = np.exp(-ln_a)
+    share = cosmology._dark_energy(a) / cosmology._expansion_rate(a) ** 2
+    pressure = cosmology.w0 + cosmology.wa * (1.0 - np.exp(ln_a))
+    return 1.5 * (1.0 - share), 2.0 - 1.5 * (1.0 + pressure * share)
+
+
+def _neutrino_growth_terms(cosmology: Cosmology, ln_a: Float) -> tuple[Float, Float]:
+    """Return 3/2 Om(a) of the matter that clusters, and 2 + dlnE/dlna, for each ln a, with massive neutrinos.
+
+    Notes
+    -----
+    The overdensity of neutrinos is that of cold matter times 1 / (1 + k / k_fs)^2, with the wave number k_fs of free
+    streaming. The growth depends on k: it is the one of _SIGMA_8_K. The expansion includes photons, and neutrinos whose
+    energy density is interpolated between its limits for small and large a. Without them, the growth would not agree
+    with CAMB at the level of the effect of small masses. sigma_8(z) / sigma_8(0) of cold matter is that of CAMB within
+    5e-4 up to z = 10 and 0.5 eV, and within 1e-4 for 0.06 eV.
+
+    References
+    ----------
+    Ringwald & Wong 2004, JCAP 12, 005; Wong 2008, JCAP 10, 035 (clustering of neutrinos)
+    """
+    a = np.exp(ln_a)
+    photons = _PHOTONS / cosmology.h**2 * a**-4.0
+    # Momentum over mass of a neutrino, from the density that neutrinos without mass would have.
+    speed = _NEUTRINOS_TO_PHOTONS * photons * a**3 / cosmology.omega_nu
+    neutrinos = cosmology.omega_nu * a**-3.0 * np.sqrt(1.0 + speed**2)
+    cold, dark_energy = cosmology.omega_cold * a**-3.0, cosmology._dark_energy(1.0 / a)
+    total = cold + neutrinos + photons + dark_energy
+    slope = -3.0 * cold - (3.0 + speed**2 / (1.0 + speed**2)) * neutrinos - 4.0 * photons
+    slope -= 3.0 * (1.0 + cosmology.w0 + cosmology.wa * (1.0 - a)) * dark_energy
+    streaming = _FREE_STREAMING * np.sqrt(a * cosmology.omega_m) * cosmology.m_nu / 3.0
+    clustering = cold + neutrinos / (1.0 + _SIGMA_8_K / streaming) ** 2
+    return 1.5 * clustering / total, 2.0 + 0.5 * slope / total
 
 
 def age(z: npt.ArrayLike, omega_m: float, hubble: float) -> Float:

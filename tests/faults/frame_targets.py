@@ -5,6 +5,7 @@ import os
 import tempfile
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from tests.faults.lake_targets import folder_target
 from truesky.api import given_frames
 from truesky.catalogue.external import ingest, mapping
 from truesky.command_line import commands
+from truesky.cosmology import FIDUCIAL
 from truesky.reduction import files as reduction_files
 from truesky.reduction import stack
 from truesky.render.products import read_back
@@ -131,7 +133,9 @@ def kept_catalogue(folder):
 @cache
 def columns():
     titles = {"origin_id": "id", "ra": "ra", "dec": "dec", "z_true": "z", "abs_mag_r01": "magnitude"}
-    return mapping.galaxy_columns("", {name: json.dumps(title) for name, title in titles.items()})
+    return replace(
+        mapping.galaxy_columns("", {name: json.dumps(title) for name, title in titles.items()}), cosmology=FIDUCIAL
+    )
 
 
 def split(folder):

@@ -162,20 +162,25 @@ REFERENCES = list(csv.DictReader(Path(__file__).with_name("cosmology_references.
 # Error relative to CCL without radiation and to CAMB with radiation, both by scripts/cosmology_references.py.
 TOLERANCES = {
     "chi": 1e-6, "growth": 1e-5, "growth_rate": 1e-3, "power": 1e-3, "sigma_8": 1e-3, "chi_with_radiation": 1e-3,
+    "chi_with_neutrinos": 4e-4, "growth_of_cold_matter": 5e-4,
 }  # fmt: skip
+# Numbers of cosmologies without and with massive neutrinos.
+COUNTS = {"chi_with_neutrinos": 6, "growth_of_cold_matter": 6}
 
 
 @pytest.mark.parametrize("quantity", TOLERANCES)
 def test_other_programs_have_the_same_values(quantity):
     rows = [row for row in REFERENCES if row["quantity"] == quantity]
-    assert len({tuple(row[name] for name in LIMITS) for row in rows}) == 5
+    assert len({tuple(row[name] for name in LIMITS) for row in rows}) == COUNTS.get(quantity, 5)
     for row in rows:
         values, at = {name: float(row[name]) for name in LIMITS}, float(row["at"])
-        cosmology = Cosmology(**values, power="eisenstein98")
+        cosmology = Cosmology(**values, power="camb" if values["m_nu"] else "eisenstein98")
         value = {
             "chi": cosmology.comoving_distance,
             "chi_with_radiation": cosmology.comoving_distance,
+            "chi_with_neutrinos": cosmology.comoving_distance,
             "growth": cosmology.growth,
+            "growth_of_cold_matter": cosmology.growth,
             "growth_rate": lambda z, of=cosmology: of.growth_rate(z, 0.55),
             "sigma_8": lambda z, of=cosmology: of.sigma_8 * of.growth(z),
             "power": lambda k, of=cosmology: linear_theory.power(of, np.array(k)),
@@ -183,11 +188,47 @@ def test_other_programs_have_the_same_values(quantity):
         assert float(value) == pytest.approx(float(row["value"]), rel=TOLERANCES[quantity], abs=0.0), row
 
 
+@pytest.mark.parametrize(("m_nu", "cold", "matter"), [(0.06, 1e-4, 4e-4), (0.5, 5e-4, 8e-3)])
+def test_the_growth_is_that_of_cold_matter(m_nu, cold, matter):
+    """All matter grows more slowly than cold matter, because neutrinos cluster at low redshifts only."""
+    for quantity, largest in (("growth_of_cold_matter", cold), ("growth_of_all_matter", matter)):
+        rows = [row for row in REFERENCES if row["quantity"] == quantity and float(row["m_nu"]) == m_nu]
+        assert len(rows) == 15
+        errors = []
+        for row in rows:
+            cosmology = Cosmology(**{name: float(row[name]) for name in LIMITS})
+            errors.append(abs(float(cosmology.growth(float(row["at"]))) / float(row["value"]) - 1.0))
+        assert 0.1 * largest < max(errors) < largest
+
+
+def test_neutrinos_are_matter_for_distances():
+    massive = replace(FIDUCIAL, m_nu=0.3)
+    assert massive.omega_nu == pytest.approx(0.3 / 93.14 / 0.67**2, rel=1e-12, abs=0.0)
+    assert massive.omega_cold == 0.319 - massive.omega_nu
+    assert np.array_equal(massive.comoving_distance(Z), FIDUCIAL.comoving_distance(Z))
+    assert (FIDUCIAL.omega_nu, FIDUCIAL.omega_cold) == (0.0, 0.319)
+
+
+def test_neutrinos_slow_the_growth_down():
+    """Small scales grow with the exponent 1 - 3/5 f_nu if neutrinos do not cluster; here they do at low redshifts."""
+    z, last = np.array([2.0, 5.0, 10.0]), 1.0
+    massless = replace(FIDUCIAL, m_nu=1e-6).growth(z)
+    for m_nu in (0.06, 0.2, 0.5):
+        cosmology = replace(FIDUCIAL, m_nu=m_nu)
+        power = np.log(cosmology.growth(z) / massless) / np.log(massless)
+        share = cosmology.omega_nu / cosmology.omega_m
+        assert np.all((power < -0.4 * share) & (power > -0.6 * share))
+        assert float(cosmology.growth_rate(1.0, 0.55)) < last
+        last = float(cosmology.growth_rate(1.0, 0.55))
+    with pytest.raises(OutOfRange, match="z = 21"):
+        cosmology.growth(21.0)
+    # The growth without massive neutrinos has no radiation, which matters less than 3e-4 up to z = 2.
+    assert massless[0] == pytest.approx(float(FIDUCIAL.growth(2.0)), rel=3e-4)
+
+
 @pytest.mark.parametrize("name", LIMITS)
 def test_the_fingerprint_depends_on_every_bit(name):
     value = getattr(FIDUCIAL, name)
-    if name == "m_nu":
-        return
     towards = LIMITS[name][1] if name != "w0" else -2.0
     assert replace(FIDUCIAL, **{name: float(np.nextafter(value, towards))}).fingerprint() != FIDUCIAL.fingerprint()
 
@@ -204,8 +245,17 @@ def test_fingerprints_are_the_same_everywhere():
         ({"n_s": float("nan")}, "n_s = nan is outside"),
         ({"sigma_8": 0.0}, "sigma_8 = 0.0 is outside"),
         ({"m_nu": -0.1}, "m_nu = -0.1 is outside"),
-        ({"m_nu": 0.06}, "m_nu = 0.06 is not possible: massive neutrinos are not simulated"),
-        ({"omega_m": 0.12, "omega_b": 0.12}, "omega_b = 0.12 must be smaller than omega_m = 0.12"),
+        ({"m_nu": 0.51}, "m_nu = 0.51 is outside"),
+        ({"m_nu": float("nan")}, "m_nu = nan is outside"),
+        (
+            {"m_nu": 0.06, "power": "eisenstein98"},
+            'm_nu = 0.06 requires power = "camb": eisenstein98 has no massive neutrinos',
+        ),
+        ({"omega_m": 0.12, "omega_b": 0.12}, "omega_b = 0.12 must be smaller than omega_m = 0.12, all matter$"),
+        (
+            {"omega_m": 0.12, "omega_b": 0.115, "m_nu": 0.5},
+            "omega_b = 0.115 must be smaller than omega_m = 0.12, all matter, less neutrinos, 0.012$",
+        ),
         ({"w0": -0.5, "wa": 0.5}, r"w0 \+ wa = 0 must be at most -0.1"),
         ({"power": "class"}, "power = 'class' is not one of eisenstein98, camb"),
     ],

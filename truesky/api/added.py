@@ -6,11 +6,12 @@ from typing import Any
 
 from lake_schema.arrays import Bool, Int
 from truesky.catalogue import added_sources
+from truesky.cosmology import Cosmology
 from truesky.render.exposure.records import Rows
 from truesky.render.windows import inputs
 
 
-def add_sources(rows: Rows, extra: Any, band: str) -> Rows:
+def add_sources(rows: Rows, extra: Any, band: str, cosmology: Cosmology) -> Rows:
     """Return catalogue rows with the sources of a user at the end.
 
     Parameters
@@ -21,6 +22,8 @@ def add_sources(rows: Rows, extra: Any, band: str) -> Rows:
         The sources, as in `added_sources.rows`.
     band : str
         Passband of their magnitudes.
+    cosmology : Cosmology
+        Parameters of the universe of the catalogue.
 
     Returns
     -------
@@ -34,7 +37,7 @@ def add_sources(rows: Rows, extra: Any, band: str) -> Rows:
     """
     names = rows.galaxy_fluxes.column_names
     flux_bands = [name.removeprefix("f_nu_") for name in names if name.startswith("f_nu_")]
-    return inputs.add_rows(rows, *added_sources.rows(extra, band, flux_bands))
+    return inputs.add_rows(rows, *added_sources.rows(extra, band, flux_bands, cosmology))
 
 
 def is_added(ids: Int) -> Bool:

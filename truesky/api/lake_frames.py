@@ -14,6 +14,7 @@ from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.tables.exposures import SELECTION_BANDS
 from truesky.api import added
+from truesky.cosmology import from_facts
 from truesky.render import detector_inputs
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing.stored_drawing import DrawingStore
@@ -109,7 +110,8 @@ class LakeFrame:
             detector_inputs.check_psf_files(aim.exposure, rows.previous_exposures, self._facts)
             if self._extra is not None:
                 band = SELECTION_BANDS.get(aim.exposure.channel, aim.exposure.band)
-                rows = added.add_sources(rows, self._extra, band)
+                galaxies = read.version(self._root, "galaxies", self._facts["inputs"]["galaxies"])
+                rows = added.add_sources(rows, self._extra, band, from_facts(galaxies.manifest["facts"]))
             self._rendered = render.render(
                 aim, rows, variant, request["seed"], request["truth"] if with_maps else (),
                 noise_seed=request["noise_seed"], drawings=self._shared.drawings,

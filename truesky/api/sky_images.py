@@ -22,6 +22,7 @@ from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.api import added
 from truesky.api.image_options import ImageRequest
+from truesky.cosmology import from_facts
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.detectors import Detector
@@ -408,7 +409,8 @@ class SkyPainter:
             inputs.refuse_unknown(rows, request.without)
         rows = inputs.select_rows(rows, request.without)
         if request.extra is not None:
-            rows = added.add_sources(rows, request.extra, aim.exposure.band)
+            cosmology = from_facts(self.tables.versions["galaxies"].manifest["facts"])
+            rows = added.add_sources(rows, request.extra, aim.exposure.band, cosmology)
         drawn = window_images.draw_window(
             aim, rows, variant, self.seed, request.noise_seed, request.effects, request.noise,
             self.psf_of(request),

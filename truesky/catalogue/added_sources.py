@@ -20,7 +20,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from truesky.catalogue import given_sources, injected_rows
 from truesky.catalogue.stars import stars as star_rows
-from truesky.cosmology import FIDUCIAL
+from truesky.cosmology import Cosmology
 from truesky.fluxes import integration, passbands, sources
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
@@ -31,7 +31,9 @@ _CELL = 12 * 4**GENERATION_ORDER
 _Rows = tuple[pa.Table, pa.Table]
 
 
-def rows(table: Any, band: str, flux_bands: Sequence[str], first_number: int = 0) -> tuple[_Rows, _Rows]:
+def rows(
+    table: Any, band: str, flux_bands: Sequence[str], cosmology: Cosmology, first_number: int = 0
+) -> tuple[_Rows, _Rows]:
     """Return the catalogue rows of added sources.
 
     Parameters
@@ -42,6 +44,8 @@ def rows(table: Any, band: str, flux_bands: Sequence[str], first_number: int = 0
         Passband of the magnitudes.
     flux_bands : sequence of str
         Passbands of the fluxes in the result.
+    cosmology : Cosmology
+        Parameters of the universe to which the sources are added.
     first_number : int
         Number of the first source in the identifiers.
 
@@ -57,10 +61,10 @@ def rows(table: Any, band: str, flux_bands: Sequence[str], first_number: int = 0
     BadInput
         If a column is unknown or missing, or a value is out of range.
     """
-    columns = given_sources.from_arrays(injected_rows.read_columns(table, "extra"))
+    columns = given_sources.from_arrays(injected_rows.read_columns(table, "extra"), cosmology)
     user_sources = UserSources(None, None, band, 0.0)
     bands = [passbands.load(name) for name in flux_bands]
-    return _galaxies(user_sources, columns, bands, first_number), _stars(columns, band, bands, first_number)
+    return _galaxies(user_sources, columns, bands, cosmology, first_number), _stars(columns, band, bands, first_number)
 
 
 def is_added(numbers: Int) -> Bool:
@@ -69,9 +73,13 @@ def is_added(numbers: Int) -> Bool:
 
 
 def _galaxies(
-    user_sources: UserSources, columns: given_sources.SourceColumns, bands: Sequence[Passband], first: int
+    user_sources: UserSources,
+    columns: given_sources.SourceColumns,
+    bands: Sequence[Passband],
+    cosmology: Cosmology,
+    first: int,
 ) -> _Rows:
-    model = given_sources.model(0, user_sources, columns, FIDUCIAL, None, 0.0)
+    model = given_sources.model(0, user_sources, columns, cosmology, None, 0.0)
     drawn = [GALAXIES.empty(), *(given_sources.galaxies(cell, columns, model) for cell in _cells(columns.galaxies))]
     drawn_rows = pa.concat_tables([each.select(drawn[0].column_names) for each in drawn])
     order = np.argsort(columns.galaxies["origin_id"], kind="stable")

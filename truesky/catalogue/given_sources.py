@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -203,7 +203,7 @@ def stars(sources: SourceColumns, band: str) -> StarCatalogue:
     return StarCatalogue(values.pop("index"), values)
 
 
-def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]]) -> SourceColumns:
+def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]], cosmology: Cosmology) -> SourceColumns:
     """Check tables in memory, and return their sources.
 
     Parameters
@@ -211,6 +211,8 @@ def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]]) -> Sourc
     tables : mapping of str to (Path, mapping of str to float array)
         For "galaxies" and "stars", the name of the table for messages, and its columns with the names of the
         properties.
+    cosmology : Cosmology
+        Parameters of the universe.
 
     Returns
     -------
@@ -230,7 +232,9 @@ def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]]) -> Sourc
                 remedy = "give axis_ratio and position_angle (deg, north through east) in place of them"
                 mistakes.add(BadInput(f"{place}: columns e1 and e2 are not possible here: {remedy}"))
                 columns = {title: values for title, values in columns.items() if title not in ("e1", "e2")}
-            values = mistakes.read(check_arrays, columns, name, place, {}) if columns else _no_sources(name)
+            values = (
+                mistakes.read(check_arrays, columns, name, place, {}, (), cosmology) if columns else _no_sources(name)
+            )
             if values is not None:
                 checked[name] = {**values, "ra": sky.wrap_angle(values["ra"])}
     for values in checked.values():
@@ -244,7 +248,12 @@ def _no_sources(name: str) -> dict[str, Array]:
 
 
 def check_arrays(
-    columns: Mapping[str, Array], name: str, place: Path, settings: Mapping[str, str], ignored: Collection[str] = ()
+    columns: Mapping[str, Array],
+    name: str,
+    place: Path,
+    settings: Mapping[str, str],
+    ignored: Collection[str] = (),
+    cosmology: Cosmology | None = None,
 ) -> dict[str, Array]:
     """Check the columns of a table in memory, and return its properties.
 
@@ -260,6 +269,8 @@ def check_arrays(
         Settings `ellipticity` and `frame` of the columns e1 and e2; empty without these columns.
     ignored : collection of str, optional
         Properties that are allowed, but neither checked nor returned.
+    cosmology : Cosmology, optional
+        Parameters of the universe, required to check absolute magnitudes if redshifts are not ignored.
 
     Returns
     -------
@@ -277,7 +288,7 @@ def check_arrays(
     _check_titles(list(columns), place, bounds, required)
     used = {title: title for title in columns if title not in ignored}
     mapped = _parse({**settings, **used}, name, {k: v for k, v in defaults.items() if k not in ignored}, bounds, place)
-    mistakes = TableMistakes()
+    mapped, mistakes = replace(mapped, cosmology=cosmology), TableMistakes()
     values = reading.check_batch(RowBatch(place, 1, {title: columns[title] for title in used}, {}), mapped, mistakes)
     if name == "galaxies" and values:
         _add_caustics(place, values, mistakes)
@@ -396,7 +407,7 @@ def _read(
         defaults = GALAXIES if name == "galaxies" else STARS
         empty = {key: np.zeros(0) for key in (*(() if source_tables.spacing else _POSITION), *defaults)}
         return empty | {"origin_id": np.zeros(0, np.int64)}
-    columns = _columns(file, name, source_tables)
+    columns = replace(_columns(file, name, source_tables), cosmology=cosmology)
     pieces = list(reading.read([file], columns, SOURCES_KIND))
     count = sum(len(piece.values["mag"]) for piece in pieces)
     if count == 0:

@@ -55,10 +55,8 @@ def _check_cosmology(request: Request) -> None:
 def check_cosmology(cosmology: Cosmology) -> None:
     """Raise BadInput if galaxies cannot be drawn in this cosmology.
 
-    The package CAMB may be missing, or the universe may be so large that its steps in distance have no identifiers.
+    The universe may be so large that its steps in distance have no identifiers, or the package CAMB may be missing.
     """
-    if cosmology.power == "camb":
-        boltzmann.check(cosmology)
     law, cell = parameters.section("halos.toml", "mass_function"), density_box.box_model(cosmology).cell
     # There are two more steps than the distance has cells: around its end, and at the start.
     largest = (ids.BLOCK_COUNT // round((law["highest"] - law["lowest"]) / law["bin"]) - 2) * cell
@@ -66,6 +64,8 @@ def check_cosmology(cosmology: Cosmology) -> None:
     if distance > largest:
         problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
         raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
+    if cosmology.power == "camb":
+        boltzmann.check(cosmology)
 
 
 def _check_dust(request: Request) -> None:

@@ -38,11 +38,13 @@ def label_halo_bias(cosmology: str) -> str:
     return content_key("bias", code_key("truesky.catalogue.matter.density_box"), cosmology)
 
 
-def label_box(cosmology: str, seed: int, cells: int) -> str:
-    """Return the label of the box of matter of a cosmology and a seed with `cells` cells per side.
+def label_box(kind: str, cosmology: str, seed: int, cells: int) -> str:
+    """Return the label of fields of the box of matter.
 
     Parameters
     ----------
+    kind : str
+        "box" for density and velocities, or "tides" for the tidal field.
     cosmology : str
         Fingerprint of the cosmology.
     seed : int
@@ -55,27 +57,7 @@ def label_box(cosmology: str, seed: int, cells: int) -> str:
     str
         The label.
     """
-    return content_key("box", code_key("truesky.catalogue.matter.density_box"), cosmology, seed, cells)
-
-
-def label_tides(cosmology: str, seed: int, cells: int) -> str:
-    """Return the label of the tidal field of the box of matter with the same arguments of `label_box`.
-
-    Parameters
-    ----------
-    cosmology : str
-        Fingerprint of the cosmology.
-    seed : int
-        Seed of the box.
-    cells : int
-        Number of cells per side of the box.
-
-    Returns
-    -------
-    str
-        The label.
-    """
-    return content_key("tides", code_key("truesky.catalogue.matter.density_box"), cosmology, seed, cells)
+    return content_key(kind, code_key("truesky.catalogue.matter.density_box"), cosmology, seed, cells)
 
 
 def label_lensing(cosmology: str, seed: int, cells: int, nside: int, with_far_planes: bool) -> str:

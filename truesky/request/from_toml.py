@@ -14,7 +14,7 @@ All keys::
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
                    rotation       deg, added to the position angle of every galaxy before lensing
     [universe.cosmology]  omega_m, omega_b, h, sigma_8, n_s, w0, wa   flat universe, by default that of Flagship
-                   m_nu           sum of the masses of neutrinos, eV: only 0
+                   m_nu           sum of the masses of three equal neutrinos, eV, default: 0
                    power = "camb" | "eisenstein98"   source of the linear power spectrum
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
                    bright_limit   H (Vega, as observed); brighter stars are omitted

@@ -34,13 +34,9 @@ WITH_DEFAULT = {
     "truesky/cosmology.py",
     "truesky/request/checks.py",
     "truesky/request/schema.py",
-    # Rows of tables in memory, in which no distance follows from a redshift.
-    "truesky/catalogue/added_sources.py",
-    "truesky/catalogue/external/mapping.py",
     # The cosmology of the shipped table.
     "truesky/catalogue/matter/boltzmann.py",
     "truesky/validation/model/census.py",
-    "truesky/validation/model/observed.py",
     "truesky/validation/model/pictures.py",
 }
 
@@ -89,7 +85,7 @@ KEPT = {
     "halo bias": ("halo_bias", halo_bias),
     "lensing maps": ("lensing_16_3", lens_maps),
     "power": ("", lambda cosmology: linear_theory.power(cosmology, np.array([0.05, 0.3]))),
-    "power of halofit": ("", lambda cosmology: theory.nonlinear_power(cosmology, np.array([0.05, 0.3]), 0.5)),
+    "power of halofit": ("", lambda cosmology: theory.matter_power(cosmology, np.array([0.05, 0.3]), 0.5)),
     "light-cone": ("halo_light_cone", light_cone),
     "catalogue": ("ingest", split_catalogue),
 }
@@ -169,6 +165,9 @@ def test_a_universe_that_is_too_large_for_identifiers_is_refused():
     """The limit is that of `halos.model`: it accepts the largest universe that the check accepts."""
     with pytest.raises(BadInput, match=r"universe.cosmology: the distance to z = 6.1 is \d+ Mpc/h, at most 6276 is"):
         request_checks.check_cosmology(replace(FIT, omega_m=0.236))
+    # No package can make such a universe possible.
+    with pytest.raises(BadInput, match=r"^universe.cosmology: the distance to z = 6.1"):
+        request_checks.check_cosmology(replace(FIDUCIAL, omega_m=0.236))
     for omega_m in (0.238, 0.6):
         cosmology = replace(FIT, omega_m=omega_m)
         request_checks.check_cosmology(cosmology)

@@ -285,7 +285,7 @@ def test_ellipticities_of_tables_in_memory_are_refused_with_the_remedy():
     with pytest.raises(
         BadInput, match="rows: columns e1 and e2 are not possible here: give axis_ratio and position_an"
     ):
-        given_sources.from_arrays({"galaxies": (Path("rows"), columns)})
+        given_sources.from_arrays({"galaxies": (Path("rows"), columns)}, FIDUCIAL)
 
 
 def test_positions_in_radians_are_named(tmp_path):

@@ -44,16 +44,16 @@ def test_a_cache_that_cannot_be_written_has_no_labels(monkeypatch):
 
 def test_labels_differ():
     labels = [
-        cache_labels.label_box(FIDUCIAL.fingerprint(), 1, 192),
-        cache_labels.label_box(FIDUCIAL.fingerprint(), 1, 256),
-        cache_labels.label_box(FIDUCIAL.fingerprint(), 2, 192),
-        cache_labels.label_box("0123456789abcdef", 1, 192),
-        cache_labels.label_tides("0123456789abcdef", 1, 192),
+        cache_labels.label_box("box", FIDUCIAL.fingerprint(), 1, 192),
+        cache_labels.label_box("box", FIDUCIAL.fingerprint(), 1, 256),
+        cache_labels.label_box("box", FIDUCIAL.fingerprint(), 2, 192),
+        cache_labels.label_box("box", "0123456789abcdef", 1, 192),
+        cache_labels.label_box("tides", "0123456789abcdef", 1, 192),
         cache_labels.label_halo_bias("0123456789abcdef"),
         cache_labels.label_halo_tables(FIDUCIAL.fingerprint()),
         cache_labels.label_halo_tables("0123456789abcdef"),
         cache_labels.label_lensing("0123456789abcdef", 1, 192, 256, True),
-        cache_labels.label_tides(FIDUCIAL.fingerprint(), 1, 192),
+        cache_labels.label_box("tides", FIDUCIAL.fingerprint(), 1, 192),
         cache_labels.label_halo_bias(FIDUCIAL.fingerprint()),
         cache_labels.label_lensing(FIDUCIAL.fingerprint(), 1, 192, 256, True),
         cache_labels.label_lensing(FIDUCIAL.fingerprint(), 1, 192, 256, False),

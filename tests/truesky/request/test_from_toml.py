@@ -105,7 +105,12 @@ BAD = [
     ("universe", {"cosmology": {"sigma_8": 0}}, "universe.cosmology.sigma_8 = 0 is outside"),
     ("universe", {"cosmology": {"m_nu": -0.1}}, "universe.cosmology.m_nu = -0.1 is outside"),
     ("universe", {"cosmology": {"m_nu": 0.51}}, "universe.cosmology.m_nu = 0.51 is outside"),
-    ("universe", {"cosmology": {"m_nu": 0.06}}, "universe.cosmology: m_nu = 0.06 is not possible"),
+    ("universe", {"cosmology": {"m_nu": float("nan")}}, "universe.cosmology.m_nu = nan is outside"),
+    (
+        "universe",
+        {"cosmology": {"m_nu": 0.06, "power": "eisenstein98"}},
+        'universe.cosmology: m_nu = 0.06 requires power = "camb": eisenstein98 has no massive neutrinos',
+    ),
     ("universe", {"cosmology": {"power": "class"}}, "universe.cosmology.power = 'class' is not one of"),
     ("stars", {"bright_limit": 26.0}, "stars.bright_limit = 26 leaves no star"),
     ("stars", {"bright_limit": "none"}, "stars.bright_limit"),

@@ -1,10 +1,13 @@
 """Correlations of theory against relations that hold for any power spectrum."""
 
+import csv
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import j0, jv
 
-from truesky.cosmology import FIDUCIAL
+from truesky.cosmology import FIDUCIAL, LIMITS, Cosmology
 from truesky.validation import theory
 
 ARCMIN = np.radians(1 / 60)
@@ -41,9 +44,27 @@ def test_a_power_law_has_the_correlation_that_it_must():
 def test_power_is_linear_where_structure_is():
     """Within halos it is at least eight times the linear power, according to the published fit."""
     k = np.array([0.01, 0.02, 5.0])
-    ratio = theory.nonlinear_power(FIDUCIAL, k, 0.5) / theory.linear_power(FIDUCIAL, k, 0.5)
+    ratio = theory.matter_power(FIDUCIAL, k, 0.5) / theory.matter_power(FIDUCIAL, k, 0.5, is_linear=True)
     assert ratio[:2] == pytest.approx(np.ones(2), abs=0.03)
     assert 8.0 < ratio[2] < 40.0
+
+
+def test_halofit_is_that_of_camb(monkeypatch):
+    """The linear power today is that of the shipped table: dark energy does not change it at fixed sigma_8."""
+    today = theory._linear_power_today(FIDUCIAL)
+    monkeypatch.setattr(theory, "_linear_power_today", lambda cosmology: today)
+    path = Path(__file__).parents[1] / "cosmology_references.csv"
+    values = {}
+    for row in csv.DictReader(path.read_text().splitlines()):
+        if row["quantity"].startswith("halofit_z"):
+            cosmology = Cosmology(**{name: float(row[name]) for name in LIMITS})
+            z, k, expected = float(row["quantity"].removeprefix("halofit_z")), float(row["at"]), float(row["value"])
+            value = float(theory.matter_power(cosmology, np.array([k]), z)[0])
+            assert value == pytest.approx(expected, rel=2e-3, abs=0.0), row
+            values[cosmology.w0, z, k] = value
+    assert len(values) == 24
+    # Dark energy with w > -1 adds power within halos, also at equal linear power.
+    assert 1.01 < values[-0.9, 0.0, 1.0] / values[-1.0, 0.0, 1.0] < 1.02
 
 
 def test_sources_at_two_distances_are_between_those_at_each():

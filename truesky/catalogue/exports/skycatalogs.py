@@ -92,7 +92,7 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     ------
     BadInput
         If the lake has no table `galaxies`, if the tables of fluxes are missing, have no LSST band or belong to other
-        rows, or if the dark energy of the lake is not a cosmological constant.
+        rows, or if the lake has massive neutrinos or dark energy that is not a cosmological constant.
     """
     catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
     if "galaxy" not in catalogues:
@@ -103,6 +103,8 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
         raise BadInput(
             f"lake {lake}: w0 = {cosmology.w0:g}, wa = {cosmology.wa:g}; skyCatalogs knows w0 = -1, wa = 0 only"
         )
+    if cosmology.m_nu > 0.0:
+        raise BadInput(f"lake {lake}: m_nu = {cosmology.m_nu:g}; skyCatalogs has no massive neutrinos")
     folder.mkdir(parents=True, exist_ok=True)
     written, object_types, templates = [], {}, set[int]()
     for kind, catalogue in catalogues.items():

@@ -304,9 +304,8 @@ def _content_key(sha256: Sequence[str], columns: Columns) -> str:
     fields = sorted((key, repr(field)) for key, field in columns.fields.items())
     settings = [columns.companion_prefixes, columns.ellipticity, columns.frame]
     bounds = sorted((key, *map(float, limits)) for key, limits in columns.bounds.items())
-    return content_key(
-        code_key(__name__), json.dumps([fields, settings, bounds]), columns.cosmology.fingerprint(), *sha256
-    )
+    cosmology = "" if columns.cosmology is None else columns.cosmology.fingerprint()
+    return content_key(code_key(__name__), json.dumps([fields, settings, bounds]), cosmology, *sha256)
 
 
 def _identifier_title(columns: Columns) -> str:

@@ -21,7 +21,7 @@ from lake_schema.errors import BadInput, refuse_mistakes
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.texts import spelling, synonyms
 from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
-from truesky.cosmology import FIDUCIAL, Cosmology
+from truesky.cosmology import Cosmology
 from truesky.fluxes import passbands
 
 Bounds = Mapping[str, tuple[float, float]]
@@ -162,8 +162,8 @@ class Columns:
         Axes of the ellipticities, one of `FRAMES` in ellipticity.py.
     path : str
         Key of the request that contains the mapping, for messages.
-    cosmology : Cosmology
-        Parameters of the universe in which distances follow from redshifts.
+    cosmology : Cosmology or None
+        Parameters of the universe in which distances follow from redshifts. None for a table in which none do.
     """
 
     fields: Mapping[str, Field]
@@ -176,7 +176,13 @@ class Columns:
     ellipticity: str = ""
     frame: str = FRAMES[0]
     path: str = ""
-    cosmology: Cosmology = FIDUCIAL
+    cosmology: Cosmology | None = None
+
+    def known_cosmology(self) -> Cosmology:
+        """Return the cosmology; raises ValueError if the mapping has none."""
+        if self.cosmology is None:
+            raise ValueError(f"{self.path}: distances require a cosmology")
+        return self.cosmology
 
     def titles(self, in_companion: bool) -> list[str]:
         """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).

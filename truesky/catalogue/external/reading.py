@@ -199,7 +199,7 @@ def check_batch(piece: RowBatch, columns: Columns, mistakes: TableMistakes) -> d
         Values by name of the property, as in `Rows`.
     """
     rows = len(next(iter(piece.columns.values())))
-    by_key = {key: _value(key, field, columns.cosmology, piece.columns, rows) for key, field in columns.fields.items()}
+    by_key = {key: _value(key, field, columns, piece.columns, rows) for key, field in columns.fields.items()}
     for k in "12":
         # If a template has the flux fraction 0, set its index and its dust to 0, because they may have invalid values.
         if f"frac_{k}" in by_key:
@@ -243,7 +243,7 @@ def column_titles(columns: Columns, *keys: str) -> str:
     return " and ".join(dict.fromkeys(titles)) or " and ".join(keys)
 
 
-def _value(key: str, field: Field, cosmology: Cosmology, columns: Mapping[str, Array], rows: int) -> Array:
+def _value(key: str, field: Field, mapped: Columns, columns: Mapping[str, Array], rows: int) -> Array:
     if field.value is not None:
         return np.full(rows, field.value)
     values = columns[field.column]
@@ -258,7 +258,7 @@ def _value(key: str, field: Field, cosmology: Cosmology, columns: Mapping[str, A
         if field.over:
             values = values / columns[field.over]
         if field.kpc_at:
-            values = values / _kpc_per_arcsec(cosmology, columns[field.kpc_at])
+            values = values / _kpc_per_arcsec(mapped.known_cosmology(), columns[field.kpc_at])
         if field.power10:
             values = 10.0**values
         if field.log10:
@@ -322,7 +322,7 @@ def _check_absolute_magnitude(
     (z_lo, z_hi), (lo, hi) = columns.bounds[z_key], columns.bounds[magnitude]
     valid = (z >= z_lo) & (z <= z_hi) & (apparent >= lo) & (apparent <= hi)
     z = np.clip(np.where(valid, z, 1.0), MIN_REDSHIFT, None)
-    absolute = apparent - columns.cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    absolute = apparent - columns.known_cosmology().distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
     titles, noun = column_titles(columns, magnitude, z_key), "the absolute magnitude from columns"
     allowed = f"must be from {lo:g} to {hi:g}"

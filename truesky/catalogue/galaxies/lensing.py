@@ -28,6 +28,7 @@ from lake_schema.arrays import Array, Bool, Float, Float32
 from lake_schema.errors import BadInput
 from lake_schema.lazy_healpy import healpy as hp
 from truesky.catalogue import parameters
+from truesky.catalogue.matter import boltzmann
 from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import sources
 from truesky.numerics import activity
@@ -123,7 +124,7 @@ def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
     z = np.array(chosen.planes + (chosen.far_planes if with_far_planes else ()))
     numbers = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
     cosmology, maps = box.model.cosmology, (nside, int(with_far_planes))
-    numbers_of_box = box.seed, box.n, cosmology.fingerprint()
+    numbers_of_box = box.seed, box.n, cosmology.fingerprint(), boltzmann.camb_version(cosmology)
     key = content_key(code_key(__name__), *numbers_of_box, *map(float, np.concatenate(numbers)), *maps)
     chi = cosmology.comoving_distance(z)
     name = f"lensing_{nside}"

@@ -160,7 +160,7 @@ def half_light_radius(
     z : float array, shape (n,)
         Redshift.
     log_stellar_mass : float array, shape (n,)
-        log10 of the stellar mass, Msun (h = 0.67).
+        log10 of the stellar mass, Msun (not Msun/h).
     red : bool array, shape (n,)
         True for galaxies on the red sequence.
     kpc_per_arcsec : float array, shape (n,)

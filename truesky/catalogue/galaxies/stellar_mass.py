@@ -1,8 +1,8 @@
 """Stellar masses and star formation rates of galaxies.
 
-M_r is the absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1. Here it is converted to h = 0.67:
-M = M_r + 5 log10 h. Masses are for the initial mass function of Chabrier 2003 and rates for Kroupa 2001, which give
-about the same values. The parameters are in stellar_mass.toml.
+M_r is the absolute magnitude in 0.1r (SDSS r blueshifted to z = 0.1) for h = 1. Here it is converted to the h of
+the universe: M = M_r + 5 log10 h. Masses are for the initial mass function of Chabrier 2003 and rates for Kroupa 2001,
+which give about the same values. The parameters are in stellar_mass.toml.
 
 References
 ----------

@@ -139,7 +139,7 @@ class Masses:
 
     def radius(self, log_mass: Float) -> Float:
         """Return the halo radius R_200m in comoving Mpc/h, from log10 of M_200m in Msun/h."""
-        density = self.shape.overdensity * self.cosmology.omega_m * self.shape.critical_density
+        density = self.shape.overdensity * self.cosmology.omega_cold * self.shape.critical_density
         return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
 
     def dispersion(self, log_mass: Float, z: Float) -> Float:

@@ -1,12 +1,16 @@
-"""Linear power spectrum of matter from CAMB, which solves the Boltzmann equations: a shipped table, or computed now.
+"""Linear power spectrum of cold matter from CAMB, which solves the Boltzmann equations: shipped, or computed now.
 
 The table linear_power.toml contains the spectrum of the fiducial cosmology, and is written by
 scripts/linear_power_table.py. It is scaled for other values of sigma_8. For other cosmologies, the optional package
 CAMB must be installed.
 
+Cold matter is dark matter and baryons. With massive neutrinos, sigma_8 of all matter is that of the cosmology, and cold
+matter has more power. Halos and galaxies follow cold matter (Castorina et al. 2014).
+
 References
 ----------
 Lewis, Challinor & Lasenby 2000, ApJ 538, 473 (CAMB)
+Castorina et al. 2014, JCAP 2, 049 (halos and massive neutrinos)
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ K_RANGE, K_NODES = (1e-4, 100.0), 700
 _SIGMA_NODES = 20_000
 # Amplitude of the primordial power for which CAMB computes the spectrum, before it is scaled to sigma_8.
 _AMPLITUDE = 2e-9
-# Density of radiation: temperature of the microwave background (K), and effective number of massless neutrinos.
+# Density of radiation: temperature of the microwave background (K), and effective number of neutrinos.
 _T_CMB, _NEUTRINOS = 2.7255, 3.044
 
 
@@ -42,7 +46,7 @@ def wave_numbers() -> Float:
 
 
 def power(cosmology: Cosmology, k: Float) -> Float:
-    """Interpolate the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc from 1e-4 to 100; 0 elsewhere.
+    """Interpolate the linear power P(k) of cold matter at z = 0, (Mpc/h)^3, for k from 1e-4 to 100 h/Mpc; 0 elsewhere.
 
     Raises BadInput for a cosmology that differs from the fiducial one in more than sigma_8 if the package CAMB is not
     installed.
@@ -55,6 +59,23 @@ def power(cosmology: Cosmology, k: Float) -> Float:
     return np.where(inside, np.exp(spline(np.clip(at, ln_k[0], ln_k[-1]))), 0.0)
 
 
+def sigma_8_of_cold_matter(cosmology: Cosmology) -> float:
+    """Return the rms of the linear overdensity of cold matter in spheres of 8 Mpc/h today, which exceeds sigma_8.
+
+    Without massive neutrinos it is sigma_8. Raises BadInput with them if CAMB is not installed.
+    """
+    return _sigma_8(_table(cosmology)) if cosmology.m_nu > 0.0 else cosmology.sigma_8
+
+
+def camb_version(cosmology: Cosmology) -> str:
+    """Return the version of CAMB if it computes the spectrum of this cosmology, and "" for a table or a formula.
+
+    It belongs to the key of everything in the cache that depends on the spectrum. Raises BadInput if CAMB is required
+    and not installed.
+    """
+    return "" if cosmology.power != "camb" or _is_shipped(cosmology) else str(_import_camb().__version__)
+
+
 def check(cosmology: Cosmology) -> None:
     """Raise BadInput if the spectrum of this cosmology is not in the shipped table and CAMB is not installed."""
     if not _is_shipped(cosmology):
@@ -62,24 +83,35 @@ def check(cosmology: Cosmology) -> None:
 
 
 def compute(cosmology: Cosmology) -> dict[str, Array]:
-    """Compute the spectrum with CAMB at the wave numbers of a table, scaled to sigma_8, as the array "power".
+    """Compute the spectrum of cold matter at the wave numbers of a table with CAMB, as the array "power".
 
-    It takes 3 CPU s. The radiation, which distances neglect, is included. Raises BadInput if CAMB is not installed.
+    It is scaled so that all matter has the sigma_8 of the cosmology. It takes 3 CPU s. The radiation, which distances
+    neglect, is included. Raises BadInput if CAMB is not installed.
     """
     camb = _import_camb()
-    h = cosmology.h
+    h, is_massive = cosmology.h, cosmology.m_nu > 0.0
     settings = camb.set_params(
-        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_m - cosmology.omega_b) * h**2, omk=0.0,
-        mnu=0.0, num_massive_neutrinos=0, nnu=_NEUTRINOS, TCMB=_T_CMB, ns=cosmology.n_s, As=_AMPLITUDE,
+        H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_cold - cosmology.omega_b) * h**2, omk=0.0,
+        mnu=cosmology.m_nu, num_massive_neutrinos=3 if is_massive else 0, neutrino_hierarchy="degenerate",
+        nnu=_NEUTRINOS, TCMB=_T_CMB, ns=cosmology.n_s, As=_AMPLITUDE,
         w=cosmology.w0, wa=cosmology.wa, dark_energy_model="ppf",
     )  # fmt: skip
+    # CAMB converts masses to a density that differs from ours by 1e-3.
+    settings.omnuh2 = cosmology.omega_nu * h**2
     settings.WantCls = False
     settings.NonLinear = camb.model.NonLinear_none
     settings.set_matter_power(redshifts=[0.0], kmax=1.2 * K_RANGE[1] * h, k_per_logint=0, silent=True)
     results = camb.get_results(settings)
-    interpolator = results.get_matter_power_interpolator(nonlinear=False, hubble_units=True, k_hunit=True)
-    spectrum = np.asarray(interpolator.P(0.0, wave_numbers()), float)
-    return {"power": spectrum * (cosmology.sigma_8 / _sigma_8(spectrum)) ** 2}
+
+    def spectrum(kind: str) -> Float:
+        interpolator = results.get_matter_power_interpolator(
+            nonlinear=False, hubble_units=True, k_hunit=True, var1=kind, var2=kind
+        )
+        return np.asarray(interpolator.P(0.0, wave_numbers()), float)
+
+    matter = spectrum("delta_tot")
+    cold = spectrum("delta_nonu") if is_massive else matter
+    return {"power": cold * (cosmology.sigma_8 / _sigma_8(matter)) ** 2}
 
 
 def _sigma_8(spectrum: Float) -> float:
@@ -96,7 +128,7 @@ def _table(cosmology: Cosmology) -> Float:
     if _is_shipped(cosmology):
         scale = (cosmology.sigma_8 / FIDUCIAL.sigma_8) ** 2
         return np.array(parameters.section(_FILE, "camb")["power"]) * scale
-    key = content_key(code_key(__name__), cosmology.fingerprint())
+    key = content_key(code_key(__name__), cosmology.fingerprint(), camb_version(cosmology))
     return cached_arrays("linear_power", key, lambda: compute(cosmology))["power"]
 
 
@@ -106,6 +138,7 @@ def _is_shipped(cosmology: Cosmology) -> bool:
 
 
 def _import_camb() -> Any:
+    """Import CAMB, which is optional; raise BadInput if it is not installed."""
     try:
         import camb
     except ModuleNotFoundError:

@@ -33,10 +33,10 @@ import scipy
 from lake_schema.arrays import Complex64, Float, Float32, Int
 from lake_schema.errors import BadInput
 from truesky.catalogue import parameters
-from truesky.catalogue.matter import linear_theory
+from truesky.catalogue.matter import boltzmann, linear_theory
 from truesky.cosmology import Cosmology
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.cache_labels import label_box, label_halo_bias, label_tides
+from truesky.numerics.cache_labels import label_box, label_halo_bias
 from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 
@@ -72,7 +72,7 @@ class BoxModel:
         """Return the values that identify the model in the key of a cached result."""
         names = [field.name for field in fields(self) if field.name != "cosmology"]
         numbers = [float(value) for name in names for value in np.atleast_1d(getattr(self, name))]
-        return [*numbers, self.cosmology.fingerprint()]
+        return [*numbers, self.cosmology.fingerprint(), boltzmann.camb_version(self.cosmology)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +154,7 @@ def load(seed: int, n: int, cosmology: Cosmology) -> Box:
         velocity = tuple(
             cached(f"box_u{axis}", partial(_displacement, linear_modes, model.cell, axis)) for axis in range(3)
         )
-    label = label_box(cosmology.fingerprint(), seed, n)
+    label = label_box("box", cosmology.fingerprint(), seed, n)
     variance = cached("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]), label)
     return Box(model, n, seed, tuple(smooth), np.asarray(variance, float), velocity)
 
@@ -168,9 +168,10 @@ def tides(box: Box) -> tuple[Float32, ...]:
         T_ij = (d_i d_j / nabla^2 - delta_ij / 3) delta
     """
     cosmology = box.model.cosmology.fingerprint()
-    key = content_key(code_key(__name__), box.seed, box.n, box.model.cell, cosmology)
+    version = boltzmann.camb_version(box.model.cosmology)
+    key = content_key(code_key(__name__), box.seed, box.n, box.model.cell, cosmology, version)
     linear_modes, tide_fields = cache(lambda: _linear_modes(box.model, box.smoothed[0])), []
-    label = label_tides(cosmology, box.seed, box.n)
+    label = label_box("tides", cosmology, box.seed, box.n)
     with scipy.fft.set_workers(min(os.cpu_count() or 1, _MAX_WORKERS)):
         for name, axis_1, axis_2 in (("xx", 0, 0), ("yy", 1, 1), ("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2)):
             make_tide = partial(_tide, linear_modes, box.model.cell, axis_1, axis_2)
@@ -275,7 +276,7 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
 
 
 def linear_power(cosmology: Cosmology, k: npt.ArrayLike) -> Float:
-    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
+    """Return the linear power P(k) of cold matter at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
     return linear_theory.power(cosmology, np.asarray(k, float))
 
 

@@ -3,17 +3,20 @@
 Colossus writes no files: its persistent storage is off, and the results are in the disc cache of truesky. Colossus has
 one current cosmology per process, which is set before each use.
 
+Colossus has no massive neutrinos. It gets the power spectrum and the growth of cold matter, and for a halo the mass of
+all matter in its Lagrangian radius. Only cold matter contributes to halo masses (Castorina et al. 2014).
+
 References
 ----------
 Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 724, 878; Diemer & Joyce 2019, ApJ 871,
-168; Diemer 2018, ApJS 239, 35 (colossus)
+168; Diemer 2018, ApJS 239, 35 (colossus); Castorina et al. 2014, JCAP 2, 049 (massive neutrinos)
 """
 
 from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,7 @@ from truesky.numerics.code_fingerprints import code_key
 MASS_DEFINITION = "200m"
 # Colossus models of the linear power spectrum, the halo mass function, the halo bias and the concentration.
 _MASS_FUNCTION, _BIAS, _CONCENTRATION = "tinker08", "tinker10", "diemer19"
-# Model of colossus for the power spectrum: the fitting formula of Eisenstein & Hu, without massive neutrinos.
+# Model of colossus for the power spectrum: the fitting formula of Eisenstein & Hu.
 _FIT = "eisenstein98"
 # log10 of the wave numbers (h/Mpc) at which colossus gets the power spectrum of CAMB, beyond all halos of the tables.
 _LOG_K = np.linspace(-5.0, 5.0, 2001)
@@ -41,16 +44,17 @@ _COARSE = 20
 
 
 def power(cosmology: Cosmology, k: Float) -> Float:
-    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc.
+    """Return the linear power P(k) of cold matter at z = 0 in (Mpc/h)^3, for k in h/Mpc.
 
     For `cosmology.power` = "camb", the spectrum of CAMB is continued beyond 1e-4 < k < 100 h/Mpc with the shape of the
     fitting formula. Raises BadInput if CAMB is required and not installed.
     """
-    fit = np.asarray(_power_cosmology(cosmology).matterPowerSpectrum(k, 0.0, model=_FIT), float)
+    fitted = replace(cosmology, power=_FIT, m_nu=0.0)
+    fit = np.asarray(_power_cosmology(fitted).matterPowerSpectrum(k, 0.0, model=_FIT), float)
     if cosmology.power == _FIT:
         return fit
     ends = np.array(boltzmann.K_RANGE)
-    first, last = boltzmann.power(cosmology, ends) / power(replace(cosmology, power=_FIT), ends)
+    first, last = boltzmann.power(cosmology, ends) / power(fitted, ends)
     inside = (k >= ends[0]) & (k <= ends[1])
     return np.where(inside, boltzmann.power(cosmology, k), fit * np.where(k < ends[0], first, last))
 
@@ -75,7 +79,7 @@ def halo_tables(cosmology: Cosmology, log_mass: Float, z: Float) -> dict[str, Fl
         The abundance dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), the linear `bias` (z, m), and the
         `concentration` c_200m (10, m) at 10 redshifts that are uniform in ln(1 + z) over the same range.
     """
-    key = content_key(code_key(__name__), cosmology.fingerprint(), log_mass, z)
+    key = content_key(code_key(__name__), cosmology.fingerprint(), boltzmann.camb_version(cosmology), log_mass, z)
     label = label_halo_tables(cosmology.fingerprint())
     return cached_arrays("halo_tables", key, lambda: _halo_tables(cosmology, log_mass, z), label)
 
@@ -101,7 +105,9 @@ def _colossus_tables(
     from colossus.halo import concentration
     from colossus.lss import bias, mass_function, peaks
 
-    mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION, "ps_args": spectrum}
+    # Ratio of all matter to cold matter in the Lagrangian radius of a halo.
+    ratio = cosmology.omega_m / cosmology.omega_cold
+    mass, args = ratio * 10.0**log_mass, {"mdef": MASS_DEFINITION, "ps_args": spectrum}
     rows = [mass_function.massFunction(mass, at, model=_MASS_FUNCTION, q_out="dndlnM", **args) for at in z]
     biases = [
         bias.haloBiasFromNu(peaks.peakHeight(mass, at, ps_args=spectrum), z=at, mdef=MASS_DEFINITION, model=_BIAS)
@@ -109,7 +115,9 @@ def _colossus_tables(
     ]
     coarse_mass, coarse_z = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
     c = [
-        concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION, ps_args=spectrum)
+        concentration.concentration(
+            ratio * 10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION, ps_args=spectrum
+        )
         for at in coarse_z
     ]
     concentrations = np.array([np.exp(np.interp(log_mass, coarse_mass, np.log(row))) for row in c])
@@ -136,11 +144,21 @@ def _set_cosmology(cosmology: Cosmology, reads_files: bool = False) -> Any:
         "H0": 100.0 * cosmology.h,
         "Om0": cosmology.omega_m,
         "Ob0": cosmology.omega_b,
-        "sigma8": cosmology.sigma_8,
+        "sigma8": boltzmann.sigma_8_of_cold_matter(cosmology),
         "ns": cosmology.n_s,
         "relspecies": False,
     }
     if not cosmology.has_constant_dark_energy:
         numbers |= {"de_model": "w0wa", "w0": cosmology.w0, "wa": cosmology.wa}
     name = f"truesky_{cosmology.fingerprint()}"
-    return colossus.setCosmology(name, numbers, persistence="r" if reads_files else "")
+    current = colossus.setCosmology(name, numbers, persistence="r" if reads_files else "")
+    if cosmology.m_nu > 0.0:
+        # Colossus only calls this method, for sigma(M, z) and concentrations.
+        current.growthFactor = partial(_growth, cosmology)
+    return current
+
+
+def _growth(cosmology: Cosmology, z: Float, derivative: int = 0) -> Float:
+    """Return the linear growth D(z), or dD/dz if `derivative` is 1, as colossus calls it."""
+    d = cosmology.growth(z)
+    return -d * cosmology.growth_rate(z, 0.0) / (1.0 + z) if derivative else d

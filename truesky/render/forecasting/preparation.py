@@ -132,9 +132,11 @@ def _catalogue_items(request: Request) -> Iterator[Item]:
     yield _item("band_ratios", "colours of galaxies", [cache_labels.label_band_ratios(band) for band in bands])
     yield _item("halo_tables", "halo abundance", [cache_labels.label_halo_tables(cosmology)])
     yield _item("halo_bias", "halo bias", [cache_labels.label_halo_bias(cosmology)])
-    yield _item("box", f"matter in {cells}^3 cells", [cache_labels.label_box(cosmology, seed, cells)], cells**3)
+    yield _item("box", f"matter in {cells}^3 cells", [cache_labels.label_box("box", cosmology, seed, cells)], cells**3)
     if universe.alignment:
-        yield _item("tides", f"tides in {cells}^3 cells", [cache_labels.label_tides(cosmology, seed, cells)], cells**3)
+        yield _item(
+            "tides", f"tides in {cells}^3 cells", [cache_labels.label_box("tides", cosmology, seed, cells)], cells**3
+        )
     if universe.lensing is None:
         with_far_planes = max(universe.high_redshift_boost, universe.quasar_boost) > 0.0
         nside = universe.lensing_nside

@@ -22,7 +22,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.catalogue.galaxies import band_ratios
 from truesky.catalogue.halos import matching
-from truesky.cosmology import FIDUCIAL, Cosmology, from_facts
+from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import passbands
 from truesky.fluxes.high_redshift import QUASAR
 from truesky.fluxes.libraries import templates
@@ -72,7 +72,7 @@ class GalaxySample:
     mags : mapping of str to float array, shape (n,)
         Apparent AB magnitudes by band.
     ultraviolet : float array, shape (n,)
-        Absolute AB magnitude at 1500 A (rest frame), for h = 0.67.
+        Absolute AB magnitude at 1500 A (rest frame), for h of `cosmology`.
     area : float
         Area of the sky, deg2.
     cosmology : Cosmology
@@ -96,9 +96,9 @@ class GalaxySample:
         return float(np.count_nonzero(selected) / self.area)
 
     def volume(self, z_min: float, z_max: float) -> float:
-        """Return the comoving volume between two redshifts in the sample's area of the sky, Mpc^3 (for h = 0.67)."""
+        """Return the comoving volume between two redshifts in the sample's area of the sky, Mpc^3 (not Mpc^3/h^3)."""
         steradian = self.area * np.radians(1.0) ** 2
-        return float(self.cosmology.comoving_volume(z_min, z_max) * steradian / FIDUCIAL.h**3)
+        return float(self.cosmology.comoving_volume(z_min, z_max) * steradian / self.cosmology.h**3)
 
 
 # Columns of the table `galaxies` that the measurements require.
@@ -182,7 +182,7 @@ def from_columns(
     curve = passbands.load(_ULTRAVIOLET_BAND)
     from_z = passbands.pivot_wavelength(curve) / _ULTRAVIOLET_AT - 1.0
     rest = m_r + band_ratios.offset(band_table, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
-    return GalaxySample(rows, mags, rest + 5.0 * np.log10(FIDUCIAL.h), area, cosmology)
+    return GalaxySample(rows, mags, rest + 5.0 * np.log10(cosmology.h), area, cosmology)
 
 
 def apparent_magnitudes(

@@ -6,6 +6,7 @@ The lensing maps of the catalogue, and maps of universes with other random seeds
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -48,8 +49,8 @@ def linear_theory(cosmology: Cosmology, ell: Float, chi: float) -> Float:
     float array, shape (n,)
         C_l at each multipole.
     """
-    weight = np.ones(1)
-    return theories.convergence_power(cosmology, ell, np.array([chi]), weight, theories.linear_power, _distances(chi))
+    linear, weight = partial(theories.matter_power, is_linear=True), np.ones(1)
+    return theories.convergence_power(cosmology, ell, np.array([chi]), weight, linear, _distances(chi))
 
 
 def _distances(chi: float) -> Float:

@@ -67,6 +67,14 @@ def test_other_dark_energy_is_refused(lake, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob("*.parquet"))
 
 
+def test_massive_neutrinos_are_refused(lake, tmp_path, monkeypatch):
+    """The format cannot name them, so that its sigma_8 would be that of another universe."""
+    monkeypatch.setattr(skycatalogs, "from_facts", lambda facts: replace(FIDUCIAL, m_nu=0.06))
+    with pytest.raises(BadInput, match=r"m_nu = 0\.06; skyCatalogs has no massive neutrinos"):
+        export_galaxies.export(lake, tmp_path / "set", "skycatalogs")
+    assert not list(tmp_path.rglob("*.parquet"))
+
+
 def test_the_yaml_file_lists_all_files_without_local_paths(written):
     folder, files = written
     text = (folder / "skyCatalog.yaml").read_text()

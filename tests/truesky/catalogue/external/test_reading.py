@@ -1,6 +1,7 @@
 """Every row of a user's tables is read; all mistakes are reported at once with the user's columns and rows."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +36,8 @@ def table(number=50, **changes):
 
 
 def galaxies(entries=GALAXIES, **more):
-    return mapping.galaxy_columns("", {key: json.dumps(value) for key, value in {**entries, **more}.items()})
+    mapped = mapping.galaxy_columns("", {key: json.dumps(value) for key, value in {**entries, **more}.items()})
+    return replace(mapped, cosmology=FIDUCIAL)
 
 
 def halos():

@@ -1,6 +1,7 @@
 """Two hundred square degrees of sources at z = 1: correlations of shear, and shear about massive halos."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -193,7 +194,7 @@ def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
     ell = np.unique(np.geomspace(5, 3e5, 500))
     linear, whole_power = (
         theory.convergence_power(FIDUCIAL, ell, np.array([CHI]), np.ones(1), of)
-        for of in (theory.linear_power, theory.nonlinear_power)
+        for of in (partial(theory.matter_power, is_linear=True), theory.matter_power)
     )
     box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, whole_power)
     plus, minus = (

@@ -118,8 +118,8 @@ def test_products_have_the_labels_for_which_forecasts_look(empty_cache):
     build_tables.galaxy_table(band, galaxies, setting, build_tables.library_key(galaxies))
     band_ratios.load(galaxies, "euclid_vis", 0.0, 0.8)
     for label in (
-        cache_labels.label_box(FIDUCIAL.fingerprint(), 3, 32),
-        cache_labels.label_tides(FIDUCIAL.fingerprint(), 3, 32),
+        cache_labels.label_box("box", FIDUCIAL.fingerprint(), 3, 32),
+        cache_labels.label_box("tides", FIDUCIAL.fingerprint(), 3, 32),
         cache_labels.label_lensing(FIDUCIAL.fingerprint(), 3, 32, 16, False),
         cache_labels.label_profiles(),
         cache_labels.label_psf("vis", vis.name, "euclid_vis", 1, mission.parameters),

@@ -32,6 +32,16 @@ def seen(rows, cells):
     return observed.from_table(rows, cells * sky.cell_area(GENERATION_ORDER), FIDUCIAL)
 
 
+def test_densities_and_magnitudes_have_the_h_of_the_sample():
+    """With another h alone, a volume in Mpc^3 is larger by h^-3; stellar masses in Msun follow this h, too."""
+    other = replace(FIDUCIAL, h=0.8)
+    rows, nothing = {name: np.zeros(0) for name in observed.COLUMNS}, np.zeros(0)
+    small, large = (observed.GalaxySample(rows, {}, nothing, 2.0, of).volume(0.2, 0.5) for of in (other, FIDUCIAL))
+    assert large / small == pytest.approx((0.8 / 0.67) ** 3, rel=1e-12)
+    shell = float(FIDUCIAL.comoving_volume(0.2, 0.5)) * 2.0 * np.radians(1.0) ** 2
+    assert large == pytest.approx(shell / 0.67**3, rel=1e-12)
+
+
 @pytest.fixture(scope="module")
 def flat():
     return mean_sky.without_clustering(made())

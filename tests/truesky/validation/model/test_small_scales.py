@@ -46,6 +46,35 @@ def test_galaxies_cluster_as_observed(found):
     assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
 
 
+def test_a_check_fails_without_structure_below_the_cells(found):
+    """The sample is the one with structure, 8 cells with the same halos, so that both share most of their noise.
+
+    Seeds are fixed: the checks have no tolerance for the noise of the sample, and no chance of failure.
+    """
+    without = small_scales.figures(_without_structure(), CELLS)
+    assert without["w_m20_0.32"] < 0.85 * found["w_m20_0.32"]
+    assert _failing(found) == []
+    assert _failing(without) == ["w_m20_0.32"]
+
+
+@pytest.mark.nightly
+def test_a_check_fails_without_structure_below_the_cells_in_many_cells():
+    """With 96 cells, the tolerances of the list are increased by one standard error of the sample."""
+    populations = small_scales.galaxy_population(SEED, Universe(box_cells=BOX_CELLS)), _without_structure()
+    whole, without = (small_scales.figures(population, 96) for population in populations)
+    assert _failing(whole, 1.0) == []
+    assert _failing(without, 1.0) == ["w_m20_0.32"]
+
+
+def _without_structure():
+    return small_scales.galaxy_population(SEED, Universe(box_cells=BOX_CELLS, structure_below_cells=False))
+
+
+def _failing(figures, n_sigma=0.0):
+    results = checks.evaluate(figures, n_sigma)
+    return [check.name for check in results if check.name.startswith("w_m20") and not check.passes]
+
+
 @pytest.mark.nightly
 def test_galaxies_cluster_less_with_satellites_of_today(found, monkeypatch):
     monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))

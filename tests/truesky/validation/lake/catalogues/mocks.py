@@ -76,5 +76,5 @@ def bias(log_mass):
     """Bias of halos at z = 0.7 from the formula of Tinker et al. 2010 for an overdensity of 200 times the mean."""
     from colossus.lss import bias as halo_bias
 
-    theory.linear_power(FIDUCIAL, np.ones(1), 0.0)
+    theory.matter_power(FIDUCIAL, np.ones(1), 0.0, is_linear=True)
     return float(halo_bias.haloBias(10.0**log_mass, 0.7, mdef="200m", model="tinker10"))
