@@ -82,6 +82,7 @@ def run(monkeypatch, name, **environment):
     for key, value in environment.items():
         monkeypatch.setenv(key, str(value))
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    # A cell that takes three minutes alone has taken ten next to other programs.
     NotebookClient(notebook, timeout=3000, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert [output for output in outputs if output.output_type == "error"] == []

@@ -193,12 +193,13 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     lost = _lost_photons(curve)
     if lost > _MAX_LOST_PHOTONS:
         first, last = passbands.GRID_FIRST, passbands.GRID_LAST
-        raise BadInput(f"{path}: {lost:.1%} of the photons are outside {first} .. {last} A, where there are no spectra")
+        problem = f"detects {lost:.1%} of its photons outside {first} .. {last} A, where there are no spectra"
+        raise BadInput(f"{path}: {problem}: cut the curve there, or leave out the band")
     return Passband(name, wavelength, response, medium)
 
 
 def _lost_photons(curve: Curve) -> float:
-    """Return the fraction of the photons of a flat spectrum that a passband detects beyond the grid of spectra."""
+    """Return the fraction of a passband's photons beyond the grid of spectra, for a source of constant f_lambda."""
     edges = np.clip([passbands.GRID_FIRST, passbands.GRID_LAST], curve.wavelength[0], curve.wavelength[-1])
     # The edges become points of the curve, so that trapezoids end there.
     wavelength = np.union1d(curve.wavelength, edges)
