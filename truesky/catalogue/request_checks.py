@@ -104,8 +104,9 @@ def _check_halos(request: Request) -> None:
 
 def _check_training(request: Request) -> None:
     if (catalogue := request.ingest.training) is not None:
+        entries, cosmology = dict(catalogue.columns), request.universe.cosmology
         columns = _with_existing_files(
-            "ingest.training", catalogue, lambda: mapping.training_columns(dict(catalogue.columns))
+            "ingest.training", catalogue, lambda: mapping.training_columns(entries, cosmology)
         )
         columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)
