@@ -28,6 +28,7 @@ from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.nearest_sed import Training
 from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.halos.halo_catalogue import LightCone
+from truesky.catalogue.matter import boltzmann
 from truesky.catalogue.request_checks import check_band, check_cosmology
 from truesky.cosmology import from_facts
 from truesky.fluxes import sources
@@ -109,8 +110,11 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
         **dust_map.facts(user_inputs.dust),
         "code": code_version(),
     }
+    version = boltzmann.camb_version(cosmology)
+    camb_facts = {"camb": version} if version else {}
+    facts |= camb_facts
     tasks = cells.tasks_of_area(request.area)
-    halo_keys = ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, "code")
+    halo_keys = ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, *camb_facts, "code")
     halo_facts = {key: facts[key] for key in halo_keys}
     halos, limits = Plan(HALOS, halo_facts, tasks), Plan(HALO_LIMITS, halo_facts, (Task("all.parquet", {}),))
     # Store, with the table `galaxies`, the multipole up to which the power of the lensing agrees with linear theory

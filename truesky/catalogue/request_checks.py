@@ -64,8 +64,7 @@ def check_cosmology(cosmology: Cosmology) -> None:
     if distance > largest:
         problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
         raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
-    if cosmology.power == "camb":
-        boltzmann.check(cosmology)
+    boltzmann.camb_version(cosmology)
 
 
 def _check_dust(request: Request) -> None:
