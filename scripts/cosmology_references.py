@@ -24,7 +24,7 @@ COSMOLOGIES = (
     Cosmology(omega_m=0.26, omega_b=0.045, h=0.73, sigma_8=0.78, n_s=0.95, w0=-1.1, wa=-0.4),
 )
 # Universes with massive neutrinos, for which only CAMB has values. The last two have nearly the largest fraction of
-# neutrinos that is possible; of several such universes, the last one has the largest error of the growth.
+# neutrinos that is possible. The error of the growth is larger in the last one than in other such universes.
 WITH_NEUTRINOS = (
     *(replace(of, m_nu=m_nu) for of in (FIDUCIAL, COSMOLOGIES[3], COSMOLOGIES[4]) for m_nu in (0.06, 0.5)),
     replace(FIDUCIAL, omega_m=0.3, m_nu=0.5),
