@@ -66,12 +66,12 @@ def test_structure_below_the_cells_adds_clustering(cells):
 
 @pytest.mark.nightly
 def test_a_check_fails_without_structure_below_the_cells():
-    """A universe that clusters as observed passes, and fails without what the structure adds, less one error."""
+    """A universe that clusters as observed passes, and fails without what the structure adds, which is 0.19 +- 0.04."""
     samples = [small_scales.measure_cells(_universe(structure_below_cells=value), 96) for value in (True, False)]
     difference, error = _add_by_structure(*samples)
-    assert difference > 3.0 * error
+    assert difference > 4.0 * error
     assert _failing({"w_m20_0.32": 1.0}) == []
-    assert _failing({"w_m20_0.32": 1.0 - difference + error}) == ["w_m20_0.32"]
+    assert _failing({"w_m20_0.32": 1.0 - difference}) == ["w_m20_0.32"]
 
 
 def _add_by_structure(with_structure, without):
