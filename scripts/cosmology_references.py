@@ -23,15 +23,21 @@ COSMOLOGIES = (
     replace(FIDUCIAL, w0=-0.9, wa=0.3),
     Cosmology(omega_m=0.26, omega_b=0.045, h=0.73, sigma_8=0.78, n_s=0.95, w0=-1.1, wa=-0.4),
 )
-# Universes with massive neutrinos, for which only CAMB has values.
-WITH_NEUTRINOS = tuple(
-    replace(cosmology, m_nu=m_nu) for cosmology in (FIDUCIAL, COSMOLOGIES[3], COSMOLOGIES[4]) for m_nu in (0.06, 0.5)
+# Universes with massive neutrinos, for which only CAMB has values. The last two have nearly the largest fraction of
+# neutrinos that is possible. The error of the growth is larger in the last one than in other such universes.
+WITH_NEUTRINOS = (
+    *(replace(of, m_nu=m_nu) for of in (FIDUCIAL, COSMOLOGIES[3], COSMOLOGIES[4]) for m_nu in (0.06, 0.5)),
+    replace(FIDUCIAL, omega_m=0.3, m_nu=0.5),
+    replace(FIDUCIAL, omega_m=0.6, h=0.474, m_nu=0.5),
 )
-# Universes for which CAMB computes the non-linear power with halofit.
-WITH_HALOFIT = (FIDUCIAL, replace(FIDUCIAL, w0=-0.9, wa=0.1))
+# Universes for which CAMB computes the non-linear power with halofit. The last one is far from a constant.
+WITH_HALOFIT = (FIDUCIAL, replace(FIDUCIAL, w0=-0.9, wa=0.1), replace(FIDUCIAL, w0=-0.6, wa=0.3))
 # Redshifts of distances and growth, redshifts of sigma_8, and wave numbers (h/Mpc) of the power spectrum. CAMB includes
 # radiation, which changes sigma_8(z) / sigma_8(0) by more than 1e-3 beyond z = 2.
 REDSHIFTS, SIGMA_REDSHIFTS, WAVE_NUMBERS = (0.5, 1.0, 2.0, 5.0, 10.0), (0.5, 1.0, 2.0), (0.01, 0.1, 1.0)
+# Wave numbers of the non-linear power, and redshifts and wave numbers of the power of cold matter (h/Mpc).
+HALOFIT_WAVE_NUMBERS = (*WAVE_NUMBERS, 5.0, 30.0)
+COLD_REDSHIFTS, COLD_WAVE_NUMBERS = (0.0, 1.0, 2.0, 5.0), (0.005, 0.02, 0.1, 1.0)
 
 
 def rows() -> Iterator[str]:
@@ -68,7 +74,9 @@ def _values_of_ccl(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
         yield "power", k, float(pyccl.linear_matter_power(warm, k * cosmology.h, 1.0)) * cosmology.h**3
 
 
-def _results_of_camb(cosmology: Cosmology, redshifts: tuple[float, ...], amplitude: float = 2e-9) -> Any:
+def _results_of_camb(
+    cosmology: Cosmology, redshifts: tuple[float, ...], amplitude: float = 2e-9, k_max: float = 5.0
+) -> Any:
     import camb
 
     h, is_massive = cosmology.h, cosmology.m_nu > 0.0
@@ -79,7 +87,7 @@ def _results_of_camb(cosmology: Cosmology, redshifts: tuple[float, ...], amplitu
         dark_energy_model="ppf", halofit_version="takahashi",
     )  # fmt: skip
     settings.omnuh2 = cosmology.m_nu / 93.14
-    settings.set_matter_power(redshifts=[*redshifts, 0.0], kmax=5.0, silent=True)
+    settings.set_matter_power(redshifts=[*redshifts, 0.0], kmax=k_max, silent=True)
     return camb.get_results(settings)
 
 
@@ -93,15 +101,19 @@ def _values_with_neutrinos(cosmology: Cosmology) -> Iterator[tuple[str, float, f
         yield "growth_of_cold_matter", z, float(value / cold[0])
         yield "growth_of_all_matter", z, float(total / matter[0])
         yield "chi_with_neutrinos", z, float(results.comoving_radial_distance(z)) * cosmology.h
+    power = results.get_matter_power_interpolator(nonlinear=False, var1="delta_nonu", var2="delta_nonu")
+    for z in COLD_REDSHIFTS:
+        for k in COLD_WAVE_NUMBERS:
+            yield f"cold_power_z{z:g}", k, float(power.P(z, k)) * (cosmology.sigma_8 / float(matter[0])) ** 2
 
 
 def _values_of_halofit(cosmology: Cosmology) -> Iterator[tuple[str, float, float]]:
     linear = _results_of_camb(cosmology, SIGMA_REDSHIFTS)
     amplitude = 2e-9 * (cosmology.sigma_8 / float(np.max(linear.get_sigma8()))) ** 2
-    results = _results_of_camb(cosmology, SIGMA_REDSHIFTS, amplitude)
+    results = _results_of_camb(cosmology, SIGMA_REDSHIFTS, amplitude, k_max=60.0)
     power = results.get_matter_power_interpolator(nonlinear=True)
     for z in (0.0, *SIGMA_REDSHIFTS):
-        for k in WAVE_NUMBERS:
+        for k in HALOFIT_WAVE_NUMBERS:
             yield f"halofit_z{z:g}", k, float(power.P(z, k))
 
 

@@ -21,19 +21,20 @@ from scripts import request_keys
 from truesky.catalogue import dust_map, given_sources
 from truesky.catalogue.external import mapping
 from truesky.catalogue.stars import bright_stars, from_catalogue
+from truesky.cosmology import MIN_M_NU
 from truesky.render.sources import ephemerides
 from truesky.request.exposures import pointing_tables
 
 _ROOT = Path(__file__).resolve().parents[1]
-_HEAD = """# Limits of all numbers
+_HEAD = f"""# Limits of all numbers
 
 Written by `python -m scripts.limits_tables > docs/limits.md`; do not edit.
 
 A number must lie between its limits, which are included. An empty field means that there is no limit. NaN and
 infinity are refused, and so is a text in quotes instead of a number. A value outside is refused in one line that names
-its place. Further conditions can relate numbers to each other; for example, an area must be convex. Properties of
-galaxies in files of users that are stored in single precision may exceed a limit by 1e-6 of it, and are then set to the
-limit.
+its place. Further conditions can relate numbers to each other; for example, an area must be convex. The sum of the
+masses of neutrinos `m_nu` must be 0, or at least {MIN_M_NU:g} eV. Properties of galaxies in files of users that are
+stored in single precision may exceed a limit by 1e-6 of it, and are then set to the limit.
 """
 _MISSION = """Numbers of `[mission.overrides]`, `[explore]`, a camera's `parameters.csv` and `bands.csv`, and of the
 database itself. A parameter must lie within the limits of every pattern that matches its name. `*` stands for any

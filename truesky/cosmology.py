@@ -50,6 +50,9 @@ LIMITS = {
     "wa": (-2.0, 2.0),
     "m_nu": (0.0, 0.5),
 }
+# Smallest sum of the masses of neutrinos above 0, eV, and largest fraction of massive neutrinos in all matter. With
+# more neutrinos, the growth and the lensing have larger errors.
+MIN_M_NU, MAX_NEUTRINO_FRACTION = 1e-3, 0.04
 # Largest w0 + wa, the equation of state of dark energy at high redshifts.
 MAX_EARLY_W = -0.1
 # Sources of the linear power spectrum, and the one that is used by default. A change of the default changes all skies.
@@ -102,7 +105,8 @@ class Cosmology:
     ------
     BadInput
         If a parameter is not within its LIMITS, baryons and neutrinos are not less than all matter, dark energy would
-        not be negligible at high redshifts, or neutrinos have a mass and the power spectrum is not that of CAMB.
+        not be negligible at high redshifts, or neutrinos have a mass that is tiny, or is too large a fraction of the
+        matter, or the power spectrum is not that of CAMB.
     """
 
     omega_m: float
@@ -120,6 +124,7 @@ class Cosmology:
             value = getattr(self, name)
             if not lo <= value <= hi:
                 raise OutOfRange(name, value, lo, hi)
+        self._check_neutrinos()
         if self.omega_b >= self.omega_cold:
             neutrinos = f", less neutrinos, {self.omega_nu:.3g}" if self.m_nu > 0.0 else ""
             problem = f"omega_b = {self.omega_b:g} must be smaller than omega_m = {self.omega_m:g}"
@@ -131,6 +136,15 @@ class Cosmology:
             raise BadInput(f"power = {self.power!r} is not one of {', '.join(POWERS)}")
         if self.m_nu > 0.0 and self.power != "camb":
             raise BadInput(f'm_nu = {self.m_nu:g} requires power = "camb": {self.power} has no massive neutrinos')
+
+    def _check_neutrinos(self) -> None:
+        if 0.0 < self.m_nu < MIN_M_NU:
+            raise BadInput(f"m_nu = {self.m_nu:g} must be 0, or from {MIN_M_NU:g} to {LIMITS['m_nu'][1]:g}")
+        fraction = self.omega_nu / self.omega_m
+        if fraction > MAX_NEUTRINO_FRACTION:
+            values = f"m_nu = {self.m_nu:g}, h = {self.h:g} and omega_m = {self.omega_m:g}"
+            problem = f"{values} make neutrinos a fraction of {fraction:.3g} of all matter"
+            raise BadInput(f"{problem}, at most {MAX_NEUTRINO_FRACTION:g} is possible: decrease m_nu")
 
     @property
     def omega_lambda(self) -> float:
@@ -144,7 +158,12 @@ class Cosmology:
 
     @property
     def omega_cold(self) -> float:
-        """Return the density parameter of cold matter today: dark matter and baryons, without massive neutrinos."""
+        """Return the density parameter of cold matter today: dark matter and baryons, without massive neutrinos.
+
+        It is the density of the matter that clusters. Massive neutrinos hardly cluster, so that all matter has the
+        overdensity of cold matter times omega_cold / omega_m. Hence lensing, tides and halo radii have `omega_cold` in
+        place of `omega_m`.
+        """
         return self.omega_m - self.omega_nu
 
     def fingerprint(self) -> str:
@@ -248,11 +267,11 @@ class Cosmology:
             return np.asarray(a * self._growth_integral(a) / self._growth_integral(np.ones(())))
         return np.asarray(np.exp(_growth_spline(self)(-np.log1p(_check_redshift("z", z)))))
 
-    def growth_rate(self, z: npt.ArrayLike, index: float) -> Float:
+    def growth_rate(self, z: npt.ArrayLike, index: float = 0.55) -> Float:
         """Return the growth rate f = dlnD / dlna of cold matter.
 
-        For a cosmological constant and neutrinos without mass it is Omega_m(z)^index (error 0.5 %). Raises OutOfRange
-        in other universes if z is NaN or not in 0 to 20.
+        For a cosmological constant and neutrinos without mass it is Omega_m(z)^index (error 0.5 %). Other universes
+        need no index, and raise OutOfRange if z is NaN or not in 0 to 20.
         """
         if not self._has_closed_growth:
             return np.asarray(_growth_spline(self)(-np.log1p(_check_redshift("z", z)), 1))

@@ -102,7 +102,7 @@ def galaxy_on_a_stamp(values):
     columns = {name: value for name, value in values.items() if name not in ("reduced_shear", "electrons")}
     columns |= {"gamma1": shear * np.cos(angle), "gamma2": shear * np.sin(angle), "ra": 10.0, "dec": 20.0, "mag": 20.0}
     found = given_sources.check_arrays(
-        {name: np.array([value]) for name, value in columns.items()}, "galaxies", Path("galaxies"), {}
+        {name: np.array([value]) for name, value in columns.items()}, "galaxies", Path("galaxies"), FIDUCIAL, {}
     )
     row = {name: float(np.float32(found[name][0])) for name in columns if name not in ("ra", "dec", "mag")}
     row["inclination"] = float(np.float32(morphology.inclination(row.pop("disk_axis_ratio"), DISK_SCALE_HEIGHT)))

@@ -5,7 +5,6 @@ import os
 import tempfile
 import warnings
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -133,9 +132,7 @@ def kept_catalogue(folder):
 @cache
 def columns():
     titles = {"origin_id": "id", "ra": "ra", "dec": "dec", "z_true": "z", "abs_mag_r01": "magnitude"}
-    return replace(
-        mapping.galaxy_columns("", {name: json.dumps(title) for name, title in titles.items()}), cosmology=FIDUCIAL
-    )
+    return mapping.galaxy_columns("", {name: json.dumps(title) for name, title in titles.items()}, FIDUCIAL)
 
 
 def split(folder):

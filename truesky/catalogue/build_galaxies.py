@@ -28,8 +28,9 @@ from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.nearest_sed import Training
 from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.halos.halo_catalogue import LightCone
+from truesky.catalogue.matter import boltzmann
 from truesky.catalogue.request_checks import check_band, check_cosmology
-from truesky.cosmology import Cosmology, from_facts
+from truesky.cosmology import from_facts
 from truesky.fluxes import sources
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
@@ -90,19 +91,18 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
-    check_cosmology(request.universe.cosmology)
+    cosmology = request.universe.cosmology
+    check_cosmology(cosmology)
     # The user's training galaxies also change the table `halos`: their dust determines how faint galaxies must be
     # drawn, and therefore how light halos must be.
-    external_facts = (
-        {"halos": _input_facts(user_inputs.halos, _halo_columns(user_inputs.halos, request.universe.cosmology))}
-        if user_inputs.halos
-        else {}
-    )
-    external_facts |= (
-        {"training": _input_facts(user_inputs.training, mapping.training_columns(dict(user_inputs.training.columns)))}
-        if user_inputs.training
-        else {}
-    )
+    external_facts = {
+        name: _input_facts(catalogue, make_columns(dict(catalogue.columns), cosmology))
+        for name, catalogue, make_columns in (
+            ("halos", user_inputs.halos, mapping.halo_columns),
+            ("training", user_inputs.training, mapping.training_columns),
+        )
+        if catalogue
+    }
     facts = {
         "seed": request.seed,
         **universe,
@@ -110,8 +110,12 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
         **dust_map.facts(user_inputs.dust),
         "code": code_version(),
     }
+    version = boltzmann.camb_version(cosmology)
+    camb_facts = {"camb": version} if version else {}
+    facts |= camb_facts
     tasks = cells.tasks_of_area(request.area)
-    halo_facts = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, "code")}
+    halo_keys = ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, *camb_facts, "code")
+    halo_facts = {key: facts[key] for key in halo_keys}
     halos, limits = Plan(HALOS, halo_facts, tasks), Plan(HALO_LIMITS, halo_facts, (Task("all.parquet", {}),))
     # Store, with the table `galaxies`, the multipole up to which the power of the lensing agrees with linear theory
     # within 10 %.
@@ -259,18 +263,14 @@ def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone |
     """Return the user's halos and the user's training galaxies; each is None if the request names no files of them."""
     light_cone = training = None
     if user_inputs is not None and user_inputs.halos is not None:
-        columns = _halo_columns(user_inputs.halos, from_facts(facts))
+        columns = mapping.halo_columns(dict(user_inputs.halos.columns), from_facts(facts))
         files, _ = ingest.list_files(user_inputs.halos.files, columns)
         light_cone = halo_catalogue.load(files, facts["halos"]["sha256"], columns)
     if user_inputs is not None and user_inputs.training is not None:
-        columns = mapping.training_columns(dict(user_inputs.training.columns))
+        columns = mapping.training_columns(dict(user_inputs.training.columns), from_facts(facts))
         files, _ = ingest.list_files(user_inputs.training.files, columns)
         training = nearest_sed.load(files, facts["training"]["sha256"], columns)
     return light_cone, training
-
-
-def _halo_columns(halos: Catalogue, cosmology: Cosmology) -> mapping.Columns:
-    return mapping.halo_columns(dict(halos.columns), cosmology)
 
 
 def _input_facts(catalogue: Catalogue, columns: mapping.Columns) -> Json:

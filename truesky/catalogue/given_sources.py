@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +163,7 @@ def model(
     IngestModel
         The model.
     """
-    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band, cosmology=cosmology)
+    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, cosmology, band=source_tables.band)
     return from_catalogue.model(seed, columns, _split(sources.galaxies), lens, rotation)
 
 
@@ -232,9 +232,7 @@ def from_arrays(tables: Mapping[str, tuple[Path, Mapping[str, Array]]], cosmolog
                 remedy = "give axis_ratio and position_angle (deg, north through east) in place of them"
                 mistakes.add(BadInput(f"{place}: columns e1 and e2 are not possible here: {remedy}"))
                 columns = {title: values for title, values in columns.items() if title not in ("e1", "e2")}
-            values = (
-                mistakes.read(check_arrays, columns, name, place, {}, (), cosmology) if columns else _no_sources(name)
-            )
+            values = mistakes.read(check_arrays, columns, name, place, cosmology, {}) if columns else _no_sources(name)
             if values is not None:
                 checked[name] = {**values, "ra": sky.wrap_angle(values["ra"])}
     for values in checked.values():
@@ -251,9 +249,9 @@ def check_arrays(
     columns: Mapping[str, Array],
     name: str,
     place: Path,
+    cosmology: Cosmology,
     settings: Mapping[str, str],
     ignored: Collection[str] = (),
-    cosmology: Cosmology | None = None,
 ) -> dict[str, Array]:
     """Check the columns of a table in memory, and return its properties.
 
@@ -265,12 +263,12 @@ def check_arrays(
         Name of the table, "galaxies" or "stars".
     place : Path
         Name of the table, or of its file, for the messages.
+    cosmology : Cosmology
+        Parameters of the universe, for absolute magnitudes, which are checked if redshifts are not ignored.
     settings : mapping of str to str
         Settings `ellipticity` and `frame` of the columns e1 and e2; empty without these columns.
     ignored : collection of str, optional
         Properties that are allowed, but neither checked nor returned.
-    cosmology : Cosmology, optional
-        Parameters of the universe, required to check absolute magnitudes if redshifts are not ignored.
 
     Returns
     -------
@@ -287,8 +285,9 @@ def check_arrays(
     required = [*_POSITION, *(key for key, value in defaults.items() if value is None)]
     _check_titles(list(columns), place, bounds, required)
     used = {title: title for title in columns if title not in ignored}
-    mapped = _parse({**settings, **used}, name, {k: v for k, v in defaults.items() if k not in ignored}, bounds, place)
-    mapped, mistakes = replace(mapped, cosmology=cosmology), TableMistakes()
+    constants = {key: value for key, value in defaults.items() if key not in ignored}
+    mapped = _parse({**settings, **used}, name, constants, bounds, cosmology, place)
+    mistakes = TableMistakes()
     values = reading.check_batch(RowBatch(place, 1, {title: columns[title] for title in used}, {}), mapped, mistakes)
     if name == "galaxies" and values:
         _add_caustics(place, values, mistakes)
@@ -306,6 +305,7 @@ def _parse(
     name: str,
     defaults: Mapping[str, float | None],
     bounds: Mapping[str, tuple[float, float]],
+    cosmology: Cosmology,
     place: object,
     required: Sequence[tuple[str, ...]] = (),
 ) -> Columns:
@@ -313,10 +313,11 @@ def _parse(
     replaced = {key for whole, keys in mapping.WHOLE_GALAXY.items() if whole in entries for key in keys}
     constants = {key: {"value": value} for key, value in defaults.items() if value is not None and key not in replaced}
     settings = _SETTINGS if name == "galaxies" else ()
-    return mapping.parse_columns({**constants, **entries}, bounds, str(place), list(required), legal_settings=settings)
+    properties, groups = {**constants, **entries}, list(required)
+    return mapping.parse_columns(properties, bounds, cosmology, str(place), groups, legal_settings=settings)
 
 
-def _columns(file: Path, name: str, source_tables: UserSources) -> Columns:
+def _columns(file: Path, name: str, source_tables: UserSources, cosmology: Cosmology) -> Columns:
     """Return which columns of a table give which properties; properties without a column have their default values.
 
     `name` is the name of the table, "galaxies" or "stars". Raises BadInput if a column is unknown or a required one is
@@ -345,7 +346,7 @@ def _columns(file: Path, name: str, source_tables: UserSources) -> Columns:
             mistakes.read(_check_titles, titles, file, bounds, [key for (key,) in required], can_map=True)
         entries |= {title: title for title in titles}
         path = f"sources.{name}: {file.name}"
-    return _parse(entries, name, defaults, bounds, path, required)
+    return _parse(entries, name, defaults, bounds, cosmology, path, required)
 
 
 def _check_titles(
@@ -407,7 +408,7 @@ def _read(
         defaults = GALAXIES if name == "galaxies" else STARS
         empty = {key: np.zeros(0) for key in (*(() if source_tables.spacing else _POSITION), *defaults)}
         return empty | {"origin_id": np.zeros(0, np.int64)}
-    columns = replace(_columns(file, name, source_tables), cosmology=cosmology)
+    columns = _columns(file, name, source_tables, cosmology)
     pieces = list(reading.read([file], columns, SOURCES_KIND))
     count = sum(len(piece.values["mag"]) for piece in pieces)
     if count == 0:

@@ -24,6 +24,7 @@ from lake_schema.texts import spelling
 from truesky.catalogue import given_sources
 from truesky.catalogue.external.ellipticity import CONVENTIONS, FRAMES
 from truesky.catalogue.galaxies import morphology
+from truesky.cosmology import FIDUCIAL
 from truesky.request.files import SOURCES_KIND
 from truesky.request.toml_values import refuse_name
 
@@ -140,7 +141,8 @@ def _check(columns: Mapping[str, Array], name: str, place: Path, settings: Mappi
     if "e1" in properties and "ellipticity" not in settings:
         conventions = spelling.join_words(CONVENTIONS)
         raise BadInput(f"{place}: columns e1 and e2 require the argument ellipticity, their convention: {conventions}")
-    values = given_sources.check_arrays(properties, name, place, options, _SPECTRA)
+    # No distance follows from a redshift, because redshifts are ignored: any cosmology gives the same result.
+    values = given_sources.check_arrays(properties, name, place, FIDUCIAL, options, _SPECTRA)
     mistakes = TableMistakes()
     for title, (allowed, text) in _FIXED.items():
         if title in values:

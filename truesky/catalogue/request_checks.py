@@ -64,8 +64,7 @@ def check_cosmology(cosmology: Cosmology) -> None:
     if distance > largest:
         problem = f"the distance to z = {matching.Z_LAST:g} is {distance:.0f} Mpc/h, at most {largest:.0f} is possible"
         raise BadInput(f"universe.cosmology: {problem}: increase omega_m, w0 or wa")
-    if cosmology.power == "camb":
-        boltzmann.check(cosmology)
+    boltzmann.camb_version(cosmology)
 
 
 def _check_dust(request: Request) -> None:
@@ -104,8 +103,9 @@ def _check_halos(request: Request) -> None:
 
 def _check_training(request: Request) -> None:
     if (catalogue := request.ingest.training) is not None:
+        entries, cosmology = dict(catalogue.columns), request.universe.cosmology
         columns = _with_existing_files(
-            "ingest.training", catalogue, lambda: mapping.training_columns(dict(catalogue.columns))
+            "ingest.training", catalogue, lambda: mapping.training_columns(entries, cosmology)
         )
         columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
         ingest.check_rows(*ingest.files_with_checksums(catalogue.files, columns), columns)

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lake_schema import ids
+from lake_schema import ids, tables
 from lake_schema.errors import BadInput
 from lake_schema.store.provenance import file_sha256
+from lake_schema.store.validate import check_rows
+from tests.truesky.catalogue import neutrinos
 from truesky.catalogue import build_galaxies, request_checks
 from truesky.catalogue.external import ingest, mapping
 from truesky.catalogue.galaxies import lensing
@@ -27,7 +29,10 @@ ROOT = Path(__file__).resolve().parents[3]
 FIT = replace(FIDUCIAL, power="eisenstein98")
 OTHERS = {
     "omega_m": 0.3, "omega_b": 0.045, "h": 0.7, "sigma_8": 0.8, "n_s": 0.97, "w0": -0.9, "wa": 0.2, "power": "camb",
+    "m_nu": neutrinos.MASSIVE.m_nu,
 }  # fmt: skip
+# Settings of a sky that is small enough for a test, without lensing maps.
+SMALL = {"box_cells": 48, "lensing": [0.0, 0.0], "galaxy_limit": 20.0, "generation_cells": [12345]}
 # Modules that may name the fiducial cosmology, instead of an argument. Those of validation compare the default universe
 # with observations.
 WITH_DEFAULT = {
@@ -36,6 +41,8 @@ WITH_DEFAULT = {
     "truesky/request/schema.py",
     # The cosmology of the shipped table.
     "truesky/catalogue/matter/boltzmann.py",
+    # Redshifts of sources that are added to a given image are ignored.
+    "truesky/catalogue/injected_rows.py",
     "truesky/validation/model/census.py",
     "truesky/validation/model/pictures.py",
 }
@@ -90,12 +97,14 @@ KEPT = {
     "catalogue": ("ingest", split_catalogue),
 }
 # Parameters on which a result does not depend: the linear power today depends on dark energy only through sigma_8, and
-# distances in Mpc/h neither on the power nor, without kpc, on h.
+# distances in Mpc/h neither on the power nor, without kpc, on h. Massive neutrinos are matter for distances.
 SAME = {
     **dict.fromkeys(("box", "velocities", "tides", "halo bias", "power"), ("w0", "wa")),
-    "light-cone": ("omega_b", "h", "sigma_8", "n_s", "power"),
-    "catalogue": ("omega_b", "sigma_8", "n_s", "power"),
+    "light-cone": ("omega_b", "h", "sigma_8", "n_s", "power", "m_nu"),
+    "catalogue": ("omega_b", "sigma_8", "n_s", "power", "m_nu"),
 }
+# Results that do not depend on the power spectrum.
+NO_POWER = ("light-cone", "catalogue")
 
 
 @pytest.fixture
@@ -116,33 +125,95 @@ def test_a_kept_result_is_not_that_of_another_cosmology(name, cheap_maps, tmp_pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(density_box, "_GAIN_CELLS", 24)
     entry, compute = KEPT[name]
-    with cache.use_temporary_dir():
+    with neutrinos.installed():
 
         def entries():
             return {path.name for path in cache.cache_dir().glob(f"{entry}-*")}
 
-        first = np.array(compute(FIT))
+        first = {}
         for parameter, value in OTHERS.items():
-            other, before = replace(FIT, **{parameter: value}), entries()
+            # Only CAMB has massive neutrinos.
+            base = FIDUCIAL if parameter == "m_nu" else FIT
+            if base not in first:
+                first[base] = np.array(compute(base))
+            other, before = replace(base, **{parameter: value}), entries()
             found = np.array(compute(other))
             assert not entry or entries() > before, parameter
-            assert np.array_equal(found, first) == (parameter in SAME.get(name, ())), parameter
-            assert np.array_equal(compute(FIT), first), parameter
+            assert np.array_equal(found, first[base]) == (parameter in SAME.get(name, ())), parameter
+            assert np.array_equal(compute(base), first[base]), parameter
+
+
+@pytest.mark.parametrize("name", [name for name, (entry, _) in KEPT.items() if entry and name not in NO_POWER])
+def test_a_kept_result_is_not_that_of_another_version_of_camb(name, cheap_maps, monkeypatch):
+    monkeypatch.setattr(density_box, "_GAIN_CELLS", 24)
+    entry, compute = KEPT[name]
+    with neutrinos.installed():
+
+        def count():
+            return len([*cache.cache_dir().glob(f"{entry}-*")])
+
+        counts = []
+        for version in ("2.0.5", "2.0.6", "2.0.6", "2.0.5"):
+            neutrinos.set_version(monkeypatch, version)
+            for cosmology in (neutrinos.MASSIVE, FIDUCIAL):
+                compute(cosmology)
+                counts.append(count())
+    assert counts == [1, 2, 3, 3, 3, 3, 3, 3]
 
 
 @pytest.mark.parametrize("parameter", OTHERS)
 def test_versions_of_tables_name_the_cosmology(parameter, monkeypatch, tmp_path):
     """The keys of halos, limits of halos and galaxies differ, so that a lake never mixes two cosmologies."""
     monkeypatch.setattr(build_galaxies, "_universe", lambda *args: None)
-    area = {"cone": {"ra": 53.0, "dec": -27.0, "radius": 0.1}}
-    request = {"name": "a", "seed": 1, "area": area}
-    some, other = (
-        from_table({**request, "universe": {"cosmology": {"power": FIT.power, **chosen}}})
-        for chosen in ({}, {parameter: OTHERS[parameter]})
-    )
+    neutrinos.set_version(monkeypatch, neutrinos.VERSION)
+    base = {"power": FIDUCIAL.power if parameter == "m_nu" else FIT.power}
+    some, other = (request_of(**base | chosen) for chosen in ({}, {parameter: OTHERS[parameter]}))
     for one, two in zip(build_galaxies.steps(tmp_path, some), build_galaxies.steps(tmp_path, other), strict=True):
         assert one.plan.key != two.plan.key, one.plan.table.name
+    some = request_of(power=FIT.power)
     assert build_galaxies._universe_section({**some.facts("universe")["universe"]}, ()) == Universe(cosmology=FIT)
+
+
+def request_of(**cosmology):
+    area = {"cone": {"ra": 53.0, "dec": -27.0, "radius": 0.1}}
+    return from_table({"name": "a", "seed": 1, "area": area, "universe": {"cosmology": cosmology}})
+
+
+def test_versions_of_tables_name_the_version_of_camb(monkeypatch, tmp_path):
+    """Only if CAMB computes the spectrum, so that the default sky does not depend on the package."""
+    monkeypatch.setattr(build_galaxies, "_universe", lambda *args: None)
+    plans = {}
+    for version in ("2.0.5", "2.0.6"):
+        neutrinos.set_version(monkeypatch, version)
+        for m_nu in (0.0, neutrinos.MASSIVE.m_nu):
+            steps = build_galaxies.steps(tmp_path, request_of(m_nu=m_nu))
+            plans[version, m_nu > 0.0] = [step.plan for step in steps]
+            # The last table, `quarantine`, has the key of `galaxies` among its facts.
+            versions = [plan.facts.get("camb") for plan in plans[version, m_nu > 0.0]]
+            assert versions == [version if m_nu else None] * 3 + [None]
+    for is_massive in (False, True):
+        keys = ([plan.key for plan in plans[version, is_massive]] for version in ("2.0.5", "2.0.6"))
+        assert [one != two for one, two in zip(*keys, strict=True)] == [is_massive] * 4
+
+
+def test_a_sky_with_massive_neutrinos(monkeypatch, tmp_path):
+    """The job makes halos and galaxies in a small box, nearly as many as without massive neutrinos."""
+    rows = {}
+    for m_nu in (neutrinos.MASSIVE.m_nu, 0.0):
+        # Compiled functions are in the cache of all tests.
+        with neutrinos.installed(own_cache=False):
+            with monkeypatch.context() as patch:
+                patch.setattr(build_galaxies, "_universe", lambda *args: None)
+                steps = build_galaxies.steps(tmp_path, request_of(m_nu=m_nu))[:3]
+            for step in steps:
+                facts = {**step.plan.facts, **SMALL}
+                rows[step.plan.table.name, m_nu > 0.0] = step.run_task(tmp_path, facts).rows
+    for name in ("halos", "halo_limits", "galaxies"):
+        massive, massless = rows[name, True], rows[name, False]
+        assert massive.num_rows == pytest.approx(massless.num_rows, rel=0.1)
+        assert massive.num_rows > 50
+        assert not massive.equals(massless)
+        check_rows(massive, tables.find_table(name, massive.column_names))
 
 
 def test_only_some_modules_know_the_default():

@@ -1,7 +1,5 @@
 """Galaxies leave in the forms of other programs, and what leaves as skyCatalogs comes back through the ingest."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -62,7 +60,7 @@ def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
         f"galaxy_flux_{pixel}.parquet",
         "skyCatalog.yaml",
     ]
-    (piece,) = reading.read(written[:1], replace(mapping.galaxy_columns("skycatalogs", {}), cosmology=FIDUCIAL))
+    (piece,) = reading.read(written[:1], mapping.galaxy_columns("skycatalogs", {}, FIDUCIAL))
     rows = read.version(lake, "galaxies").rows()
     for name in ("gamma1", "gamma2", "kappa", "a_v", "z_true", "disk_axis_ratio", "bulge_half_light_radius"):
         assert piece.values[name] == pytest.approx(rows[name].to_numpy(), rel=1e-5), name

@@ -106,6 +106,13 @@ BAD = [
     ("universe", {"cosmology": {"m_nu": -0.1}}, "universe.cosmology.m_nu = -0.1 is outside"),
     ("universe", {"cosmology": {"m_nu": 0.51}}, "universe.cosmology.m_nu = 0.51 is outside"),
     ("universe", {"cosmology": {"m_nu": float("nan")}}, "universe.cosmology.m_nu = nan is outside"),
+    ("universe", {"cosmology": {"m_nu": 1e-160}}, "universe.cosmology: m_nu = 1e-160 must be 0, or from 0.001 to 0.5"),
+    (
+        "universe",
+        {"cosmology": {"m_nu": 0.5, "h": 0.4, "omega_m": 0.24}},
+        "universe.cosmology: m_nu = 0.5, h = 0.4 and omega_m = 0.24 make neutrinos a fraction of 0.14 of all matter, "
+        "at most 0.04 is possible: decrease m_nu",
+    ),
     (
         "universe",
         {"cosmology": {"m_nu": 0.06, "power": "eisenstein98"}},

@@ -10,7 +10,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +93,7 @@ def galaxy_columns(catalogue: Catalogue, replaces_lensing: bool, cosmology: Cosm
     BadInput
         If the mapping in the request is wrong.
     """
-    columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
-    columns = replace(columns, cosmology=cosmology)
+    columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns), cosmology)
     columns = mapping.with_last_template(columns, templates.galaxy_library().flux.shape[0] - 1)
     return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
@@ -304,7 +303,7 @@ def _content_key(sha256: Sequence[str], columns: Columns) -> str:
     fields = sorted((key, repr(field)) for key, field in columns.fields.items())
     settings = [columns.companion_prefixes, columns.ellipticity, columns.frame]
     bounds = sorted((key, *map(float, limits)) for key, limits in columns.bounds.items())
-    cosmology = "" if columns.cosmology is None else columns.cosmology.fingerprint()
+    cosmology = columns.cosmology.fingerprint()
     return content_key(code_key(__name__), json.dumps([fields, settings, bounds]), cosmology, *sha256)
 
 

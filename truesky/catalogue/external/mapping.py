@@ -144,6 +144,8 @@ class Columns:
         How each property is computed, by name of the property.
     bounds : mapping of str to (float, float)
         Lowest and highest valid value of each property.
+    cosmology : Cosmology
+        Parameters of the universe in which distances follow from redshifts.
     nullable : tuple of str
         Properties whose values may be missing (NaN).
     band : str
@@ -162,12 +164,11 @@ class Columns:
         Axes of the ellipticities, one of `FRAMES` in ellipticity.py.
     path : str
         Key of the request that contains the mapping, for messages.
-    cosmology : Cosmology or None
-        Parameters of the universe in which distances follow from redshifts. None for a table in which none do.
     """
 
     fields: Mapping[str, Field]
     bounds: Bounds
+    cosmology: Cosmology
     nullable: tuple[str, ...] = ()
     band: str = ""
     companion_prefixes: tuple[str, ...] = ()
@@ -176,13 +177,6 @@ class Columns:
     ellipticity: str = ""
     frame: str = FRAMES[0]
     path: str = ""
-    cosmology: Cosmology | None = None
-
-    def known_cosmology(self) -> Cosmology:
-        """Return the cosmology; raises ValueError if the mapping has none."""
-        if self.cosmology is None:
-            raise ValueError(f"{self.path}: distances require a cosmology")
-        return self.cosmology
 
     def titles(self, in_companion: bool) -> list[str]:
         """Return the names of the columns to read from a file (`in_companion` False) or from its companion file (True).
@@ -204,7 +198,7 @@ def _formats(text: str) -> dict[str, dict[str, Any]]:
     return user_files.parse_toml(text)
 
 
-def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
+def galaxy_columns(name: str, overrides: Mapping[str, str], cosmology: Cosmology) -> Columns:
     """Return which columns of a user's catalogue give which properties of galaxies, and with which conversion.
 
     Parameters
@@ -214,6 +208,8 @@ def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
     overrides : mapping of str to str
         For each property or setting that the request gives: its column or value as JSON text. They override the
         format.
+    cosmology : Cosmology
+        Parameters of the universe in which distances follow from redshifts.
 
     Returns
     -------
@@ -235,12 +231,13 @@ def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
     entries = {**{key: value for key, value in shipped.items() if key in SETTINGS}, **shipped["columns"], **requested}
     required = ("ra",), ("dec",), ("z_true", "z_obs"), ("abs_mag_r01", "mag_r01", "mag")
     path = "ingest.galaxies.columns"
-    return parse_columns(entries, GALAXY_BOUNDS, path, required, NULLABLE, SETTINGS)
+    return parse_columns(entries, GALAXY_BOUNDS, cosmology, path, required, NULLABLE, SETTINGS)
 
 
 def parse_columns(
     entries: Mapping[str, Any],
     bounds: Bounds,
+    cosmology: Cosmology,
     path: str,
     required: Sequence[Sequence[str]],
     nullable: tuple[str, ...] = (),
@@ -254,6 +251,8 @@ def parse_columns(
         Column or definition of each property, and settings (`SETTINGS`), as in a TOML file.
     bounds : mapping of str to (float, float)
         Allowed properties with the lowest and highest valid value.
+    cosmology : Cosmology
+        Parameters of the universe in which distances follow from redshifts.
     path : str
         Key of the request that contains the entries, for messages.
     required : sequence of sequence of str
@@ -298,7 +297,7 @@ def parse_columns(
     messages += _excluded_keys(fields, settings, path)
     refuse_mistakes(messages)
     companion_prefixes = tuple(settings.pop("beside", ()))
-    return Columns(fields, bounds, nullable, companion_prefixes=companion_prefixes, path=path, **settings)
+    return Columns(fields, bounds, cosmology, nullable, companion_prefixes=companion_prefixes, path=path, **settings)
 
 
 def _explain_property(
@@ -368,18 +367,19 @@ def halo_columns(entries: Mapping[str, str], cosmology: Cosmology) -> Columns:
     """
     parsed = {key: json.loads(text) for key, text in entries.items()}
     required = ("ra",), ("dec",), ("z_true",), ("log_mass",)
-    return replace(parse_columns(parsed, HALO_BOUNDS, "ingest.halos.columns", required), cosmology=cosmology)
+    return parse_columns(parsed, HALO_BOUNDS, cosmology, "ingest.halos.columns", required)
 
 
-def training_columns(entries: Mapping[str, str]) -> Columns:
+def training_columns(entries: Mapping[str, str], cosmology: Cosmology) -> Columns:
     """Return which columns of a user's training table give which properties of galaxies, and with which conversion.
 
-    `entries` contains for each property that the request gives its column or value, as JSON text. Raises BadInput if
-    such a text is wrong, or if one of the properties in TRAINING_BOUNDS is missing.
+    `entries` contains for each property that the request gives its column or value, as JSON text. Distances follow from
+    redshifts in `cosmology`. Raises BadInput if such a text is wrong, or if one of the properties in TRAINING_BOUNDS is
+    missing.
     """
     parsed = {key: json.loads(text) for key, text in entries.items()}
     required = [(key,) for key in TRAINING_BOUNDS]
-    return parse_columns(parsed, TRAINING_BOUNDS, "ingest.training.columns", required)
+    return parse_columns(parsed, TRAINING_BOUNDS, cosmology, "ingest.training.columns", required)
 
 
 def companion_file(file: Path, prefixes: Sequence[str]) -> Path:

@@ -258,7 +258,7 @@ def _value(key: str, field: Field, mapped: Columns, columns: Mapping[str, Array]
         if field.over:
             values = values / columns[field.over]
         if field.kpc_at:
-            values = values / _kpc_per_arcsec(mapped.known_cosmology(), columns[field.kpc_at])
+            values = values / _kpc_per_arcsec(mapped.cosmology, columns[field.kpc_at])
         if field.power10:
             values = 10.0**values
         if field.log10:
@@ -322,7 +322,7 @@ def _check_absolute_magnitude(
     (z_lo, z_hi), (lo, hi) = columns.bounds[z_key], columns.bounds[magnitude]
     valid = (z >= z_lo) & (z <= z_hi) & (apparent >= lo) & (apparent <= hi)
     z = np.clip(np.where(valid, z, 1.0), MIN_REDSHIFT, None)
-    absolute = apparent - columns.known_cosmology().distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    absolute = apparent - columns.cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     lo, hi = GALAXY_BOUNDS["abs_mag_r01"]
     titles, noun = column_titles(columns, magnitude, z_key), "the absolute magnitude from columns"
     allowed = f"must be from {lo:g} to {hi:g}"

@@ -164,8 +164,8 @@ def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Floa
     numbers = alignments.numbers
     amplitude = numbers.amplitude * 10.0 ** (-0.4 * numbers.slope * (m_r - numbers.magnitude))
     amplitude = alignments.strength * amplitude * np.where(red, 1.0, numbers.blue)
-    omega_m = alignments.box.model.cosmology.omega_m
-    return np.asarray(-amplitude * numbers.c1_rho_crit * omega_m * tide(alignments, ra, dec, chi))
+    density = alignments.box.model.cosmology.omega_cold
+    return np.asarray(-amplitude * numbers.c1_rho_crit * density * tide(alignments, ra, dec, chi))
 
 
 def satellite_ellipticity(alignments: Alignments, direction: Float, distance: Float, red: Bool) -> Complex:

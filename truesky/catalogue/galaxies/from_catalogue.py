@@ -189,7 +189,7 @@ def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Fl
     m_r, colour, sed, law_2, ebv_2 = _light(
         catalogue, universe, z, kind, _intrinsic_mag(catalogue, universe, lens, a_v), rng
     )
-    cosmology = universe.columns.known_cosmology()
+    cosmology = universe.columns.cosmology
     reference_mag = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
     log_mass = stellar_mass.log_stellar_mass(universe.masses, cosmology.h, m_r, colour.colour, z)
     log_mass = _value_or_computed(catalogue, "log_stellar_mass", log_mass)
@@ -342,7 +342,7 @@ def _light(
     m_r = catalogue.get("abs_mag_r01")
     # Without an absolute magnitude, estimate it for a spectrum with constant f_lambda, in order to draw a colour.
     apparent = catalogue.get("mag_r01", intrinsic_mag)
-    distance_modulus = universe.columns.known_cosmology().distance_modulus(z)
+    distance_modulus = universe.columns.cosmology.distance_modulus(z)
     guess = m_r if m_r is not None else np.asarray(apparent) - distance_modulus - 2.5 * np.log10(1.0 + z)
     fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
     drawn_colour = sequences.draw(universe.colours, universe.colour_limits, guess, z, fraction, rng("colour"))
@@ -384,7 +384,7 @@ def _spectra(catalogue: CatalogueColumns) -> Sed:
 def _shapes(
     catalogue: CatalogueColumns, universe: IngestModel, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
 ) -> dict[str, Float]:
-    n, shapes, scale = z.size, universe.shapes, universe.columns.known_cosmology().kpc_per_arcsec(z)
+    n, shapes, scale = z.size, universe.shapes, universe.columns.cosmology.kpc_per_arcsec(z)
     radius = morphology.half_light_radius(shapes.size, z, log_mass, red, scale, rng)
     fraction = catalogue.get("bulge_fraction", morphology.bulge_fraction(shapes.bulge, log_mass, red, rng))
     sersic = catalogue.get("bulge_sersic_index", morphology.sersic_index(shapes.bulge, red, rng))

@@ -115,7 +115,7 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     last = templates.galaxy_library().flux.shape[0] - 1
-    key = content_key(code_key(__name__), columns_json, last, *sha256)
+    key = content_key(code_key(__name__), columns_json, last, columns.cosmology.fingerprint(), *sha256)
     limited = mapping.with_last_template(columns, last)
     return build_training(cached_arrays("training", key, lambda: _read(files, limited)), last)
 

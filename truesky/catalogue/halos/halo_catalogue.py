@@ -74,7 +74,7 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
         the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
-    key = content_key(code_key(__name__), columns_json, columns.known_cosmology().fingerprint(), *sha256)
+    key = content_key(code_key(__name__), columns_json, columns.cosmology.fingerprint(), *sha256)
     arrays = cached_arrays("halo_light_cone", key, lambda: _read(files, columns))
     return LightCone(**arrays)
 
@@ -129,7 +129,7 @@ def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
     ra, dec = sky.check_positions(values["ra"], values["dec"])
     index, z = sky.healpix_29(ra, dec), values["z_true"]
-    chi = columns.known_cosmology().comoving_distance(z)
+    chi = columns.cosmology.comoving_distance(z)
     if "origin_id" in values:
         _refuse_duplicates(pieces, columns.fields["origin_id"].column)
     velocity = values.get("velocity", np.zeros(z.size))

@@ -16,7 +16,7 @@ Castorina et al. 2014, JCAP 2, 049 (halos and massive neutrinos)
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from importlib import metadata
 
 import numpy as np
 import scipy
@@ -70,16 +70,16 @@ def sigma_8_of_cold_matter(cosmology: Cosmology) -> float:
 def camb_version(cosmology: Cosmology) -> str:
     """Return the version of CAMB if it computes the spectrum of this cosmology, and "" for a table or a formula.
 
-    It belongs to the key of everything in the cache that depends on the spectrum. Raises BadInput if CAMB is required
-    and not installed.
+    It belongs to the key of everything in the cache, and in a lake, that depends on the spectrum. Raises BadInput if
+    CAMB is required and not installed.
     """
-    return "" if cosmology.power != "camb" or _is_shipped(cosmology) else str(_import_camb().__version__)
-
-
-def check(cosmology: Cosmology) -> None:
-    """Raise BadInput if the spectrum of this cosmology is not in the shipped table and CAMB is not installed."""
-    if not _is_shipped(cosmology):
-        _import_camb()
+    if cosmology.power != "camb" or _is_shipped(cosmology):
+        return ""
+    # The metadata of the package suffice: a key does not need its compiled library.
+    try:
+        return metadata.version("camb")
+    except metadata.PackageNotFoundError:
+        raise _not_installed() from None
 
 
 def compute(cosmology: Cosmology) -> dict[str, Array]:
@@ -88,7 +88,10 @@ def compute(cosmology: Cosmology) -> dict[str, Array]:
     It is scaled so that all matter has the sigma_8 of the cosmology. It takes 3 CPU s. The radiation, which distances
     neglect, is included. Raises BadInput if CAMB is not installed.
     """
-    camb = _import_camb()
+    try:
+        import camb
+    except ModuleNotFoundError:
+        raise _not_installed() from None
     h, is_massive = cosmology.h, cosmology.m_nu > 0.0
     settings = camb.set_params(
         H0=100.0 * h, ombh2=cosmology.omega_b * h**2, omch2=(cosmology.omega_cold - cosmology.omega_b) * h**2, omk=0.0,
@@ -137,13 +140,8 @@ def _is_shipped(cosmology: Cosmology) -> bool:
     return replace(cosmology, sigma_8=FIDUCIAL.sigma_8, power=FIDUCIAL.power) == FIDUCIAL
 
 
-def _import_camb() -> Any:
-    """Import CAMB, which is optional; raise BadInput if it is not installed."""
-    try:
-        import camb
-    except ModuleNotFoundError:
-        raise BadInput(
-            'universe.cosmology: power = "camb" requires the package camb, which is not installed: '
-            "pip install 'truesky[camb]', or camb alone"
-        ) from None
-    return camb
+def _not_installed() -> BadInput:
+    return BadInput(
+        'universe.cosmology: power = "camb" requires the package camb, which is not installed: '
+        "pip install 'truesky[camb]', or camb alone"
+    )

@@ -185,7 +185,6 @@ def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: 
     growth_here = cosmology.growth(z)
     nodes = np.linspace(float(cosmology.growth(table.z[-1])), 1.0, _GAIN_NODES)
     gain = np.interp(growth_here, nodes, density_box.matter_gain(box.model, nodes))
-    # Massive neutrinos hardly cluster: all matter has the overdensity of cold matter times omega_cold / omega_m.
     weight = 1.5 * cosmology.omega_cold / HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
     return Layers(chi, thick, number, growth, growth_here, gain, weight)
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lake_schema.arrays import Float
 from truesky.catalogue.matter import boltzmann
@@ -153,12 +154,38 @@ def _set_cosmology(cosmology: Cosmology, reads_files: bool = False) -> Any:
     name = f"truesky_{cosmology.fingerprint()}"
     current = colossus.setCosmology(name, numbers, persistence="r" if reads_files else "")
     if cosmology.m_nu > 0.0:
-        # Colossus only calls this method, for sigma(M, z) and concentrations.
+        # Colossus computes D(z) for matter without neutrinos. All quantities of `_colossus_tables` get D through this
+        # method alone: sigma(M, z), from which abundance, bias and peak height follow, and the exponent of the growth,
+        # dlnD / dln(1 + z), in the concentration. The power spectrum of `power` is that of z = 0.
         current.growthFactor = partial(_growth, cosmology)
     return current
 
 
-def _growth(cosmology: Cosmology, z: Float, derivative: int = 0) -> Float:
-    """Return the linear growth D(z), or dD/dz if `derivative` is 1, as colossus calls it."""
+def _growth(cosmology: Cosmology, z: npt.ArrayLike, derivative: int = 0, inverse: bool = False) -> Float:
+    """Return the linear growth D(z), or dD/dz if `derivative` is 1, with the arguments of growthFactor of colossus.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    z : array_like
+        Redshift, 0 to 20.
+    derivative : int, optional
+        0 for D or 1 for dD/dz.
+    inverse : bool, optional
+        Only False: z(D) is not available.
+
+    Returns
+    -------
+    float array
+        D or dD/dz, in the shape of `z`.
+
+    Raises
+    ------
+    NotImplementedError
+        If colossus asks for a higher derivative, or for z(D).
+    """
+    if inverse or derivative not in (0, 1):
+        raise NotImplementedError(f"growth with derivative = {derivative}, inverse = {inverse} is not available")
     d = cosmology.growth(z)
-    return -d * cosmology.growth_rate(z, 0.0) / (1.0 + z) if derivative else d
+    return -d * cosmology.growth_rate(z) / (1.0 + np.asarray(z, float)) if derivative else d

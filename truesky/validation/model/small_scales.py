@@ -69,9 +69,36 @@ def galaxy_population(seed: int, settings: Universe) -> Population:
 def figures(universe: Population, count: int) -> dict[str, float]:
     """Measure w of bright galaxies divided by w of the power law, in bins of projected separation.
 
-    `universe` comes from `galaxy_population`. Galaxies are drawn in `count` (at least 2) HEALPix cells of order 5,
-    distributed over the sky. Names of the results contain the lower edge of the bin in Mpc/h; errors are from the
-    scatter between cells.
+    `universe` comes from `galaxy_population`, and `count` is the number of cells as in `measure_cells`. Names of the
+    results contain the lower edge of the bin in Mpc/h; errors are from the scatter between cells.
+    """
+    return summarise(measure_cells(universe, count))
+
+
+def summarise(ratio: Float) -> dict[str, float]:
+    """Return the means and errors of the rows of `measure_cells`, by the names of `figures`."""
+    names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
+    error = ratio.std(0, ddof=1) / np.sqrt(len(ratio))
+    return {
+        **dict(zip(names, ratio.mean(0).tolist(), strict=True)),
+        **{f"{name}_error": value for name, value in zip(names, error.tolist(), strict=True)},
+    }
+
+
+def measure_cells(universe: Population, count: int) -> Float:
+    """Measure w of bright galaxies divided by w of the power law in each of several cells.
+
+    Parameters
+    ----------
+    universe : Population
+        Model from `galaxy_population`.
+    count : int
+        Number of HEALPix cells of order 5, at least 2, which are distributed over the sky.
+
+    Returns
+    -------
+    float array, shape (count, 4)
+        The ratios by cell and bin of projected separation. Two universes with the same halos share most of their noise.
     """
     low, high = (float(universe.cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
@@ -88,13 +115,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
         _, ra, dec = sky.random_in_cell(ORDER, cell, _RANDOM, stream(universe.seed, "small_scales", cell))
         chance[row] = _count_pairs(ra, dec, theta) / _RANDOM**2
     expected = chance.mean(0) * number.mean() ** 2
-    ratio = (pair_counts / expected - 1.0) / power_law(np.concatenate(chi), theta)
-    names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
-    error = ratio.std(0, ddof=1) / np.sqrt(count)
-    return {
-        **dict(zip(names, ratio.mean(0).tolist(), strict=True)),
-        **{f"{name}_error": value for name, value in zip(names, error.tolist(), strict=True)},
-    }
+    return np.asarray((pair_counts / expected - 1.0) / power_law(np.concatenate(chi), theta))
 
 
 def _count_pairs(ra: Float, dec: Float, theta: Float) -> Float:

@@ -1,7 +1,6 @@
 """Every row of a user's tables is read; all mistakes are reported at once with the user's columns and rows."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -36,8 +35,7 @@ def table(number=50, **changes):
 
 
 def galaxies(entries=GALAXIES, **more):
-    mapped = mapping.galaxy_columns("", {key: json.dumps(value) for key, value in {**entries, **more}.items()})
-    return replace(mapped, cosmology=FIDUCIAL)
+    return mapping.galaxy_columns("", {key: json.dumps(value) for key, value in {**entries, **more}.items()}, FIDUCIAL)
 
 
 def halos():

@@ -14,6 +14,7 @@ from tests import requests
 from truesky.catalogue import build_galaxies
 from truesky.catalogue.external import mapping
 from truesky.catalogue.galaxies import galaxies, nearest_sed
+from truesky.cosmology import FIDUCIAL
 from truesky.request.from_toml import parse
 from truesky.request.schema import Universe
 
@@ -123,8 +124,8 @@ def test_an_unknown_template_is_refused(tmp_path, monkeypatch):
     values["sed"][4] = 30.5
     path = tmp_path / "synthetic.parquet"
     pq.write_table(pa.table(values), path)
-    columns = mapping.training_columns({key: f'"{key}"' for key in KEYS})
+    columns = mapping.training_columns({key: f'"{key}"' for key in KEYS}, FIDUCIAL)
     with pytest.raises(BadInput, match=r"synthetic\.parquet: column sed of row 5 is 30\.5, but must be from 0 to 30"):
         nearest_sed.load([path], ["x"], columns)
     with pytest.raises(BadInput, match=r"ingest\.training\.columns must have ebv"):
-        mapping.training_columns({key: f'"{key}"' for key in KEYS[:-1]})
+        mapping.training_columns({key: f'"{key}"' for key in KEYS[:-1]}, FIDUCIAL)
