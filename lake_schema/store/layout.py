@@ -280,7 +280,22 @@ def requests_folder(root: Below) -> Below:
 def request_folder(root: Below, request: str) -> Below:
     """Return the folder with the links of a request (named set of settings), which need not exist.
 
-    BadInput is raised if the name is not valid, or if the folder is a link that leads out of the lake.
+    Parameters
+    ----------
+    root : Path or UPath
+        Folder of the lake.
+    request : str
+        Name of the request.
+
+    Returns
+    -------
+    Path or UPath
+        The folder.
+
+    Raises
+    ------
+    BadInput
+        If the name is not valid, or if the folder is a link that leads out of the lake.
     """
     return check_inside(root, requests_folder(root) / check_name(request))
 
