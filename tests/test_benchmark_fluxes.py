@@ -96,5 +96,5 @@ def test_the_notebook_draws_the_figures(results, monkeypatch):
     NotebookClient(notebook, timeout=1200, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert [output for output in outputs if output.output_type == "error"] == []
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 12
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 13
     check("".join(output.text for output in outputs if output.output_type == "stream"), results)
