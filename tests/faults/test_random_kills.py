@@ -62,7 +62,9 @@ def start(request_file, lake, workers, threads):
 def is_worker(pid):
     """Return True for a Python process that computes tasks for Spark."""
     with suppress(OSError):
-        return b"pyspark.daemon" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        # Workers on one machine have a module of this package, others that of PySpark.
+        command = Path(f"/proc/{pid}/cmdline").read_bytes()
+        return b"truesky.running.spark_workers" in command or b"pyspark.daemon" in command
     return False
 
 
