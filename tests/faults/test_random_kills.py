@@ -1,6 +1,7 @@
 """Runs with one to four workers and one or two threads that are killed at random moments: all lakes have equal bytes.
 
-tests/faults/test_repeat.py and tests/test_same_bytes.py have short versions, without Spark.
+tests/faults/test_spark.py has a short version with a worker that dies; those of tests/faults/test_repeat.py need no
+Spark.
 """
 
 import os
