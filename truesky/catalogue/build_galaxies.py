@@ -13,6 +13,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from lake_schema.errors import BadInput
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import layout, parquet, read
 from lake_schema.store.plan import Json, Output, Plan, Task
@@ -30,7 +31,7 @@ from truesky.catalogue.halos import halo_catalogue, population
 from truesky.catalogue.halos.halo_catalogue import LightCone
 from truesky.catalogue.matter import boltzmann
 from truesky.catalogue.request_checks import check_band, check_cosmology
-from truesky.cosmology import from_facts
+from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import sources
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
@@ -256,7 +257,16 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
     if settings.get("lensing") is not None:
         settings["lensing"] = tuple(settings["lensing"])
     settings["cosmology"] = from_facts(facts)
+    _refuse_other_camb(settings["cosmology"], facts.get("camb", ""))
     return Universe(**settings)
+
+
+def _refuse_other_camb(cosmology: Cosmology, planned: str) -> None:
+    """Raise BadInput if this process has another version of CAMB than the driver had, and so another spectrum."""
+    version = boltzmann.camb_version(cosmology)
+    if version != planned:
+        problem = f"this worker has CAMB {version}, and the driver has {planned or 'none'}"
+        raise BadInput(f"universe.cosmology: {problem}: install the same version on all computers")
 
 
 def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone | None, Training | None]:
@@ -282,12 +292,10 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
     files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
     catalogue_facts = {"sha256": sha256, "format": catalogue.format, "columns": dict(catalogue.columns)}
     dust = request.ingest.dust
-    universe = request.facts("universe")["universe"]
-    lens_facts = {name: universe[name] for name in (*_LENS_FACTS, "cosmology")}
     facts = {
         "seed": request.seed,
         "ingest": catalogue_facts,
-        **lens_facts,
+        **_lens_facts(request),
         **dust_map.facts(dust),
         "code": code_version(),
     }
@@ -297,14 +305,17 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
     return Step(plan, partial(ingest_galaxies, catalogue=catalogue, dust=dust))
 
 
-def _given_step(request: Request, source_tables: UserSources) -> Step:
+def _lens_facts(request: Request) -> Json:
     universe = request.facts("universe")["universe"]
-    lens_facts = {name: universe[name] for name in (*_LENS_FACTS, "cosmology")}
+    return {name: universe[name] for name in (*_LENS_FACTS, "cosmology")}
+
+
+def _given_step(request: Request, source_tables: UserSources) -> Step:
     source_facts = source_tables.facts(request.area.bounding_circle())
     given_sources.load(source_tables, request.area, request.universe.cosmology)
     plan = Plan(
         GALAXIES,
-        {"seed": request.seed, "sources": source_facts, **lens_facts, "code": code_version()},
+        {"seed": request.seed, "sources": source_facts, **_lens_facts(request), "code": code_version()},
         cells.tasks_of_area(request.area),
     )
     return Step(plan, partial(draw_given_galaxies, source_tables=source_tables, area=request.area))

@@ -196,6 +196,14 @@ def test_versions_of_tables_name_the_version_of_camb(monkeypatch, tmp_path):
         assert [one != two for one, two in zip(*keys, strict=True)] == [is_massive] * 4
 
 
+@pytest.mark.parametrize("planned", ["2.0.6", ""])
+def test_a_worker_with_another_version_of_camb_is_refused(planned, monkeypatch, tmp_path):
+    neutrinos.set_version(monkeypatch, "2.0.5")
+    facts = request_of(m_nu=neutrinos.MASSIVE.m_nu).facts("universe")["universe"] | {"camb": planned}
+    with pytest.raises(BadInput, match=f"this worker has CAMB 2.0.5, and the driver has {planned or 'none'}: install"):
+        build_galaxies.draw_halos(tmp_path, {**facts, **SMALL, "seed": 1})
+
+
 def test_a_sky_with_massive_neutrinos(monkeypatch, tmp_path):
     """The job makes halos and galaxies in a small box, nearly as many as without massive neutrinos."""
     rows = {}
