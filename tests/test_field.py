@@ -336,7 +336,8 @@ def photometry(image):
     index = np.flatnonzero(alone & (hits == 0))
 
     def aperture(data):
-        return sep.sum_circle(np.ascontiguousarray(data), image.x[index], image.y[index], radius, subpix=0)[0]
+        # Whole pixels, because parts of a pixel have less noise than the root of the part of its variance.
+        return sep.sum_circle(np.ascontiguousarray(data), image.x[index], image.y[index], radius, subpix=1)[0]
 
     noise = np.sqrt(aperture(image.variance))
     return index, aperture(image.electrons), aperture(image.noise_free), noise
