@@ -58,8 +58,8 @@ _BOX = (8, 4)
 # Sigma of the Gaussian weight for the centroid of a line, pixels.
 _SIGMA = 2.0
 _TABLE_HEADER = """\
-# Settings of drawing spectra. allowed: the error of a pixel, of its noise, that they are for. Bright sources exceed it:
-# their errors are proportional to their light (column `background`).
+# Settings of drawing spectra. allowed: the accuracy.background for which a row is used. Errors grow with the light of
+# a source, and those of H_E = 17 to 23 exceed it (columns `background` and `background_held`).
 #
 # edge, faint: of a sky pixel's noise; min_size: pixels; along, across: samples a pixel; block: A that share a PSF;
 # nodes: wavelengths of the PSF; positions: of the PSF on a detector, one of euclid.DEGREES; separable: light of the

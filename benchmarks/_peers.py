@@ -113,8 +113,8 @@ def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
     return np.asarray(frame.array)
 
 
-def ufig_seconds(scene: Scene) -> float:
-    """Return the CPU time (s) that UFig needs to draw the photons of all galaxies, or NaN if it is not installed.
+def ufig_seconds(scene: Scene) -> float | None:
+    """Return the CPU time (s) that UFig needs to draw the photons of all galaxies, or None if it is not installed.
 
     Bulge and disc of a galaxy are drawn as two objects. The PSF is a Moffat profile for all wavelengths. The shorter of
     two times counts.
@@ -125,7 +125,7 @@ def ufig_seconds(scene: Scene) -> float:
         from ufig.plugins.render_galaxies_flexion import integrate_image
     except ImportError:
         print("UFig is not installed (pip install ufig) and is not compared")
-        return float("nan")
+        return None
     sources = scenes.sources(scene, 1, stars=0)
     shape, n = sources.shapes, len(sources)
     fraction = np.concatenate([shape.bulge_fraction, 1 - shape.bulge_fraction])

@@ -130,7 +130,8 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
             shared = seconds(scene, tiers["survey"], repeats, stars=False, shared=True)
             out |= {"vis_shared_s": shared, "vis_shared_vs_galsim_cached": cached / shared}
         ufig = peers.ufig_seconds(scene)
-        out |= {f"{scene.name}_ufig_s": ufig, f"{scene.name}_vs_ufig": ufig / galaxies}
+        if ufig is not None:
+            out |= {f"{scene.name}_ufig_s": ufig, f"{scene.name}_vs_ufig": ufig / galaxies}
     if not quick:
         out["psf_planes_cold_s"], out["psf_planes_warm_s"] = psf_plane_seconds()
     return out

@@ -336,7 +336,7 @@ def photometry(image):
     index = np.flatnonzero(alone & (hits == 0))
 
     def aperture(data):
-        # Whole pixels, because parts of a pixel have less noise than the root of the part of its variance.
+        # Whole pixels: a part f of a pixel has f times its noise, but a sum of variances would give sqrt(f) times it.
         return sep.sum_circle(np.ascontiguousarray(data), image.x[index], image.y[index], radius, subpix=1)[0]
 
     noise = np.sqrt(aperture(image.variance))

@@ -262,10 +262,10 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
 
 
 def _refuse_other_camb(cosmology: Cosmology, planned: str) -> None:
-    """Raise BadInput if this process has another version of CAMB than the driver had, and so another spectrum."""
+    """Raise BadInput if this process has another version of CAMB than the driver, because its spectrum would differ."""
     version = boltzmann.camb_version(cosmology)
     if version != planned:
-        problem = f"this worker has CAMB {version}, and the driver has {planned or 'none'}"
+        problem = f"this worker has CAMB {version or 'none'}, and the driver has {planned or 'none'}"
         raise BadInput(f"universe.cosmology: {problem}: install the same version on all computers")
 
 

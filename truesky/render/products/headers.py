@@ -17,6 +17,7 @@ from truesky.randomness import rng
 from truesky.render.camera import astrometry, detectors, observatories, sections
 from truesky.render.channels.readout import Extension
 from truesky.render.channels.registry import find_effects
+from truesky.render.dispersing import draw
 from truesky.render.effects.charge import ramp, ramp_nonlinearity
 from truesky.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
 from truesky.render.exposure import truth_maps
@@ -319,10 +320,13 @@ def _lamp_cards(lamp: int, rendered: RenderedDetector) -> tuple[Card, ...]:
 def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     """Return the cards with the errors of the simulation: errors that the request allows (ACC*), expected ones (ERR*).
 
-    Expected errors come from drawing sources (if the image has a PSF) and from the charge transfer effects, if applied.
-    They are independent and are added in quadrature.
+    Expected errors come from drawing sources or their spectra (if the image has a PSF) and from the charge transfer
+    effects, if applied. They are independent and are added in quadrature.
     """
-    causes = [] if rendered.psf is None else [asdict(accuracy.expected_errors(rendered.accuracy))]
+    causes = []
+    if rendered.psf is not None:
+        of_images = asdict(accuracy.expected_errors(rendered.accuracy))
+        causes = [of_images if rendered.spectra is None else of_images | draw.expected_errors(rendered.accuracy)]
     applied = [decision.name for decision in rendered.decisions if decision.applied]
     causes += [charge_transfer.source_errors(rendered.scene, name) for name in applied]
     errors = {name: math.hypot(*(cause.get(name, 0.0) for cause in causes)) for name in _ERRORS}

@@ -16,6 +16,7 @@ from tests.truesky.render import nominal
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import small
 from truesky.render.camera import astrometry, detectors, observatories
+from truesky.render.dispersing import draw
 from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.scene import Scene
 from truesky.render.products import fits_files, head_files, headers, read_back
@@ -158,6 +159,18 @@ def test_header_has_allowed_and_expected_errors(rendered, written):
         reached = sum(cause.get(name, 0.0) ** 2 for cause in made) ** 0.5
         assert header[f"ERR{short[name]}"] == pytest.approx(reached, abs=0.0)
         assert 0.0 < header[f"ERR{short[name]}"] <= value
+
+
+def test_header_of_spectra_has_the_errors_of_spectra(rendered):
+    """Without charge transfer, which has errors of its own."""
+    still = tuple(replace(decision, applied=False) for decision in rendered.decisions)
+    cards = headers._accuracy_cards(replace(rendered, spectra={}, decisions=still))
+    values = {key: value for key, value, _ in cards}
+    named = draw.expected_errors(rendered.accuracy)
+    assert (values["ERRFLUX"], values["ERRPOS"], values["ERRBACK"]) == tuple(named.values())
+    assert values["ERRSHAPE"] == accuracy.expected_errors(rendered.accuracy).shape
+    # Those of images are smaller than the allowed one, and those of bright spectra larger.
+    assert values["ERRBACK"] > values["ACCBACK"]
 
 
 @pytest.mark.parametrize("preset", accuracy.PRESETS)
