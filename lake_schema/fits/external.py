@@ -292,7 +292,7 @@ def read_frame(path: Path, extension: int | str | None = None) -> tuple[Array, f
         Pixels in the type of the file and the byte order of this machine. Integers become floating-point numbers if
         some are missing (BLANK); these are NaN.
     cards, primary_cards : astropy.io.fits.Header
-        Header of the image, and that of the primary unit.
+        Header of the image, and that of the primary unit. The value of a card that violates the standard is its text.
     number : int
         Number of the extension.
 
@@ -317,7 +317,21 @@ def read_frame(path: Path, extension: int | str | None = None) -> tuple[Array, f
             if missing.any():
                 pixels = np.where(missing, np.nan, pixels)
         pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-        return pixels, hdu.header.copy(), hdus[0].header.copy(), number
+        return pixels, _with_values(hdu.header), _with_values(hdus[0].header), number
+
+
+def _with_values(header: fits.Header) -> fits.Header:
+    """Return a copy of a header in which a card that violates the standard has its text as its value."""
+    from astropy.io import fits
+
+    cards = []
+    for card in header.copy().cards:
+        try:
+            card.value  # noqa: B018  (astropy parses the card here, and may fail)
+        except fits.VerifyError:
+            card = fits.Card(card.keyword, card.image[10:].strip())
+        cards.append(card)
+    return fits.Header(cards)
 
 
 def _frame_number(path: Path, hdus: fits.HDUList, extension: int | str | None) -> int:

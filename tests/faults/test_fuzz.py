@@ -108,6 +108,9 @@ def test_mutations_are_reproducible():
         ("master, sealed", 115),
         ("image, sealed", 228),
         ("calibrated image, sealed", 116),
+        ("frame with WCS", 659),
+        ("stack, sealed", 3021),
+        ("stack, sealed", 3580),
     ],
 )
 def test_inputs_that_once_failed_are_refused(name, number):

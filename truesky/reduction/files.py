@@ -372,8 +372,8 @@ def read_image(path: Path) -> ImageFile:
     Raises
     ------
     BadInput
-        If the file does not exist, its extensions do not begin with SCI, WHT and FLG, or its WCS is incomplete or
-        wrong.
+        If the file does not exist, its extensions do not begin with SCI, WHT and FLG, which must be images of equal
+        shape, or its WCS is incomplete or wrong.
     """
     units = read_images(user_files.check_file(path, "calibrated image"))
     if [unit.name for unit in units[1:4]] != ["SCI", "WHT", "FLG"]:
@@ -381,6 +381,9 @@ def read_image(path: Path) -> ImageFile:
             f"{user_files.format_path(path)}: is not a calibrated image: truesky reduce LAKE --out FOLDER makes them"
         )
     image, weight, flags = (np.asarray(unit.data) for unit in units[1:4])
+    if image.ndim != 2 or not image.shape == weight.shape == flags.shape:
+        problem = f"SCI, WHT and FLG are no images of equal shape: {image.shape}, {weight.shape} and {flags.shape}"
+        raise BadInput(f"{user_files.format_path(path)}: {problem}")
     try:
         astrometry.from_cards(units[0].cards)
     except BadInput as error:
