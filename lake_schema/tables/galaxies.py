@@ -117,7 +117,7 @@ _OTHER_COLUMNS = (
         "float32",
         "",
         "phys.mass",
-        "log10 of the stellar mass / Msun (h = 0.67), Chabrier",
+        "log10 of the stellar mass / Msun (with h of the universe), Chabrier",
         0.0,
         14.0,
         True,

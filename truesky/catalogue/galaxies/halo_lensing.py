@@ -1,7 +1,10 @@
-"""Lensing of galaxies by halos, in addition to the lensing by the large-scale matter of the simulated box.
+"""Lensing of galaxies by halos and the matter around them, in addition to the large-scale matter of the simulated box.
 
 Notes
 -----
+The matter around halos follows the same structure below the cells of the box as the halos (`fine_convergence`). Below,
+"halos" includes this matter.
+
 The large-scale matter deflects the light of a halo as well as the light of a source behind the halo; the two
 deflections differ by 20 to 40 arcsec. Distances between halos and sources on the sky are therefore measured between the
 positions at which they are observed with the lensing by the box alone. Lensing by halos is summed at this position
@@ -34,7 +37,8 @@ from truesky.catalogue.halos import lens_halos
 from truesky.catalogue.halos.halos import LEVELS, Halos
 from truesky.catalogue.halos.lens_halos import Settings
 from truesky.catalogue.halos.population import CellCache, Population
-from truesky.cosmology import Cosmology
+from truesky.catalogue.matter import fine_convergence
+from truesky.catalogue.matter.fine_convergence import FineMatter
 from truesky.fluxes import sources
 
 # All sources in one HEALPix cell of this order are compared with the same halos.
@@ -57,6 +61,22 @@ MinDistance = Callable[[int, int], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Lensing at the nodes of a square grid in the plane that touches the sphere at the centre of a cell.
+
+    Attributes
+    ----------
+    step : float
+        Distance between nodes, rad.
+    table : float array, shape (p, side, side, 5)
+        kappa, gamma1, gamma2, deflection to the east and north (rad) for sources on each of p planes, by y and x.
+    """
+
+    step: float
+    table: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
     """All matter that lenses the sources in one order-8 cell: maps of the simulated matter, and single halos.
 
@@ -74,9 +94,10 @@ class Neighbourhood:
         Position, distance and profile of each halo, in the rows that halo_lensing_sums defines.
     planes : float array, shape (p,)
         Inverse comoving distances of the sources of `smooth`, ascending from 0, h/Mpc.
-    smooth : float array, shape (p, side, side, 5)
-        Part of the halos' lensing that varies slowly, at the nodes of a square grid in the plane: kappa, gamma1,
-        gamma2, deflection to the east and north (rad).
+    smooth : Grid
+        Part of the halos' lensing that varies slowly.
+    matter : Grid or None
+        Lensing by the matter that follows the structure below the cells of the box; None if there is no such structure.
     max_deflection : float
         Upper limit of the deflection by halos, rad.
     """
@@ -86,7 +107,8 @@ class Neighbourhood:
     frame: Float
     halos: Float
     planes: Float
-    smooth: Float
+    smooth: Grid
+    matter: Grid | None
     max_deflection: float
 
 
@@ -130,8 +152,9 @@ def lens_of_cell(
     halos, identifiers = halos[:, reaching], identifiers[reaching]
     halos = halos[:, np.lexsort((identifiers, halos[_MASS], halos[_CHI]))]
     table = np.concatenate([_stereographic(frame, halos[:3].T), halos[_CHI:_MASS]])
-    grid = _grid(cells.population.cosmology, settings, table)
-    return Neighbourhood(lens, settings, frame, table, *grid, _max_deflection(table))
+    planes = np.append(0.0, 1.0 / cells.population.cosmology.comoving_distance(np.array(settings.planes))[::-1])
+    grids = _smooth_lensing(settings, table, planes), _matter_lensing(settings, cells, planes, frame)
+    return Neighbourhood(lens, settings, frame, table, planes, *grids, _max_deflection(table))
 
 
 def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
@@ -328,26 +351,45 @@ def _max_enclosed_ratio() -> tuple[Float, Float]:
     return nodes, np.array(enclosed)
 
 
-def _grid(cosmology: Cosmology, settings: Settings, halos: Float) -> tuple[Float, Float]:
-    """Return the slowly varying part of the lensing by halos on a grid around the centre of an order-8 cell.
+def _grid_radius(settings: Settings) -> float:
+    """Return the radius (rad) of the circle around the centre of an order-8 cell in which lensing is interpolated."""
+    return float(np.radians(sky.cell_radius(GENERATION_ORDER)) + _GRID_MARGIN + np.radians(settings.step / 60.0))
 
-    Return the inverse comoving distances of the planes, shape (p,), h/Mpc, and the lensing of sources at the nodes:
-    kappa, gamma1, gamma2, deflection to the east and north (rad), shape (p, side, side, 5).
+
+def _smooth_lensing(settings: Settings, halos: Float, planes: Float) -> Grid:
+    """Return the slowly varying part of the lensing by halos around the centre of an order-8 cell.
+
+    `planes`, shape (p,), are the inverse comoving distances of the sources, h/Mpc.
     """
     # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     step = np.radians(settings.step / 60.0)
-    half = int(np.ceil((np.radians(sky.cell_radius(GENERATION_ORDER)) + _GRID_MARGIN) / step)) + 1
+    half = int(np.ceil(_grid_radius(settings) / step))
     side = 2 * half + 1
-    inverse_distances = np.append(0.0, 1.0 / cosmology.comoving_distance(np.array(settings.planes))[::-1])
     axis = step * np.arange(-half, half + 1)
     y, x = np.meshgrid(axis, axis, indexing="ij")
-    place = np.tile(np.stack([x.ravel(), y.ravel()]), inverse_distances.size)
+    place = np.tile(np.stack([x.ravel(), y.ravel()]), planes.size)
     out = np.zeros((5, place.shape[1]))
     wide = np.ascontiguousarray(halos[:, halos[sums.WIDE] > halos[sums.CLOSE]])
-    sums.add_smooth(place, np.repeat(inverse_distances, side * side), wide, out)
-    return inverse_distances, np.ascontiguousarray(out.T).reshape(inverse_distances.size, side, side, 5)
+    sums.add_smooth(place, np.repeat(planes, side * side), wide, out)
+    return Grid(step, np.ascontiguousarray(out.T).reshape(planes.size, side, side, 5))
+
+
+def _matter_lensing(settings: Settings, cells: CellCache, planes: Float, frame: Float) -> Grid | None:
+    """Return the lensing by the matter that follows the structure below the cells of the box, around a cell's centre.
+
+    `planes`, shape (p,), are the inverse comoving distances of the sources, h/Mpc. Return None if halos have no such
+    structure, or if they are the user's.
+    """
+    model = cells.population.halos
+    if model.fine is None or cells.population.light_cone is not None:
+        return None
+    if cells.matter is None:
+        distance = settings.max_distance(cells.population.cosmology)
+        points = fine_convergence.points(model.box, model.steps, model.fine, distance)
+        cells.matter = FineMatter(model.box, model.replicas, model.fine, points, planes)
+    return Grid(*fine_convergence.lensing_grid(cells.matter, frame, _grid_radius(settings)))
 
 
 def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell: Int) -> Float:
@@ -360,7 +402,9 @@ def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell:
     first = np.append(np.unique(cell, return_index=True)[1], cell.size)
     terms = np.zeros((5, cell.size))
     sums.add_halos(place, inverse_distance, first, lens.halos, terms)
-    sums.add_nodes(place, inverse_distance, lens.planes, np.radians(lens.settings.step / 60.0), lens.smooth, terms)
+    for grid in (lens.smooth, lens.matter):
+        if grid is not None:
+            sums.add_nodes(place, inverse_distance, lens.planes, grid.step, grid.table, terms)
     return terms
 
 

@@ -26,6 +26,7 @@ from truesky.catalogue.halos.luminosity_function import Inverse, Volume
 from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.halos.satellites import Satellites
 from truesky.catalogue.matter import density_box, fine_structure
+from truesky.catalogue.matter.fine_convergence import FineMatter
 from truesky.cosmology import Cosmology
 
 CENTRAL, SATELLITE = 0, 1
@@ -128,11 +129,14 @@ class CellCache:
         are last.
     lenses : OrderedDict
         Table and identifiers of the halos that lens, by (order, nested index, log10 of the lowest mass in Msun/h).
+    matter : FineMatter or None
+        Matter that lenses in addition to halos and the box; None until it is first needed.
     """
 
     population: Population
     drawn: OrderedDict[tuple[int, int], tuple[Halos, Satellites]] = field(default_factory=OrderedDict)
     lenses: OrderedDict[tuple[int, int, float], tuple[Float, Int]] = field(default_factory=OrderedDict)
+    matter: FineMatter | None = None
 
     def halos_and_satellites(self, order: int, cell: int) -> tuple[Halos, Satellites]:
         """Return the halos drawn in a HEALPix cell of order 8, 5 or 2, and all their satellites.

@@ -188,3 +188,64 @@ def choose_candidates(place: Any, amplitude: Any, value: Any, out: Any) -> None:
                 break
             j += 1
         out[i] = j
+
+
+@exact_jit
+def sum_matter(direction: Any, value: Any, box: Any, frames: Any, points: Any, planes: Any, out: Any) -> None:
+    """Sum the structure of matter below the cells of the box along lines of sight.
+
+    Parameters
+    ----------
+    direction : float array, shape (3, n)
+        Unit vectors of the lines of sight.
+    value : float array, shape (s, n)
+        G at the points of each line of sight, which are at the same distances for all lines.
+    box : tuple
+        Gaussian field of the box of simulated matter (float32[cells^3]), number of cells per side, side (Mpc/h), and
+        variance of the field.
+    frames : tuple of array, shape (s, 3)
+        Axes (int64), signs, and shifts in units of the side, of the replica of the box at each distance.
+    points : tuple of array, shape (s,)
+        Comoving distance (Mpc/h), linear growth, amplitude B, ln <exp(B G)>, and weight in the convergence.
+    planes : float array, shape (p,)
+        Inverse comoving distances of the sources, h/Mpc, ascending.
+    out : float array, shape (p, n)
+        Output: the convergence.
+    """
+    field, cells, length, variance = box
+    axes, sign, shift = frames
+    chi, growth, amplitude, log_norm, weight = points
+    pixels, last = direction.shape[1], cells - 1
+    # The convergence is total - moment / (distance of the source).
+    total, moment = np.zeros(pixels), np.zeros(pixels)
+    # Planes are filled from the nearest one, which is the last, to infinity.
+    plane = planes.size - 1
+    for s in range(chi.size):
+        while plane >= 0 and planes[plane] * chi[s] >= 1.0:
+            for p in range(pixels):
+                out[plane, p] = total[p] - planes[plane] * moment[p]
+            plane -= 1
+        along_x, along_y, along_z = direction[axes[s, 0]], direction[axes[s, 1]], direction[axes[s, 2]]
+        scale = chi[s] / length
+        scale_x, scale_y, scale_z = sign[s, 0] * scale, sign[s, 1] * scale, sign[s, 2] * scale
+        offset, previous, density = 0.5 * growth[s] * growth[s] * variance, -1, 0.0
+        for p in range(pixels):
+            # Positions in the box, in units of its side, modulo 1. Rounding can give exactly 1.
+            x, y, z = (
+                along_x[p] * scale_x + shift[s, 0],
+                along_y[p] * scale_y + shift[s, 1],
+                along_z[p] * scale_z + shift[s, 2],
+            )
+            x, y, z = x - np.floor(x), y - np.floor(y), z - np.floor(z)
+            i, j, k = min(int(x * cells), last), min(int(y * cells), last), min(int(z * cells), last)
+            index = (i * cells + j) * cells + k
+            # Neighbouring lines of sight are often in the same cell of the box.
+            if index != previous:
+                density = weight[s] * np.exp(growth[s] * np.float64(field[index]) - offset)
+                previous = index
+            added = density * np.expm1(amplitude[s] * value[s, p] - log_norm[s])
+            total[p] += added
+            moment[p] += added * chi[s]
+    for rest in range(plane, -1, -1):
+        for p in range(pixels):
+            out[rest, p] = total[p] - planes[rest] * moment[p]

@@ -46,7 +46,9 @@ def lone(box, ra, dec, chi=800.0, amplitude=3e-9, size=2 * ARCMIN):
     halo = np.array([0, 0, chi, amplitude, size, max(size, 10 * ARCMIN), max(size, 25 * ARCMIN), 6.0])[:, None]
     empty = replace(box, maps=tuple(np.zeros_like(one) for one in box.maps))
     frame = halo_lensing._frames(np.array([ra]), np.array([dec]))[0]
-    return Neighbourhood(empty, chosen, frame, halo, *halo_lensing._grid(FIDUCIAL, chosen, halo), np.inf)
+    planes = np.append(0.0, 1.0 / FIDUCIAL.comoving_distance(np.array(chosen.planes))[::-1])
+    smooth = halo_lensing._smooth_lensing(chosen, halo, planes)
+    return Neighbourhood(empty, chosen, frame, halo, planes, smooth, None, np.inf)
 
 
 @pytest.mark.parametrize(("ra", "dec"), [(40.0, 20.0), (0.0, -1.0), (359.9999, 60.0), (123.0, 89.5), (10.0, -89.9)])
@@ -136,7 +138,24 @@ def test_lensing_does_not_depend_on_the_limit_of_a_request(universe, near, chang
     found = halo_lensing.lens_of_cell(universe.lens, CellCache(other), CELL)
     assert near.halos.shape[1] > 5000
     assert found.halos.tobytes() == near.halos.tobytes()
-    assert found.smooth.tobytes() == near.smooth.tobytes()
+    assert found.smooth.table.tobytes() == near.smooth.table.tobytes()
+    assert found.matter.table.tobytes() == near.matter.table.tobytes()
+
+
+def test_matter_lenses_only_with_the_structure_that_halos_follow(universe, near):
+    """Without structure below the cells, and with halos of the user, only halos and the box lens."""
+    index = sky.healpix_29([217.0], [33.0])
+    users = LightCone(index, np.array([1000.0]), np.array([13.0]), np.zeros(1))
+    without = galaxies.halos_and_galaxies(SEED, Universe(**SMALL, structure_below_cells=False))
+    for population in (without, replace(universe.population, light_cone=users)):
+        assert halo_lensing.lens_of_cell(universe.lens, CellCache(population), CELL).matter is None
+    assert near.matter.table[0, ..., 0].std() > 0.01
+
+
+def test_no_deflection_by_matter_is_near_the_limit(near):
+    """The limit of the deflection by all halos but the strongest must also hold for the matter around them."""
+    deflection = np.hypot(near.matter.table[0, ..., 3], near.matter.table[0, ..., 4])
+    assert 0 < deflection.max() < 0.6 * halo_lensing._OTHER_DEFLECTION
 
 
 def test_halos_of_the_catalogue_are_those_that_lens(universe, cells):
@@ -172,9 +191,11 @@ def test_the_smooth_part_of_halos_is_that_of_a_direct_sum(universe, cells, near,
     chosen = lens_halos.settings()
     monkeypatch.setattr(lens_halos, "settings", lambda: replace(chosen, close=1000.0))
     direct = halo_lensing.lens_of_cell(universe.lens, CellCache(universe.population), CELL)
-    once = [replace(one, settings=replace(one.settings, repeat_threshold=np.inf)) for one in (near, direct)]
+    once = [
+        replace(one, matter=None, settings=replace(one.settings, repeat_threshold=np.inf)) for one in (near, direct)
+    ]
     split, whole = (halo_lensing.lensing_at_images(one, *behind) for one in once)
-    assert not direct.smooth.any()
+    assert not direct.smooth.table.any()
     assert np.all(np.std(split - whole, axis=1)[:3] < 0.01 * np.std(whole, axis=1)[:3])
     assert 3600 * np.degrees(np.abs(split - whole)[3:].max()) < 0.5
 
