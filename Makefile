@@ -54,8 +54,9 @@ check: .venv/installed-test
 	@$(RUN) ruff check . && ruff format --check . && codespell && mypy && lint-imports --no-cache && python -m scripts.plain_words --check
 
 bench: .venv/installed-bench spark
-	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; \
-	    [ "$$name" = compare.py ] || python -m "benchmarks.$${name%.py}"; done
+	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; name=$${name%.py}; \
+	    published="benchmarks/results/$$name.json"; \
+	    [ "$$name" = compare ] || python -m "benchmarks.$$name" $$([ ! -e "$$published" ] || echo --json "$$published"); done
 
 # For example, make bench-compare BASE=origin/main SUBJECTS="vis lsst"
 bench-compare: .venv/installed-bench spark

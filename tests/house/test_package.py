@@ -240,3 +240,10 @@ def test_a_package_with_two_versions_is_not_pinned(monkeypatch):
     assert pin_packages.read("a==1 \\\n    --hash=x\nb==2\n") == {"a": ["a==1 \\", "    --hash=x"], "b": ["b==2"]}
     with pytest.raises(SystemExit, match="a has two versions"):
         pin_packages.read("a==1 ; python_version < '3.12'\na==2 ; python_version >= '3.12'\n")
+
+
+def test_published_times_come_from_one_commit():
+    """Times of several commits or machines cannot be compared."""
+    results = [json.loads(file.read_text()) for file in (ROOT / "benchmarks" / "results").glob("*.json")]
+    assert len(results) > 10
+    assert len({(result["commit"], result["machine"]) for result in results}) == 1

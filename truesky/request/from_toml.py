@@ -8,7 +8,7 @@ All keys::
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells
-                   structure_below_cells  true | false   clustering of galaxies below 4 Mpc/h, default: true
+                   structure_below_cells  true | false   clustering and lensing below 4 Mpc/h, default: true
                    lensing_nside         64 to 2048, default: by area and accuracy (lensing_resolution.py)
                    high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)

@@ -76,7 +76,8 @@ class Universe:
         Number of cells of 4 Mpc/h along each side of the periodic box with the simulated matter density.
     structure_below_cells : bool
         True if the density of halos has structure on scales below the cells of the box, which increases the clustering
-        of galaxies below 4 Mpc/h. False for random positions below this scale. Halos from a file do not depend on it.
+        of galaxies below 4 Mpc/h, and if the matter around halos lenses. False for random positions below this scale.
+        Halos from a file do not depend on it, and the matter around them does not lens.
     lensing_nside : int
         HEALPix N_side of the lensing maps computed from the matter box. Maps with 1024 need 4.8 GB in the cache on
         disc. A request without this key has the value of truesky/request/lensing_resolution.py.

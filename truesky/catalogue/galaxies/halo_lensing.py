@@ -2,8 +2,10 @@
 
 Notes
 -----
-The matter around halos follows the same structure below the cells of the box as the halos (`fine_convergence`). Below,
-"halos" includes this matter.
+The lensing by the matter around halos (`fine_convergence`) is added to that by halos, on a grid. The matter is at its
+true direction, without the deflection by the box. Interpolation between source planes lets matter between the planes
+lens sources at the same distance: a source halfway in 1 / distance gets up to a quarter of the lensing by matter at its
+own redshift that a source on the next plane gets.
 
 The large-scale matter deflects the light of a halo as well as the light of a source behind the halo; the two
 deflections differ by 20 to 40 arcsec. Distances between halos and sources on the sky are therefore measured between the
@@ -50,7 +52,7 @@ _CHI, _CIRCLE, _MASS = 3, 7, 9
 # Largest number of HEALPix cells whose halos are cached. It is enough for all cells with halos that lens sources in an
 # order-8 cell and its neighbours.
 _MAX_CACHED_CELLS = 1024
-# Upper limit of the deflection by all halos together except the strongest one, rad.
+# Upper limit of the deflection by all halos except the strongest one and by the matter around halos together, rad.
 _OTHER_DEFLECTION = float(np.radians(45.0 / 3600.0))
 # Angle (rad) by which the grid for the slowly varying part of the halos' lensing extends beyond the cell with the
 # sources. It is larger than any deflection.
@@ -78,7 +80,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """All matter that lenses the sources in one order-8 cell: maps of the simulated matter, and single halos.
+    """All matter that lenses the sources in one order-8 cell: maps of the box, halos, and the matter around them.
 
     Halos are projected on the plane that touches the sphere at the centre of the cell.
 
@@ -93,13 +95,13 @@ class Neighbourhood:
     halos : float array, shape (8, h)
         Position, distance and profile of each halo, in the rows that halo_lensing_sums defines.
     planes : float array, shape (p,)
-        Inverse comoving distances of the sources of `smooth`, ascending from 0, h/Mpc.
+        Inverse comoving distances of the sources of `smooth` and `matter`, ascending from 0, h/Mpc.
     smooth : Grid
         Part of the halos' lensing that varies slowly.
     matter : Grid or None
         Lensing by the matter that follows the structure below the cells of the box; None if there is no such structure.
     max_deflection : float
-        Upper limit of the deflection by halos, rad.
+        Upper limit of the deflection by halos and the matter around them, rad.
     """
 
     box: Planes
@@ -234,7 +236,7 @@ def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
     if largest > lens.max_deflection:
         largest_arcsec, allowed_arcsec = (np.degrees(angle) * 3600.0 for angle in (largest, lens.max_deflection))
         raise BadInput(
-            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, "
+            f"table galaxies: halos and the matter around them deflect light by {largest_arcsec:.0f} arcsec, "
             f"at most {allowed_arcsec:.0f} are allowed"
         )
 

@@ -249,3 +249,36 @@ def sum_matter(direction: Any, value: Any, box: Any, frames: Any, points: Any, p
     for rest in range(plane, -1, -1):
         for p in range(pixels):
             out[rest, p] = total[p] - planes[rest] * moment[p]
+
+
+@exact_jit
+def spread_pixels(place: Any, kappa: Any, step: Any, radius: Any, out: Any) -> None:
+    """Add the convergence of pixels, times a weight, to the nodes of a square grid, and the sum of the weights.
+
+    Parameters
+    ----------
+    place : float array, shape (2, m)
+        Positions x and y of the pixels relative to the centre of the grid, rad.
+    kappa : float array, shape (m, p)
+        Convergence of the pixels for sources at p distances.
+    step : float
+        Distance between nodes, rad.
+    radius : float
+        Angle r beyond which the weight is 0, rad; at the angle theta, it is (1 - (theta / r)^2)^2.
+    out : float array, shape (p + 1, side, side)
+        The sums by y and x, to which the weighted convergence and, last, the weights are added. The centre of the grid
+        is the node side // 2.
+    """
+    side, planes = out.shape[1], kappa.shape[1]
+    for m in range(place.shape[1]):
+        x, y = place[0, m] / step + side // 2, place[1, m] / step + side // 2
+        first_x, last_x = max(int(np.ceil(x - radius / step)), 0), min(int(np.floor(x + radius / step)), side - 1)
+        first_y, last_y = max(int(np.ceil(y - radius / step)), 0), min(int(np.floor(y + radius / step)), side - 1)
+        for j in range(first_y, last_y + 1):
+            for i in range(first_x, last_x + 1):
+                inside = 1.0 - ((i - x) ** 2 + (j - y) ** 2) * (step / radius) ** 2
+                if inside > 0.0:
+                    weight = inside * inside
+                    for plane in range(planes):
+                        out[plane, j, i] += weight * kappa[m, plane]
+                    out[planes, j, i] += weight

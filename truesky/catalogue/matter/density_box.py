@@ -12,7 +12,7 @@ R and the amplitude A depend on the halo bias times D; f is the growth rate.
 Notes
 -----
 The log-normal field has the power of linear theory within 5 % at 0.02 < k < 0.2 h/Mpc (tests). There is no halo
-exclusion. The structure of the halo density below the cell size of 4 Mpc/h is in `fine_structure`.
+exclusion. The structure of halos and matter below the cell size of 4 Mpc/h is in `fine_structure`.
 
 References
 ----------

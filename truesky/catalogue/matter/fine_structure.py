@@ -1,7 +1,7 @@
-"""Structure of the halo density on scales below the voxels of the box of simulated matter (4 Mpc/h).
+"""Structure of the density of halos on scales below the voxels of the box of simulated matter (4 Mpc/h).
 
-The number density of halos is multiplied by a log-normal field, which depends only on the seed and the comoving
-position x relative to the observer::
+The number density of halos (and of the matter around them, see `fine_convergence`) is multiplied by a log-normal
+field, which depends only on the seed and the comoving position x relative to the observer::
 
     n(x) = n_voxel exp(B G(x)) / <exp(B G)>
 

@@ -178,8 +178,9 @@ def expected(ell, c_l):
 def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
     """Image positions have equal weights in theory, so sources are weighted by their magnification.
 
-    xi+ agrees within 10 %, and xi- within 15 %. The variance of the box is replaced by its theoretical value. Clusters
-    cause an error of 3 % at 5' to 10' in 215 deg2.
+    From 1.3' to 83', xi+ agrees within 10 %, and xi- within 15 % at the smallest separation and 13 % at others. The
+    amplitude of the matter around halos was chosen with this field. The variance of the box is replaced by its
+    theoretical value. Clusters cause an error of 3 % at 5' to 10' in 215 deg2.
     """
     centre = sample.frame[:, 2].mean(0)
     lon, lat = np.degrees([np.arctan2(centre[1], centre[0]), np.arctan2(centre[2], np.hypot(*centre[:2]))])
@@ -201,4 +202,4 @@ def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
         (one - other + mean) / by_theory for one, other, mean, by_theory in zip(whole, of_box, box, wanted, strict=True)
     )
     assert np.all(np.abs(plus - 1) < 0.10)
-    assert np.all(np.abs(minus - 1) < 0.15)
+    assert np.all(np.abs(minus - 1) < [0.15, *[0.13] * 6])
