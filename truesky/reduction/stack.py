@@ -35,7 +35,7 @@ from truesky.reduction.stacking import Contribution, Stack
 from truesky.render.camera import astrometry
 
 # Header keywords whose values must be equal in all images of a stack.
-_SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
+_SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "BAND", "ZEROPNT")
 # Other keywords that each image must have.
 _REQUIRED_CARDS = ("IMAGETYP", "DETECTOR")
 # Keywords that each image must have with a number above 0 as value.
