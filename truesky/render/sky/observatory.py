@@ -118,9 +118,19 @@ class Site:
         return float(np.degrees(np.arctan2(east, north)))
 
     def azimuth(self, ra: float, dec: float, mjd: float) -> float:
-        """Return the azimuth of a position in degrees, 0 to 360 from north through east, with the error of `altitude`.
+        """Return the azimuth of a position.
 
-        `ra` and `dec` are the ICRS position in degrees, `mjd` is the date.
+        Parameters
+        ----------
+        ra, dec : float
+            ICRS position in degrees.
+        mjd : float
+            Date (MJD).
+
+        Returns
+        -------
+        float
+            Angle in degrees from north through east, 0 to 360. Its error on the sky is the error of `altitude`.
         """
         hour, latitude, declination = float(self.hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
         east = -np.cos(declination) * np.sin(hour)

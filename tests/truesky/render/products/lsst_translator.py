@@ -3,6 +3,8 @@
 Each property is read from the keyword from which obs_lsst reads it.
 """
 
+from typing import ClassVar
+
 import astropy.units as u
 from astro_metadata_translator import FitsTranslator
 from astro_metadata_translator.translators import helpers
@@ -17,9 +19,9 @@ class LsstCamTranslator(FitsTranslator):
     """Translator of LSSTCam, whose nights begin at noon 12 h behind UTC."""
 
     name, supported_instrument = "LSSTCam", "LSSTCam"
-    _const_map = {}
+    _const_map: ClassVar = {}
     # Properties that have the value of one keyword.
-    _trivial_map = {
+    _trivial_map: ClassVar = {
         "instrument": "INSTRUME",
         "telescope": "TELESCOP",
         "detector_group": "RAFTBAY",

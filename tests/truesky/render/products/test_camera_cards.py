@@ -1,4 +1,4 @@
-"""Camera-specific headers: software of the observatories reads them, and DECam's pipeline trims a raw frame with them."""
+"""Camera-specific headers, with which software of the observatories identifies raw frames and trims them."""
 
 import re
 import subprocess
@@ -154,7 +154,7 @@ REAL = {
 
 @cache
 def frame(camera, name, kind="science", exact=True, **columns):
-    """Return a small frame. Its pixels are those of a bias frame, which needs no PSF and no sources; tests read cards."""
+    """Return a small frame for tests of its cards, with the pixels of a bias frame: they need no PSF and no sources."""
     none, band = fields.galaxies([], []), tools.BANDS[camera]
     exposed = {
         "channel": "EXT", "camera": camera, "band": band, "exposure_id": 134567, "image_type": "bias", "ra": 53.1,
@@ -188,7 +188,8 @@ def test_translators_read_every_property(camera, name, kind):
     assert len(PROPERTIES) == 40
     # A flat of MegaPrime may be of the sky or of a lamp. Flats and bias frames of LSSTCam have no position.
     unclear = {("megacam", "flat"): {"can_see_sky"}} | {("lsstcam", k): {"tracking_radec"} for k in ("flat", "bias")}
-    assert {key for key in PROPERTIES if getattr(found, key) is None} == UNKNOWN[camera] | unclear.get((camera, kind), set())
+    unknown = {key for key in PROPERTIES if getattr(found, key) is None}
+    assert unknown == UNKNOWN[camera] | unclear.get((camera, kind), set())
     types = {"science": "science", "flat": "flat", "dark": "dark", "bias": "bias"}
     types |= {"decam": {"flat": "dome flat", "bias": "zero"}, "hsc": {"flat": "domeflat"}}.get(camera, {})
     assert found.observation_type == types[kind]
@@ -217,7 +218,7 @@ def test_translated_properties_are_those_of_the_plan(camera, name):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_translated_place_and_weather(camera):
-    """The direction is that of astropy, the place that of the observatory, the weather like in real headers."""
+    """They agree with astropy (direction), the mission database (place) and real headers (weather)."""
     one = frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera))
     found, row = translated(one), one.exposure
     site = EarthLocation.from_geodetic(*(
@@ -243,7 +244,7 @@ def test_translated_place_and_weather(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_cards_have_the_form_of_real_ones(camera):
-    """Same type, and the same letters and digits at the same places of texts that are numbers, dates or identifiers."""
+    """The types are equal. Texts with numbers have digits, and other characters, at the same places."""
     header = header_of(frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera)))
     for key, real in REAL[camera].items():
         assert type(header[key]) is type(real), key
@@ -252,7 +253,7 @@ def test_cards_have_the_form_of_real_ones(camera):
 
 
 def test_raw_pointings_have_the_error_of_the_header():
-    """The boresight with the pointing error is the same in all cards; the true one is in none."""
+    """All cards have the same boresight, which includes the pointing error."""
     one = frame("decam", "S25", exact=False)
     header, found = header_of(one), translated(one).tracking_radec
     raw, true = (SkyCoord(ra, dec, unit="deg") for ra, dec in ((header["RA"], header["DEC"]), (53.1, -27.8)))
@@ -310,7 +311,7 @@ def written(one, folder, rice=False):
 @pytest.mark.parametrize("rice", [False, True])
 @pytest.mark.parametrize("camera", ["decam", "megacam"])
 def test_translators_find_the_detectors_in_the_file_of_an_exposure(camera, rice, tmp_path):
-    """The software of MegaPrime does not read the primary header; that of DECam does."""
+    """The software of DECam reads the primary header, and the software of MegaPrime does not."""
     names = [name for key, name in CCDS if key == camera]
     files = [(name, written(frame(camera, name), tmp_path, rice)) for name in names]
     path = tmp_path / "exposure.fits"
