@@ -40,8 +40,8 @@ _PROGRAM = "truesky"
 _PROGRAM_TEXT = "program (no meaning in a simulation)"
 _FOCUS_TEXT = "focus (no meaning in a simulation)"
 _HUMIDITY_TEXT = "[percent] humidity (no meaning in a simulation)"
-# Number of different values of SEQNUM, the number of an LSSTCam exposure in its night: it has at most 5 digits.
-_SEQUENCE_NUMBERS = 100_000
+# Number of different values of SEQNUM, the number of an LSSTCam exposure in its night: obs_lsst stores it in 15 bits.
+_SEQUENCE_NUMBERS = 32_768
 # Image types for which the shutter opens.
 _SHUTTER_TYPES = ("science", "deep", "flat")
 # Names of the image types of truesky in the headers of each camera.
@@ -227,7 +227,7 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
     return (
         ("OBSID", f"MC_S_{night}_{sequence:06d}", "observation identifier"),
         ("DAYOBS", night, "date of the night's first noon, 12 h behind TAI"),
-        ("SEQNUM", sequence, "exposure identifier modulo 100000"),
+        ("SEQNUM", sequence, "exposure identifier modulo 32768"),
         ("CAMCODE", "MC", "code of the camera"),
         ("IMGTYPE", _image_type(rendered), "type of observation"),
         ("CONTRLLR", "S", "controller (S: simulation)"),
@@ -306,7 +306,7 @@ def _detector_number(rendered: RenderedDetector) -> int:
 
 
 def _sequence_number(rendered: RenderedDetector) -> int:
-    """Return the number of an LSSTCam exposure in its night, which has at most 5 digits."""
+    """Return the number of an LSSTCam exposure in its night."""
     return rendered.exposure.exposure_id % _SEQUENCE_NUMBERS
 
 

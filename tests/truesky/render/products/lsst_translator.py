@@ -52,7 +52,8 @@ class LsstCamTranslator(FitsTranslator):
 
     def to_exposure_id(self):
         number = self._header["SEQNUM"]
-        assert 0 <= number < 100_000
+        # obs_lsst packs it in 15 bits.
+        assert 0 <= number < 2**15
         return int(f"{self._header['DAYOBS']}{number:05d}")
 
     def to_visit_id(self):

@@ -116,7 +116,7 @@ WORDS = {
     "decam": ("DECam", "r DECam SDSS c0002 6415.0 1480.0", "ct4m20250818t071200"),
     "hsc": ("HSC", "HSC-Z", "HSCE00134567"),
     "megacam": ("MegaPrime", "r.MP9602", "134567"),
-    "lsstcam": ("LSSTCam", "r_57", "MC_S_20250817_034567"),
+    "lsstcam": ("LSSTCam", "r_57", "MC_S_20250817_003495"),
 }
 # Properties that the translator of a camera reads from no keyword.
 UNKNOWN = {"decam": {"altaz_end"}, "hsc": {"altaz_end"}, "megacam": {"altaz_end", "detector_group"}, "lsstcam": set()}
@@ -209,7 +209,7 @@ def test_translated_properties_are_those_of_the_plan(camera, name):
     assert found.boresight_airmass == row.airmass
     assert (found.detector_num, found.detector_unique_name) == CCDS[camera, name]
     assert (found.instrument, found.physical_filter, found.observation_id) == WORDS[camera]
-    assert found.exposure_id == found.visit_id == (2025081734567 if camera == "lsstcam" else row.exposure_id)
+    assert found.exposure_id == found.visit_id == (2025081703495 if camera == "lsstcam" else row.exposure_id)
     assert found.object == header_of(one)["OBJECT"]
     # DECam and MegaPrime cannot be rotated.
     angle = {"decam": 90.0, "megacam": 0.0}.get(camera, row.position_angle)
@@ -288,9 +288,9 @@ def test_sexagesimal_numbers(value, decimals, plus, text):
     assert camera_cards._sexagesimal(value, decimals, plus) == text
 
 
-def test_lsst_counts_exposures_of_a_night_to_99999():
+def test_lsst_counts_exposures_of_a_night_in_15_bits():
     header = header_of(frame("lsstcam", "R22_S11", exposure_id=1_200_003))
-    assert (header["SEQNUM"], header["OBSID"]) == (3, "MC_S_20250817_000003")
+    assert (header["SEQNUM"], header["OBSID"]) == (20355, "MC_S_20250817_020355")
 
 
 def test_filters_of_users_keep_their_names():
