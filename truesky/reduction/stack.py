@@ -35,7 +35,7 @@ from truesky.reduction.stacking import Contribution, Stack
 from truesky.render.camera import astrometry
 
 # Header keywords whose values must be equal in all images of a stack.
-_SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "BAND", "ZEROPNT")
+_SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
 # Other keywords that each image must have.
 _REQUIRED_CARDS = ("IMAGETYP", "DETECTOR")
 # Keywords that each image must have with a number above 0 as value.
@@ -215,9 +215,8 @@ def _deepest_place(weight: Float) -> tuple[float, float]:
 
 def _stack_cards(images: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
     first = images[0]
-    shared_cards = {
-        key: (key, value, comment) for key, value, comment in first.cards if key in (*_SHARED_CARDS, "SEED", "MISSION")
-    }
+    keywords = (*_SHARED_CARDS, "BAND", "SEED", "MISSION")
+    shared_cards = {key: (key, value, comment) for key, value, comment in first.cards if key in keywords}
     exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in images})
     return (
         *shared_cards.values(),
