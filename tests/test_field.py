@@ -307,7 +307,7 @@ def sources(field, header):
         motion = ["pm_ra", "pm_dec"] if catalogue == "stars" else []
         middle = header["MJD-OBS"] + 0.5 * header["EXPTIME"] / 86400.0
         where = catalogue_rows.apply_proper_motion(read.version(field, catalogue).rows(["ra", "dec", *motion]), middle)
-        flux = read.version(field, fluxes).rows([f"f_nu_{header['FILTER']}"])
+        flux = read.version(field, fluxes).rows([f"f_nu_{header['BAND']}"])
         x, y = system.all_world2pix(where["ra"].to_numpy(), where["dec"].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
         electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]

@@ -215,9 +215,8 @@ def _deepest_place(weight: Float) -> tuple[float, float]:
 
 def _stack_cards(images: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
     first = images[0]
-    shared_cards = {
-        key: (key, value, comment) for key, value, comment in first.cards if key in (*_SHARED_CARDS, "SEED", "MISSION")
-    }
+    keywords = (*_SHARED_CARDS, "BAND", "SEED", "MISSION")
+    shared_cards = {key: (key, value, comment) for key, value, comment in first.cards if key in keywords}
     exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in images})
     return (
         *shared_cards.values(),

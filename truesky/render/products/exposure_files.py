@@ -29,14 +29,22 @@ from truesky.render.products.keys import part_name
 # Keywords in the headers of detector files whose cards go to the primary header of the file with all detectors, if they
 # are equal for all detectors. The keywords `headers.PER_ARRAY_KEYWORDS` also stay in the headers of the arrays.
 _EXPOSURE_KEYWORDS = (
-    "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
-    "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
+    "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "BAND", "IMAGETYP",
+    "LAMP", "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
     "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME",
     "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "BUNIT", "OBSTYPE",
     "PROCTYPE", "PRODTYPE", "EXPNUM", "OBSID", "SEQNUM", "IMGTYPE", "CONTRLLR", "ROTPA", "ROTCOORD", "RASTART",
     "DECSTART", "AMSTART", "SHUTTIME", "DARKTIME", "INJLEVEL", "INJON", "INJOFF", "NSHUFFLE", "PHASETIM", "DEFOCUS",
     "TARGMAG", "TARGBAND", "TARGDIST",
+    "EXPREQ", "TELRA", "TELDEC", "ZD", "AZ", "OBS-LONG", "OBS-LAT", "OBS-ELEV", "OUTTEMP", "PRESSURE", "HUMIDITY",
+    "PROPID", "TELFOCUS", "DATA-TYP", "EXP-ID", "FILTER01", "UT-STR", "UT-END", "UT", "MJD-STR", "MJD-END", "MJD",
+    "RA2000", "DEC2000", "INST-PA", "ALTITUDE", "AZIMUTH", "OUT-TMP", "OUT-PRS", "OUT-HUM", "PROP-ID", "FOC-VAL",
+    "UTC-OBS", "RA_DEG", "DEC_DEG", "TELALT", "TELAZ", "LONGITUD", "LATITUDE", "TEMPERAT", "RELHUMID", "RUNID",
+    "DAYOBS", "CAMCODE", "DATE", "DATE-BEG", "MJD-BEG", "DATE-END", "TRACKSYS", "ELSTART", "AZSTART", "ELEND", "AZEND",
+    "VIGN_MIN", "AIRTEMP", "PROGRAM", "FOCUSZ",
 )  # fmt: skip
+# Cameras whose software does not read the primary header: the headers of their arrays keep all cards.
+_CAMERAS_WITHOUT_PRIMARY = ("megacam",)
 
 
 def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
@@ -101,7 +109,7 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
     files = [(name, products.sidecar_path(rows[name]["path"])) for name in order]
     heads = [products.sidecar_path(head_files.head_path(rows[name]["path"])) for name in order]
     writers = {
-        path: partial(_write, files, _cards(exposure, facts)),
+        path: partial(_write, files, _cards(exposure, facts), _kept_keywords(exposure["camera"])),
         head_files.head_path(path): partial(_write_heads, heads),
     }
     return Output(table, writers)
@@ -125,5 +133,10 @@ def _write_heads(files: Sequence[Path], path: Path) -> None:
     head_files.write((file.read_text(encoding="ascii") for file in files), path)
 
 
-def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], path: Path) -> None:
-    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, headers.PER_ARRAY_KEYWORDS)
+def _kept_keywords(camera: str) -> tuple[str, ...]:
+    """Return the keywords of the exposure that also stay in the headers of the arrays."""
+    return _EXPOSURE_KEYWORDS if camera in _CAMERAS_WITHOUT_PRIMARY else headers.PER_ARRAY_KEYWORDS
+
+
+def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], kept_keywords: Sequence[str], path: Path) -> None:
+    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, kept_keywords)

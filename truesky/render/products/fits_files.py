@@ -103,9 +103,10 @@ def _science_images(rendered: RenderedDetector) -> list[Image]:
         # in the WCS of the array count from its first column and row, including prescan and overscan.
         array_cards = (*array.cards, *headers.section_cards(rendered, array))
         array_keywords = {keyword for keyword, *_ in array_cards}
-        return [Image(array.data, (*(card for card in cards if card[0] not in array_keywords), *array_cards))]
+        own_cards = (*(card for card in cards if card[0] not in array_keywords), *array_cards)
+        return [Image(array.data, own_cards, camera_cards.first_name(rendered))]
     arrays = [
         Image(extension.data, headers.array_cards(rendered, extension, cards), extension.name)
         for extension in readout.extensions
     ]
-    return [Image(None, cards), *arrays]
+    return [Image(None, cards, camera_cards.first_name(rendered)), *arrays]

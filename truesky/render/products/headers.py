@@ -276,7 +276,8 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         ("INSTRUME", place.instrument, "instrument"),
         ("CHANNEL", exposure.channel, "channel"),
         ("DETECTOR", rendered.detector.name, "detector name"),
-        ("FILTER", exposure.band, "passband"),
+        ("FILTER", place.filters.get(exposure.band, exposure.band), "filter"),
+        ("BAND", exposure.band, "passband in tables of truesky"),
         *((("GRISM", exposure.grism, "grism"),) if exposure.grism else ()),
         *((("GRISMPA", exposure.grism_angle, "[deg] dispersion direction, from x to y"),) if exposure.grism else ()),
         ("IMAGETYP", exposure.image_type, "image type"),
@@ -289,7 +290,7 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *((("AIRMASS", air, "airmass at the boresight"),) if air is not None else ()),
         ("EXPOSURE", exposure.exposure_id, "exposure identifier"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
-        ("DATE-OBS", _iso_date(start), "start of the exposure"),
+        ("DATE-OBS", iso_date(start), "start of the exposure"),
         ("MJD-OBS", start, "[d] start of the exposure"),
         ("TIMESYS", place.time_scale, "time scale of DATE-OBS and MJD-OBS"),
         *astrometry.cards(rendered.wcs),
@@ -344,7 +345,7 @@ def _object_name(exposure: ExposureRow) -> str:
     return exposure.survey if exposure.field is None else f"{exposure.survey} {exposure.field}"
 
 
-def _iso_date(mjd: float) -> str:
+def iso_date(mjd: float) -> str:
     """Return an MJD as a date in ISO 8601 with milliseconds, without a time zone."""
     return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
 

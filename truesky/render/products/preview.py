@@ -179,7 +179,9 @@ def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Lab
     for number, label in enumerate(preview_labels.close_ups(names, image.shape, header["PIXSCALE"])):
         axes = figure.add_axes((0.735, 0.01 + (0.93 + 0.008) / CLOSE_UPS * (CLOSE_UPS - 1 - number), 0.255, 0.305))
         _close_up(axes, main, image, label, header["PIXSCALE"], upside_down, "abc"[number])
-    title = f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {header['FILTER']}   {header['EXPTIME']:g} s"
+    # Lakes of the first versions have no card BAND; their card FILTER has the same value.
+    band = header.get("BAND", header["FILTER"])
+    title = f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {band}   {header['EXPTIME']:g} s"
     figure.text(0.012, 0.958, title, color=_INK, fontsize=15, fontweight="bold")
     figure.text(0.988, 0.958, _caption(header, system, image.shape), color=_INK, fontsize=10.5, ha="right")
     path.parent.mkdir(parents=True, exist_ok=True)

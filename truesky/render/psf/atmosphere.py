@@ -28,9 +28,9 @@ _STEPS = 600
 # Height over which the air pressure falls by the factor e, m.
 _SCALE_HEIGHT = 8400.0
 # Air pressure at sea level, mm Hg.
-_PRESSURE = 760.0
+_SEA_LEVEL_PRESSURE = 760.0
 # Temperature on mountain tops at night, deg C (Filippenko 1982).
-_TEMPERATURE = 7.0
+TEMPERATURE = 7.0
 # Pressure of water vapour on mountain tops at night, mm Hg (Filippenko 1982).
 _VAPOUR = 8.0
 
@@ -148,6 +148,11 @@ def fried_length(seeing: float, wavelength: float, outer: float) -> float:
     return float(length)
 
 
+def pressure(height: float) -> float:
+    """Return the mean air pressure in mm Hg at a height above sea level in metres."""
+    return float(_SEA_LEVEL_PRESSURE * np.exp(-height / _SCALE_HEIGHT))
+
+
 def refraction(wavelength: Float, height: float) -> Float:
     """Return the atmospheric refraction of a source at a zenith distance of 45 deg.
 
@@ -169,8 +174,8 @@ def refraction(wavelength: Float, height: float) -> Float:
     Filippenko 1982, PASP 94, 715, eqs. 1 to 4.
     """
     wave_number2 = (1e4 / wavelength) ** 2
-    pressure, warm = _PRESSURE * np.exp(-height / _SCALE_HEIGHT), 1.0 + 0.003661 * _TEMPERATURE
+    air, warm = pressure(height), 1.0 + 0.003661 * TEMPERATURE
     dry = 64.328 + 29498.1 / (146.0 - wave_number2) + 255.4 / (41.0 - wave_number2)
-    dry *= pressure * (1.0 + (1.049 - 0.0157 * _TEMPERATURE) * 1e-6 * pressure) / (720.883 * warm)
+    dry *= air * (1.0 + (1.049 - 0.0157 * TEMPERATURE) * 1e-6 * air) / (720.883 * warm)
     wet = _VAPOUR * (0.0624 - 0.000680 * wave_number2) / warm
     return np.asarray((dry - wet) * 1e-6 / _ARCSEC)

@@ -44,6 +44,8 @@ _FROM_MOON = 30.0
 _MAX_AIRMASS = 2.0
 # Largest airmass with which an exposure is simulated. A field that is lower is simulated at its highest altitude.
 HIGHEST_AIRMASS = 3.0
+# Altitude (deg) at which the airmass is `HIGHEST_AIRMASS`.
+_LOWEST_ALTITUDE = 19.3168
 # Step in days with which dark time (night with the Moon down or far away) is searched: a quarter of an hour.
 _STEP = 1.0 / 96.0
 # Number of days after the earliest date in which dark time (night with the Moon down or far away) is searched.
@@ -115,6 +117,26 @@ class Site:
         north = np.sin(latitude) * np.cos(declination) - np.cos(latitude) * np.sin(declination) * np.cos(hour)
         return float(np.degrees(np.arctan2(east, north)))
 
+    def azimuth(self, ra: float, dec: float, mjd: float) -> float:
+        """Return the azimuth of a position.
+
+        Parameters
+        ----------
+        ra, dec : float
+            ICRS position in degrees.
+        mjd : float
+            Date (MJD).
+
+        Returns
+        -------
+        float
+            Angle in degrees from north through east, 0 to 360. Its error on the sky is the error of `altitude`.
+        """
+        hour, latitude, declination = float(self.hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
+        east = -np.cos(declination) * np.sin(hour)
+        north = np.sin(declination) * np.cos(latitude) - np.cos(declination) * np.sin(latitude) * np.cos(hour)
+        return float(np.degrees(np.arctan2(east, north)) % 360.0)
+
     def hour_angle(self, ra: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
         """Return the angle in radians by which a right ascension (deg) has passed the meridian, for dates (MJD)."""
         turns = _TURN + _TURNS_A_DAY * (np.asarray(mjd, float) - _MJD_J2000)
@@ -168,6 +190,30 @@ def airmass_and_zenith(ra: float, dec: float, mjd: float, site: Site) -> tuple[f
     highest = 90.0 - abs(dec - site.latitude)
     field_airmass = min(float(airmass(highest)), HIGHEST_AIRMASS) if highest > 0.0 else HIGHEST_AIRMASS
     return field_airmass, 0.0 if dec < site.latitude else 180.0
+
+
+def altitude_and_azimuth(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
+    """Return the altitude and the azimuth of a field, in agreement with `airmass_and_zenith`.
+
+    Parameters
+    ----------
+    ra, dec : float
+        ICRS position of the field in degrees.
+    mjd : float
+        Date (MJD).
+    site : Site
+        The observatory.
+
+    Returns
+    -------
+    (float, float)
+        Altitude in degrees; azimuth in degrees from north through east. If the field is too low at this date, they are
+        the values on the meridian, as for the airmass. The altitude is never below that of `HIGHEST_AIRMASS`.
+    """
+    altitude = float(site.altitude(ra, dec, mjd))
+    if altitude > 0.0 and float(airmass(altitude)) <= HIGHEST_AIRMASS:
+        return altitude, site.azimuth(ra, dec, mjd)
+    return max(90.0 - abs(dec - site.latitude), _LOWEST_ALTITUDE), 180.0 if dec < site.latitude else 0.0
 
 
 def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:

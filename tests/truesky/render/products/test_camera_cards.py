@@ -1,15 +1,27 @@
-"""Camera-specific headers: the sections that DECam's pipeline uses to trim a raw frame."""
+"""Camera-specific headers, with which software of the observatories identifies raw frames and trims them."""
 
 import re
+import subprocess
+from dataclasses import replace
+from functools import cache
 
+import astropy.units as u
 import numpy as np
 import pytest
+from astro_metadata_translator import PROPERTIES, DecamTranslator, MegaPrimeTranslator, ObservationInfo
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.io import fits
+from astropy.time import Time
+from astropy.utils import iers
 
+from lake_schema.fits import images
+from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION
+from tests.truesky.render.products import lsst_translator
 from tests.truesky.render.products import test_tools as tools
 from truesky.render.camera.detectors import detectors
-from truesky.render.products import camera_cards
+from truesky.render.products import camera_cards, exposure_files, fits_files, raw_pointing
+from truesky.request.accuracy import SURVEY
 
 # Some of the numbers of DECam's CCDs.
 NUMBERS = {"S29": 1, "S25": 4, "S1": 25, "S4": 28, "S7": 31, "N1": 32, "N4": 35, "N30": 61, "N31": 62}
@@ -90,3 +102,239 @@ def test_values_of_each_amplifier(decam):
 
 def test_other_cameras_have_no_such_cards():
     assert camera_cards.cards(tools.stars_on("jpcam", 0.05)) == ()
+
+
+# Two CCDs of each camera with their numbers and names in the headers of the observatories.
+CCDS = {
+    ("decam", "S25"): (4, "S25"), ("decam", "N31"): (62, "N31"), ("hsc", "1_53"): (0, "1_53"),
+    ("hsc", "0_30"): (16, "0_30"), ("megacam", "ccd02"): (2, "ccd02"), ("megacam", "ccd14"): (14, "ccd14"),
+    ("lsstcam", "R01_S00"): (0, "R01_S00"), ("lsstcam", "R22_S11"): (94, "R22_S11"),
+}  # fmt: skip
+CAMERAS = tuple(dict.fromkeys(camera for camera, _ in CCDS))
+# Instrument, filter and observation identifier.
+WORDS = {
+    "decam": ("DECam", "r DECam SDSS c0002 6415.0 1480.0", "ct4m20250818t071200"),
+    "hsc": ("HSC", "HSC-Z", "HSCE00134567"),
+    "megacam": ("MegaPrime", "r.MP9602", "134567"),
+    "lsstcam": ("LSSTCam", "r_57", "MC_S_20250817_003495"),
+}
+# Properties that the translator of a camera reads from no keyword.
+UNKNOWN = {"decam": {"altaz_end"}, "hsc": {"altaz_end"}, "megacam": {"altaz_end", "detector_group"}, "lsstcam": set()}
+# Air pressure in real headers of each camera, hPa.
+PRESSURES = {"decam": 779.0, "hsc": 621.7, "megacam": 617.65, "lsstcam": 742.1}
+# Values of some keywords of real headers.
+REAL = {
+    "decam": {
+        "OBSID": "ct4m20130901t060255", "TELRA": "02:51:16.790", "TELDEC": "-00:00:05.699", "ZD": 50.46, "AZ": 61.24,
+        "OBS-LONG": 70.81489, "OBS-LAT": -30.16606, "OBS-ELEV": 2215.0, "EXPREQ": 200.0, "DARKTIME": 201.15662,
+        "EXPNUM": 160496, "CCDNUM": 25, "DETPOS": "S25", "OUTTEMP": 11.9, "PRESSURE": 779.0, "HUMIDITY": 23.0,
+        "OBSTYPE": "object", "FILTER": "z DECam SDSS c0004 9260.0 1520.0",
+    },
+    "hsc": {
+        "EXP-ID": "HSCE00123456", "FRAMEID": "HSCA90402512", "DET-ID": 50, "T_CCDSN": "120", "FILTER01": "HSC-i",
+        "DATA-TYP": "OBJECT", "UT-STR": "06:15:55.908", "UT-END": "06:16:27.928", "MJD": 56598.261,
+        "RA2000": "21:22:59.982", "DEC2000": "+00:30:00.07", "INST-PA": 0.0, "ALTITUDE": 63.04, "AZIMUTH": 226.7,
+        "OUT-TMP": 272.35, "OUT-HUM": 33.1, "OUT-PRS": 621.7, "FOC-VAL": 3.7,
+    },
+    "megacam": {
+        "EXPNUM": 1038843, "OBSID": 1038843, "OBSTYPE": "OBJECT", "EXPREQ": 615.0, "DARKTIME": 615.0,
+        "UTC-OBS": "14:33:32.400", "RA_DEG": 135.409417, "DEC_DEG": -2.4, "TELALT": 52.02, "TELAZ": 122.34,
+        "LATITUDE": 19.825252, "LONGITUD": -155.468876, "TEMPERAT": 0.9, "RELHUMID": 39.77, "PRESSURE": 617.65,
+        "FILTER": "i.MP9702", "EXTNAME": "ccd02",
+    },
+    "lsstcam": {
+        "OBSID": "MC_O_20250609_000578", "DAYOBS": "20250609", "SEQNUM": 578, "IMGTYPE": "OBJECT", "CONTRLLR": "O",
+        "DATE-BEG": "2025-06-10T07:31:55.280", "MJD-BEG": 60836.3, "DATE-END": "2025-06-10T07:32:26.229",
+        "DATE": "2025-06-10T07:32:26.225", "RASTART": 320.6, "DECSTART": -17.94, "ELSTART": 67.99, "AZSTART": 60.27,
+        "ELEND": 68.09, "AZEND": 60.07, "ROTPA": 131.4, "TRACKSYS": "RADEC", "VIGN_MIN": "NO", "FILTER": "y_10",
+        "AIRTEMP": 9.7, "PRESSURE": 74210.0, "HUMIDITY": 11.2, "FOCUSZ": -3.2, "SHUTTIME": 30.0, "DARKTIME": 30.9,
+    },
+}  # fmt: skip
+
+
+@cache
+def frame(camera, name, kind="science", exact=True, **columns):
+    """Return a small frame for tests of its cards, with the pixels of a bias frame: they need no PSF and no sources."""
+    none, band = fields.galaxies([], []), tools.BANDS[camera]
+    exposed = {
+        "channel": "EXT", "camera": camera, "band": band, "exposure_id": 134567, "image_type": "bias", "ra": 53.1,
+        "dec": -27.8, "position_angle": 12.0, "mjd": 60905.3, "exposure_time_s": 90.0, "airmass": 1.37, **columns,
+    }  # fmt: skip
+    tables = none, fields.fluxes(none, band, 0.0), fields.stars([], []), fields.fluxes(none, band, 0.0)
+    one = fields.rendered(exposed, fields.small(camera, name, 64), tables, tools.SURE if exact else MISSION, SURVEY)
+    seconds = 0.0 if kind == "bias" else 90.0
+    return replace(
+        one, exposure=replace(one.exposure, image_type=kind), scene=replace(one.scene, exposure_time_s=seconds)
+    )
+
+
+def header_of(one):
+    """Return the header of the first image in the file of a detector."""
+    (unit,) = fits_files._science_images(one)
+    cards = raw_pointing.cards(unit.cards, one.exposure, one.detector, one.scene.mission, one.seed)
+    return images.primary_hdu(replace(unit, cards=cards)).header
+
+
+def translated(one):
+    """Return the properties that the translator of the observatory reads; it raises if it cannot read one."""
+    translator = lsst_translator.LsstCamTranslator if one.exposure.camera == "lsstcam" else None
+    return ObservationInfo(header_of(one), translator_class=translator, pedantic=True)
+
+
+@pytest.mark.parametrize("kind", ["science", "flat", "dark", "bias"])
+@pytest.mark.parametrize(("camera", "name"), CCDS)
+def test_translators_read_every_property(camera, name, kind):
+    found = translated(frame(camera, name, kind))
+    assert len(PROPERTIES) == 40
+    # A flat of MegaPrime may be of the sky or of a lamp. Flats and bias frames of LSSTCam have no position.
+    unclear = {("megacam", "flat"): {"can_see_sky"}} | {("lsstcam", k): {"tracking_radec"} for k in ("flat", "bias")}
+    unknown = {key for key in PROPERTIES if getattr(found, key) is None}
+    assert unknown == UNKNOWN[camera] | unclear.get((camera, kind), set())
+    types = {"science": "science", "flat": "flat", "dark": "dark", "bias": "bias"}
+    types |= {"decam": {"flat": "dome flat", "bias": "zero"}, "hsc": {"flat": "domeflat"}}.get(camera, {})
+    assert found.observation_type == types[kind]
+    assert bool(found.can_see_sky) == (kind == "science")
+
+
+@pytest.mark.parametrize(("camera", "name"), CCDS)
+def test_translated_properties_are_those_of_the_plan(camera, name):
+    one = frame(camera, name)
+    row, found = one.exposure, translated(one)
+    start = Time(row.mjd, format="mjd", scale="utc")
+    assert abs(found.datetime_begin - start).to_value("s") < 1e-3
+    assert abs(found.datetime_end - start).to_value("s") == pytest.approx(row.exposure_time_s, abs=1e-3)
+    for key in ("exposure_time", "exposure_time_requested", "dark_time"):
+        assert getattr(found, key).to_value("s") == row.exposure_time_s
+    assert found.tracking_radec.separation(SkyCoord(row.ra, row.dec, unit="deg")).arcsec < 0.1
+    assert found.boresight_airmass == row.airmass
+    assert (found.detector_num, found.detector_unique_name) == CCDS[camera, name]
+    assert (found.instrument, found.physical_filter, found.observation_id) == WORDS[camera]
+    assert found.exposure_id == found.visit_id == (2025081703495 if camera == "lsstcam" else row.exposure_id)
+    assert found.object == header_of(one)["OBJECT"]
+    # DECam and MegaPrime cannot be rotated.
+    angle = {"decam": 90.0, "megacam": 0.0}.get(camera, row.position_angle)
+    assert found.boresight_rotation_angle.deg == pytest.approx(angle, abs=1e-9)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_translated_place_and_weather(camera):
+    """They agree with astropy (direction), the mission database (place) and real headers (weather)."""
+    one = frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera))
+    found, row = translated(one), one.exposure
+    site = EarthLocation.from_geodetic(*(
+        one.scene.mission.value(f"ext.{camera}.site.{key}", unit)
+        for key, unit in (("longitude", "deg"), ("latitude", "deg"), ("height", "m"))
+    ))  # fmt: skip
+    metres = [(getattr(found.location, axis) - getattr(site, axis)).to_value("m") for axis in "xyz"]
+    assert np.linalg.norm(metres) < 1000.0
+    with iers.conf.set_temp("auto_download", False):
+        real = SkyCoord(row.ra, row.dec, unit="deg").transform_to(AltAz(obstime=found.datetime_begin, location=site))
+    seen = found.altaz_begin
+    if camera in ("decam", "lsstcam"):
+        assert SkyCoord(seen.az, seen.alt).separation(SkyCoord(real.az, real.alt)).deg < 0.2
+    else:
+        # The field is below the horizon of Maunakea at this date. It is highest in the south.
+        assert real.alt.deg < 10.0
+        assert seen.az.deg == 180.0
+        assert seen.alt.deg == pytest.approx(90.0 - site.lat.deg + row.dec, abs=0.01)
+    assert found.pressure.to_value("hPa") == pytest.approx(PRESSURES[camera], rel=0.01)
+    assert found.temperature.to_value("deg_C", equivalencies=u.temperature()) == pytest.approx(7.0)
+    assert found.relative_humidity == 40.0
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_cards_have_the_form_of_real_ones(camera):
+    """The types are equal. Texts with numbers have digits, and other characters, at the same places."""
+    header = header_of(frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera)))
+    for key, real in REAL[camera].items():
+        assert type(header[key]) is type(real), key
+        if isinstance(real, str) and any(mark in real for mark in ":0123456789") and "FILTER" not in key:
+            assert re.sub(r"\d", "0", header[key]).replace("_S_", "_O_")[1:] == re.sub(r"\d", "0", real)[1:], key
+
+
+def test_raw_pointings_have_the_error_of_the_header():
+    """All cards have the same boresight, which includes the pointing error."""
+    one = frame("decam", "S25", exact=False)
+    header, found = header_of(one), translated(one).tracking_radec
+    raw, true = (SkyCoord(ra, dec, unit="deg") for ra, dec in ((header["RA"], header["DEC"]), (53.1, -27.8)))
+    assert found.separation(raw).arcsec < 0.02
+    assert found.separation(true).arcsec > 0.5
+
+
+def test_detector_numbers_do_not_depend_on_the_layout():
+    """One CCD of HSC does not work, and the standard layout leaves it out: the numbers of the others stay."""
+    names = [detector.name for detector in detectors("hsc", MISSION)]
+    assert "1_47" not in names
+    assert names.index("0_30") == 15
+    assert translated(frame("hsc", "0_30")).detector_num == 16
+
+
+def test_identifiers_of_hsc_images_differ():
+    found = {camera_cards._frame_identifier(n, ccd) for n in (0, 1, 2, 499_999, 500_000) for ccd in range(112)}
+    assert len(found) == 5 * 112
+    assert all(re.fullmatch(r"HSC[A-Z]\d{8}", text) for text in found)
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "plus", "text"),
+    [
+        (23.99999999, 3, "", "00:00:00.000"),
+        (-0.5, 2, "+", "-00:30:00.00"),
+        (89.99999999, 2, "+", "+90:00:00.00"),
+        (2.8546639, 3, "", "02:51:16.790"),
+    ],
+)
+def test_sexagesimal_numbers(value, decimals, plus, text):
+    assert camera_cards._sexagesimal(value, decimals, plus) == text
+
+
+def test_lsst_counts_exposures_of_a_night_in_15_bits():
+    header = header_of(frame("lsstcam", "R22_S11", exposure_id=1_200_003))
+    assert (header["SEQNUM"], header["OBSID"]) == (20355, "MC_S_20250817_020355")
+
+
+def test_filters_of_users_keep_their_names():
+    one = frame("decam", "S25")
+    header = header_of(replace(one, exposure=replace(one.exposure, band="narrow")))
+    assert header["FILTER"] == header["BAND"] == "narrow"
+    assert header_of(one)["BAND"] == "des_r"
+
+
+def written(one, folder, rice=False):
+    """Write the science image of a detector and return its path."""
+    rows, writers = fits_files.products(one, (), rice)
+    path = folder / f"{one.detector.name}.fits"
+    writers[rows["path"][0].as_py()](path)
+    return path
+
+
+@pytest.mark.parametrize("rice", [False, True])
+@pytest.mark.parametrize("camera", ["decam", "megacam"])
+def test_translators_find_the_detectors_in_the_file_of_an_exposure(camera, rice, tmp_path):
+    """The software of DECam reads the primary header, and the software of MegaPrime does not."""
+    names = [name for key, name in CCDS if key == camera]
+    files = [(name, written(frame(camera, name), tmp_path, rice)) for name in names]
+    path = tmp_path / "exposure.fits"
+    exposure_files._write(files, (), exposure_files._kept_keywords(camera), path)
+    translator = {"decam": DecamTranslator, "megacam": MegaPrimeTranslator}[camera]
+    found = [
+        ObservationInfo(header, translator_class=translator, pedantic=True)
+        for header in translator.determine_translatable_headers(str(path))
+    ]
+    assert [one.detector_num for one in found] == [CCDS[camera, name][0] for name in names]
+    assert {(one.physical_filter, one.visit_id, one.exposure_time.to_value("s")) for one in found} == {
+        (WORDS[camera][1], 134567, 90.0)
+    }
+    with fits.open(path) as units:
+        assert ("TELESCOP" in units[1].header) == (camera == "megacam")
+        assert [unit.header["EXTNAME"] for unit in units[1:]] == names
+
+
+@pytest.mark.parametrize("rice", [False, True])
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_files_follow_the_standard(camera, rice, tmp_path):
+    path = written(frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera)), tmp_path, rice)
+    with fits.open(path, checksum=True) as units:
+        units.verify("exception")
+    done = subprocess.run([tools.tool("fitsverify", "HEASARC"), "-q", str(path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

@@ -27,6 +27,9 @@ def test_altitudes_and_zenith_are_astropy_s(site):
         field = SkyCoord(53.1, -27.8, unit="deg")
         seen = field.transform_to(frame)
         assert np.abs(seen.alt.deg - site.altitude(53.1, -27.8, times.mjd)).max() < 0.2
+        azimuths = np.array([site.azimuth(53.1, -27.8, mjd) for mjd in times.mjd])
+        turned = ((azimuths - seen.az.deg + 180.0) % 360.0 - 180.0) * np.cos(seen.alt.rad)
+        assert np.abs(turned).max() < 0.2
         higher = AltAz(az=seen.az, alt=seen.alt + 0.1 * u.deg, obstime=times, location=place)
         theirs = field.position_angle(SkyCoord(higher).transform_to("icrs")).deg
         ours = np.array([site.zenith(53.1, -27.8, mjd) for mjd in times.mjd])
@@ -53,6 +56,17 @@ def test_every_field_has_an_airmass(ra, dec, mjd, site):
     found, zenith = observatory.airmass_and_zenith(ra, dec, mjd, site)
     assert 1.0 <= found <= observatory.HIGHEST_AIRMASS
     assert -180.0 <= zenith <= 180.0
+
+
+@given(st.floats(0.0, 359.9), st.floats(-90.0, 90.0), st.floats(60000.0, 62000.0), st.sampled_from([LSST, CFHT]))
+def test_altitude_and_airmass_agree(ra, dec, mjd, site):
+    altitude, azimuth = observatory.altitude_and_azimuth(ra, dec, mjd, site)
+    found, zenith = observatory.airmass_and_zenith(ra, dec, mjd, site)
+    assert observatory.airmass(altitude) == pytest.approx(found, rel=1e-4)
+    assert 0.0 <= azimuth <= 360.0
+    # A field in the east rises: the position angle of its zenith is negative. On the meridian the sign is not defined.
+    if abs(np.sin(np.radians(azimuth))) > 1e-6:
+        assert (azimuth < 180.0) == (zenith < 0.0)
 
 
 @pytest.mark.parametrize("start", [60000.0, 60100.3, 60290.9])
