@@ -19,6 +19,10 @@ class Observatory:
         Time scale in the camera's files, such as "UTC" or "TAI".
     seconds_ahead_of_utc : float
         Times in the time scale of the files minus times in UTC, s.
+    has_noao_sections : bool
+        True if DETSEC and DETSIZE count pixels of the mosaic of all detectors, and BIASSEC covers all rows of an array.
+        False, as for LSSTCam, if DETSEC and DETSIZE count pixels of the detector, and BIASSEC covers the rows of its
+        pixels only.
     """
 
     telescope: str
@@ -26,6 +30,7 @@ class Observatory:
     convention: str
     time_scale: str = "UTC"
     seconds_ahead_of_utc: float = 0.0
+    has_noao_sections: bool = True
 
 
 # Time in the scale TAI minus time in UTC, s, since 2017.
@@ -37,7 +42,7 @@ _OBSERVATORIES = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
     "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv"),
-    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", "TAI", _TAI),
+    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", "TAI", _TAI, has_noao_sections=False),
     "megacam": Observatory("CFHT 3.6m", "MegaPrime", "tpv"),
     "jpcam": Observatory("JST250", "JPCam", "tpv"),
     "gpc1": Observatory("PS1", "GPC1", "tpv"),
