@@ -291,7 +291,7 @@ def follow_axes(
     """
     of_wcs, of_header = tuple(cards), {key: value for key, value, _ in header}
     values = {key: value for key, value, _ in of_wcs}
-    signs = {}
+    signs: dict[str, float] = {}
     for axis in (1, 2):
         keys = [f"CD{i}_{axis}" for i in (1, 2)]
         if all(key in values and key in of_header for key in keys):

@@ -212,8 +212,9 @@ def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Flo
 def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
     """Return (keyword, value, comment) for the read noise of the detector, and for the part that is in the image.
 
-    The read noise in the image is 0 if other noise is so large that read noise is not drawn. An up-the-ramp image also
-    has the noise of a single read. Values are in electrons rms: one number, or one per amplifier.
+    The read noise in the image is 0 if other noise is so large that read noise is not drawn in the pixels. Prescan and
+    overscan always have it, unless the request switches it off. An up-the-ramp image also has the noise of a single
+    read. Values are in electrons rms: one number, or one per amplifier.
     """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
