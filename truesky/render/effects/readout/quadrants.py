@@ -266,18 +266,6 @@ def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
     return prescan, overscan, rows, scene.injection_rows
 
 
-def pixel_area(scene: Scene) -> tuple[int, int, int]:
-    """Return where the pixels of the detector are in the plane of a quadrant or amplifier, in readout order.
-
-    They are the rows below the first number, and the columns from the second number on and below the third. The other
-    rows and columns are prescan and overscan.
-    """
-    if scene.layout is not None:
-        return scene.layout.height, scene.layout.prescan, scene.layout.prescan + scene.layout.width
-    prescan, *_ = overscan_sizes(scene)
-    return scene.half_rows, prescan, prescan + scene.nx // 2
-
-
 def apply_amplifiers(frame: Frame, layout: Layout, rng: np.random.Generator | None = None) -> Frame:
     """Split a frame into the amplifiers of a ground camera's detector, each with the pixel at [0, 0] read first.
 

@@ -15,7 +15,6 @@ from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, copy_frame, map_pixels, zero_contribution
-from truesky.render.effects.readout import quadrants
 from truesky.render.effects.scene import Frame, Scene
 
 
@@ -86,7 +85,7 @@ def add_to_scans(frame: Frame, scene: Scene, rng: np.random.Generator, out: Fram
     out = copy_frame(frame, out)
     if out.ndim == 3:
         sigmas = np.array(np.broadcast_to(_sigma(scene), len(out)), float)
-        _add_to_scans(out, sigmas, pixel_random.draw_key(rng), *quadrants.pixel_area(scene))
+        _add_to_scans(out, sigmas, pixel_random.draw_key(rng), *scene.pixels_in_plane)
     return out
 
 

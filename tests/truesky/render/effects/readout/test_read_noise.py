@@ -44,7 +44,7 @@ def test_prescan_and_overscan_have_read_noise_under_a_bright_sky(camera):
     hidden, decision = read(scene)
     assert not decision.applied
     everywhere, _ = read(replace(scene, forced={"read_noise": True}))
-    height, first, past = quadrants.pixel_area(scene)
+    height, first, past = scene.pixels_in_plane
     scans = np.ones(hidden.shape, bool)
     scans[:, :height, first:past] = False
     # Pixels of the detector have no read noise, and all others have that of the full effect.
@@ -76,7 +76,7 @@ def test_numbers_of_the_scans_do_not_depend_on_the_sky():
 
 
 def test_the_overscan_of_a_file_has_the_noise_of_its_header(tmp_path):
-    """Sample of 512 x 54 / 2 pixels per amplifier, 16 amplifiers; 5 standard errors of the noise."""
+    """Sample of 512 x 54 pixels in each of 16 amplifiers; significance 6e-7 (5 standard errors)."""
     one = tools.stars_on("lsstcam", BRIGHT, small("lsstcam", "R22_S11", 1024), mission=MISSION, way="amplifiers")
     assert not next(d for d in one.decisions if d.name == "read_noise").applied
     path = tools.put(one, tmp_path).path
