@@ -20,6 +20,7 @@ from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.pointing import boresight_for
+from truesky.render.camera.sections import Section, steps_of_text
 from truesky.render.products import head_files, read_back
 from truesky.request.from_toml import parse
 
@@ -137,7 +138,7 @@ def test_ccdproc_reduces_the_file_by_its_header(whole):
 
 
 def test_separate_amplifiers_are_extensions(lake, whole, tmp_path):
-    """If the request sets it, each amplifier is an extension; the pixels are the same."""
+    """If the request sets it, each amplifier is an extension in readout order; the pixels are the same."""
     root = layout.resolve_lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
     make(root, render_exposures.steps(root, replace(parse(lake.parent / "r.toml"), readout="amplifiers")))
     version = read.version(root, "exposure_files")
@@ -147,9 +148,14 @@ def test_separate_amplifiers_are_extensions(lake, whole, tmp_path):
         for number, unit in enumerate(units[1:]):
             ccd, letter = together[1 + number // 2], "AB"[number % 2]
             own, there = tools.window(unit.header["DATASEC"]), tools.window(ccd.header[f"DATASEC{letter}"])
-            np.testing.assert_array_equal(unit.data[own], ccd.data[there])
+            column_step, row_step = steps_of_text(unit.header["CCDSEC"])
+            # Amplifier B is read from the right.
+            assert (column_step, row_step) == (1 if letter == "A" else -1, 1)
+            np.testing.assert_array_equal(unit.data[own][:, ::column_step], ccd.data[there])
             assert unit.header["GAIN"] == pytest.approx(ccd.header[f"GAIN{letter}"])
-            assert unit.header["DETSEC"] == ccd.header[f"DETSEC{letter}"]
+            places = [header[key] for header, key in ((unit.header, "DETSEC"), (ccd.header, f"DETSEC{letter}"))]
+            assert Section.from_text(places[0]) == Section.from_text(places[1])
+            assert steps_of_text(places[0])[0] == column_step * steps_of_text(places[1])[0]
 
 
 def images_shape(text):

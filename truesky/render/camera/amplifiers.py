@@ -233,22 +233,17 @@ class Layout:
         return _flip_to_readout_order(plane, self.amplifiers[number])
 
     def amplifier_sections(self, number: int) -> Sections:
-        """Return the sections for the FITS header of an array with an amplifier's pixels, prescan and overscan.
+        """Return the sections for the FITS header of a plane in readout order: pixels, their place, and bias columns.
 
-        They are the rectangle of the pixels in the array, the rectangle of the same pixels on the detector, and the
-        columns that measure the bias: overscan, or prescan if there is no overscan.
-        The array is a plane in readout order, flipped to the axes of the detector by `to_detector_axes`. `number` is
-        the index of the amplifier.
+        The bias columns are the overscan, or the prescan if there is no overscan, in all rows. `number` is the index of
+        the amplifier.
         """
         amplifier = self.amplifiers[number]
-        x = self.overscan if amplifier.read_right else self.prescan
-        data = Section(x, self.overscan_rows if amplifier.read_top else 0, self.width, self.height)
-        prescan, overscan = (0, self.prescan), (self.prescan + self.width, self.overscan)
-        first, count = overscan if self.overscan else prescan
-        if amplifier.read_right:
-            first = self.scan_columns + self.width - first - count
+        data = Section(self.prescan, 0, self.width, self.height)
+        first, count = (self.prescan + self.width, self.overscan) if self.overscan else (0, self.prescan)
         bias = Section(first, 0, count, self.height + self.overscan_rows) if count else None
-        return Sections(data, amplifier.pixels, bias)
+        steps = (-1 if amplifier.read_right else 1, -1 if amplifier.read_top else 1)
+        return Sections(data, amplifier.pixels, bias, steps)
 
     def to_raw_image(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """Arrange planes [amplifier, row, column], whose pixel [0, 0] is read first, as the image of the raw file."""

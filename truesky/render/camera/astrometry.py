@@ -241,6 +241,65 @@ def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
     return out
 
 
+def flip_pixels(system: WCS, steps: tuple[int, int], size: tuple[int, int]) -> WCS:
+    """Return the world coordinate system of an image whose columns or rows are in the opposite order.
+
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the original image.
+    steps : (int, int)
+        For columns and rows: -1 to reverse their order, 1 to keep it.
+    size : (int, int)
+        Numbers of columns and rows of the image.
+
+    Returns
+    -------
+    WCS
+        World coordinate system of the flipped image; `system` is unchanged.
+    """
+    from astropy.wcs import Sip
+
+    out, signs = system.deepcopy(), np.array(steps, float)
+    out.wcs.crpix = np.where(signs < 0.0, np.array(size) + 1.0 - _crpix(system), _crpix(system))
+    out.wcs.cd = system.wcs.cd * signs
+    if system.sip is not None:
+        powers = np.arange(len(system.sip.a))
+        of_terms = signs[0] ** powers[:, None] * signs[1] ** powers
+        out.sip = Sip(signs[0] * of_terms * system.sip.a, signs[1] * of_terms * system.sip.b, None, None, _crpix(out))
+    out.wcs.set()
+    return out
+
+
+def follow_axes(
+    cards: Iterable[tuple[str, Any, str]], header: Iterable[tuple[str, Any, str]]
+) -> tuple[tuple[str, Any, str], ...]:
+    """Return the cards of a WCS with the matrix CD for an array whose columns or rows are in the opposite order.
+
+    Parameters
+    ----------
+    cards : iterable of Card
+        Cards (keyword, value, comment) of a WCS.
+    header : iterable of Card
+        Header of the array, with a matrix CD that differs from that of `cards` by a small rotation, and perhaps by the
+        order of columns or rows.
+
+    Returns
+    -------
+    tuple of Card
+        The cards, with the signs of the matrix CD for the order of columns and rows in `header`.
+    """
+    of_wcs, of_header = tuple(cards), {key: value for key, value, _ in header}
+    values = {key: value for key, value, _ in of_wcs}
+    signs: dict[str, float] = {}
+    for axis in (1, 2):
+        keys = [f"CD{i}_{axis}" for i in (1, 2)]
+        if all(key in values and key in of_header for key in keys):
+            is_opposite = sum(float(values[key]) * float(of_header[key]) for key in keys) < 0.0
+            signs |= dict.fromkeys(keys, -1.0 if is_opposite else 1.0)
+    return tuple((key, signs[key] * value if key in signs else value, text) for key, value, text in of_wcs)
+
+
 def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
     """Build the world coordinate system from FITS cards (keyword, value, comment) that truesky has written.
 

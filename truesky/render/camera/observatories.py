@@ -28,6 +28,10 @@ class Observatory:
     filters : mapping of str to str
         Names of the filters in the camera's files (keyword FILTER), by name of the passband. A passband that is not in
         the mapping, such as that of a user, has the same name in the files.
+    has_noao_sections : bool
+        True if DETSEC and DETSIZE count pixels of the mosaic of all detectors, and BIASSEC covers all rows of an array.
+        False, as for LSSTCam, if DETSEC and DETSIZE count pixels of the detector, and BIASSEC covers the rows of its
+        pixels only.
     """
 
     telescope: str
@@ -36,6 +40,7 @@ class Observatory:
     time_scale: str = "UTC"
     seconds_ahead_of_utc: float = 0.0
     filters: Mapping[str, str] = field(default_factory=dict)
+    has_noao_sections: bool = True
 
 
 # Time in the scale TAI minus time in UTC, s, since 2017.
@@ -60,7 +65,7 @@ _OBSERVATORIES = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
     "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv", filters=_DECAM_FILTERS),
-    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", "TAI", _TAI, _LSSTCAM_FILTERS),
+    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", "TAI", _TAI, _LSSTCAM_FILTERS, False),
     "megacam": Observatory("CFHT 3.6m", "MegaPrime", "tpv", filters=_MEGACAM_FILTERS),
     "jpcam": Observatory("JST250", "JPCam", "tpv"),
     "gpc1": Observatory("PS1", "GPC1", "tpv"),

@@ -31,6 +31,16 @@ class Section:
         """Text of the rectangle for a FITS header, "[x1:x2,y1:y2]", counted from 1 and with both ends included."""
         return f"[{self.x + 1}:{self.x + self.nx},{self.y + 1}:{self.y + self.ny}]"
 
+    def text_along(self, steps: tuple[int, int]) -> str:
+        """Return the text of the rectangle for a FITS header, with decreasing numbers along axes with the step -1.
+
+        `steps` has 1 or -1 for columns and for rows. For example, "[512:1,1:100]" has the steps (-1, 1).
+        """
+        columns, rows = (
+            (low + 1, low + n)[::step] for low, n, step in zip((self.x, self.y), (self.nx, self.ny), steps, strict=True)
+        )
+        return f"[{columns[0]}:{columns[1]},{rows[0]}:{rows[1]}]"
+
     @property
     def slices(self) -> tuple[slice, slice]:
         """Slices (rows, columns) that select the rectangle from an array [rows, columns]."""
@@ -44,15 +54,30 @@ class Section:
     def from_text(cls, text: str) -> Section:
         """Create a rectangle from the text of a FITS header, "[x1:x2,y1:y2]", counted from 1.
 
-        ValueError is raised if the text has another form.
+        Numbers may decrease along an axis; `steps_of_text` tells this. ValueError is raised if the text has another
+        form.
         """
-        (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
-        return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
+        (x, last_x), (y, last_y) = (sorted(ends) for ends in _ends_of_text(text))
+        return cls(x - 1, y - 1, last_x - x + 1, last_y - y + 1)
+
+
+def steps_of_text(text: str) -> tuple[int, int]:
+    """Return 1 or -1 for columns and for rows: -1 if the numbers in the text of a FITS section decrease.
+
+    The text has the form "[x1:x2,y1:y2]"; ValueError is raised otherwise.
+    """
+    columns, rows = (1 if first <= last else -1 for first, last in _ends_of_text(text))
+    return columns, rows
+
+
+def _ends_of_text(text: str) -> list[tuple[int, int]]:
+    (x_first, x_last), (y_first, y_last) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
+    return [(x_first, x_last), (y_first, y_last)]
 
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Parts of an array, such as the image of an amplifier, that has the orientation of the detector.
+    """Parts of an array, such as the image of an amplifier.
 
     Attributes
     ----------
@@ -63,11 +88,15 @@ class Sections:
     bias : Section or None
         Columns of the array without light that give its bias level, in all rows (FITS: BIASSEC). None if the array has
         no such columns.
+    steps : (int, int)
+        Steps on the detector, 1 or -1, from one column and from one row of the array to the next. The default (1, 1) is
+        an array with the orientation of the detector.
     """
 
     data: Section
     ccd: Section
     bias: Section | None = None
+    steps: tuple[int, int] = (1, 1)
 
     @classmethod
     def full_frame(cls, nx: int, ny: int) -> Sections:
@@ -76,7 +105,9 @@ class Sections:
         return cls(section, section)
 
 
-def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[Detector]) -> str | None:
+def to_mosaic_section(
+    detector: Detector, section: Section, detectors: Sequence[Detector], steps: tuple[int, int] = (1, 1)
+) -> str | None:
     """Convert a rectangle of a detector to pixels of the camera's mosaic, whose pixel grid continues across the gaps.
 
     Parameters
@@ -88,12 +119,15 @@ def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[
     detectors : sequence of Detector
         All detectors of the camera. The mosaic has the orientation of most detectors. It begins at the lowest column
         and row of any detector.
+    steps : (int, int), optional
+        Steps on the detector, 1 or -1, from one column and from one row of the array to the next.
 
     Returns
     -------
     str or None
-        Text "[x1:x2,y1:y2]" for a FITS header, counted from 1. Numbers decrease if the detector is mounted upside down.
-        None if the detector is turned by 90 deg relative to the mosaic, because its columns are rows of the mosaic.
+        Text "[x1:x2,y1:y2]" for a FITS header, counted from 1. Numbers decrease if the array is read in the opposite
+        direction, or if the detector is mounted upside down. None if the detector is turned by 90 deg relative to the
+        mosaic, because its columns are rows of the mosaic.
 
     Notes
     -----
@@ -106,7 +140,8 @@ def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[
         round(position - first)
         for position, first in zip(_corner(aligned_detector), _mosaic_origin(aligned_camera), strict=True)
     )
-    columns, rows = (section.x + 1, section.x + section.nx), (section.y + 1, section.y + section.ny)
+    columns = (section.x + 1, section.x + section.nx)[:: steps[0]]
+    rows = (section.y + 1, section.y + section.ny)[:: steps[1]]
     if aligned_detector.upside_down:
         columns, rows = (
             (size + 1 - first, size + 1 - last) for size, (first, last) in ((detector.nx, columns), (detector.ny, rows))

@@ -20,7 +20,8 @@ import scipy
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.fits.images import Card, Image
 from truesky.render.camera import astrometry
-from truesky.render.camera.sections import Section, Sections
+from truesky.render.camera.amplifiers import Layout
+from truesky.render.camera.sections import Section, Sections, steps_of_text
 from truesky.render.effects.charge import ramp
 from truesky.render.effects.readout import adc
 from truesky.render.effects.readout import quadrants as layout
@@ -364,33 +365,44 @@ def _assemble_amplifiers(array: Array, scene: Scene) -> Array:
 
 
 def _by_amplifier(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """Make the file of a ground detector with one extension (ADU) per amplifier.
+    """Make the file of a ground detector with one extension (ADU) per amplifier, in the order of the readout.
 
-    The name of an extension is that of the amplifier. Amplifiers of LSSTCam have the names in its own files: "C10"
-    becomes "Segment10".
+    The first pixel of an array is read first: prescan, pixels and overscan of each row follow one another. The name of
+    an extension is that of the amplifier. Amplifiers of LSSTCam have the names in its own files: "C10" becomes
+    "Segment10".
     """
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
     extensions = []
     for number, amplifier in enumerate(amplifier_layout.amplifiers):
         parts = amplifier_layout.amplifier_sections(number)
-        across, up = (getattr(parts.data, axis) - getattr(parts.ccd, axis) for axis in "xy")
         cards: tuple[Card, ...] = (
             ("AMPNAME", amplifier.name, "amplifier name"),
-            *astrometry.cards(astrometry.shift_pixels(system, across, up)),
+            *astrometry.cards(_amplifier_wcs(system, parts, amplifier_layout)),
         )
         name = _SEGMENT.sub("Segment", amplifier.name)
-        extensions.append(
-            Extension(name, amplifier_layout.to_detector_axes(raw[number], number), "adu", cards, number, parts)
-        )
+        extensions.append(Extension(name, raw[number], "adu", cards, number, parts))
     return Readout(tuple(extensions), raw, amplifier_layout.assemble)
+
+
+def _amplifier_wcs(system: WCS, parts: Sections, amplifier_layout: Layout) -> WCS:
+    """Return the world coordinate system of an amplifier's plane from that of the detector, `system`."""
+    size, place = (amplifier_layout.nx, amplifier_layout.ny), parts.ccd
+    # First column and row of the amplifier's pixels, on the detector with its axes in the order of the readout.
+    first = [
+        n - low - pixels if step < 0 else low
+        for n, low, pixels, step in zip(size, (place.x, place.y), (place.nx, place.ny), parts.steps, strict=True)
+    ]
+    flipped = astrometry.flip_pixels(system, parts.steps, size)
+    return astrometry.shift_pixels(flipped, parts.data.x - first[0], parts.data.y - first[1])
 
 
 def _assemble_extensions(read: Sequence[Image], calibrate: Callable[[Array, dict[str, Any]], Array]) -> Array:
     """Assemble the pixels [ny, nx] of a detector from a file with one extension per amplifier.
 
     `read` are the images of the file, of which the first has only the header. `calibrate` converts the array of an
-    extension, given its FITS cards, before its detector pixels are cut out.
+    extension, given its FITS cards, before its detector pixels are cut out. The card CCDSEC also tells whether columns
+    or rows of the array are in the opposite order.
     """
     parts = [(unit, {**_header(read[0]), **_header(unit)}) for unit in read[1:]]
     places = [Section.from_text(header["CCDSEC"]) for _, header in parts]
@@ -398,8 +410,9 @@ def _assemble_extensions(read: Sequence[Image], calibrate: Callable[[Array, dict
         calibrate(np.asarray(unit.data), header)[Section.from_text(header["DATASEC"]).slices] for unit, header in parts
     ]
     out = np.zeros((max(p.y + p.ny for p in places), max(p.x + p.nx for p in places)), arrays[0].dtype)
-    for place, pixels in zip(places, arrays, strict=True):
-        out[place.slices] = pixels
+    for (_, header), place, pixels in zip(parts, places, arrays, strict=True):
+        column_step, row_step = steps_of_text(header["CCDSEC"])
+        out[place.slices] = pixels[::row_step, ::column_step]
     return out
 
 

@@ -55,6 +55,9 @@ class Effect:
     in_place : bool
         True if `apply` has a parameter `out`, an array for the changed frame, which may be the frame itself. Allocating
         memory for a new frame takes longer than most effects.
+    apply_to_scans : callable, optional
+        Function (frame, scene, rng, out) that applies the effect to prescan and overscan only. It is used if the effect
+        is not needed in the pixels, whose light hides it, unless the request switches the effect off.
     """
 
     name: str
@@ -68,6 +71,7 @@ class Effect:
     cost: float = 0.0
     systematic: Callable[[Scene], float] | None = None
     in_place: bool = False
+    apply_to_scans: Callable[[Frame, Scene, np.random.Generator, Frame | None], Frame] | None = None
 
     def margin(self, scene: Scene) -> float:
         """Return the size of the effect divided by the noticeable change. Above 1 the effect is needed.
@@ -263,4 +267,7 @@ def apply_all(
                 callback(effect.name, previous, frame)
             # Free the previous frame before the next effect allocates a new one, to reduce the peak memory.
             del previous
+        elif effect.apply_to_scans is not None and not decision.forced:
+            frame = effect.apply_to_scans(frame, scene, stream(effect), frame if is_new else None)
+            is_new = True
     return frame, decisions

@@ -270,6 +270,18 @@ class Scene:
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
+    def pixels_in_plane(self) -> tuple[int, int, int]:
+        """Place of the detector's pixels in the plane of a quadrant or amplifier, in readout order.
+
+        They are the rows below the first number, and the columns from the second number on and below the third. The
+        other rows and columns are prescan and overscan.
+        """
+        if self.layout is not None:
+            return self.layout.height, self.layout.prescan, self.layout.prescan + self.layout.width
+        prescan = int(self.value("fpa.prescan", "pix"))
+        return self.half_rows, prescan, prescan + self.nx // 2
+
+    @property
     def injection_rows(self) -> int:
         """Number of charge-injection rows between the detector's halves, which are not read.
 

@@ -148,22 +148,28 @@ def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Car
     """Return the cards that tell which part of an array has pixels of the detector, and where these belong.
 
     DATASEC and TRIMSEC are the part of the array, and BIASSEC its overscan. CCDSEC is the place on the detector, and
-    DETSEC the place in the mosaic of all detectors. The result is () if the sections of the array are unknown.
+    DETSEC the place in the mosaic of all detectors, or on the detector for cameras whose files count so. Numbers of
+    both decrease along axes in which the array is read in the opposite direction. The result is () if the sections of
+    the array are unknown.
     """
     array_sections = extension.sections
     if array_sections is None:
         return ()
-    all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
-    mosaic_section = sections.to_mosaic_section(rendered.detector, array_sections.ccd, all_detectors)
+    ccd_section = array_sections.ccd.text_along(array_sections.steps)
+    mosaic_section: str | None = ccd_section
+    bias = array_sections.bias
+    if observatories.for_camera(rendered.exposure.camera).has_noao_sections:
+        all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
+        mosaic_section = sections.to_mosaic_section(
+            rendered.detector, array_sections.ccd, all_detectors, array_sections.steps
+        )
+    elif bias:
+        bias = replace(bias, y=array_sections.data.y, ny=array_sections.data.ny)
     return (
         ("DATASEC", array_sections.data.text, "section with the detector pixels"),
         ("TRIMSEC", array_sections.data.text, "section to keep when trimming"),
-        *(
-            (("BIASSEC", array_sections.bias.text, "section for measuring the bias level"),)
-            if array_sections.bias
-            else ()
-        ),
-        ("CCDSEC", array_sections.ccd.text, "DATASEC in detector coordinates"),
+        *((("BIASSEC", bias.text, "section for measuring the bias level"),) if bias else ()),
+        ("CCDSEC", ccd_section, "DATASEC in detector coordinates"),
         *((("DETSEC", mosaic_section, "DATASEC in mosaic coordinates"),) if mosaic_section else ()),
     )
 
@@ -181,6 +187,8 @@ def amplifier_cards(rendered: RenderedDetector, number: int | None) -> tuple[Car
 
 
 def _mosaic_size(rendered: RenderedDetector) -> str:
+    if not observatories.for_camera(rendered.exposure.camera).has_noao_sections:
+        return sections.Section(0, 0, rendered.detector.nx, rendered.detector.ny).text
     return sections.mosaic_size(detectors.detectors(rendered.exposure.camera, rendered.scene.mission))
 
 
@@ -204,8 +212,9 @@ def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Flo
 def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
     """Return (keyword, value, comment) for the read noise of the detector, and for the part that is in the image.
 
-    The read noise in the image is 0 if other noise is so large that read noise is not drawn. An up-the-ramp image also
-    has the noise of a single read. Values are in electrons rms: one number, or one per amplifier.
+    The read noise in the image is 0 if other noise is so large that read noise is not drawn in the pixels. Prescan and
+    overscan always have it, unless the request switches it off. An up-the-ramp image also has the noise of a single
+    read. Values are in electrons rms: one number, or one per amplifier.
     """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}

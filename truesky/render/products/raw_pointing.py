@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from lake_schema.fits.images import Card
 from lake_schema.mission.configuration import MissionConfiguration
@@ -89,10 +90,10 @@ def cards(
     if offset == rotation == 0.0:
         return tuple(header)
     ra, dec, angle = commanded_pointing(exposure, detector, mission, seed)
-    raw_values = {"RA": ra, "DEC": dec}
+    raw_values: dict[str, Any] = {"RA": ra, "DEC": dec}
     raw_values |= {
         key: value
-        for key, value, _ in astrometry.cards(astrometry.wcs(detector, ra, dec, angle))
+        for key, value, _ in astrometry.follow_axes(astrometry.cards(astrometry.wcs(detector, ra, dec, angle)), header)
         if _depends_on_pointing(key)
     }
     out: list[Card] = []

@@ -14,7 +14,7 @@ import numpy as np
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.store import read as versions
-from truesky.render.camera import tpv
+from truesky.render.camera import astrometry, tpv
 from truesky.render.camera.sections import Section
 from truesky.render.channels import registry
 from truesky.render.channels.readout import ReadoutMode
@@ -144,7 +144,9 @@ def with_true_wcs(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card
     """
     if all(key not in raw_pointing.ERRORS for key, *_ in cards):
         return tuple(cards)
-    true = {card[0]: card for card in head_files.first_cards(path) if not card[0].startswith("CRPIX")}
+    # The first image of the head file may be an amplifier with columns or rows in the order of its readout.
+    first_cards = astrometry.follow_axes(head_files.first_cards(path), cards)
+    true = {card[0]: card for card in first_cards if not card[0].startswith("CRPIX")}
     if not true:
         return tuple(cards)
     boresight = {"RA": true["CRVAL1"][1], "DEC": true["CRVAL2"][1]}

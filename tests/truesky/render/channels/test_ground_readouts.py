@@ -13,7 +13,7 @@ from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION
 from tests.truesky.render.products import test_tools as tools
 from truesky.render.camera import astrometry
-from truesky.render.camera.sections import Section
+from truesky.render.camera.sections import Section, steps_of_text
 from truesky.render.channels import ground
 from truesky.render.planning import ground_surveys
 from truesky.render.products import read_back
@@ -45,26 +45,35 @@ def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
         first, *arrays = units
         assert first.data is None
         assert [unit.header["EXTNAME"] for unit in arrays] == [
-            *(f"Segment1{n}" for n in range(8)), *(f"Segment0{n}" for n in range(8))
+            *(f"Segment1{n}" for n in range(8)), *(f"Segment0{n}" for n in reversed(range(8)))
         ]  # fmt: skip
         together = np.zeros_like(rendered("raw").science)
         for n, unit in enumerate(arrays, 1):
             header = unit.header
             assert header["AMPNAME"] == whole[f"AMP{n}"]
+            column_step, row_step = steps_of_text(header["CCDSEC"])
             together[Section.from_text(header["CCDSEC"]).slices] = unit.data[
                 Section.from_text(header["DATASEC"]).slices
-            ]
-            rows = Section.from_text(whole[f"BSEC{n}"])
+            ][::row_step, ::column_step]
             bias = unit.data[Section.from_text(header["BIASSEC"]).slices]
-            of_pixels = Section.from_text(header["DATASEC"])
-            np.testing.assert_array_equal(bias[of_pixels.y : of_pixels.y + rows.ny], raw[rows.slices])
+            in_one_array = raw[Section.from_text(whole[f"BSEC{n}"]).slices]
+            np.testing.assert_array_equal(bias[::row_step, ::column_step], in_one_array)
             assert header["GAIN"] == pytest.approx(whole[f"GAIN{n}"])
             assert header["RDNOISE"] == pytest.approx(whole[f"RDN{n}"])
             layout = rendered("raw").scene.layout
             assert unit.data.shape == (layout.height + layout.overscan_rows, layout.scan_columns + layout.width)
+            # Amplifiers of e2v: C1x are read from the upper right corner, C0x from the lower left one.
+            assert (column_step, row_step) == ((-1, -1) if header["AMPNAME"][1] == "1" else (1, 1))
+            assert header["DATASEC"] == header["TRIMSEC"] == f"[11:{10 + layout.width},1:{layout.height}]"
+            assert header["BIASSEC"] == f"[{11 + layout.width}:{64 + layout.width},1:{layout.height}]"
+            # LSSTCam counts DETSEC on the sensor.
+            assert header["DETSEC"] == header["CCDSEC"]
+            assert header["BITPIX"] == 32
+            assert "BZERO" not in header
         np.testing.assert_array_equal(together, raw[Section.from_text(whole["DATASEC"]).slices])
         np.testing.assert_array_equal(together, rendered("raw").science)
-        # Each pixel of the mosaic belongs to one amplifier.
+        assert whole["DETSIZE"] == f"[1:{layout.nx},1:{layout.ny}]"
+        # Each pixel of the sensor belongs to one amplifier.
         place = [Section.from_text(unit.header["DETSEC"]) for unit in arrays]
         assert (
             sum(p.nx * p.ny for p in place)
@@ -90,7 +99,13 @@ def test_each_amplifier_looks_where_its_pixels_do(files):
         data, place = Section.from_text(header["DATASEC"]), Section.from_text(header["CCDSEC"])
         assert pixels[data.slices].shape == (place.ny, place.nx)
         here = WCS(header).all_pix2world([data.x + 3.0], [data.y + 5.0], 0)
-        there = system.all_pix2world([place.x + 3.0], [place.y + 5.0], 0)
+        x, y = (
+            first + (n if step > 0 else size - 1 - n)
+            for first, size, step, n in zip(
+                (place.x, place.y), (place.nx, place.ny), steps_of_text(header["CCDSEC"]), (3, 5), strict=True
+            )
+        )
+        there = system.all_pix2world([x], [y], 0)
         np.testing.assert_allclose(here, there, atol=1e-9)
 
 
@@ -146,7 +161,8 @@ def test_ccdproc_reduces_amplifiers_by_their_headers(camera, tmp_path):
     found, steps = np.zeros(one.science.shape), 0
     for text, image in tools.reduced(path):
         assert image.unit == "electron"
-        found[tools.window(text)] = image.data
+        column_step, row_step = steps_of_text(text)
+        found[Section.from_text(text).slices] = image.data[::row_step, ::column_step]
         steps += 1
     assert steps == len(one.scene.layout.amplifiers)
     sky = (one.scene.sky_rate + one.scene.dark_rate) * one.scene.exposure_time_s

@@ -23,9 +23,11 @@ LARGEST = {"lsstcam": 2**18 - 1, "decam": 2**16 - 1}
 
 
 @cache
-def star(camera, electrons=3e7, largest=None, way="raw"):
+def star(camera, electrons=3e7, largest=None, way="raw", full_well=None):
     """Render a star in the middle of a part of a detector."""
-    mission = MISSION if largest is None else resolve(overrides={f"ext.{camera}.adc_max": (largest, "adu")})
+    given = {"adc_max": (largest, "adu"), "full_well": (full_well, "electron")}
+    overrides = {f"ext.{camera}.{key}": value for key, value in given.items() if value[0] is not None}
+    mission = resolve(overrides=overrides) if overrides else MISSION
     one = fields.small(camera, detectors.detectors(camera, MISSION)[0].name, SIDE)
     exposed = {
         "channel": "EXT", "camera": camera, "band": BANDS[camera], "exposure_time_s": SECONDS, "sky": 10.0,
@@ -77,6 +79,11 @@ def test_more_than_sixteen_bits_are_stored_in_thirty_two(tmp_path):
             assert {unit.header["BITPIX"] for unit in units if unit.data is not None} == {32}
             assert "BZERO" not in units[-1].header
         np.testing.assert_array_equal(read_back.frame(path).data, one.science)
+    # A converter of 18 bits reaches its highest number if the full well is larger.
+    (tmp_path / "full").mkdir()
+    deep = star("lsstcam", full_well=1e6)
+    path = put(deep, tmp_path / "full", rice=True)["science"]
+    assert read_back.frame(path).data.max() == 2**18 - 1 == fits.getheader(path, 1)["SATURATE"]
     # If the limit of the converter is below the full well, it limits the charge.
     header = fits.getheader(put(few, tmp_path)["science"])
     assert header["BITPIX"] == 16

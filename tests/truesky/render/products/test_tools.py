@@ -24,6 +24,7 @@ from tests.truesky.render.fields import MISSION, small
 from truesky.render.camera import astrometry, observatories
 from truesky.render.camera.detectors import detectors
 from truesky.render.camera.pointing import boresight_for
+from truesky.render.camera.sections import Section
 from truesky.render.channels import registry
 from truesky.render.products import fits_files, truth_table
 from truesky.request.accuracy import SURVEY
@@ -283,6 +284,9 @@ def reduced(path):
             raw = ccdproc.CCDData.read(path, hdu=number if "INHERIT" in header else 0)
         if "NAMPS" not in header:
             if "BIASSEC" in header:
+                # The bias section of LSSTCam covers the rows of pixels only.
+                rows = Section.from_text(header["BIASSEC"]).slices[0]
+                raw = raw[rows] if rows.stop < len(raw.data) else raw
                 level = ccdproc.subtract_overscan(raw, fits_section=header["BIASSEC"], overscan_axis=1, median=True)
             else:
                 level = raw.subtract(header["BIAS"] * u.adu, handle_meta="first_found")

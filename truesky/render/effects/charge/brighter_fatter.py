@@ -2,7 +2,9 @@
 
 The displacement of a border is proportional to the charge in the pixels around it. The charge in the strip between the
 old and the new border moves to the neighbouring pixel, so that the total charge is conserved. Displacements grow during
-the exposure, and their mean is half of the final displacement.
+the exposure, and their mean is half of the final displacement. Borders between columns are fixed by implants (channel
+stops), and those between rows by voltages only: charge displaces borders between rows more, so that neighbours in a
+column have a larger covariance than neighbours in a row.
 
 In VIS, the charge-injection rows between the two halves of the detector are drained and hold no charge. The halves
 therefore do not affect each other. The row of each half next to the drained rows loses a strip of its charge to them:
@@ -11,7 +13,7 @@ nearest pixel of it.
 
 References
 ----------
-Antilogus et al. 2014, JINST 9, C03048; Guyonnet et al. 2015, A&A 575, A41
+Antilogus et al. 2014, JINST 9, C03048; Guyonnet et al. 2015, A&A 575, A41; Astier et al. 2019, A&A 629, A36
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ MAX_CROSSING = 0.2
 
 def apply(
     frame: Frame,
-    shift: float,
+    shifts: tuple[float, float],
     softening: float,
     capacity: float,
     threshold: float,
@@ -57,9 +59,9 @@ def apply(
     ----------
     frame : float array, shape (ny, nx)
         Whole electrons, 0 or more.
-    shift : float
-        Displacement of each border of a pixel, towards the pixel's centre, by one electron in this pixel, in pixels per
-        electron, 0 to 1e-4.
+    shifts : (float, float)
+        Displacement of a border between columns and of a border between rows, towards the centre of the pixel, by one
+        electron in this pixel, in pixels per electron, 0 to 1e-4.
     softening : float
         Depth of the stored charge below the surface at which borders are measured, in pixels, 0 to 100. See `kernel`.
     capacity : float
@@ -82,16 +84,16 @@ def apply(
     Raises
     ------
     OutOfRange
-        If `shift`, `softening`, `capacity` or `threshold` is outside its limits or NaN.
+        If a shift, `softening`, `capacity` or `threshold` is outside its limits or NaN.
     """
     for name, value, low, high in (
-        ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
+        *(("brighter-fatter shift", shift, 0.0, 1e-4) for shift in shifts), ("full well", capacity, 1.0, 1e9),
         ("brighter-fatter threshold", threshold, 0.0, np.inf),
     ):  # fmt: skip
         if not low <= value <= high:
             raise OutOfRange(name, value, low, high)
     out = copy_frame(frame, out)
-    if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
+    if max(shifts) == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
     # Use single precision: it is exact for whole electrons below 2^24, and the moved charge has a relative error of
     # 1e-7.
@@ -101,12 +103,12 @@ def apply(
         padded[:REACH], padded[-REACH:] = padded[REACH], padded[-REACH - 1]
     gap_start = (len(out) - gap) // 2
     charge[REACH + gap_start : REACH + gap_start + gap] = 0.0
-    weights = kernel(shift, softening).astype(np.float32)
     # Highest charge in each block of `_BLOCK` pixels of a row. A last column of zeros is the neighbour of the last
     # block.
     block_max = np.zeros((len(charge), -(-charge.shape[1] // _BLOCK) + 1), np.float32)
     _find_block_max(charge.view(np.int32), block_max.view(np.int32))
-    for vertical in (False, True):
+    for vertical, shift in zip((False, True), shifts, strict=True):
+        weights = kernel(shift, softening).astype(np.float32)
         _move_charge(charge, block_max, out, weights, pixel_random.draw_key(rng), vertical, threshold, gap_start, gap)
     return out
 
@@ -147,13 +149,57 @@ def kernel(shift: float, softening: float) -> Frame:
     return np.asarray(shift * field / field[REACH, 0])
 
 
-def variance_slope(shift: float, softening: float) -> float:
-    """Return the relative loss of variance in a flat field, per electron of its mean, by the brighter-fatter effect.
+def border_shifts(shift: float, ratio: float) -> tuple[float, float]:
+    """Return the displacements of a border between columns and of one between rows from their mean.
 
     Parameters
     ----------
     shift : float
-        Displacement of a border by one electron in an adjacent pixel, in pixels.
+        Mean displacement by one electron in an adjacent pixel, in pixels.
+    ratio : float
+        Displacement of borders between rows, divided by that of borders between columns, more than 0.
+
+    Returns
+    -------
+    (float, float)
+        Displacement of borders between columns and of borders between rows by one electron, in pixels.
+    """
+    between_columns = 2.0 * shift / (1.0 + ratio)
+    return between_columns, ratio * between_columns
+
+
+def covariance_slopes(shifts: tuple[float, float], softening: float) -> tuple[float, float]:
+    """Return the covariances of neighbours in a flat field, divided by the squared mean in electrons.
+
+    Parameters
+    ----------
+    shifts : (float, float)
+        Displacement of a border between columns and of one between rows by one electron in an adjacent pixel, in
+        pixels.
+    softening : float
+        Depth of the charge below the surface at which borders are measured, in pixels, 0 to 100.
+
+    Returns
+    -------
+    (float, float)
+        Covariance of neighbours in a row (serial direction) and of neighbours in a column (parallel direction) in
+        1/electron, valid to first order in the mean. It is the change of a pixel's area by one electron in the
+        neighbour: the common border moves away, the opposite one and the two others move into the pixel.
+    """
+    (common_border, opposite_border), side_border = kernel(1.0, softening)[REACH], kernel(1.0, softening)[REACH + 1, 0]
+    across, along = float(common_border - opposite_border), float(2.0 * side_border)
+    between_columns, between_rows = shifts
+    return across * between_columns - along * between_rows, across * between_rows - along * between_columns
+
+
+def variance_slope(shifts: tuple[float, float], softening: float) -> float:
+    """Return the relative loss of variance in a flat field, per electron of its mean, by the brighter-fatter effect.
+
+    Parameters
+    ----------
+    shifts : (float, float)
+        Displacement of a border between columns and of one between rows by one electron in an adjacent pixel, in
+        pixels.
     softening : float
         Depth of the charge below the surface at which borders are measured, in pixels, 0 to 100.
 
@@ -163,7 +209,7 @@ def variance_slope(shift: float, softening: float) -> float:
         Value c (1/electron) of the formula variance = mean (1 - c mean). It is valid to first order in the mean. Only
         the charge of the pixel itself contributes, through its four borders.
     """
-    return 4.0 * float(kernel(shift, softening)[REACH, 0])
+    return sum(2.0 * float(kernel(shift, softening)[REACH, 0]) for shift in shifts)
 
 
 @jit
@@ -250,8 +296,11 @@ def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, fir
                 displacement[c] += weight * (side_1[c] - side_2[c])
 
 
-def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
-    shift, softening = scene.value("bfe.shift", "pix / electron"), scene.value("bfe.softening", "pix")
+def _parameters(scene: Scene) -> tuple[tuple[float, float], float, float, float, int]:
+    softening = scene.value("bfe.softening", "pix")
+    shifts = border_shifts(scene.value("bfe.shift", "pix / electron"), scene.value("bfe.shift_ratio", ""))
+    # Use the larger displacement of both directions for the threshold.
+    shift = max(shifts)
     # If all pixels hold n electrons, at most sum(kernel) n x 2 n / 4 electrons cross a border, and a pixel has four
     # borders. The borders of a block of pixels do not move if all pixels around have less charge than `threshold`. The
     # threshold is so low that the neglected charge is below the accepted error of the background, and the neglected
@@ -261,15 +310,15 @@ def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
         np.sqrt(2.0 * max_noise / max(float(kernel(shift, softening).sum()), 1e-30)),
         scene.accuracy.shape / (_R2_GROWTH * max(shift, 1e-30)),
     )
-    return shift, softening, scene.value("full_well", "electron"), float(threshold), scene.injection_rows
+    return shifts, softening, scene.value("full_well", "electron"), float(threshold), scene.injection_rows
 
 
 def _contribution(scene: Scene) -> float:
-    shift, _, capacity, *_ = _parameters(scene)
+    shifts, _, capacity, *_ = _parameters(scene)
     peak = min(scene.peak_electrons, capacity) + scene.sky_electrons
     # The brightest pixel of a star in VIS loses 1.2 shift peak^2 electrons: four borders, half of the final
     # displacement, and two thirds of the peak's charge at a border. The factor 1.5 includes a safety margin.
-    return 1.5 * shift * peak**2
+    return 1.5 * 0.5 * sum(shifts) * peak**2
 
 
 EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=1e-2, in_place=True)

@@ -1,4 +1,8 @@
-"""Read noise of detectors that are read once: the output amplifier adds Gaussian noise to every pixel."""
+"""Read noise of detectors that are read once: the output amplifier adds Gaussian noise to every pixel.
+
+If the noise of light hides read noise, it is left out in the pixels of the detector. Prescan and overscan have no light
+and always have read noise, with the same random numbers in both cases.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect, map_pixels, zero_contribution
+from truesky.render.effects.effect import Effect, copy_frame, map_pixels, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 
@@ -59,6 +63,54 @@ def _add(pixels: Any, sigma: float, key: Any, first: int) -> None:
             block[i] += sigma * noise[i]
 
 
+def add_to_scans(frame: Frame, scene: Scene, rng: np.random.Generator, out: Frame | None = None) -> Frame:
+    """Add Gaussian read noise to prescan and overscan, and leave the other pixels unchanged.
+
+    Parameters
+    ----------
+    frame : float array, shape (q, ny, nx) for q amplifiers
+        Electrons, with the pixel at [0, 0] read first. A frame (ny, nx) has no prescan and overscan.
+    scene : Scene
+        Properties of the detector, with the read noise of each amplifier.
+    rng : numpy.random.Generator
+        Random generator in the state that `apply` gets. Each pixel has the same random number as there.
+    out : float64 array, shape of `frame`, optional
+        Array for the result, which may be `frame` itself. By default a new array.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including read noise in prescan and overscan.
+    """
+    out = copy_frame(frame, out)
+    if out.ndim == 3:
+        sigmas = np.array(np.broadcast_to(_sigma(scene), len(out)), float)
+        _add_to_scans(out, sigmas, pixel_random.draw_key(rng), *scene.pixels_in_plane)
+    return out
+
+
+@jit
+def _add_to_scans(planes: Any, sigmas: Any, key: Any, height: int, first_column: int, past_column: int) -> None:
+    """Add Gaussian noise to prescan and overscan of planes [amplifier, row, column], in place.
+
+    `sigmas` has the standard deviation of each amplifier in electrons. Pixels of the detector are the rows below
+    `height` and the columns from `first_column` on and below `past_column`. The random bits of a pixel derive from the
+    key `key` and the flat index of the pixel in `planes`.
+    """
+    normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
+    _, ny, nx = planes.shape
+    for q in range(len(planes)):
+        for r in range(ny):
+            # Columns of two runs without light: before and after the pixels, or the whole row in two parts.
+            for run in range(2):
+                start, end = (0, first_column) if run == 0 else (past_column if r < height else first_column, nx)
+                for first in range(start, end, pixel_random.BLOCK):
+                    noise = normals[: min(pixel_random.BLOCK, end - first)]
+                    pixel_random.fill_normals(noise, bits, key, (q * ny + r) * nx + first)
+                    for i in range(len(noise)):
+                        planes[q, r, first + i] += sigmas[q] * noise[i]
+
+
 def _sigma(scene: Scene) -> float | Float:
     return scene.amplifier_values("read_noise", "electron")
 
@@ -71,4 +123,5 @@ EFFECT = Effect(
     cost=9e-3,
     systematic=zero_contribution,
     in_place=True,
+    apply_to_scans=add_to_scans,
 )

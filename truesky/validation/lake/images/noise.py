@@ -116,9 +116,10 @@ def _sky_rows(context: FrameContext) -> list[Row]:
 def read_variance(amplifier: Amplifier) -> float:
     """Return the variance of a pixel without light in e-^2, from read noise and rounding to whole ADU.
 
-    It is measured in the overscan, or computed from the header if the amplifier has no overscan.
+    It is measured in the overscan, or computed from the header if the amplifier has no overscan, or if read noise is
+    left out in the pixels, which the overscan always has.
     """
-    if amplifier.samples and np.isfinite(amplifier.noise):
+    if amplifier.samples and amplifier.header_read_noise > 0.0 and np.isfinite(amplifier.noise):
         return amplifier.noise**2
     return amplifier.header_read_noise**2 + amplifier.gain**2 / 12.0
 

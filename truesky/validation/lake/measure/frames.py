@@ -27,6 +27,8 @@ _SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
 _WCS_KEYWORD = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)[12]|(CD|PC)[12]_[12]|PV\d_\d+|[AB]P?_(ORDER|\d_\d)|LONPOLE|LATPOLE|RADESYS"
 )
+# Pattern of the keywords of SIP coefficients, such as A_2_0.
+_SIP_TERM = re.compile(r"[AB]P?_\d_\d")
 # End of the name of the extension that has chi^2 of the fits to infrared ramps.
 _QUALITY = ".CHI2"
 # Keyword in the header of the extension with the quality of ramp fits, if it has flags instead of chi^2.
@@ -256,7 +258,8 @@ def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
     size = [axis.stop - axis.start for axis in data]
     ccd = section(header["CCDSEC"]) if "CCDSEC" in header else (slice(0, size[0]), slice(0, size[1]))
     bias = array[section(header["BIASSEC"])] if "BIASSEC" in header else None
-    return [(ccd, array[data], bias, header, str(header.get("EXTNAME", "")))]
+    column_step, row_step = _steps(header["CCDSEC"]) if "CCDSEC" in header else (1, 1)
+    return [(ccd, array[data][::row_step, ::column_step], bias, header, str(header.get("EXTNAME", "")))]
 
 
 def _numbered_amplifier(header: dict[str, Any], array: Array, n: int) -> _AmplifierData:
@@ -298,8 +301,14 @@ def section(text: str) -> tuple[slice, slice]:
     match = _SECTION.fullmatch(text.strip())
     if match is None:
         raise BadInput(f"section must be of the form [x1:x2,y1:y2], got {text!r}")
-    x1, x2, y1, y2 = map(int, match.groups())
+    (x1, x2), (y1, y2) = (sorted(map(int, ends)) for ends in (match.groups()[:2], match.groups()[2:]))
     return slice(y1 - 1, y2), slice(x1 - 1, x2)
+
+
+def _steps(text: str) -> tuple[int, int]:
+    """Return 1 or -1 for columns and rows of a FITS section "[x1:x2,y1:y2]": -1 if the numbers decrease."""
+    x1, x2, y1, y2 = map(int, re.findall(r"\d+", text))
+    return 1 if x1 <= x2 else -1, 1 if y1 <= y2 else -1
 
 
 def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
@@ -316,12 +325,32 @@ def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
     all_cards = {**first, **header}
     names = ("DSEC1", "CSEC1") if "DSEC1" in all_cards else ("DATASEC", "CCDSEC")
     if all(name in all_cards for name in names):
-        (dy, dx), (cy, cx) = (section(all_cards[name]) for name in names)
-        wcs_cards["CRPIX1"] -= dx.start - cx.start
-        wcs_cards["CRPIX2"] -= dy.start - cy.start
+        _move_reference(wcs_cards, *(all_cards[name] for name in names))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         return WCS(wcs_cards)
+
+
+def _move_reference(wcs_cards: dict[str, Any], data: str, ccd: str) -> None:
+    """Convert the WCS cards of an array, in place, to the pixels of the detector.
+
+    `data` is the FITS section of the array that lies at the section `ccd` of the detector. The numbers of `ccd` may
+    decrease; columns or rows of the array are then in the opposite order.
+    """
+    steps = _steps(ccd)
+    starts = [[axis.start for axis in section(text)[::-1]] for text in (data, ccd)]
+    sizes = [axis.stop - axis.start for axis in section(ccd)[::-1]]
+    for number, (step, data_start, ccd_start, size) in enumerate(zip(steps, *starts, sizes, strict=True), start=1):
+        inside = wcs_cards[f"CRPIX{number}"] - data_start
+        wcs_cards[f"CRPIX{number}"] = ccd_start + (inside if step > 0 else size + 1 - inside)
+        for row in (1, 2):
+            for key in (f"CD{row}_{number}", f"PC{row}_{number}"):
+                if key in wcs_cards:
+                    wcs_cards[key] *= step
+    # The distortion is a polynomial of pixels from the reference pixel (SIP). TPV counts in degrees on the sky.
+    for key in [key for key in wcs_cards if _SIP_TERM.fullmatch(key)]:
+        name, p, q = key.split("_")
+        wcs_cards[key] *= steps[name.startswith("B")] * steps[0] ** int(p) * steps[1] ** int(q)
 
 
 def sky_to_pixel(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:

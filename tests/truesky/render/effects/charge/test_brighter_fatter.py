@@ -13,6 +13,8 @@ from truesky.render.effects.scene import Scene
 from truesky.request import accuracy
 
 SHIFT, SOFT, FULL = 1.2e-7, 0.5, 2e5
+# Equal displacements of borders between columns and between rows.
+EVEN = (SHIFT, SHIFT)
 
 
 def widths(image):
@@ -32,7 +34,7 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
     for peak in (5e4, 2e5):
         image = star(peak)
         mean = np.mean(
-            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
+            [brighter_fatter.apply(image, EVEN, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
             axis=0,
         )
         growth[peak] = widths(mean) / widths(image) - 1
@@ -44,10 +46,10 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
 def test_variance_of_a_flat_falls_as_predicted():
     level = 1e5
     flat = np.random.default_rng(1).poisson(level, (1200, 1200)).astype(float)
-    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(2))
+    out = brighter_fatter.apply(flat, EVEN, SOFT, FULL, 0.0, 0, np.random.default_rng(2))
     assert out.sum() == flat.sum()
     lost = 1 - out.var() / flat.var()
-    assert lost == pytest.approx(brighter_fatter.variance_slope(SHIFT, SOFT) * level, rel=0.1)
+    assert lost == pytest.approx(brighter_fatter.variance_slope(EVEN, SOFT) * level, rel=0.1)
     # The neighbours of a pixel get the part of its fluctuation that it loses.
     rest = out - out.mean()
     assert (rest[:, 1:] * rest[:, :-1]).mean() > 0.0015 * level
@@ -57,12 +59,58 @@ def test_variance_of_a_flat_falls_as_predicted():
 def test_rows_and_columns_are_alike():
     image = star(1e5)
     one = np.mean(
-        [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
+        [brighter_fatter.apply(image, EVEN, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
     )
     two = np.mean(
-        [brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
+        [brighter_fatter.apply(image.T, EVEN, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
     )
     assert np.abs(one - two.T).max() < 1.0
+
+
+def covariances(shifts, soft, level, side=3000):
+    """Return the covariances of neighbours in a row and in a column of a flat, divided by the squared mean, 1/e-."""
+    flat = np.random.default_rng(1).poisson(level, (side, side)).astype(float)
+    out = brighter_fatter.apply(flat, shifts, soft, FULL, 0.0, 0, np.random.default_rng(2))
+    assert out.sum() == flat.sum()
+    rest = out - out.mean()
+    return (rest[:, 1:] * rest[:, :-1]).mean() / level**2, (rest[1:] * rest[:-1]).mean() / level**2
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.66])
+def test_covariances_of_flats_in_rows_and_columns_are_those_of_the_borders(ratio):
+    """Flats of LSSTCam with 2e4 electrons, in which second-order terms are small.
+
+    Sample of 3000 x 3000 pixels; significance 6e-7 (5 standard errors) plus 5 % for terms of higher order.
+    """
+    level, side, soft = 2e4, 3000, 0.3
+    shifts = brighter_fatter.border_shifts(7.75e-7, ratio)
+    assert np.mean(shifts) == pytest.approx(7.75e-7, rel=1e-12, abs=0.0)
+    found = covariances(shifts, soft, level, side)
+    expected = brighter_fatter.covariance_slopes(shifts, soft)
+    error = 5.0 / (level * side)
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, rel=0.05, abs=error)
+    # The mean of both directions does not depend on the ratio.
+    even = brighter_fatter.covariance_slopes((7.75e-7, 7.75e-7), soft)
+    assert np.mean(expected) == pytest.approx(np.mean(even), rel=1e-12, abs=0.0)
+
+
+def test_lsstcam_has_larger_covariances_in_columns_than_in_rows():
+    """Sensors of LSST have ratios of 2 to 3 (GalSim's models of both makers have 2.4 and more); VIS is assumed even.
+
+    Flats of 5e4 electrons, sample of 3000 x 3000 pixels; significance 6e-7: 5 standard errors of the ratio are 0.4.
+    """
+    mission, parameters = resolve(), {}
+    for section in ("ext.lsstcam", "vis"):
+        kind = small("lsstcam", "R22_S11", 64) if section != "vis" else small("vis", "3-4", 64)
+        scene = Scene(mission, section, 30.0, 50.0, 1e5, kind)
+        parameters[section] = brighter_fatter.EFFECT.parameters(scene)
+    (shifts, soft, *_), (even, *_) = parameters["ext.lsstcam"], parameters["vis"]
+    assert even[0] == even[1]
+    in_rows, in_columns = covariances(shifts, soft, 5e4)
+    linear = brighter_fatter.covariance_slopes(shifts, soft)
+    assert linear[1] / linear[0] == pytest.approx(2.76, abs=0.01)
+    assert in_columns / in_rows == pytest.approx(2.76, abs=0.4)
 
 
 def test_kernel_falls_off():
@@ -75,7 +123,7 @@ def test_kernel_falls_off():
 
 def test_charge_above_full_well_does_not_repel():
     image = star(1e9)
-    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
+    out = brighter_fatter.apply(image, EVEN, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
     assert out.min() >= 0
     assert out.sum() == image.sum()
 
@@ -122,7 +170,7 @@ def test_negligible_charge_does_not_move():
     light[100:125, 200:225] += star(1.5e5)
     light[297:, 397:] += 5e4
     every, some = (
-        brighter_fatter.apply(light, SHIFT, SOFT, FULL, dim, 0, np.random.default_rng(4)) for dim in (0.0, 700.0)
+        brighter_fatter.apply(light, EVEN, SOFT, FULL, dim, 0, np.random.default_rng(4)) for dim in (0.0, 700.0)
     )
     assert some.sum() == light.sum()
     np.testing.assert_array_equal(every[105:120, 205:220], some[105:120, 205:220])
@@ -139,10 +187,10 @@ def test_the_threshold_is_within_the_accuracy(preset):
     """Errors of a star just below the threshold: its size, and charge that would cross the borders of its pixels."""
     wanted = accuracy.preset(preset)
     scene = Scene(resolve(), "vis", 560.53, 0.25, 1e4, accuracy=wanted)
-    shift, softening, full, dim, _ = brighter_fatter.EFFECT.parameters(scene)
+    shifts, softening, full, dim, _ = brighter_fatter.EFFECT.parameters(scene)
     bright = star(2e5)
     mean = np.mean(
-        [brighter_fatter.apply(bright, shift, softening, full, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
+        [brighter_fatter.apply(bright, shifts, softening, full, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
         axis=0,
     )
     growth = (widths(mean) ** 2).sum() / (widths(bright) ** 2).sum() - 1
@@ -151,7 +199,8 @@ def test_the_threshold_is_within_the_accuracy(preset):
     frame = np.zeros((400, 400))
     frame[2::5, 2::5] = np.floor(dim)
     left_alone, followed = (
-        brighter_fatter.apply(frame, shift, softening, full, least, 0, np.random.default_rng(6)) for least in (dim, 0.0)
+        brighter_fatter.apply(frame, shifts, softening, full, least, 0, np.random.default_rng(6))
+        for least in (dim, 0.0)
     )
     np.testing.assert_array_equal(left_alone, frame)
     noticed = wanted.background * scene.pixel_noise
@@ -165,7 +214,7 @@ def test_a_pixel_never_gives_more_than_it_can_spare():
     """At the largest shift borders would move past whole pixels: each gives a fifth over each of four."""
     frame = np.zeros((9, 9))
     frame[4, 4] = 1e5
-    out = brighter_fatter.apply(frame, 1e-4, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
+    out = brighter_fatter.apply(frame, (1e-4, 1e-4), SOFT, FULL, 0.0, 0, np.random.default_rng(1))
     assert out.min() >= 0
     assert out.sum() == frame.sum()
     # Charge crosses one border after the other, each time a fraction of the remaining charge.
@@ -176,8 +225,8 @@ def test_a_pixel_never_gives_more_than_it_can_spare():
 @pytest.mark.parametrize(
     "wrong",
     [
-        (-1.0, 0.5, 2e5, 0.0), (np.nan, 0.5, 2e5, 0.0), (1e-7, -1.0, 2e5, 0.0), (1e-7, 0.5, 0.0, 0.0),
-        (1e-7, 0.5, 2e5, np.nan),
+        ((-1.0, 1e-7), 0.5, 2e5, 0.0), ((1e-7, np.nan), 0.5, 2e5, 0.0), (EVEN, -1.0, 2e5, 0.0), (EVEN, 0.5, 0.0, 0.0),
+        (EVEN, 0.5, 2e5, np.nan),
     ],
 )  # fmt: skip
 def test_nonsense_is_refused(wrong):
