@@ -146,9 +146,9 @@ def field(demo):
 # Of the small field.
 SMALL_DIGESTS = {
     "halos": "b5c47ba858fff8a53213a5c9e389efddd5867433a6e2bfd90a3af5cd693b7444",
-    "galaxies": "af0789be5b915129d7023e79a5081afe8851e9e5f6c159b8da0f894c98f80039",
+    "galaxies": "687fee42ac741ad5cfcf8bc76388447f14732736e01a6320a96a881a82f8fa84",
     "stars": "9a32733575d38388edc939bcd158f2ad9d04cca842e6db791e8f7d71abc3090f",
-    "galaxy_fluxes": "edf2444a4fe0d2dde7537e5ed771692efb27d099aecb8f57116ecd2a5c322c53",
+    "galaxy_fluxes": "abcba2119b2a6e020c12942903d2301591382ffd5c20bebbdf7c95db1b2efb85",
     "star_fluxes": "f9df21235aab21a247f81524452b6c3acd781b152897398c46f32ef0b5f7cd09",
 }
 
