@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 
 LIST = Path(__file__).with_name("slow_tests.csv")
-# CPU seconds: above SLOW a test should be on the list. It fails only above LIMIT, since machines differ.
-SLOW, LIMIT = 5.0, 10.0
+# CPU seconds: above SLOW a test should be on the list. It fails only above LIMIT, since the same test takes up to three
+# times as long on a slower machine, or on a core whose other thread is busy.
+SLOW, LIMIT = 5.0, 20.0
 # Most entries of the list.
 LONGEST = 40
 
