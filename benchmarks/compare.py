@@ -25,6 +25,9 @@ from pathlib import Path
 from benchmarks import _subjects, report
 from benchmarks._detectors import ROOT
 
+# File that a commit must have, because benchmarks import the library from it. Without it, Python would import the library
+# of this working copy if that is installed, and compare this working copy with itself.
+_LIBRARY = Path("truesky", "render", "__init__.py")
 _DEFAULTS = ("vis", "nisp_p", "nisp_s", "lsst", "fluxes", "catalogue")
 
 
@@ -32,7 +35,7 @@ _DEFAULTS = ("vis", "nisp_p", "nisp_s", "lsst", "fluxes", "catalogue")
 def checkout(commit: str) -> Iterator[Path]:
     """Provide a folder with the files of a commit and the benchmarks of this working copy during a `with` block.
 
-    SystemExit is raised if git does not know the commit.
+    SystemExit is raised if git does not know the commit, or if its library has another name than now.
     """
     git = shutil.which("git") or "git"
     with tempfile.TemporaryDirectory(prefix="truesky-base-") as name:
@@ -42,7 +45,12 @@ def checkout(commit: str) -> Iterator[Path]:
         if added.returncode:
             raise SystemExit(f"benchmarks.compare: commit {commit}: {added.stderr.strip().splitlines()[-1]}")
         try:
-            shutil.rmtree(folder / "benchmarks")
+            if not (folder / _LIBRARY).is_file():
+                raise SystemExit(
+                    f"benchmarks.compare: commit {commit}: it has no package truesky.render (the library had another name "
+                    "then), which the benchmarks import: choose a later commit"
+                )
+            shutil.rmtree(folder / "benchmarks", ignore_errors=True)
             shutil.copytree(ROOT / "benchmarks", folder / "benchmarks")
             yield folder
         finally:

@@ -54,3 +54,17 @@ def test_ratios_are_new_times_by_old_times(monkeypatch):
 def test_an_unknown_commit_is_refused():
     with pytest.raises(SystemExit, match="commit no-such-commit: "):
         compare.main(["no-such-commit"])
+
+
+def test_a_commit_whose_library_has_another_name_is_refused(tmp_path, monkeypatch):
+    """Without its own package truesky, the process of the base would import the installed one, this working copy."""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=A", "-c", "user.email=a@b.c"]
+    (tmp_path / "truesky").mkdir()
+    (tmp_path / "truesky" / "__init__.py").write_text("")
+    for command in (["init", "--quiet"], ["add", "."], ["commit", "--quiet", "--no-gpg-sign", "-m", "Old"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(compare, "ROOT", tmp_path)
+    with pytest.raises(SystemExit, match=r"^benchmarks\.compare: commit HEAD: it has no package truesky\.render \("):
+        compare.main(["HEAD"])
+    listed = subprocess.run([*git, "worktree", "list"], capture_output=True, text=True, check=True).stdout
+    assert len(listed.splitlines()) == 1
