@@ -1,7 +1,9 @@
 """Brighter-fatter: charge only moves, stars widen in proportion to their peaks, flats lose variance as predicted."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import galsim
 import numpy as np
 import pytest
 
@@ -93,6 +95,26 @@ def test_covariances_of_flats_in_rows_and_columns_are_those_of_the_borders(ratio
     # The mean of both directions does not depend on the ratio.
     even = brighter_fatter.covariance_slopes((7.75e-7, 7.75e-7), soft)
     assert np.mean(expected) == pytest.approx(np.mean(even), rel=1e-12, abs=0.0)
+
+
+def border_ratio(model):
+    """Return the displacement of borders between rows over that between columns in a sensor model of GalSim.
+
+    The model has the vertices of 9 x 9 pixels of 10 um with 1e5 electrons in the central one.
+    """
+    x0, y0, angle, x, y = np.loadtxt(Path(galsim.meta_data.share_dir) / "sensors" / f"{model}.dat", skiprows=1).T
+    centre = np.median(x0)
+    of_pixel = (x0 == centre) & (y0 == centre)
+    across, up, angle = (np.abs(values[of_pixel]) for values in (x - centre, y - centre, angle - np.pi))
+    # Leave out corners, which belong to both borders.
+    steep = np.abs(np.tan(angle))
+    return (5.0 - up[steep > 1.01]).mean() / (5.0 - across[steep < 0.99]).mean()
+
+
+def test_the_ratio_of_lsstcam_is_that_of_the_sensor_models():
+    ratios = [border_ratio(model) for model in ("lsst_e2v_50_8", "lsst_itl_50_8")]
+    assert np.ptp(ratios) < 0.1
+    assert resolve().value("ext.lsstcam.bfe.shift_ratio", "") == pytest.approx(np.mean(ratios), abs=0.01)
 
 
 def test_lsstcam_has_larger_covariances_in_columns_than_in_rows():
