@@ -11,6 +11,7 @@ LSE-400 (LSSTCam: header service); astro_metadata_translator and obs_lsst (keywo
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -40,8 +41,13 @@ _PROGRAM = "truesky"
 _PROGRAM_TEXT = "program (no meaning in a simulation)"
 _FOCUS_TEXT = "focus (no meaning in a simulation)"
 _HUMIDITY_TEXT = "[percent] humidity (no meaning in a simulation)"
-# Number of different values of SEQNUM, the number of an LSSTCam exposure in its night: obs_lsst stores it in 15 bits.
-_SEQUENCE_NUMBERS = 32_768
+# Smallest SEQNUM, the number of an LSSTCam exposure in its night. No real night has so many exposures, so that simulated
+# exposures have other identifiers than real ones, and obs_lsst does not apply its corrections of real headers.
+_FIRST_SEQUENCE_NUMBER = 10_000
+# Number of different values of SEQNUM, which obs_lsst stores in 15 bits.
+_SEQUENCE_NUMBERS = 32_768 - _FIRST_SEQUENCE_NUMBER
+# Names of CCDs of Hyper Suprime-Cam: number of the readout unit, 0 or 1, and number of the CCD in it.
+_HSC_CCD = re.compile(r"([01])_(\d\d)")
 # Image types for which the shutter opens.
 _SHUTTER_TYPES = ("science", "deep", "flat")
 # Names of the image types of truesky in the headers of each camera.
@@ -169,7 +175,7 @@ def _hsc(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...
     return (
         ("DATA-TYP", _image_type(rendered), "type of observation"),
         ("EXP-ID", f"HSCE{exposure.exposure_id:08d}", "exposure identifier"),
-        ("FRAMEID", _frame_identifier(exposure.exposure_id, number), "identifier of this image"),
+        ("FRAMEID", _frame_identifier(exposure.exposure_id, rendered.detector.name, number), "identifier of this image"),
         ("DET-ID", number, "CCD number, from 0"),
         ("T_CCDSN", f"{number:03d}", "serial number (simulation: CCD number)"),
         ("FILTER01", filters.get(exposure.band, exposure.band), "filter"),
@@ -218,7 +224,8 @@ def _megacam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
 
 def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...]:
     """Return the cards of an LSSTCam sensor; ROTPA is the position angle to which the rotator turns the camera."""
-    exposure, (raft, sensor) = rendered.exposure, rendered.detector.name.split("_")
+    # A sensor of a user's layout may have a name without a raft.
+    exposure, (raft, _, sensor) = rendered.exposure, rendered.detector.name.rpartition("_")
     kind, number = rendered.detector.kind.upper(), _detector_number(rendered)
     seconds, opens = rendered.scene.exposure_time_s, exposure.image_type in _SHUTTER_TYPES
     # A night begins at noon in the time zone 12 h west of Greenwich.
@@ -227,7 +234,7 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
     return (
         ("OBSID", f"MC_S_{night}_{sequence:06d}", "observation identifier"),
         ("DAYOBS", night, "date of the night's first noon, 12 h behind TAI"),
-        ("SEQNUM", sequence, "exposure identifier modulo 32768"),
+        ("SEQNUM", sequence, "from the exposure identifier, 10000 to 32767"),
         ("CAMCODE", "MC", "code of the camera"),
         ("IMGTYPE", _image_type(rendered), "type of observation"),
         ("CONTRLLR", "S", "controller (S: simulation)"),
@@ -307,18 +314,20 @@ def _detector_number(rendered: RenderedDetector) -> int:
 
 def _sequence_number(rendered: RenderedDetector) -> int:
     """Return the number of an LSSTCam exposure in its night."""
-    return rendered.exposure.exposure_id % _SEQUENCE_NUMBERS
+    return _FIRST_SEQUENCE_NUMBER + rendered.exposure.exposure_id % _SEQUENCE_NUMBERS
 
 
-def _frame_identifier(exposure_id: int, number: int) -> str:
+def _frame_identifier(exposure_id: int, name: str, number: int) -> str:
     """Return the identifier of an image of Hyper Suprime-Cam: HSC, a letter and 8 digits.
 
-    Two digits have the CCD number modulo 100. The other digits count pairs of numbers per exposure, of which CCDs from
-    100 on have the second. The letter counts millions.
+    The last two digits are the number of the CCD in its readout unit. The other digits are an even number for each
+    exposure plus the number of the readout unit, 0 or 1. The letter counts millions. A CCD of a user's layout, whose
+    `name` does not contain these numbers, has the last two digits of its `number` and the digits before them.
     """
-    hundreds, last_digits = divmod(number, 100)
-    millions, count = divmod(2 * exposure_id + hundreds, 1_000_000)
-    return f"HSC{chr(ord('A') + millions % 26)}{count:06d}{last_digits:02d}"
+    found = _HSC_CCD.fullmatch(name)
+    readout_unit, ccd = map(int, found.groups()) if found else divmod(number, 100)
+    millions, count = divmod(2 * exposure_id + readout_unit, 1_000_000)
+    return f"HSC{chr(ord('A') + millions % 26)}{count:06d}{ccd:02d}"
 
 
 def _sexagesimal(value: float, decimals: int, plus: str) -> str:

@@ -8,7 +8,7 @@ from functools import cache
 import astropy.units as u
 import numpy as np
 import pytest
-from astro_metadata_translator import PROPERTIES, DecamTranslator, MegaPrimeTranslator, ObservationInfo
+from astro_metadata_translator import PROPERTIES, DecamTranslator, HscTranslator, MegaPrimeTranslator, ObservationInfo
 from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.io import fits
 from astropy.time import Time
@@ -19,6 +19,7 @@ from tests.truesky.render import fields
 from tests.truesky.render.fields import MISSION
 from tests.truesky.render.products import lsst_translator
 from tests.truesky.render.products import test_tools as tools
+from truesky.render.camera import bands
 from truesky.render.camera.detectors import detectors
 from truesky.render.products import camera_cards, exposure_files, fits_files, raw_pointing
 from truesky.request.accuracy import SURVEY
@@ -111,12 +112,14 @@ CCDS = {
     ("lsstcam", "R01_S00"): (0, "R01_S00"), ("lsstcam", "R22_S11"): (94, "R22_S11"),
 }  # fmt: skip
 CAMERAS = tuple(dict.fromkeys(camera for camera, _ in CCDS))
+# Rafts (row, column) of LSSTCam without science sensors.
+CORNERS = ((0, 0), (0, 4), (4, 0), (4, 4))
 # Instrument, filter and observation identifier.
 WORDS = {
     "decam": ("DECam", "r DECam SDSS c0002 6415.0 1480.0", "ct4m20250818t071200"),
     "hsc": ("HSC", "HSC-Z", "HSCE00134567"),
     "megacam": ("MegaPrime", "r.MP9602", "134567"),
-    "lsstcam": ("LSSTCam", "r_57", "MC_S_20250817_003495"),
+    "lsstcam": ("LSSTCam", "r_57", "MC_S_20250817_030727"),
 }
 # Properties that the translator of a camera reads from no keyword.
 UNKNOWN = {"decam": {"altaz_end"}, "hsc": {"altaz_end"}, "megacam": {"altaz_end", "detector_group"}, "lsstcam": set()}
@@ -209,7 +212,7 @@ def test_translated_properties_are_those_of_the_plan(camera, name):
     assert found.boresight_airmass == row.airmass
     assert (found.detector_num, found.detector_unique_name) == CCDS[camera, name]
     assert (found.instrument, found.physical_filter, found.observation_id) == WORDS[camera]
-    assert found.exposure_id == found.visit_id == (2025081703495 if camera == "lsstcam" else row.exposure_id)
+    assert found.exposure_id == found.visit_id == (2025081730727 if camera == "lsstcam" else row.exposure_id)
     assert found.object == header_of(one)["OBJECT"]
     # DECam and MegaPrime cannot be rotated.
     angle = {"decam": 90.0, "megacam": 0.0}.get(camera, row.position_angle)
@@ -269,10 +272,41 @@ def test_detector_numbers_do_not_depend_on_the_layout():
     assert translated(frame("hsc", "0_30")).detector_num == 16
 
 
+def test_every_ccd_has_the_number_of_the_observatory():
+    """All CCDs of DECam and HSC that work, and all of MegaCam and LSSTCam, whose numbers follow from their names."""
+    rafts = [f"R{row}{column}" for row in range(5) for column in range(5) if (row, column) not in CORNERS]
+    numbers = {
+        "decam": {name: number - 1 for number, name in DecamTranslator.detector_names.items()} | {"N30": 60},
+        "hsc": {name: number for number, name in enumerate(HscTranslator._DETECTOR_NUM_TO_UNIQUE_NAME)},
+        "megacam": {f"ccd{number:02d}": number for number in range(40)},
+        "lsstcam": {f"{raft}_S{n // 3}{n % 3}": 9 * i + n for i, raft in enumerate(rafts) for n in range(9)},
+    }
+    for camera, expected in numbers.items():
+        one = frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera))
+        for detector in detectors(camera, MISSION):
+            assert camera_cards._detector_number(replace(one, detector=detector)) == expected[detector.name]
+
+
+def test_sensors_of_a_users_layout_may_have_any_name(monkeypatch):
+    one = frame("lsstcam", "R22_S11")
+    spare = replace(one.detector, name="spare")
+    monkeypatch.setattr(camera_cards.detectors, "detectors", lambda camera, mission: (spare,))
+    cards = {key: value for key, value, _ in camera_cards.cards(replace(one, detector=spare))}
+    assert [cards[key] for key in ("RAFTBAY", "CCDSLOT", "CHIPID", "DETNUM")] == ["", "spare", "spare", 189]
+
+
+def test_identifiers_of_hsc_images_are_those_of_real_headers():
+    """Real images of two exposures, 904024 and 40900, which are the first of two numbers for an exposure each."""
+    assert camera_cards._frame_identifier(904_024 // 2, "1_12", 50) == "HSCA90402512"
+    assert camera_cards._frame_identifier(40_900 // 2, "1_07", 37) == "HSCA04090107"
+
+
 def test_identifiers_of_hsc_images_differ():
-    found = {camera_cards._frame_identifier(n, ccd) for n in (0, 1, 2, 499_999, 500_000) for ccd in range(112)}
-    assert len(found) == 5 * 112
+    names = [detector.name for detector in detectors("hsc", MISSION)]
+    found = {camera_cards._frame_identifier(n, name, 0) for n in (0, 1, 2, 499_999, 500_000) for name in names}
+    assert len(found) == 5 * len(names)
     assert all(re.fullmatch(r"HSC[A-Z]\d{8}", text) for text in found)
+    assert camera_cards._frame_identifier(3, "spare", 112) == "HSCA00000712"
 
 
 @pytest.mark.parametrize(
@@ -290,7 +324,41 @@ def test_sexagesimal_numbers(value, decimals, plus, text):
 
 def test_lsst_counts_exposures_of_a_night_in_15_bits():
     header = header_of(frame("lsstcam", "R22_S11", exposure_id=1_200_003))
-    assert (header["SEQNUM"], header["OBSID"]) == (20355, "MC_S_20250817_020355")
+    assert (header["SEQNUM"], header["OBSID"]) == (26067, "MC_S_20250817_026067")
+
+
+# Nights and SEQNUM for which obs_lsst corrects headers of LSSTCam (translators/lsstCam.py, fix_header): position angle,
+# shutter, filter z instead of y, filter i.
+CORRECTED = {20250422: (0, 250), 20250705: (1, 736), 20250715: (205, 1218), 20250609: (76, 578), 20250819: (4, 1052)}
+
+
+@pytest.mark.parametrize("exposure_id", [0, 1, 300, 22_767, 22_768, 100_000])
+def test_lsst_exposures_are_not_mistaken_for_real_ones(exposure_id):
+    number = header_of(frame("lsstcam", "R22_S11", exposure_id=exposure_id))["SEQNUM"]
+    assert all(not first <= number <= last for first, last in CORRECTED.values())
+    assert 10_000 <= number < 2**15
+
+
+# Filters of the passbands in obs_decam, obs_subaru, obs_cfht and obs_lsst, which HSC spells in capitals. HSC has the
+# filters r and i of 2016 (R2, I2), and MegaCam the filters u and r of 2015.
+FILTERS = {
+    "des_g": "g DECam SDSS c0001 4720.0 1520.0", "des_r": "r DECam SDSS c0002 6415.0 1480.0",
+    "des_i": "i DECam SDSS c0003 7835.0 1470.0", "des_z": "z DECam SDSS c0004 9260.0 1520.0",
+    "hsc_g": "HSC-G", "hsc_r": "HSC-R2", "hsc_i": "HSC-I2", "hsc_z": "HSC-Z", "hsc_y": "HSC-Y",
+    "cfis_u": "u.MP9302", "cfis_r": "r.MP9602",
+    "lsst_u": "u_24", "lsst_g": "g_6", "lsst_r": "r_57", "lsst_i": "i_39", "lsst_z": "z_20", "lsst_y": "y_10",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_every_band_has_the_filter_of_the_observatory(camera):
+    one = frame(camera, *(name for key, name in list(CCDS)[::2] if key == camera))
+    names = {
+        band: translated(replace(one, exposure=replace(one.exposure, band=band))).physical_filter
+        for band in bands.ground_bands(camera, MISSION)
+    }
+    assert names == {band: FILTERS[band.replace("lsst2016", "lsst")] for band in names}
+    assert names
 
 
 def test_filters_of_users_keep_their_names():
