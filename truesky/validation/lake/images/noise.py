@@ -42,10 +42,11 @@ def check(context: FrameContext) -> list[Row]:
 def _overscan_rows(context: FrameContext) -> list[Row]:
     rows = []
     for amplifier in context.frame.amplifiers:
-        # Skip amplifiers without simulated read noise: all pixels of their overscan have nearly the same whole number.
-        if amplifier.samples and np.isfinite(amplifier.noise) and amplifier.header_read_noise > 0.0:
+        # Skip amplifiers whose read noise the request switches off: all pixels of their overscan have nearly the same
+        # whole number.
+        if amplifier.samples and np.isfinite(amplifier.noise) and amplifier.overscan_read_noise > 0.0:
             # Add the noise of rounding to whole ADU, which the read noise in the header does not include.
-            expected = np.hypot(amplifier.header_read_noise, amplifier.gain / np.sqrt(12.0))
+            expected = np.hypot(amplifier.overscan_read_noise, amplifier.gain / np.sqrt(12.0))
             value = amplifier.noise / expected
             error = value / np.sqrt(amplifier.samples)
             rows.append(

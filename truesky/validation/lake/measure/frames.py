@@ -39,6 +39,8 @@ _UNCERTAIN_POINTING = "CSYER1"
 # Fraction of the overscan columns that is not used, half of it at each side: columns next to the image contain charge
 # released by traps.
 _SKIPPED = 0.5
+# Beginning of a card EFFECTn of a frame in which the request switches read noise off, also in prescan and overscan.
+_WITHOUT_READ_NOISE = "read_noise: off (forced)"
 # Differences between neighbours in the overscan are outliers beyond this number of standard deviations.
 _CLIP = 5.0
 
@@ -60,11 +62,13 @@ class Amplifier:
     noise : float
         rms noise of the overscan, e-; NaN if there is no overscan.
     header_read_noise : float
-        rms read noise in the header, e-.
+        rms read noise of the pixels in the header, e-; 0 if light hides it.
     samples : int
         Number of pixels of the overscan that were used, 0 without overscan.
     saturation_level : float
         Pixels at or above this level are saturated, e- above the level without light.
+    overscan_read_noise : float
+        rms read noise of the overscan in the header, e-; 0 if the request switches it off.
     """
 
     name: str
@@ -75,6 +79,7 @@ class Amplifier:
     header_read_noise: float
     samples: int
     saturation_level: float
+    overscan_read_noise: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,8 +270,9 @@ def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
 def _numbered_amplifier(header: dict[str, Any], array: Array, n: int) -> _AmplifierData:
     """Return amplifier number `n` (from 1) of an array that contains several; keywords end with this number."""
     cards = {**header, "GAIN": header[f"GAIN{n}"]}
-    if f"RDN{n}" in header and header.get("RDNDRAWN", 1.0) > 0.0:
-        cards["RDNDRAWN"] = header[f"RDN{n}"]
+    if f"RDN{n}" in header:
+        cards["RDNOISE"] = header[f"RDN{n}"]
+        cards["RDNDRAWN"] = header[f"RDN{n}"] if header.get("RDNDRAWN", 1.0) > 0.0 else 0.0
     bias = array[section(header[f"BSEC{n}"])]
     place = section(header[f"CSEC{n}"])
     return place, array[section(header[f"DSEC{n}"])], bias if bias.size else None, cards, str(header[f"AMP{n}"])
@@ -287,7 +293,20 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
         noise = float(np.std(step) / 2.0) * gain if step.size else np.nan
         samples = overscan.size
     saturation_level = (float(cards["SATURATE"]) - (level if cards.get("BUNIT", "adu") != "electron" else 0.0)) * gain
-    return Amplifier(name, ccd, gain, level, noise, read_noise, samples, saturation_level)
+    return Amplifier(
+        name, ccd, gain, level, noise, read_noise, samples, saturation_level, _overscan_read_noise(cards)
+    )  # fmt: skip
+
+
+def _overscan_read_noise(cards: Mapping[str, Any]) -> float:
+    """Return the read noise (e-) that the overscan of an amplifier has according to its header.
+
+    It is that of the detector, also if light hides it in the pixels, unless the request switches read noise off.
+    """
+    effects = (str(value) for key, value in cards.items() if key.startswith("EFFECT"))
+    if any(effect.startswith(_WITHOUT_READ_NOISE) for effect in effects):
+        return 0.0
+    return float(cards.get("RDNOISE", cards["RDNDRAWN"]))
 
 
 def section(text: str) -> tuple[slice, slice]:
