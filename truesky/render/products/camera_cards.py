@@ -46,6 +46,8 @@ _HUMIDITY_TEXT = "[percent] humidity (no meaning in a simulation)"
 _FIRST_SEQUENCE_NUMBER = 10_000
 # Number of different values of SEQNUM, which obs_lsst stores in 15 bits.
 _SEQUENCE_NUMBERS = 32_768 - _FIRST_SEQUENCE_NUMBER
+# First and last night (DAYOBS) in which ROTPA of LSSTCam is 90 deg too large in real headers. obs_lsst subtracts 90 deg.
+_ROTATED_NIGHTS = ("20250302", "20250421")
 # Names of CCDs of Hyper Suprime-Cam: number of the readout unit, 0 or 1, and number of the CCD in it.
 _HSC_CCD = re.compile(r"([01])_(\d\d)")
 # Image types for which the shutter opens.
@@ -223,7 +225,10 @@ def _megacam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
 
 
 def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...]:
-    """Return the cards of an LSSTCam sensor; ROTPA is the position angle to which the rotator turns the camera."""
+    """Return the cards of an LSSTCam sensor; ROTPA is the position angle to which the rotator turns the camera.
+
+    ROTPA is 90 deg larger in nights in which it is so in real headers, because the observatory's software subtracts it.
+    """
     # A sensor of a user's layout may have a name without a raft.
     exposure, (raft, _, sensor) = rendered.exposure, rendered.detector.name.rpartition("_")
     kind, number = rendered.detector.kind.upper(), _detector_number(rendered)
@@ -249,7 +254,7 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("DATE-END", conditions.end, "end of the exposure"),
         ("MJD-END", conditions.end_mjd, "[d] end of the exposure"),
         ("TRACKSYS", "RADEC", "coordinates that the telescope tracks"),
-        ("ROTPA", conditions.position_angle, "[deg] position angle of y, north through east"),
+        ("ROTPA", *_rotation(conditions.position_angle, night)),
         ("ROTCOORD", "sky", "reference of ROTPA"),
         ("RASTART", conditions.ra, "[deg] boresight RA at exposure start"),
         ("DECSTART", conditions.dec, "[deg] boresight Dec at exposure start"),
@@ -315,6 +320,15 @@ def _detector_number(rendered: RenderedDetector) -> int:
 def _sequence_number(rendered: RenderedDetector) -> int:
     """Return the number of an LSSTCam exposure in its night."""
     return _FIRST_SEQUENCE_NUMBER + rendered.exposure.exposure_id % _SEQUENCE_NUMBERS
+
+
+def _rotation(position_angle: float, night: str) -> tuple[float, str]:
+    """Return value and comment of the card ROTPA of an LSSTCam exposure in a night (DAYOBS)."""
+    text = "[deg] position angle of y, north through east"
+    if not _ROTATED_NIGHTS[0] <= night <= _ROTATED_NIGHTS[1]:
+        return position_angle, text
+    # obs_lsst does not correct an angle of 0.
+    return (position_angle + 90.0) % 360.0 or 360.0, "[deg] position angle of y + 90 in this night"
 
 
 def _frame_identifier(exposure_id: int, name: str, number: int) -> str:

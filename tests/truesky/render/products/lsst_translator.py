@@ -47,6 +47,14 @@ class LsstCamTranslator(FitsTranslator):
     def observing_date_to_offset(cls, observing_date):
         return TimeDelta(43200.0, format="sec", scale="tai")
 
+    @classmethod
+    def fix_header(cls, header, instrument, obsid, filename=None):
+        """Correct the rotation of the first nights, as obs_lsst does."""
+        is_wrong = 20250301 < int(header["DAYOBS"]) < 20250422 and bool(header["ROTPA"])
+        if is_wrong:
+            header["ROTPA"] -= 90.0
+        return is_wrong
+
     def to_observing_day(self):
         return int(self._header["DAYOBS"])
 

@@ -339,6 +339,20 @@ def test_lsst_exposures_are_not_mistaken_for_real_ones(exposure_id):
     assert 10_000 <= number < 2**15
 
 
+# Noon 12 h behind TAI, at which the nights of 2 March and 22 April 2025 begin.
+NIGHTS = 60736.5, 60787.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 12.0, 270.0])
+@pytest.mark.parametrize("mjd", [NIGHTS[0] - 0.01, NIGHTS[0] + 0.01, NIGHTS[1] - 0.01, NIGHTS[1] + 0.01])
+def test_lsst_rotations_are_right_after_the_corrections_of_obs_lsst(mjd, angle):
+    """Its corrections of real headers of the first nights also apply to simulated frames."""
+    one = frame("lsstcam", "R22_S11", mjd=mjd, position_angle=angle)
+    day = int(header_of(one)["DAYOBS"])
+    assert (20250301 < day < 20250422) == (NIGHTS[0] < mjd < NIGHTS[1])
+    assert translated(one).boresight_rotation_angle.wrap_at("360d").deg == pytest.approx(angle, abs=1e-9)
+
+
 # Filters of the passbands in obs_decam, obs_subaru, obs_cfht and obs_lsst, which HSC spells in capitals. HSC has the
 # filters r and i of 2016 (R2, I2), and MegaCam the filters u and r of 2015.
 FILTERS = {
