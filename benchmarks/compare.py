@@ -25,8 +25,8 @@ from pathlib import Path
 from benchmarks import _subjects, report
 from benchmarks._detectors import ROOT
 
-# File that a commit must have, because benchmarks import the library from it. Without it, Python would import the library
-# of this working copy if that is installed, and compare this working copy with itself.
+# File that a commit must have, because benchmarks import the library from it. Without it, Python would import the
+# library of this working copy if that is installed, and compare this working copy with itself.
 _LIBRARY = Path("truesky", "render", "__init__.py")
 _DEFAULTS = ("vis", "nisp_p", "nisp_s", "lsst", "fluxes", "catalogue")
 
@@ -47,8 +47,8 @@ def checkout(commit: str) -> Iterator[Path]:
         try:
             if not (folder / _LIBRARY).is_file():
                 raise SystemExit(
-                    f"benchmarks.compare: commit {commit}: it has no package truesky.render (the library had another name "
-                    "then), which the benchmarks import: choose a later commit"
+                    f"benchmarks.compare: commit {commit}: it has no package truesky.render (the library had another "
+                    "name then), which the benchmarks import: choose a later commit"
                 )
             shutil.rmtree(folder / "benchmarks", ignore_errors=True)
             shutil.copytree(ROOT / "benchmarks", folder / "benchmarks")

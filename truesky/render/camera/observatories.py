@@ -51,7 +51,7 @@ _DECAM_FILTERS = {
     "des_i": "i DECam SDSS c0003 7835.0 1470.0",
     "des_z": "z DECam SDSS c0004 9260.0 1520.0",
 }
-# The passbands r and i are those of the filters of 2016.
+# The passbands r and i are curves of the filters of 2016.
 _HSC_FILTERS = {f"hsc_{name[0]}": f"HSC-{name}" for name in ("g", "r2", "i2", "z", "y")}
 _MEGACAM_FILTERS = {"cfis_u": "u.MP9302", "cfis_r": "r.MP9602"}
 _LSSTCAM_FILTERS = {

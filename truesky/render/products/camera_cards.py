@@ -41,12 +41,12 @@ _PROGRAM = "truesky"
 _PROGRAM_TEXT = "program (no meaning in a simulation)"
 _FOCUS_TEXT = "focus (no meaning in a simulation)"
 _HUMIDITY_TEXT = "[percent] humidity (no meaning in a simulation)"
-# Smallest SEQNUM, the number of an LSSTCam exposure in its night. No real night has so many exposures, so that simulated
-# exposures have other identifiers than real ones, and obs_lsst does not apply its corrections of real headers.
+# Smallest SEQNUM, the number of an LSSTCam exposure in its night. Real nights have fewer exposures. Simulated exposures
+# therefore have other identifiers than real ones, and obs_lsst does not apply its corrections of real filters to them.
 _FIRST_SEQUENCE_NUMBER = 10_000
 # Number of different values of SEQNUM, which obs_lsst stores in 15 bits.
 _SEQUENCE_NUMBERS = 32_768 - _FIRST_SEQUENCE_NUMBER
-# First and last night (DAYOBS) in which ROTPA of LSSTCam is 90 deg too large in real headers. obs_lsst subtracts 90 deg.
+# First and last night (DAYOBS) in which ROTPA of real LSSTCam headers is 90 deg too large. obs_lsst subtracts 90 deg.
 _ROTATED_NIGHTS = ("20250302", "20250421")
 # Names of CCDs of Hyper Suprime-Cam: number of the readout unit, 0 or 1, and number of the CCD in it.
 _HSC_CCD = re.compile(r"([01])_(\d\d)")
@@ -177,7 +177,7 @@ def _hsc(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...
     return (
         ("DATA-TYP", _image_type(rendered), "type of observation"),
         ("EXP-ID", f"HSCE{exposure.exposure_id:08d}", "exposure identifier"),
-        ("FRAMEID", _frame_identifier(exposure.exposure_id, rendered.detector.name, number), "identifier of this image"),
+        ("FRAMEID", _frame_identifier(exposure.exposure_id, rendered.detector.name, number), "image identifier"),
         ("DET-ID", number, "CCD number, from 0"),
         ("T_CCDSN", f"{number:03d}", "serial number (simulation: CCD number)"),
         ("FILTER01", filters.get(exposure.band, exposure.band), "filter"),
@@ -338,8 +338,8 @@ def _frame_identifier(exposure_id: int, name: str, number: int) -> str:
     exposure plus the number of the readout unit, 0 or 1. The letter counts millions. A CCD of a user's layout, whose
     `name` does not contain these numbers, has the last two digits of its `number` and the digits before them.
     """
-    found = _HSC_CCD.fullmatch(name)
-    readout_unit, ccd = map(int, found.groups()) if found else divmod(number, 100)
+    match = _HSC_CCD.fullmatch(name)
+    readout_unit, ccd = map(int, match.groups()) if match else divmod(number, 100)
     millions, count = divmod(2 * exposure_id + readout_unit, 1_000_000)
     return f"HSC{chr(ord('A') + millions % 26)}{count:06d}{ccd:02d}"
 
