@@ -22,6 +22,7 @@ from tests.truesky.render.products import test_tools as tools
 from truesky.render.camera import bands
 from truesky.render.camera.detectors import detectors
 from truesky.render.products import camera_cards, exposure_files, fits_files, raw_pointing
+from truesky.render.sky import observatory
 from truesky.request.accuracy import SURVEY
 
 # Some of the numbers of DECam's CCDs.
@@ -243,6 +244,25 @@ def test_translated_place_and_weather(camera):
     assert found.pressure.to_value("hPa") == pytest.approx(PRESSURES[camera], rel=0.01)
     assert found.temperature.to_value("deg_C", equivalencies=u.temperature()) == pytest.approx(7.0)
     assert found.relative_humidity == 40.0
+
+
+# Real headers: boresight, start (UTC; LSSTCam: TAI), altitude and azimuth.
+DIRECTIONS = {
+    "decam": (42.81996, -0.00158, "2013-09-01T06:02:55.754", 90.0 - 50.46, 61.24),
+    "hsc": (320.74993, 0.50002, "2013-11-02T06:15:55.908", 63.0436, 226.6892),
+    "megacam": (135.40942, -2.4, "2008-11-01T14:33:32.4", 52.02, 122.34),
+    "lsstcam": (320.6, -17.94, "2025-06-10T07:31:55.280", 67.99, 60.27),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_directions_are_those_of_real_headers(camera):
+    """The error is 0.2 deg of a great circle, because precession is neglected."""
+    ra, dec, start, altitude, azimuth = DIRECTIONS[camera]
+    mjd = Time(start, scale="tai" if camera == "lsstcam" else "utc").utc.mjd
+    site = observatory.Site.from_mission(f"ext.{camera}", MISSION)
+    up, along = observatory.altitude_and_azimuth(ra, dec, mjd, site)
+    assert SkyCoord(along, up, unit="deg").separation(SkyCoord(azimuth, altitude, unit="deg")).deg < 0.2
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
