@@ -137,5 +137,5 @@ def move_exposure(exposure: ExposureRow, detector: Detector, place: tuple[float,
         The new exposure, in which the columns of the detector point north at this place. The y axis of the focal plane
         points south if the detector is mounted upside down.
     """
-    ra, dec, angle = boresight_for(detector, *place, -detector.rotation)
+    ra, dec, angle = boresight_for(detector, *place, -detector.row_angle)
     return replace(exposure, ra=ra, dec=dec, position_angle=angle)

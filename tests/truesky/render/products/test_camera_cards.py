@@ -211,8 +211,9 @@ def test_translated_properties_are_those_of_the_plan(camera, name):
     assert (found.instrument, found.physical_filter, found.observation_id) == WORDS[camera]
     assert found.exposure_id == found.visit_id == (2025081703495 if camera == "lsstcam" else row.exposure_id)
     assert found.object == header_of(one)["OBJECT"]
-    # DECam and MegaPrime cannot be rotated.
-    angle = {"decam": 90.0, "megacam": 0.0}.get(camera, row.position_angle)
+    # DECam and MegaPrime cannot be rotated. The y axis of the pipelines of DECam and HSC points east and west (90 and
+    # 270 deg) where the position angle is 0.
+    angle = {"decam": 90.0, "megacam": 0.0, "hsc": 270.0 + row.position_angle}.get(camera, row.position_angle)
     assert found.boresight_rotation_angle.deg == pytest.approx(angle, abs=1e-9)
 
 
