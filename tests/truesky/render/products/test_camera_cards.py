@@ -84,10 +84,12 @@ def test_the_mosaic_is_of_both_amplifiers(decam):
 
 
 def test_amplifiers_are_read_from_their_own_sides(decam):
+    """In headers of raw frames of S1, AMPSECA is [2048:1025,4096:1] and AMPSECB is [1:1024,4096:1]."""
     _, header, _ = decam
+    assert header["DETPOS"].startswith("S")
     (a, rows), (b, _) = (ends(header[f"AMPSEC{letter}"]) for letter in "AB")
-    assert a[0] < a[1] < b[1] < b[0]
-    assert rows[0] < rows[1]
+    assert b[0] < b[1] < a[1] < a[0]
+    assert rows[0] > rows[1]
 
 
 def test_values_of_each_amplifier(decam):
