@@ -135,7 +135,7 @@ def test_electrons_are_what_the_raw_frame_was_before_it_was_read(files):
 def test_headers_are_in_the_words_of_the_survey(files, way):
     header = fits.getheader(files[way])
     assert (header["RAFTBAY"], header["CCDSLOT"], header["DETNUM"]) == ("R22", "S11", 94)
-    assert header["LSST_NUM"] == "E2V-094"
+    assert header["LSST_NUM"] == "E2V-CCD250-382"
     assert (header["IMGTYPE"], header["TIMESYS"], header["EXPTIME"]) == ("SKYEXP", "TAI", header["SHUTTIME"])
     assert (header["ROTPA"], header["AMSTART"]) == (33.0, 1.25)
     assert (header["RASTART"], header["DECSTART"]) == (header["RA"], header["DEC"])
