@@ -94,8 +94,8 @@ class Row:
     location : str
         File and line number, for error messages.
     values : mapping of str to str
-        Entries by name of the column, in the order of `COLUMNS` and `OPTIONAL_COLUMNS`, without blanks around them. Entries of columns of
-        whole numbers consist of digits only.
+        Entries by name of the column, in the order of `COLUMNS` and `OPTIONAL_COLUMNS`, without blanks around them.
+        Entries of columns of whole numbers consist of digits only.
     """
 
     location: str
@@ -193,7 +193,8 @@ def read_rows(folder: Path, file: str) -> list[Row]:
         if any(len(value) > _MAX_TEXT_LENGTH or not value.isprintable() for value in cells):
             raise BadInput(f"{location}: a text is longer than {_MAX_TEXT_LENGTH} or has unprintable characters")
         texts = dict(zip(header, cells, strict=True))
-        rows.append(_with_integers(Row(location, {column: texts[column] for column in (*expected, *optional) if column in texts})))
+        values = {column: texts[column] for column in (*expected, *optional) if column in texts}
+        rows.append(_with_integers(Row(location, values)))
     if not rows:
         raise BadInput(f"{path_text}: has no rows")
     return rows

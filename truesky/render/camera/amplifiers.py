@@ -3,7 +3,7 @@
 In most raw files the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. The
 prescan and overscan columns of amplifiers in the left half of the detector lie to the left of all pixels, the other
 ones to the right. Prescan and overscan rows lie below or above all pixels, as in the files of DECam and MegaCam: on the
-side away from the readout if one row of amplifiers covers the detector. In interleaved raw files, such as those of
+side away from the readout if one row of amplifiers covers the detector. In interleaved raw files, such as the files of
 Hyper Suprime-Cam, prescan and overscan of each amplifier lie next to its own pixels. The WCS is then valid for the
 pixels after prescan and overscan have been cut out.
 
@@ -50,19 +50,19 @@ _OPPOSITE_END_DISTANCE = 2.0
 _BEFORE, _PIXELS, _AFTER = range(3)
 
 
-class _Segment(NamedTuple):
-    """A part of an amplifier along one axis: `count` pixels from `source` in its plane and from `target` in the file.
+class _Part(NamedTuple):
+    """A part of an amplifier along one axis: `size` pixels from `source` in its plane and from `target` in the file.
 
     The plane has the axes of the detector. All numbers count from 0.
     """
 
     source: int
     target: int
-    count: int
+    size: int
 
 
 # Prescan, pixels and overscan.
-_Segments = tuple[_Segment, _Segment, _Segment]
+_Parts = tuple[_Part, _Part, _Part]
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +217,7 @@ class Layout:
 
     @property
     def data_section(self) -> Section | None:
-        """Rectangle of the raw file that contains the detector's pixels; None if scans lie between its columns or rows."""
+        """Rectangle of the raw file with the detector's pixels; None if prescan or overscan lies between them."""
         sections = [self.amplifier_data_section(number) for number in range(len(self.amplifiers))]
         shifts = {(s.x - a.pixels.x, s.y - a.pixels.y) for s, a in zip(sections, self.amplifiers, strict=True)}
         return Section(*shifts.pop(), self.nx, self.ny) if len(shifts) == 1 else None
@@ -265,8 +265,10 @@ class Layout:
 
         `number` is the index of the amplifier. Each part is `_BEFORE` (prescan), `_PIXELS` or `_AFTER` (overscan).
         """
-        columns, rows = (segments[part] for segments, part in zip(self._segments(number), (of_columns, of_rows), strict=True))
-        return Section(columns.target, rows.target, columns.count, rows.count)
+        columns, rows = (
+            segments[part] for segments, part in zip(self._segments(number), (of_columns, of_rows), strict=True)
+        )
+        return Section(columns.target, rows.target, columns.size, rows.size)
 
     def to_detector_axes(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
         """Flip an amplifier's plane from readout order (pixel [0, 0] read first) to the axes of the detector.
@@ -296,8 +298,8 @@ class Layout:
             columns, rows = self._segments(number)
             for row in rows:
                 for column in columns:
-                    block = flipped[row.source : row.source + row.count, column.source : column.source + column.count]
-                    out[row.target : row.target + row.count, column.target : column.target + column.count] = block
+                    block = flipped[row.source : row.source + row.size, column.source : column.source + column.size]
+                    out[row.target : row.target + row.size, column.target : column.target + column.size] = block
         return out
 
     @property
@@ -306,7 +308,7 @@ class Layout:
         places = [amplifier.pixels for amplifier in self.amplifiers]
         return sorted({place.x for place in places}), sorted({place.y for place in places})
 
-    def _segments(self, number: int) -> tuple[_Segments, _Segments]:
+    def _segments(self, number: int) -> tuple[_Parts, _Parts]:
         """Return prescan, pixels and overscan of an amplifier along its columns, and the same along its rows.
 
         `number` is the index of the amplifier.
@@ -321,19 +323,19 @@ class Layout:
                 _interleaved_segments(*of_rows, j * (self.height + self.scan_rows)),
             )
         # Numbers of columns and rows of amplifiers whose prescan and overscan lie to the left of or below all pixels.
-        left, below = len(across) // 2, len(up) // 2
+        n_left, n_below = len(across) // 2, len(up) // 2
         if len(up) == 1 and all(a.read_top for a in self.amplifiers):
-            below = 1
+            n_below = 1
         return (
             _outer_segments(
                 *of_columns,
-                left * self.scan_columns + pixels.x,
-                i * self.scan_columns + (self.nx if i >= left else 0),
+                n_left * self.scan_columns + pixels.x,
+                i * self.scan_columns + (self.nx if i >= n_left else 0),
             ),
             _outer_segments(
                 *of_rows,
-                below * self.scan_rows + pixels.y,
-                j * self.scan_rows + (self.ny if j >= below else 0),
+                n_below * self.scan_rows + pixels.y,
+                j * self.scan_rows + (self.ny if j >= n_below else 0),
             ),
         )
 
@@ -343,33 +345,32 @@ def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> 
     return plane[:: -1 if amplifier.read_top else 1, :: -1 if amplifier.read_right else 1]
 
 
-def _outer_segments(counts: tuple[int, int, int], is_flipped: bool, pixels_start: int, scan_start: int) -> _Segments:
+def _outer_segments(counts: tuple[int, int, int], is_flipped: bool, pixels_start: int, scan_start: int) -> _Parts:
     """Return where prescan, pixels and overscan of an amplifier are along one axis, in its plane and in the raw file.
 
     `counts` are their lengths. `is_flipped` is True if the last pixel of the plane, in the axes of the detector, is
     read first. `pixels_start` is the position of the first pixel in the file, and `scan_start` the position of the
     first prescan or overscan pixel. All prescan and overscan pixels lie next to each other.
     """
-    before, pixels, after = _interleaved_segments(counts, is_flipped, 0)
-    scans = (scan_start + after.count, scan_start) if is_flipped else (scan_start, scan_start + before.count)
+    prescan, pixels, overscan = _interleaved_segments(counts, is_flipped, 0)
     return (
-        before._replace(target=scans[0]),
+        prescan._replace(target=scan_start + (overscan.size if is_flipped else 0)),
         pixels._replace(target=pixels_start),
-        after._replace(target=scans[1]),
+        overscan._replace(target=scan_start + (0 if is_flipped else prescan.size)),
     )
 
 
-def _interleaved_segments(counts: tuple[int, int, int], is_flipped: bool, start: int) -> _Segments:
+def _interleaved_segments(counts: tuple[int, int, int], is_flipped: bool, start: int) -> _Parts:
     """Return the same as `_outer_segments` if all pixels of the amplifier lie next to each other in the raw file.
 
     `start` is the position of the first one in the file.
     """
     n_before, pixels, n_after = counts
     sources = (n_after + pixels, n_after, 0) if is_flipped else (0, n_before, n_before + pixels)
-    before, inside, after = (
-        _Segment(source, start + source, count) for source, count in zip(sources, counts, strict=True)
+    prescan, inside, overscan = (
+        _Part(source, start + source, size) for source, size in zip(sources, counts, strict=True)
     )
-    return before, inside, after
+    return prescan, inside, overscan
 
 
 @lru_cache(maxsize=256)

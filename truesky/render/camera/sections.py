@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lake_schema.arrays import Int
+from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector
 
 
@@ -134,8 +135,8 @@ def to_mosaic_section(
     Positions are rounded to whole pixels, an error of up to half a pixel, and rotations to quarter turns.
     """
     mosaic = _mosaic_axes(detectors)
-    directions = mosaic.T @ _quarter_axes(_orientation(detector))
-    if directions[0, 0] == 0:
+    directions = matrices.matmul(mosaic.T, _quarter_axes(_orientation(detector)))
+    if directions[0, 0] == 0.0:
         return None
     x_offset, y_offset = (
         round(position - first)
@@ -143,9 +144,9 @@ def to_mosaic_section(
     )
     columns = (section.x + 1, section.x + section.nx)[:: steps[0]]
     rows = (section.y + 1, section.y + section.ny)[:: steps[1]]
-    if directions[0, 0] < 0:
+    if directions[0, 0] < 0.0:
         columns = detector.nx + 1 - columns[0], detector.nx + 1 - columns[1]
-    if directions[1, 1] < 0:
+    if directions[1, 1] < 0.0:
         rows = detector.ny + 1 - rows[0], detector.ny + 1 - rows[1]
     return f"[{x_offset + columns[0]}:{x_offset + columns[1]},{y_offset + rows[0]}:{y_offset + rows[1]}]"
 
@@ -190,7 +191,7 @@ def _mosaic_axes(detectors: Sequence[Detector]) -> Int:
 
 def _sides(detector: Detector, mosaic: Int) -> tuple[int, int]:
     """Return how many columns and rows of a mosaic, given by its axes, a detector covers."""
-    is_along = (mosaic.T @ _quarter_axes(_orientation(detector)))[0, 0] != 0
+    is_along = matrices.matmul(mosaic.T, _quarter_axes(_orientation(detector)))[0, 0] != 0.0
     return (detector.nx, detector.ny) if is_along else (detector.ny, detector.nx)
 
 

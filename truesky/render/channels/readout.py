@@ -442,7 +442,7 @@ def _amplifier_pixels(read: Sequence[Image]) -> Array:
 
 
 def _join_sections(header: Mapping[str, Any], array: Array, convert: Callable[[Array, int], Array]) -> Array:
-    """Join the pixels of all amplifiers in an array, by its cards DSECn and CSECn, to those of the detector [ny, nx].
+    """Join the pixels of all amplifiers in an array, by its cards DSECn and CSECn, to an image of the detector.
 
     `convert` is a function of the pixels of an amplifier and its number from 1, which returns the pixels to join. The
     result is 0 in pixels that no amplifier reads.

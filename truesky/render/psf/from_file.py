@@ -9,9 +9,10 @@ each plane is the fraction of the light that it contains. The header cards are:
 - PIXEL: T if the PSF images are already averaged over the detector's pixel; by default F.
 
 The planes of a cube have the axes of the focal plane, with x to the right. They are rotated for detectors that are
-mounted rotated, and mirrored for detectors whose rows run in the mirrored direction. A file of PSFEx has the axes and pixels of the detector, includes the average over a pixel, and
-contains polynomials of the position on the detector. Its optional card PSFLIGHT is the fraction of a star's light that
-its images contain, like the sum of a plane in a cube; by default 1. truesky writes this card, PSFEx does not.
+mounted rotated, and mirrored for detectors whose rows run in the mirrored direction. A file of PSFEx has the axes and
+pixels of the detector, includes the average over a pixel, and contains polynomials of the position on the detector. Its
+optional card PSFLIGHT is the fraction of a star's light that its images contain, like the sum of a plane in a cube; by
+default 1. truesky writes this card, PSFEx does not.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from truesky.render.camera import amplifiers, detectors
 from truesky.render.effects.charge import bleeding
 from truesky.render.effects.readout import bias_structure, charge_transfer, crosstalk
 
-# Corners from which the pixels of each amplifier are read (L lower, U upper, L left, R right). obs_decam, obs_subaru and
-# obs_cfht: readoutcorner of the amplifiers, 0 to 3 for LL, LR, UR, UL.
+# Corners from which the pixels of each amplifier are read (L lower, U upper, L left, R right). obs_decam, obs_subaru
+# and obs_cfht: readoutcorner of the amplifiers, 0 to 3 for LL, LR, UR, UL.
 CORNERS = {
     ("decam", "S1"): {"A": "UR", "B": "UL"},
     ("decam", "S29"): {"A": "UR", "B": "UL"},
@@ -27,9 +27,9 @@ CORNERS = {
     ("megacam", "ccd02"): {"A": "LL", "B": "LR"},
     ("megacam", "ccd20"): {"A": "LL", "B": "LR"},
 }  # fmt: skip
-# Pixels, overscan columns, overscan rows and prescan columns of each amplifier in the raw file. S1: DATASECA, BIASSECA,
-# POSTSECA and PRESECA of raw headers. N1: boxes of the amplifiers in obs_decam. HSC: T_EFMN11 and so on, T_OSMN11 and so
-# on in raw headers of CCDs 37 and 50. MegaPrime: DSECA and BSECA of raw headers, without the overscan rows in BSECA.
+# Pixels, overscan columns, overscan rows and prescan columns of each amplifier in the raw file. S1: DATASECA,
+# BIASSECA, POSTSECA and PRESECA of raw headers. N1: boxes of the amplifiers in obs_decam. HSC: T_EFMN11, T_OSMN11 and
+# the like in raw headers of CCDs 37 and 50. MegaPrime: DSECA and BSECA of raw headers, without overscan rows.
 SECTIONS = {
     ("decam", "S1"): (
         ("[1081:2104,51:4146]", "[2105:2154,51:4146]", "[1081:2104,1:50]", "[2155:2160,51:4146]"),
@@ -168,8 +168,9 @@ def test_read_tops_of_segments_are_those_of_corners():
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_raw_files_contain_each_prescan_and_overscan_pixel_next_to_its_own_amplifier(camera):
-    """The raw image in the columns of an amplifier's pixels is the same in the order of the readout: rows before, pixels
-    and rows after them, if one row of amplifiers covers the detector.
+    """In the columns of an amplifier's pixels, rows of the raw image follow one another as they are read.
+
+    This holds if one row of amplifiers covers the detector.
     """
     one = detectors.detectors(camera, MISSION)[0]
     layout = layout_of(camera, one.name, nx=256, ny=192)

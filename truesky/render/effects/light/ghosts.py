@@ -167,20 +167,16 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
     places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
     # Convert the arms from the axes of the focal plane to the axes of the detector.
     arms = tuple(
-        (
-            *map(float, detector.from_focal_plane(x, y)),
-            detector.own_degrees(pupil_value(f"spider{number}.angle", "deg")),
-            reach,
-        )
-        for number, (x, y) in enumerate(places, start=1)
+        (float(x), float(y), detector.own_degrees(pupil_value(f"spider{number}.angle", "deg")), reach)
+        for number, (x, y) in enumerate((detector.from_focal_plane(*place) for place in places), start=1)
     )
-    along, up = map(float, detector.from_focal_plane(0.0, length))
+    along, up = detector.from_focal_plane(0.0, length)
     width = scale * pupil_value("spider_width", "mm")
     ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
     return (
         noticeable_lights(scene, ratio, plate),
         ratio,
-        (along, up),
+        (float(along), float(up)),
         Pupil(radius, hole, arms, width),
     )
 

@@ -95,8 +95,8 @@ def _add_to_scans(planes: Any, sigmas: Any, key: Any, rows: tuple[int, int], col
     """Add Gaussian noise to prescan and overscan of planes [amplifier, row, column], in place.
 
     `sigmas` has the standard deviation of each amplifier in electrons. Pixels of the detector are the rows from
-    `rows[0]` on and below `rows[1]`, and columns likewise. The random bits of a pixel derive from the key `key` and the
-    flat index of the pixel in `planes`.
+    `rows[0]` to `rows[1]` - 1 and the columns from `columns[0]` to `columns[1]` - 1. The random bits of a pixel derive
+    from the key `key` and the flat index of the pixel in `planes`.
     """
     normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
     _, ny, nx = planes.shape
