@@ -11,6 +11,7 @@ contains::
 
 The folder's name is the camera's name. Gain, read noise and full well are given in amplifiers.csv only. Blank values
 in bands.csv: without a curve, truesky's passband of this name is used; without fringes, the band has no fringes.
+Optional columns are flip and serial in layout.csv, and prescan_rows and interleaved in amplifiers.csv.
 Columns may have any order, and lines that begin with ``#`` are comments. ``truesky mission camera FOLDER
 --like decam`` writes such a folder with the values of a known camera, to be edited.
 """

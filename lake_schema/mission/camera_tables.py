@@ -49,6 +49,8 @@ COLUMNS = {
     BANDS: ("band", "curve", "medium", *BAND_UNITS, *OPTIONAL_BAND_UNITS),
     WAVEFRONT: ("noll", "x_power", "y_power", "coefficient_nm"),
 }  # fmt: skip
+# Columns that a file may have in addition. Without one, its numbers are 0 and its texts blank.
+OPTIONAL_COLUMNS = {LAYOUT: ("flip", "serial"), AMPLIFIERS: ("prescan_rows", "interleaved")}
 # Lowest and highest allowed value of each column of whole numbers, in any of the files.
 INTEGER_BOUNDS = {
     "nx": (1, _MAX_PIXELS),
@@ -60,6 +62,9 @@ INTEGER_BOUNDS = {
     "prescan": (0, _MAX_SCAN),
     "overscan": (0, _MAX_SCAN),
     "overscan_rows": (0, _MAX_SCAN),
+    "prescan_rows": (0, _MAX_SCAN),
+    "interleaved": (0, 1),
+    "flip": (0, 1),
     "noll": (4, 66),
     "x_power": (0, 10),
     "y_power": (0, 10),
@@ -89,8 +94,8 @@ class Row:
     location : str
         File and line number, for error messages.
     values : mapping of str to str
-        Entries by name of the column, in the order of `COLUMNS`, without blanks around them. Entries of columns of
-        whole numbers consist of digits only.
+        Entries by name of the column, in the order of `COLUMNS` and `OPTIONAL_COLUMNS`, without blanks around them.
+        Entries of columns of whole numbers consist of digits only.
     """
 
     location: str
@@ -133,7 +138,9 @@ class Row:
 
 
 def read_rows(folder: Path, file: str) -> list[Row]:
-    """Read a CSV table of a camera, which must have exactly the expected columns, in any order.
+    """Read a CSV table of a camera, which must have exactly the expected columns and may have optional ones.
+
+    The columns may be in any order.
 
     Blank lines, and lines that begin with #, are ignored.
 
@@ -163,7 +170,7 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     ]
     if len(numbered) > _MAX_ROWS + 1:
         raise BadInput(f"{path_text}: has more than {_MAX_ROWS} rows")
-    expected = COLUMNS[file]
+    expected, optional = COLUMNS[file], OPTIONAL_COLUMNS.get(file, ())
     try:
         table = list(csv.reader(io.StringIO("\n".join(line for _, line in numbered)), strict=True))
     except csv.Error as error:
@@ -171,11 +178,12 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     if len(table) != len(numbered):
         raise BadInput(f"{path_text}: a text spans several lines")
     header = [column.strip() for column in table[0]] if table else []
-    if unknown := [column for column in header if column not in expected]:
-        raise BadInput(f"{path_text}: unknown column {unknown[0]!r}, the columns must be {', '.join(expected)}")
+    if unknown := [column for column in header if column not in (*expected, *optional)]:
+        extra = f", and may be {', '.join(optional)}" if optional else ""
+        raise BadInput(f"{path_text}: unknown column {unknown[0]!r}, the columns must be {', '.join(expected)}{extra}")
     if missing := [column for column in expected if column not in header]:
         raise BadInput(f"{path_text}: column {missing[0]} is missing")
-    if len(header) != len(expected):
+    if len(header) != len(set(header)):
         raise BadInput(f"{path_text}: a column is given twice")
     rows = []
     for (number, _), entries in zip(numbered[1:], table[1:], strict=True):
@@ -185,7 +193,8 @@ def read_rows(folder: Path, file: str) -> list[Row]:
         if any(len(value) > _MAX_TEXT_LENGTH or not value.isprintable() for value in cells):
             raise BadInput(f"{location}: a text is longer than {_MAX_TEXT_LENGTH} or has unprintable characters")
         texts = dict(zip(header, cells, strict=True))
-        rows.append(_with_integers(Row(location, {column: texts[column] for column in expected})))
+        values = {column: texts[column] for column in (*expected, *optional) if column in texts}
+        rows.append(_with_integers(Row(location, values)))
     if not rows:
         raise BadInput(f"{path_text}: has no rows")
     return rows
@@ -333,7 +342,8 @@ def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
         for other, (other_x, other_y) in zip(rows, corners, strict=False):
             if abs(other_x - x) < nx and abs(other_y - y) < ny:
                 raise BadInput(f"{row.location}: overlaps amplifier {other.text('amplifier')}")
-        for column in ("nx", "ny", "prescan", "overscan", "overscan_rows"):
+        optional = tuple(column for column in OPTIONAL_COLUMNS[AMPLIFIERS] if column in row.values)
+        for column in ("nx", "ny", "prescan", "overscan", "overscan_rows", *optional):
             if row.number(column) != rows[0].number(column):
                 raise BadInput(f"{row.location}: {column} differs from the first amplifier of the type")
         corners.append((x, y))

@@ -20,6 +20,7 @@ from lake_schema.mission.camera_tables import (
     COLUMNS,
     LAYOUT,
     OPTIONAL_BAND_UNITS,
+    OPTIONAL_COLUMNS,
     PARAMETERS,
     WAVEFRONT,
 )
@@ -61,7 +62,10 @@ def write_like(camera: str, folder: Path) -> list[Path]:
         BANDS: [_band_row(prefix, band, mission) for band in _band_names(prefix, mission)],
         AMPLIFIERS: _amplifier_rows(prefix, mission),
     }
-    texts = {name: _csv_text(COLUMNS[name], rows) for name, rows in tables.items()}
+    texts = {
+        name: _csv_text(_amplifier_columns(prefix, mission) if name == AMPLIFIERS else COLUMNS[name], rows)
+        for name, rows in tables.items()
+    }
     for key, file in (("layout", LAYOUT), ("psf.wavefront", WAVEFRONT)):
         texts[file] = mission.content(mission.model(prefix + key)).decode()
     new_folder = user_files.check_folder(folder)
@@ -81,14 +85,20 @@ def _amplifier_rows(prefix: str, mission: MissionConfiguration) -> list[tuple[st
     mean = {key: mission.value(prefix + key, unit) for key, unit in AMPLIFIER_UNITS.items()}
     ratios = {key: [float(row[key]) / float(rows[0][key]) for row in rows] for key in ("gain", "read_noise")}
     ratios["full_well"] = [1.0] * len(rows)
-    geometry_columns = [column for column in COLUMNS[AMPLIFIERS] if column not in AMPLIFIER_UNITS]
+    columns = _amplifier_columns(prefix, mission)
     return [
-        (
-            *(row[column] for column in geometry_columns),
-            *(f"{mean[key] * ratios[key][i]:.7g}" for key in AMPLIFIER_UNITS),
+        tuple(
+            f"{mean[column] * ratios[column][i]:.7g}" if column in AMPLIFIER_UNITS else row[column]
+            for column in columns
         )
         for i, row in enumerate(rows)
     ]
+
+
+def _amplifier_columns(prefix: str, mission: MissionConfiguration) -> tuple[str, ...]:
+    """Return the columns of amplifiers.csv: all necessary ones, and the optional ones that the camera's table has."""
+    first = mission.rows(f"{prefix}amplifiers")[0]
+    return (*COLUMNS[AMPLIFIERS], *(column for column in OPTIONAL_COLUMNS[AMPLIFIERS] if column in first))
 
 
 def _band_names(prefix: str, mission: MissionConfiguration) -> list[str]:

@@ -56,7 +56,10 @@ _RAW_CARDS: tuple[str, ...] = (
 )
 _RAW_CARDS += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
 # Keywords of single amplifiers, which are not copied to a calibrated image: they end with a number or a letter.
-_AMPLIFIER_CARDS = re.compile(r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT)[A-Z]")
+_AMPLIFIER_CARDS = re.compile(
+    r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT|[ADTBC]SEC)[A-Z]"
+    r"|T_(EF|OS)M[NX][0-9]+|T_GAIN[0-9]+"
+)
 # Largest allowed number of pixels in a master that the user made with another program.
 _MAX_PIXELS = 1 << 28
 # Names of the simulated effects that the correction "nonlinearity" undoes: nonlinearity of CCDs, of each read of an

@@ -246,7 +246,8 @@ def test_hsc_is_104_ccds_by_rule_of_which_one_is_dead():
     rule = [(31.8454 * k, y) for k, ys in columns.items() for y in ys]
     rule += [(x, y) for x in (-143.85, 143.85) for y in (-214.35, 220.35)]
     design = resolve(ladder=("DES", "BLT", "CBE", "REQ", "SIM")).rows("ext.hsc.layout")
-    measured = np.array([[float(r["x_mm"]), float(r["y_mm"])] for r in design])
+    # The x axis of the rule points south and its y axis west.
+    measured = np.array([[-float(r["y_mm"]), float(r["x_mm"])] for r in design])
     assert len(rule) == 104
     assert farthest(measured, np.array(rule)) < 0.066
     assert len(MISSION.rows("ext.hsc.layout")) == 103

@@ -112,7 +112,7 @@ def bias(frame):
     columns = bias_structure.structure(len(layout.amplifiers), width, *bias_structure.EFFECT.parameters(scene), rng)
     behind = columns[:, layout.prescan + layout.width :] if layout.overscan else columns[:, : layout.prescan]
     columns = columns - behind.mean(axis=1, keepdims=True)
-    return layout.assemble(np.repeat(columns[:, None], layout.height + layout.overscan_rows, axis=1))
+    return layout.assemble(np.repeat(columns[:, None], layout.planes_shape[1], axis=1))
 
 
 def truth(ground):

@@ -149,9 +149,9 @@ def test_separate_amplifiers_are_extensions(lake, whole, tmp_path):
             ccd, letter = together[1 + number // 2], "AB"[number % 2]
             own, there = tools.window(unit.header["DATASEC"]), tools.window(ccd.header[f"DATASEC{letter}"])
             column_step, row_step = steps_of_text(unit.header["CCDSEC"])
-            # Amplifier B is read from the right.
-            assert (column_step, row_step) == (1 if letter == "A" else -1, 1)
-            np.testing.assert_array_equal(unit.data[own][:, ::column_step], ccd.data[there])
+            # Both CCDs are southern ones: amplifier A is read from the upper right, B from the upper left.
+            assert (column_step, row_step) == (-1 if letter == "A" else 1, -1)
+            np.testing.assert_array_equal(unit.data[own][::row_step, ::column_step], ccd.data[there])
             assert unit.header["GAIN"] == pytest.approx(ccd.header[f"GAIN{letter}"])
             places = [header[key] for header, key in ((unit.header, "DETSEC"), (ccd.header, f"DETSEC{letter}"))]
             assert Section.from_text(places[0]) == Section.from_text(places[1])

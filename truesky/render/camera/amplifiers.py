@@ -1,12 +1,14 @@
 """Amplifiers of a ground camera's detector: the pixels that each one reads, and their positions in the raw file.
 
-In the raw file the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. The prescan
-and overscan columns of amplifiers in the left half of the detector lie to the left of all pixels, the other ones to the
-right. Overscan rows lie below or above all pixels, as in the files of DECam and MegaCam.
+In most raw files the pixels lie side by side as on the detector, so that one WCS is valid for all amplifiers. The
+prescan and overscan columns of amplifiers in the left half of the detector lie to the left of all pixels, the other
+ones to the right. Prescan and overscan rows lie below or above all pixels, as in the files of DECam and MegaCam: on the
+side away from the readout if one row of amplifiers covers the detector. In interleaved raw files, such as the files of
+Hyper Suprime-Cam, prescan and overscan of each amplifier lie next to its own pixels. The WCS is then valid for the
+pixels after prescan and overscan have been cut out.
 
 An image that is split into amplifiers has planes "in readout order": its axes are [amplifier, row, column], and the
-pixel at [0, 0] of a plane is read first. The columns of a plane are prescan, pixels and overscan, in this order; the
-rows are pixels and overscan.
+pixel at [0, 0] of a plane is read first. Columns and rows of a plane are prescan, pixels and overscan, in this order.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +44,25 @@ _MAX_DISTANCE = 4.0
 # Distance that is added for two amplifiers that are read at opposite ends of the columns, because it reduces their
 # crosstalk. The unit is the size of an amplifier.
 _OPPOSITE_END_DISTANCE = 2.0
+
+
+# Indices of the parts of an amplifier's columns or rows: prescan, pixels and overscan.
+_BEFORE, _PIXELS, _AFTER = range(3)
+
+
+class _Part(NamedTuple):
+    """A part of an amplifier along one axis: `size` pixels from `source` in its plane and from `target` in the file.
+
+    The plane has the axes of the detector. All numbers count from 0.
+    """
+
+    source: int
+    target: int
+    size: int
+
+
+# Prescan, pixels and overscan.
+_Parts = tuple[_Part, _Part, _Part]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +107,11 @@ class Layout:
         Number of rows that each amplifier reads after its pixels.
     amplifiers : tuple of Amplifier
         The amplifiers.
+    prescan_rows : int
+        Number of rows that each amplifier reads before its pixels.
+    is_interleaved : bool
+        True if prescan and overscan of each amplifier lie next to its own pixels in the raw file; False if they lie
+        outside of all pixels.
     """
 
     nx: int
@@ -94,6 +120,8 @@ class Layout:
     overscan: int
     overscan_rows: int
     amplifiers: tuple[Amplifier, ...]
+    prescan_rows: int = 0
+    is_interleaved: bool = False
 
     @property
     def width(self) -> int:
@@ -109,6 +137,11 @@ class Layout:
     def scan_columns(self) -> int:
         """Number of prescan and overscan columns of each amplifier together."""
         return self.prescan + self.overscan
+
+    @property
+    def scan_rows(self) -> int:
+        """Number of prescan and overscan rows of each amplifier together."""
+        return self.prescan_rows + self.overscan_rows
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
@@ -141,15 +174,19 @@ class Layout:
             raise BadInput(f"frame has the shape {frame.shape}, but the amplifiers cover {self.ny} x {self.nx} pixels")
         out = np.zeros(self.planes_shape, frame.dtype)
         for plane, amplifier in zip(out, self.amplifiers, strict=True):
-            plane[: self.height, self.prescan : self.prescan + self.width] = _flip_to_readout_order(
-                frame[amplifier.pixels.slices], amplifier
-            )
+            plane[self.pixels_in_plane] = _flip_to_readout_order(frame[amplifier.pixels.slices], amplifier)
         return out
 
     @property
     def planes_shape(self) -> tuple[int, int, int]:
         """Numbers of amplifiers, rows and columns of the result of `split`."""
-        return len(self.amplifiers), self.height + self.overscan_rows, self.scan_columns + self.width
+        return len(self.amplifiers), self.height + self.scan_rows, self.scan_columns + self.width
+
+    @property
+    def pixels_in_plane(self) -> tuple[slice, slice]:
+        """Rows and columns of the detector's pixels in the plane of an amplifier, in readout order."""
+        rows, columns = self.prescan_rows, self.prescan
+        return slice(rows, rows + self.height), slice(columns, columns + self.width)
 
     def readout_places(self, rows: Int, columns: Int) -> Int:
         """Return where n pixels of the detector are in the result of `split`.
@@ -164,7 +201,7 @@ class Layout:
             is_inside = (row >= 0) & (row < pixels.ny) & (column >= 0) & (column < pixels.nx)
             row, column = row[is_inside], column[is_inside]
             out[is_inside, 0] = number
-            out[is_inside, 1] = pixels.ny - 1 - row if amplifier.read_top else row
+            out[is_inside, 1] = self.prescan_rows + (pixels.ny - 1 - row if amplifier.read_top else row)
             out[is_inside, 2] = self.prescan + (pixels.nx - 1 - column if amplifier.read_right else column)
         return out
 
@@ -175,26 +212,26 @@ class Layout:
         """
         out = np.zeros((self.ny, self.nx), planes.dtype)
         for plane, amplifier in zip(planes, self.amplifiers, strict=True):
-            pixels = plane[: self.height, self.prescan : self.prescan + self.width]
-            out[amplifier.pixels.slices] = _flip_to_readout_order(pixels, amplifier)
+            out[amplifier.pixels.slices] = _flip_to_readout_order(plane[self.pixels_in_plane], amplifier)
         return out
 
     @property
-    def data_section(self) -> Section:
-        """Rectangle of the raw file that contains the detector's pixels, without prescan and overscan."""
-        across, up = (len(starts) for starts in self._starts)
-        return Section((across // 2) * self.scan_columns, (up // 2) * self.overscan_rows, self.nx, self.ny)
+    def data_section(self) -> Section | None:
+        """Rectangle of the raw file with the detector's pixels; None if prescan or overscan lies between them."""
+        sections = [self.amplifier_data_section(number) for number in range(len(self.amplifiers))]
+        shifts = {(s.x - a.pixels.x, s.y - a.pixels.y) for s, a in zip(sections, self.amplifiers, strict=True)}
+        return Section(*shifts.pop(), self.nx, self.ny) if len(shifts) == 1 else None
 
     @property
     def raw_shape(self) -> tuple[int, int]:
         """Number of rows and columns of the raw file, with prescan and overscan."""
         across, up = (len(starts) for starts in self._starts)
-        return self.ny + up * self.overscan_rows, self.nx + across * self.scan_columns
+        nx, ny = (across * self.width, up * self.height) if self.is_interleaved else (self.nx, self.ny)
+        return ny + up * self.scan_rows, nx + across * self.scan_columns
 
     def amplifier_data_section(self, number: int) -> Section:
         """Return the rectangle of the raw file with the pixels of an amplifier, given by its index."""
-        pixels, data = self.amplifiers[number].pixels, self.data_section
-        return Section(data.x + pixels.x, data.y + pixels.y, pixels.nx, pixels.ny)
+        return self._raw_section(number, _PIXELS, _PIXELS)
 
     def amplifier_bias_section(self, number: int) -> Section:
         """Return the rectangle of the raw file with an amplifier's overscan columns, which measure its bias level.
@@ -202,28 +239,36 @@ class Layout:
         It covers the rows of the amplifier's pixels. An amplifier without overscan columns has the prescan columns
         instead. `number` is the index of the amplifier.
         """
-        first, count = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
-        return self._scan_columns_section(number, first, count)
+        return self._raw_section(number, _AFTER if self.overscan else _BEFORE, _PIXELS)
 
     def amplifier_prescan_section(self, number: int) -> Section:
         """Return the rectangle of the raw file with the prescan columns of an amplifier, in the rows of its pixels."""
-        return self._scan_columns_section(number, 0, self.prescan)
+        return self._raw_section(number, _BEFORE, _PIXELS)
 
     def amplifier_overscan_section(self, number: int) -> Section:
         """Return the rectangle of the raw file with the overscan rows of an amplifier, in the columns of its pixels."""
-        pixels, (_, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
-        return Section(pixels.x, scan_y, pixels.nx, self.overscan_rows)
+        return self._raw_section(number, _PIXELS, _AFTER)
 
-    def _scan_columns_section(self, number: int, first: int, count: int) -> Section:
-        """Return the rectangle of the raw file with `count` prescan or overscan columns of an amplifier.
+    def amplifier_raw_section(self, number: int) -> Section:
+        """Return the rectangle of the raw file with the columns that an amplifier reads, in the rows of its pixels.
 
-        `first` is the first of these columns, counted in the order in which prescan and overscan columns are read.
+        For an amplifier whose prescan or overscan does not lie next to its pixels, it contains what lies in between.
         `number` is the index of the amplifier.
         """
-        amplifier, (scan_x, _) = self.amplifiers[number], self._scan_origin(number)
-        if amplifier.read_right:
-            first = self.scan_columns - first - count
-        return Section(scan_x + first, self.amplifier_data_section(number).y, count, self.height)
+        parts = [self._raw_section(number, columns, _PIXELS) for columns in (_BEFORE, _PIXELS, _AFTER)]
+        parts = [part for part in parts if part.nx]
+        first, past = min(part.x for part in parts), max(part.x + part.nx for part in parts)
+        return Section(first, parts[0].y, past - first, parts[0].ny)
+
+    def _raw_section(self, number: int, of_columns: int, of_rows: int) -> Section:
+        """Return the rectangle of the raw file with a part of the columns and rows of an amplifier.
+
+        `number` is the index of the amplifier. Each part is `_BEFORE` (prescan), `_PIXELS` or `_AFTER` (overscan).
+        """
+        columns, rows = (
+            segments[part] for segments, part in zip(self._segments(number), (of_columns, of_rows), strict=True)
+        )
+        return Section(columns.target, rows.target, columns.size, rows.size)
 
     def to_detector_axes(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
         """Flip an amplifier's plane from readout order (pixel [0, 0] read first) to the axes of the detector.
@@ -239,9 +284,9 @@ class Layout:
         the amplifier.
         """
         amplifier = self.amplifiers[number]
-        data = Section(self.prescan, 0, self.width, self.height)
+        data = Section(self.prescan, self.prescan_rows, self.width, self.height)
         first, count = (self.prescan + self.width, self.overscan) if self.overscan else (0, self.prescan)
-        bias = Section(first, 0, count, self.height + self.overscan_rows) if count else None
+        bias = Section(first, 0, count, self.height + self.scan_rows) if count else None
         steps = (-1 if amplifier.read_right else 1, -1 if amplifier.read_top else 1)
         return Sections(data, amplifier.pixels, bias, steps)
 
@@ -249,14 +294,12 @@ class Layout:
         """Arrange planes [amplifier, row, column], whose pixel [0, 0] is read first, as the image of the raw file."""
         out = np.zeros(self.raw_shape, planes.dtype)
         for number, (plane, amplifier) in enumerate(zip(planes, self.amplifiers, strict=True)):
-            pixels, (scan_x, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
             flipped = _flip_to_readout_order(plane, amplifier)
-            columns = _scan_segments(self.prescan, self.width, self.overscan, pixels.x, scan_x, amplifier.read_right)
-            rows = _scan_segments(0, self.height, self.overscan_rows, pixels.y, scan_y, amplifier.read_top)
-            for source_y, target_y, count_y in rows:
-                for source_x, target_x, count_x in columns:
-                    block = flipped[source_y : source_y + count_y, source_x : source_x + count_x]
-                    out[target_y : target_y + count_y, target_x : target_x + count_x] = block
+            columns, rows = self._segments(number)
+            for row in rows:
+                for column in columns:
+                    block = flipped[row.source : row.source + row.size, column.source : column.source + column.size]
+                    out[row.target : row.target + row.size, column.target : column.target + column.size] = block
         return out
 
     @property
@@ -265,16 +308,36 @@ class Layout:
         places = [amplifier.pixels for amplifier in self.amplifiers]
         return sorted({place.x for place in places}), sorted({place.y for place in places})
 
-    def _scan_origin(self, number: int) -> tuple[int, int]:
-        """Return the lowest prescan or overscan column of an amplifier in the raw file, and its lowest overscan row.
+    def _segments(self, number: int) -> tuple[_Parts, _Parts]:
+        """Return prescan, pixels and overscan of an amplifier along its columns, and the same along its rows.
 
-        Both count from 0. `number` is the index of the amplifier.
+        `number` is the index of the amplifier.
         """
-        pixels, (across, up) = self.amplifiers[number].pixels, self._starts
-        i, j = across.index(pixels.x), up.index(pixels.y)
-        x = i * self.scan_columns + (self.nx if i >= len(across) // 2 else 0)
-        y = j * self.overscan_rows + (self.ny if j >= len(up) // 2 else 0)
-        return x, y
+        amplifier, (across, up) = self.amplifiers[number], self._starts
+        of_columns = (self.prescan, self.width, self.overscan), amplifier.read_right
+        of_rows = (self.prescan_rows, self.height, self.overscan_rows), amplifier.read_top
+        pixels, i, j = amplifier.pixels, across.index(amplifier.pixels.x), up.index(amplifier.pixels.y)
+        if self.is_interleaved:
+            return (
+                _interleaved_segments(*of_columns, i * (self.width + self.scan_columns)),
+                _interleaved_segments(*of_rows, j * (self.height + self.scan_rows)),
+            )
+        # Numbers of columns and rows of amplifiers whose prescan and overscan lie to the left of or below all pixels.
+        n_left, n_below = len(across) // 2, len(up) // 2
+        if len(up) == 1 and all(a.read_top for a in self.amplifiers):
+            n_below = 1
+        return (
+            _outer_segments(
+                *of_columns,
+                n_left * self.scan_columns + pixels.x,
+                i * self.scan_columns + (self.nx if i >= n_left else 0),
+            ),
+            _outer_segments(
+                *of_rows,
+                n_below * self.scan_rows + pixels.y,
+                j * self.scan_rows + (self.ny if j >= n_below else 0),
+            ),
+        )
 
 
 def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> npt.NDArray[Number]:
@@ -282,24 +345,32 @@ def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> 
     return plane[:: -1 if amplifier.read_top else 1, :: -1 if amplifier.read_right else 1]
 
 
-def _scan_segments(
-    n_before: int, pixels: int, n_after: int, pixels_start: int, scan_start: int, is_flipped: bool
-) -> list[tuple[int, int, int]]:
+def _outer_segments(counts: tuple[int, int, int], is_flipped: bool, pixels_start: int, scan_start: int) -> _Parts:
     """Return where prescan, pixels and overscan of an amplifier are along one axis, in its plane and in the raw file.
 
-    A plane is the array of one amplifier, here with the axes of the detector. Each of the three segments is (start in
-    the plane, start in the file, length), in pixels from 0. `n_before`, `pixels` and `n_after` are the lengths of
-    prescan, pixels and overscan. `pixels_start` is the position of the first pixel in the file, and `scan_start` the
-    position of the first prescan or overscan pixel. `is_flipped` is True if the last pixel of the plane is read first.
+    `counts` are their lengths. `is_flipped` is True if the last pixel of the plane, in the axes of the detector, is
+    read first. `pixels_start` is the position of the first pixel in the file, and `scan_start` the position of the
+    first prescan or overscan pixel. All prescan and overscan pixels lie next to each other.
     """
-    parts = [(n_before, scan_start), (pixels, pixels_start), (n_after, scan_start + n_before)]
-    if is_flipped:
-        parts = [(n_after, scan_start), (pixels, pixels_start), (n_before, scan_start + n_after)]
-    segments, source = [], 0
-    for count, target in parts:
-        segments.append((source, target, count))
-        source += count
-    return segments
+    prescan, pixels, overscan = _interleaved_segments(counts, is_flipped, 0)
+    return (
+        prescan._replace(target=scan_start + (overscan.size if is_flipped else 0)),
+        pixels._replace(target=pixels_start),
+        overscan._replace(target=scan_start + (0 if is_flipped else prescan.size)),
+    )
+
+
+def _interleaved_segments(counts: tuple[int, int, int], is_flipped: bool, start: int) -> _Parts:
+    """Return the same as `_outer_segments` if all pixels of the amplifier lie next to each other in the raw file.
+
+    `start` is the position of the first one in the file.
+    """
+    n_before, pixels, n_after = counts
+    sources = (n_after + pixels, n_after, 0) if is_flipped else (0, n_before, n_before + pixels)
+    prescan, inside, overscan = (
+        _Part(source, start + source, size) for source, size in zip(sources, counts, strict=True)
+    )
+    return prescan, inside, overscan
 
 
 @lru_cache(maxsize=256)
@@ -346,7 +417,16 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
         )
         for row in rows
     )
-    return Layout(detector.nx, detector.ny, prescan, overscan, overscan_rows, amplifiers)
+    return Layout(
+        detector.nx,
+        detector.ny,
+        prescan,
+        overscan,
+        overscan_rows,
+        amplifiers,
+        int(first.get("prescan_rows", "0")),
+        first.get("interleaved", "0") == "1",
+    )
 
 
 def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, str], ...]:

@@ -49,24 +49,23 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     """
     from astropy.wcs import WCS, Sip
 
-    angle, turn = np.radians(position_angle), np.radians(detector.rotation)
+    angle = np.radians(position_angle)
     # The columns of `axes` are the directions (east, north) of the focal plane's x and y axes.
     axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    from_centre = matrices.matmul(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
+    from_centre = matrices.matmul(detector.axes.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
     system = WCS(naxis=2)
     has_distortion = bool(detector.distortion_terms)
     system.wcs.ctype = [f"{axis}{_PROJECTIONS[has_distortion]}" for axis in ("RA---", "DEC--")]
     system.wcs.cunit = ["deg", "deg"]
     system.wcs.crval = [ra, dec]
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
-    system.wcs.cd = matrices.matmul(axes, rotation) * detector.pixel_scale / 3600.0
+    system.wcs.cd = matrices.matmul(axes, detector.axes) * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
     # Set the longitude of the pole: with the default, north is turned by 180 deg for a boresight exactly at the pole.
     system.wcs.lonpole = 180.0
     if has_distortion:
         system.sip = Sip(
-            *distortion.sip(detector.distortion_terms, detector.pixel_scale * rotation), None, None, _crpix(system)
+            *distortion.sip(detector.distortion_terms, detector.pixel_scale * detector.axes), None, None, _crpix(system)
         )
     system.wcs.set()
     return system

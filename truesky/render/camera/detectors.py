@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission import detector_overrides
 from lake_schema.mission.configuration import MissionConfiguration
@@ -67,6 +69,11 @@ class Detector:
         Effects of a tilt of the filter; None for a camera whose filters do not tilt.
     kind : str
         Type of the detector in the layout of a ground camera; "" for VIS and NISP.
+    is_mirrored : bool
+        True if the row index increases in the direction opposite to that of a detector that is only rotated. The image
+        of a detector as its file has it is then a mirror image of the sky.
+    serial : str
+        Serial number by the manufacturer; "" if unknown.
     """
 
     name: str
@@ -81,11 +88,66 @@ class Detector:
     injection_rows: int = 0
     filter_wheel: FilterWheel | None = None
     kind: str = ""
+    is_mirrored: bool = False
+    serial: str = ""
+
+    @property
+    def axes(self) -> Float:
+        """Directions in which columns and rows increase, float[2, 2].
+
+        The first column has the unit vector (x, y) in the focal plane along which the column index increases, the
+        second column that of the row index. The matrix converts vectors on the detector to the focal plane, and its
+        transpose is the inverse. All code takes the rotation and the parity of a detector from here.
+        """
+        turn = np.radians(self.rotation)
+        cosine, sine = float(np.cos(turn)), float(np.sin(turn))
+        return np.array([[cosine, -self.handedness * sine], [sine, self.handedness * cosine]])
+
+    @property
+    def handedness(self) -> float:
+        """Return -1 if the detector's image is mirrored against the focal plane, otherwise 1."""
+        return -1.0 if self.is_mirrored else 1.0
 
     @property
     def upside_down(self) -> bool:
-        """True if the detector is mounted upside down: turned by more than 90 deg against the focal plane."""
-        return float(np.cos(np.radians(self.rotation))) < 0.0
+        """True if the row index increases downwards in the focal plane, against its y axis."""
+        return float(self.axes[1, 1]) < 0.0
+
+    @property
+    def row_angle(self) -> float:
+        """Angle from the y axis of the focal plane to the direction in which the row index increases, deg.
+
+        It is counted like `rotation`, from x to y, and lies in no particular range.
+        """
+        return self.rotation + 180.0 * self.is_mirrored
+
+    def own_degrees(self, angle: float) -> float:
+        """Convert a direction in the focal plane to the detector.
+
+        `angle` is counted from the focal plane's x axis to its y axis. The result is counted from the direction of
+        increasing column index to that of increasing row index. Both are in degrees.
+        """
+        return self.handedness * (angle - self.rotation)
+
+    def own_radians(self, angle: float) -> float:
+        """Convert a direction in the focal plane to the detector, as `own_degrees` but in radians."""
+        return self.handedness * (angle - float(np.radians(self.rotation)))
+
+    def to_focal_plane(self, along: npt.ArrayLike, up: npt.ArrayLike) -> tuple[Float, Float]:
+        """Convert positions on the detector to positions (x, y) in the focal plane, all in arcsec.
+
+        `along` is measured from the detector's centre in the direction of columns, `up` in that of rows.
+        """
+        axes, along, up = self.axes, np.asarray(along, float), np.asarray(up, float)
+        return self.x + axes[0, 0] * along + axes[0, 1] * up, self.y + axes[1, 0] * along + axes[1, 1] * up
+
+    def from_focal_plane(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[Float, Float]:
+        """Convert vectors (x, y) in the focal plane to the directions of columns and rows of the detector.
+
+        For the position of a point on the detector, give its vector from the detector's centre.
+        """
+        axes, x, y = self.axes, np.asarray(x, float), np.asarray(y, float)
+        return axes[0, 0] * x + axes[1, 0] * y, axes[0, 1] * x + axes[1, 1] * y
 
     @property
     def half_diagonal(self) -> float:
@@ -266,6 +328,8 @@ def _read_layout(section: str, mission: MissionConfiguration) -> tuple[Detector,
             pixel_scale=scale,
             distortion_terms=distortion_terms,
             kind=row["type"],
+            is_mirrored=row.get("flip", "0") == "1",
+            serial=row.get("serial", ""),
         )
         for row in mission.rows(f"{section}.layout")
     )

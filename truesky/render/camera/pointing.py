@@ -94,9 +94,10 @@ def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
     row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
     width = np.array([[d.nx * d.pixel_scale] for d in detectors]) * column
     height = np.array([[d.ny * d.pixel_scale] for d in detectors]) * row
-    turn = np.radians([[d.rotation] for d in detectors])
-    x = np.array([[d.x] for d in detectors]) + np.cos(turn) * width - np.sin(turn) * height
-    y = np.array([[d.y] for d in detectors]) + np.sin(turn) * width + np.cos(turn) * height
+    # The axes of a detector, float[2, 2, n, 1].
+    axes = np.array([d.axes for d in detectors]).transpose(1, 2, 0)[..., None]
+    x = np.array([[d.x] for d in detectors]) + axes[0, 0] * width + axes[0, 1] * height
+    y = np.array([[d.y] for d in detectors]) + axes[1, 0] * width + axes[1, 1] * height
     for bending in {d.distortion_terms for d in detectors if d.distortion_terms}:
         has_terms = np.array([d.distortion_terms == bending for d in detectors])
         x[has_terms], y[has_terms] = distortion.distort(x[has_terms], y[has_terms], bending)

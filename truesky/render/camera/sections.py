@@ -7,14 +7,15 @@ NOAO, mosaic data structures (Valdes 1998): DATASEC, BIASSEC, TRIMSEC, CCDSEC, D
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numpy as np
+
+from lake_schema.arrays import Int
+from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector
-
-# Rotations of a detector against the mosaic (image of all detectors of a camera), in turns of 90 deg, for which columns
-# of the detector are columns of the mosaic: not turned, and upside down.
-_ALONG = (0, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,75 +118,91 @@ def to_mosaic_section(
     section : Section
         Rectangle of pixels of the detector.
     detectors : sequence of Detector
-        All detectors of the camera. The mosaic has the orientation of most detectors. It begins at the lowest column
-        and row of any detector.
+        All detectors of the camera. The mosaic has the orientation and the parity of most detectors. It begins at the
+        lowest column and row of any detector.
     steps : (int, int), optional
         Steps on the detector, 1 or -1, from one column and from one row of the array to the next.
 
     Returns
     -------
     str or None
-        Text "[x1:x2,y1:y2]" for a FITS header, counted from 1. Numbers decrease if the array is read in the opposite
-        direction, or if the detector is mounted upside down. None if the detector is turned by 90 deg relative to the
-        mosaic, because its columns are rows of the mosaic.
+        Text "[x1:x2,y1:y2]" for a FITS header, counted from 1. Numbers decrease along axes in which the array is read
+        in the opposite direction, or in which the detector runs against the mosaic. None if the detector is turned by
+        90 deg relative to the mosaic, because its columns are rows of the mosaic.
 
     Notes
     -----
     Positions are rounded to whole pixels, an error of up to half a pixel, and rotations to quarter turns.
     """
-    aligned_detector, *aligned_camera = _align_to_mosaic((detector, *detectors))
-    if _quarter_turns(aligned_detector) not in _ALONG:
+    mosaic = _mosaic_axes(detectors)
+    directions = matrices.matmul(mosaic.T, _quarter_axes(_orientation(detector)))
+    if directions[0, 0] == 0.0:
         return None
     x_offset, y_offset = (
         round(position - first)
-        for position, first in zip(_corner(aligned_detector), _mosaic_origin(aligned_camera), strict=True)
+        for position, first in zip(_corner(detector, mosaic), _mosaic_origin(detectors, mosaic), strict=True)
     )
     columns = (section.x + 1, section.x + section.nx)[:: steps[0]]
     rows = (section.y + 1, section.y + section.ny)[:: steps[1]]
-    if aligned_detector.upside_down:
-        columns, rows = (
-            (size + 1 - first, size + 1 - last) for size, (first, last) in ((detector.nx, columns), (detector.ny, rows))
-        )
+    if directions[0, 0] < 0.0:
+        columns = detector.nx + 1 - columns[0], detector.nx + 1 - columns[1]
+    if directions[1, 1] < 0.0:
+        rows = detector.ny + 1 - rows[0], detector.ny + 1 - rows[1]
     return f"[{x_offset + columns[0]}:{x_offset + columns[1]},{y_offset + rows[0]}:{y_offset + rows[1]}]"
 
 
 def mosaic_size(detectors: Sequence[Detector]) -> str:
     """Return the size of the mosaic of a camera's detectors as text for the FITS card DETSIZE: "[1:columns,1:rows]"."""
-    aligned = _align_to_mosaic(detectors)
+    mosaic = _mosaic_axes(detectors)
     right, top = (
-        max(round(_corner(d)[axis] - first) + _sides(d)[axis] for d in aligned)
-        for axis, first in enumerate(_mosaic_origin(aligned))
+        max(round(_corner(d, mosaic)[axis] - first) + _sides(d, mosaic)[axis] for d in detectors)
+        for axis, first in enumerate(_mosaic_origin(detectors, mosaic))
     )
     return f"[1:{right},1:{top}]"
 
 
-def _align_to_mosaic(detectors: Sequence[Detector]) -> Sequence[Detector]:
-    """Return the detectors with positions and rotations in the axes of the mosaic (image of all detectors).
+def _orientation(detector: Detector) -> tuple[bool, int]:
+    """Return the parity of a detector (True if it is mirrored) and its rotation in quarter turns, 0 to 3."""
+    return detector.is_mirrored, round(detector.rotation / 90.0) % 4
 
-    These are the axes of the focal plane. If the column index of most detectors increases along the y axis of the focal
-    plane, up or down, they are axes turned by 90 deg. Columns of most detectors are then columns of the mosaic.
+
+def _quarter_axes(orientation: tuple[bool, int]) -> Int:
+    """Return the directions of columns and rows, `Detector.axes`, for a result of `_orientation`, in whole numbers."""
+    is_mirrored, turns = orientation
+    cosine, sine = (1, 0, -1, 0)[turns], (0, 1, 0, -1)[turns]
+    sign = -1 if is_mirrored else 1
+    return np.array([[cosine, -sign * sine], [sine, sign * cosine]])
+
+
+def _mosaic_axes(detectors: Sequence[Detector]) -> Int:
+    """Return the directions of columns and rows of the mosaic (image of all detectors of a camera) in the focal plane.
+
+    They are the axes of the focal plane if the columns of most detectors run along its x axis, in either direction, and
+    these detectors are not mirrored. Otherwise they are the axes of most detectors with the most frequent parity and
+    with columns along the same line. If two opposite rotations are equally frequent, the smaller one is taken.
     """
-    if 2 * sum(_quarter_turns(d) in _ALONG for d in detectors) >= len(detectors):
-        return detectors
-    return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in detectors]
+    counts = Counter((is_mirrored, turns % 2) for is_mirrored, turns in map(_orientation, detectors))
+    is_mirrored, line = max(sorted(counts), key=lambda orientation: counts[orientation])
+    if not is_mirrored:
+        return _quarter_axes((False, line))
+    both = Counter(_orientation(d) for d in detectors)
+    return _quarter_axes(max(((True, line), (True, line + 2)), key=lambda orientation: both[orientation]))
 
 
-def _quarter_turns(detector: Detector) -> int:
-    return round(detector.rotation / 90.0) % 4
+def _sides(detector: Detector, mosaic: Int) -> tuple[int, int]:
+    """Return how many columns and rows of a mosaic, given by its axes, a detector covers."""
+    is_along = matrices.matmul(mosaic.T, _quarter_axes(_orientation(detector)))[0, 0] != 0.0
+    return (detector.nx, detector.ny) if is_along else (detector.ny, detector.nx)
 
 
-def _sides(detector: Detector) -> tuple[int, int]:
-    """Return how many columns and rows of the mosaic (image of all detectors of a camera) a detector covers."""
-    along = _quarter_turns(detector) in _ALONG
-    return (detector.nx, detector.ny) if along else (detector.ny, detector.nx)
+def _corner(detector: Detector, mosaic: Int) -> tuple[float, float]:
+    """Return the lower left corner (x, y) of a detector in a mosaic with given axes, in pixels from the boresight."""
+    nx, ny = _sides(detector, mosaic)
+    # One of both products is 0.
+    x, y = (float(axis[0] * detector.x + axis[1] * detector.y) for axis in mosaic.T)
+    return x / detector.pixel_scale - nx / 2, y / detector.pixel_scale - ny / 2
 
 
-def _corner(detector: Detector) -> tuple[float, float]:
-    """Return the lower left corner (x, y) of a detector in the axes of the mosaic, in pixels from the boresight."""
-    nx, ny = _sides(detector)
-    return detector.x / detector.pixel_scale - nx / 2, detector.y / detector.pixel_scale - ny / 2
-
-
-def _mosaic_origin(detectors: Sequence[Detector]) -> tuple[float, float]:
-    corners = [_corner(d) for d in detectors]
+def _mosaic_origin(detectors: Sequence[Detector], mosaic: Int) -> tuple[float, float]:
+    corners = [_corner(d, mosaic) for d in detectors]
     return min(x for x, _ in corners), min(y for _, y in corners)

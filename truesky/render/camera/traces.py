@@ -108,7 +108,7 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
     rows = _grism_rows(grism, detector.section, mission)
     to_field = _to_field_matrix(detector, mission)
     # Angle from the direction of increasing column index on the detector to the direction of dispersion.
-    turn = np.radians(float(rows[0]["direction_deg"]) + tilt - detector.rotation)
+    turn = np.radians(detector.own_degrees(float(rows[0]["direction_deg"]) + tilt))
     cosine, sine = float(np.cos(turn)), float(np.sin(turn))
     order_traces = []
     for order in sorted({int(row["order"]) for row in rows}, reverse=True):
@@ -176,12 +176,11 @@ def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float
     edges of the camera's mosaic of detectors, if this is symmetric.
     """
     all_detectors = detectors(detector.section, mission)
-    turn = np.radians(detector.rotation)
     half = np.array([(detector.nx - 1) / 2, (detector.ny - 1) / 2])
     out = np.array([[1.0, 0.0, 0.0]] * 3)
     for axis, name in enumerate("xy"):
         reach = max(abs(getattr(d, name)) + (d.nx, d.ny)[axis] * d.pixel_scale / 2 for d in all_detectors)
-        step = np.array([(np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))][axis]) * detector.pixel_scale
+        step = detector.axes[axis] * detector.pixel_scale
         out[axis + 1] = np.array([getattr(detector, name) - float((step * half).sum()), *step]) / reach
     return out
 

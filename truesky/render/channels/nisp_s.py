@@ -94,11 +94,9 @@ def _vignetting_throughput(
     exposure: ExposureRow, detector: Detector, column: Float, row: Float, mission: MissionConfiguration
 ) -> Float:
     _, requested_tilt = _grism_and_tilt(exposure, detector.section, mission)
-    angle = np.radians(detector.rotation)
     u = (column - (detector.nx - 1) / 2) * detector.pixel_scale
     v = (row - (detector.ny - 1) / 2) * detector.pixel_scale
-    x = detector.x + np.cos(angle) * u - np.sin(angle) * v
-    y = detector.y + np.sin(angle) * u + np.cos(angle) * v
+    x, y = detector.to_focal_plane(u, v)
     return grism_wheel.vignetting_throughput(
         x, y, float(exposure.grism_angle or 0.0), requested_tilt, detector.section, mission
     )

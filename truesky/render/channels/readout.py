@@ -9,7 +9,7 @@ FRAME is a single array without amplifiers.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -314,14 +314,15 @@ QUADRANTS = ReadoutMode(
 def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     """Make the file of a ground detector with all amplifiers in one array (ADU).
 
-    FITS cards give the section, gain and read noise of each amplifier; their keywords end with its number from 1.
+    FITS cards give the section, gain and read noise of each amplifier; their keywords end with its number from 1. If
+    prescan or overscan lies between the pixels, the array has no section DATASEC. The WCS is then that of the detector
+    after the sections DSECn have been joined, as in files of Hyper Suprime-Cam.
     """
     amplifier_layout, raw = scene.layout, adc.to_file_type(frame, scene)
     assert amplifier_layout is not None
+    data = amplifier_layout.data_section
     cards: list[Card] = [
-        *astrometry.cards(
-            astrometry.shift_pixels(system, amplifier_layout.data_section.x, amplifier_layout.data_section.y)
-        ),
+        *astrometry.cards(system if data is None else astrometry.shift_pixels(system, data.x, data.y)),
         ("NAMPS", len(amplifier_layout.amplifiers), "number of amplifiers"),
     ]
     numbers = (
@@ -352,7 +353,7 @@ def _amplifiers(frame: Frame, scene: Scene, detector: str, system: WCS) -> Reado
                 ),
                 (f"CCDSEC{amplifier.name}", amplifier.pixels.text, "pixels in detector coordinates"),
             ]
-    parts = Sections(amplifier_layout.data_section, Section(0, 0, amplifier_layout.nx, amplifier_layout.ny))
+    parts = None if data is None else Sections(data, Section(0, 0, amplifier_layout.nx, amplifier_layout.ny))
     return Readout(
         (Extension("", amplifier_layout.to_raw_image(raw), "adu", tuple(cards), sections=parts),),
         raw,
@@ -430,12 +431,29 @@ _SEGMENT = re.compile(r"^C(?=[01][0-7]$)")
 def _amplifier_pixels(read: Sequence[Image]) -> Array:
     """Return the pixels [ny, nx] of a ground detector as stored, from the images of its file.
 
-    Without a card DATASEC (files in electrons), the whole array is returned.
+    Without cards that tell where the pixels are (files in electrons), the whole array is returned.
     """
     if read[0].data is None:
         return _assemble_extensions(read, lambda array, header: array)
     header, array = _header(read[0]), np.asarray(read[0].data)
-    return array[Section.from_text(header["DATASEC"]).slices] if "DATASEC" in header else array
+    if "DATASEC" in header:
+        return array[Section.from_text(header["DATASEC"]).slices]
+    return _join_sections(header, array, lambda pixels, n: pixels) if "NAMPS" in header else array
+
+
+def _join_sections(header: Mapping[str, Any], array: Array, convert: Callable[[Array, int], Array]) -> Array:
+    """Join the pixels of all amplifiers in an array, by its cards DSECn and CSECn, to an image of the detector.
+
+    `convert` is a function of the pixels of an amplifier and its number from 1, which returns the pixels to join. The
+    result is 0 in pixels that no amplifier reads.
+    """
+    numbers = range(1, int(header["NAMPS"]) + 1)
+    places = [Section.from_text(header[f"CSEC{n}"]) for n in numbers]
+    parts = [convert(array[Section.from_text(header[f"DSEC{n}"]).slices], n) for n in numbers]
+    out = np.zeros((max(p.y + p.ny for p in places), max(p.x + p.nx for p in places)), parts[0].dtype)
+    for place, pixels in zip(places, parts, strict=True):
+        out[place.slices] = pixels
+    return out
 
 
 def _amplifier_electrons(read: Sequence[Image]) -> Float:
@@ -448,12 +466,13 @@ def _amplifier_electrons(read: Sequence[Image]) -> Float:
     header, array = _header(read[0]), np.asarray(read[0].data)
     if "NAMPS" not in header:
         return _frame_electrons(read)
-    out = np.zeros(_amplifier_pixels(read).shape)
-    for n in range(1, int(header["NAMPS"]) + 1):
-        pixels, place, bias = (Section.from_text(header[f"{key}{n}"]) for key in ("DSEC", "CSEC", "BSEC"))
+
+    def to_electrons(pixels: Array, n: int) -> Array:
+        bias = Section.from_text(header[f"BSEC{n}"])
         level = float(array[bias.slices].mean()) if bias.nx and bias.ny else float(header["BIAS"])
-        out[place.slices] = (array[pixels.slices] - level) * float(header[f"GAIN{n}"])
-    return out
+        return np.asarray((pixels - level) * float(header[f"GAIN{n}"]))
+
+    return _join_sections(header, array, to_electrons)
 
 
 def _amplifier_places(rows: Int, columns: Int, scene: Scene) -> tuple[Int, tuple[int, ...]]:

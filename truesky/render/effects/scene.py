@@ -270,16 +270,15 @@ class Scene:
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
-    def pixels_in_plane(self) -> tuple[int, int, int]:
-        """Place of the detector's pixels in the plane of a quadrant or amplifier, in readout order.
+    def pixels_in_plane(self) -> tuple[slice, slice]:
+        """Rows and columns of the detector's pixels in the plane of a quadrant or amplifier, in readout order.
 
-        They are the rows below the first number, and the columns from the second number on and below the third. The
-        other rows and columns are prescan and overscan.
+        The other rows and columns are prescan and overscan.
         """
         if self.layout is not None:
-            return self.layout.height, self.layout.prescan, self.layout.prescan + self.layout.width
+            return self.layout.pixels_in_plane
         prescan = int(self.value("fpa.prescan", "pix"))
-        return self.half_rows, prescan, prescan + self.nx // 2
+        return slice(0, self.half_rows), slice(prescan, prescan + self.nx // 2)
 
     @property
     def injection_rows(self) -> int:

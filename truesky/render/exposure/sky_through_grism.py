@@ -102,10 +102,8 @@ def _offset(trace: Trace, column: Float, row: Float, wavelength: float) -> tuple
 
 def _is_in_field_stop(column: Float, row: Float, detector: Detector, mission: MissionConfiguration) -> Bool:
     """Return the mask of the positions (columns and rows of the detector) that the telescope's field stop transmits."""
-    turn = np.radians(detector.rotation)
     u = (column - (detector.nx - 1) / 2) * detector.pixel_scale
     v = (row - (detector.ny - 1) / 2) * detector.pixel_scale
-    x = detector.x + np.cos(turn) * u - np.sin(turn) * v
-    y = detector.y + np.sin(turn) * u + np.cos(turn) * v
+    x, y = detector.to_focal_plane(u, v)
     half = [0.5 * mission.value(f"plm.unvignetted_{axis}", "arcsec") for axis in "xy"]
     return np.asarray((np.abs(x) <= half[0]) & (np.abs(y) <= half[1]))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from lake_schema.fits.images import Card
 from lake_schema.mission import model
 from truesky.render.camera import detectors, observatories, sections
-from truesky.render.camera.amplifiers import Amplifier
+from truesky.render.camera.amplifiers import Amplifier, Layout
 from truesky.render.channels import image_types
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import headers, raw_pointing
@@ -189,7 +189,7 @@ def _hsc(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...
         ("MJD", conditions.mjd, "[d] MJD at the start"),
         ("RA2000", _sexagesimal(conditions.ra / 15.0, 3, ""), "[h:m:s] boresight right ascension"),
         ("DEC2000", _sexagesimal(conditions.dec, 2, "+"), "[d:m:s] boresight declination"),
-        ("INST-PA", (270.0 - conditions.position_angle) % 360.0, "[deg] 270 deg - position angle of y"),
+        ("INST-PA", -conditions.position_angle % 360.0, "[deg] minus the position angle of y"),
         ("ALTITUDE", conditions.altitude, "[deg] altitude at the start"),
         ("AZIMUTH", conditions.azimuth, "[deg] azimuth at the start, north through east"),
         ("OUT-TMP", atmosphere.TEMPERATURE + _ZERO_CELSIUS, "[K] air temperature"),
@@ -197,7 +197,35 @@ def _hsc(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...
         ("OUT-HUM", _HUMIDITY, _HUMIDITY_TEXT),
         ("PROP-ID", _PROGRAM, _PROGRAM_TEXT),
         ("FOC-VAL", 0.0, f"[mm] {_FOCUS_TEXT}"),
+        *_channel_cards(rendered),
     )
+
+
+def _channel_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
+    """Return cards with the ranges of pixels and overscan, and the gain, of each channel of a Hyper Suprime-Cam CCD.
+
+    The result is () unless all channels are in one array in ADU.
+    """
+    layout = _raw_layout(rendered)
+    if layout is None:
+        return ()
+    gains = np.broadcast_to(rendered.scene.amplifier_values("gain", "electron / adu"), len(layout.amplifiers))
+    channel_cards: list[Card] = []
+    for number in range(len(layout.amplifiers)):
+        data, n = layout.amplifier_data_section(number), number + 1
+        columns, rows = layout.amplifier_bias_section(number), layout.amplifier_overscan_section(number)
+        for name, text, axes in (
+            ("EF", "effective range", ((data.x, data.nx), (data.y, data.ny))),
+            ("OS", "overscan region", ((columns.x, columns.nx), (rows.y, rows.ny))),
+        ):
+            for axis, (first, count) in enumerate(axes, start=1):
+                place = f"pixel of {'xy'[axis - 1]}-{text} for ch{n}"
+                channel_cards += [
+                    (f"T_{name}MN{n}{axis}", first + 1, f"MIN {place}"),
+                    (f"T_{name}MX{n}{axis}", first + count, f"MAX {place}"),
+                ]
+        channel_cards.append((f"T_GAIN{n}", float(gains[number]), f"gain for channel {n}"))
+    return tuple(channel_cards)
 
 
 def _megacam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...]:
@@ -207,7 +235,7 @@ def _megacam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("OBSTYPE", _image_type(rendered), "type of observation"),
         ("EXPNUM", exposure.exposure_id, "exposure number"),
         ("OBSID", exposure.exposure_id, "exposure number"),
-        ("CCDNAME", rendered.detector.name, "name of the CCD (simulation: place)"),
+        ("CCDNAME", rendered.detector.serial or rendered.detector.name, "serial number of the CCD (or its place)"),
         ("EXPREQ", exposure.exposure_time_s, "[s] requested exposure time"),
         ("DARKTIME", rendered.scene.exposure_time_s, "[s] time from clearing to readout"),
         ("UTC-OBS", conditions.start[11:], "[h:m:s] UTC at the start"),
@@ -221,7 +249,44 @@ def _megacam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("PRESSURE", conditions.pressure, "[hPa] air pressure"),
         ("RELHUMID", _HUMIDITY, _HUMIDITY_TEXT),
         ("RUNID", _PROGRAM, _PROGRAM_TEXT),
+        *_megacam_amplifier_cards(rendered),
     )
+
+
+def _megacam_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
+    """Return cards with the sections, gain and read noise of amplifiers A and B of a MegaPrime CCD.
+
+    The overscan columns BSECA and BSECB cover all rows. The result is () unless both are in one array in ADU.
+    """
+    layout = _raw_layout(rendered)
+    if layout is None:
+        return ()
+    all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
+    numbers = {key: value for key, value, _ in headers.amplifier_values(rendered)}
+    letter_cards: list[Card] = []
+    for number, amplifier in enumerate(layout.amplifiers):
+        letter, pixels = amplifier.name, layout.amplifier_data_section(number)
+        bias = replace(layout.amplifier_bias_section(number), y=0, ny=layout.raw_shape[0])
+        place = sections.to_mosaic_section(rendered.detector, amplifier.pixels, all_detectors)
+        letter_cards += [
+            *(((f"DETSEC{letter}", place, f"mosaic area of amplifier {letter}"),) if place else ()),
+            (f"ASEC{letter}", layout.amplifier_raw_section(number).text, f"section of amplifier {letter}"),
+            (f"DSEC{letter}", pixels.text, f"pixels of amplifier {letter}"),
+            (f"TSEC{letter}", pixels.text, f"pixels of amplifier {letter}"),
+            (f"BSEC{letter}", bias.text, f"overscan of amplifier {letter}"),
+            (f"CSEC{letter}", amplifier.pixels.text, "pixels in detector coordinates"),
+            *(
+                (f"{key}{letter}", float(np.broadcast_to(numbers[key], len(layout.amplifiers))[number]), text)
+                for key, _, text in _NUMBERS[:2]
+            ),
+        ]
+    return tuple(letter_cards)
+
+
+def _raw_layout(rendered: RenderedDetector) -> Layout | None:
+    """Return the amplifiers of a detector, or None unless all of them are in one array in ADU."""
+    layout, arrays = rendered.scene.layout, rendered.readout.extensions
+    return None if layout is None or len(arrays) > 1 or arrays[0].unit != "adu" else layout
 
 
 def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card, ...]:
@@ -247,7 +312,7 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("CCDSLOT", sensor, "sensor position in the raft"),
         ("CHIPID", rendered.detector.name, "names of raft and sensor"),
         ("DETNUM", number, "sensor number, from 0"),
-        ("LSST_NUM", f"{kind}-{number:03d}", "manufacturer and number of the sensor"),
+        ("LSST_NUM", rendered.detector.serial or f"{kind}-{number:03d}", "manufacturer and number of the sensor"),
         ("DATE", conditions.end, "end of the exposure"),
         ("DATE-BEG", conditions.start, "start of the exposure"),
         ("MJD-BEG", conditions.mjd, "[d] start of the exposure"),
@@ -363,8 +428,8 @@ def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     They are the cards that DECam has in addition to the amplifier cards of all ground cameras. The result is () unless
     all amplifiers are in one array in ADU.
     """
-    layout, arrays = rendered.scene.layout, rendered.readout.extensions
-    if layout is None or len(arrays) > 1 or arrays[0].unit != "adu":
+    layout = _raw_layout(rendered)
+    if layout is None:
         return ()
     all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
     numbers = {key: value for key, value, _ in headers.amplifier_values(rendered)}

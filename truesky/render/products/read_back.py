@@ -21,8 +21,11 @@ from truesky.render.channels.readout import ReadoutMode
 from truesky.render.products import head_files, raw_pointing
 
 # Keyword of the card that tells which part of an array contains the pixels of the detector. The card is present if the
-# array also has prescan or overscan.
+# array also has prescan or overscan around them.
 _DATA = "DATASEC"
+# Keyword of the card with the number of amplifiers in an array. If prescan and overscan lie between their pixels, the
+# array has this card but no card DATASEC, and its WCS is that of the pixels without prescan and overscan.
+_AMPLIFIERS = "NAMPS"
 
 
 def image_file(version: versions.Version, path: str) -> Path:
@@ -70,7 +73,7 @@ def frame(path: Path) -> images.Image:
         If the file has several arrays, prescan or overscan, and its card CHANNEL is not the name of a channel.
     """
     read = images.read_images(path)
-    if read[0].data is not None and _DATA not in _header(read):
+    if read[0].data is not None and not {_DATA, _AMPLIFIERS} & _header(read).keys():
         return images.Image(read[0].data, with_true_wcs(path, read[0].cards))
     return images.Image(_readout_mode(path, read).read_pixels(read), _trim_header(with_true_wcs(path, read[0].cards)))
 

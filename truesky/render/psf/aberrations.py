@@ -87,7 +87,7 @@ class TransferRatio:
     step: float
 
     @classmethod
-    def from_wavefront(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> TransferRatio:
+    def from_wavefront(cls, nm: Float, telescope: Telescope, wave: float, fried: float, axes: Float) -> TransferRatio:
         """Compute the ratio for a wavefront, without the shift of the image's centroid that the wavefront causes.
 
         Parameters
@@ -100,8 +100,8 @@ class TransferRatio:
             Wavelength, Angstrom.
         fried : float
             Fried length at this wavelength, m. The lattice of shifts extends to at least 3.3 Fried lengths.
-        turn : float
-            Angle from the x axis of the focal plane to the x axis of the detector, radian, positive towards the y axis.
+        axes : float array, shape (2, 2)
+            Directions of the columns and rows of the detector in the focal plane, see `Detector.axes`.
 
         Returns
         -------
@@ -114,7 +114,7 @@ class TransferRatio:
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
         lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)
         x, y, clear, plain = _pupil(telescope.radius, telescope.inner)
-        x, y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+        x, y = axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
         phase = galsim.zernike.Zernike(nm * (20.0 * np.pi / wave))(x, y)
         field = scipy.fft.fft2(clear * np.exp(1j * phase), (_TRANSFORM, _TRANSFORM))
         overlap = scipy.fft.ifft2(np.abs(field) ** 2)[np.ix_(lags, lags)]

@@ -9,9 +9,10 @@ each plane is the fraction of the light that it contains. The header cards are:
 - PIXEL: T if the PSF images are already averaged over the detector's pixel; by default F.
 
 The planes of a cube have the axes of the focal plane, with x to the right. They are rotated for detectors that are
-mounted rotated. A file of PSFEx has the axes and pixels of the detector, includes the average over a pixel, and
-contains polynomials of the position on the detector. Its optional card PSFLIGHT is the fraction of a star's light that
-its images contain, like the sum of a plane in a cube; by default 1. truesky writes this card, PSFEx does not.
+mounted rotated, and mirrored for detectors whose rows run in the mirrored direction. A file of PSFEx has the axes and
+pixels of the detector, includes the average over a pixel, and contains polynomials of the position on the detector. Its
+optional card PSFLIGHT is the fraction of a star's light that its images contain, like the sum of a plane in a cube; by
+default 1. truesky writes this card, PSFEx does not.
 """
 
 from __future__ import annotations
@@ -138,6 +139,8 @@ def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Pass
     spaced = matrices.matmul(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
     turns = round(detector.rotation / 90.0)
     images = np.stack([np.rot90(_resample(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
+    if detector.is_mirrored:
+        images = images[:, ::-1]
     return Planes(waves, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), _half(detector))
 
 

@@ -121,7 +121,7 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
     # exponentially distributed, and is drawn as rms^2 times -2 ln(1 - u) with a uniform u from 0 to 1. The size is
     # limited to 0.5.
     size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
-    angle = 2.0 * (np.pi * float(turn) - np.radians(detector.rotation))
+    angle = 2.0 * detector.own_radians(np.pi * float(turn))
     shear = size * float(np.cos(angle)), size * float(np.sin(angle))
     slope = mission.value(f"{section}.psf.seeing_slope", "")
     if exposure.airmass is None or exposure.zenith is None:
@@ -129,7 +129,7 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
     # Angle on the detector from the x axis to the zenith, positive towards y. For the position angle 0 the x axis of
     # the focal plane points west and the y axis north, so north is at 90 deg. Position angles, from north to east, are
     # counted in the same direction as angles from x to y.
-    zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
+    zenith = float(np.radians(detector.own_degrees(90.0 + exposure.zenith - exposure.position_angle)))
     tan_zenith_distance = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(
         f"{section}.psf.refraction", ""
     )
@@ -206,10 +206,10 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
     samples = int(np.clip(np.ceil(_SAMPLES_OF_FWHM * scale / widths.min()), _LEAST_SAMPLES, _MOST_SAMPLES))
     grid = _Grid.from_pixels(SIDE, samples, scale)
     lifts = atmosphere.refraction(waves, air.height) * air.tan_zenith_distance
-    middle, turn = _wavefront(detector, 0.0, 0.0, mission), float(np.radians(detector.rotation))
+    middle = _wavefront(detector, 0.0, 0.0, mission)
     images = []
     for wave, length, lift in zip(waves, fried, lifts - lifts.mean(), strict=True):
-        ratio = TransferRatio.from_wavefront(middle, telescope, float(wave), length, turn)
+        ratio = TransferRatio.from_wavefront(middle, telescope, float(wave), length, detector.axes)
         plane_transfer = grid.transfer(float(wave), length, telescope, air) * grid.interpolate_ratio(ratio, float(wave))
         if lift != 0.0:
             plane_transfer *= grid.phase_shift(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
@@ -248,9 +248,12 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
     vanes = int(mission.value(f"{section}.pupil.vanes"))
     width = mission.value(f"{section}.pupil.vane_width", "mm")
     # On an altazimuth mount, the vanes of the spider have a fixed angle to the direction of the zenith. On other mounts
-    # they have a fixed angle to the x axis of the focal plane. `turn` converts to an angle from the detector's x axis.
-    turn = air.zenith if mission.value(f"{section}.pupil.altazimuth") == 1.0 else -np.radians(detector.rotation)
-    first = mission.value(f"{section}.pupil.vane_angle", "rad") + turn
+    # they have a fixed angle to the x axis of the focal plane. `first` is an angle from the detector's x axis.
+    vane, is_altazimuth = (
+        mission.value(f"{section}.pupil.vane_angle", "rad"),
+        mission.value(f"{section}.pupil.altazimuth") == 1.0,
+    )
+    first = air.zenith + detector.handedness * vane if is_altazimuth else detector.own_radians(vane)
     length = 1e3 * (telescope.radius - telescope.inner)
     bars = np.array([(first + 2.0 * np.pi * i / vanes, width, length) for i in range(vanes)]).reshape(vanes, 3)
     area = 1e6 * np.pi * (telescope.radius**2 - telescope.inner**2)
@@ -287,11 +290,10 @@ def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfigura
 
     `x` and `y` are measured from the centre of the detector along its own axes, in units of half of its sides.
     """
-    turn, scale = np.radians(detector.rotation), detector.pixel_scale
-    u, v = x * detector.nx * scale / 2, y * detector.ny * scale / 2
-    at = (detector.x + np.cos(turn) * u - np.sin(turn) * v, detector.y + np.sin(turn) * u + np.cos(turn) * v)
+    scale = detector.pixel_scale
+    at = detector.to_focal_plane(x * detector.nx * scale / 2, y * detector.ny * scale / 2)
     reach = max(np.hypot(abs(d.x), abs(d.y)) + d.half_diagonal for d in detectors(detector.section[4:], mission))
-    return euclid.wavefront(at[0] / reach, at[1] / reach, detector.section, mission)
+    return euclid.wavefront(float(at[0] / reach), float(at[1] / reach), detector.section, mission)
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,9 +421,8 @@ def _drift(
     if not powers:
         return np.zeros((0, len(grid.along) + 1, len(grid.along) + 1))
     fried = atmosphere.fried_length(air.seeing, wave, telescope.outer)
-    turn = float(np.radians(detector.rotation))
     fronts = [_wavefront(detector, *at, mission) for at in ((0.0, 0.0), *nodes)]
-    ratios = [TransferRatio.from_wavefront(front, telescope, wave, fried, turn) for front in fronts]
+    ratios = [TransferRatio.from_wavefront(front, telescope, wave, fried, detector.axes) for front in fronts]
     x, y = np.array(nodes).T
     from_nodes = matrices.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
     off = np.stack([r.values - ratios[0].values for r in ratios[1:]])

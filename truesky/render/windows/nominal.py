@@ -61,8 +61,13 @@ def find_instrument(band: str, camera: str | None, mission: MissionConfiguration
 
 
 def central_detector(camera: str, mission: MissionConfiguration) -> Detector:
-    """Return the detector of a camera whose centre is closest to the optical axis."""
-    return min(detectors.detectors(camera, mission), key=lambda d: (round(float(np.hypot(d.x, d.y)), 6), d.name))
+    """Return the detector of a camera whose centre is closest to the optical axis, as if it were not mirrored.
+
+    Images without a planned exposure therefore have east to the left, and not to the right as in raw frames of DECam.
+    """
+    all_detectors = detectors.detectors(camera, mission)
+    central = min(all_detectors, key=lambda d: (round(float(np.hypot(d.x, d.y)), 6), d.name))
+    return replace(central, is_mirrored=False)
 
 
 def nominal_exposure(
@@ -137,5 +142,5 @@ def move_exposure(exposure: ExposureRow, detector: Detector, place: tuple[float,
         The new exposure, in which the columns of the detector point north at this place. The y axis of the focal plane
         points south if the detector is mounted upside down.
     """
-    ra, dec, angle = boresight_for(detector, *place, -detector.rotation)
+    ra, dec, angle = boresight_for(detector, *place, -detector.row_angle)
     return replace(exposure, ra=ra, dec=dec, position_angle=angle)

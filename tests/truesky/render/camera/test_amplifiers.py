@@ -41,12 +41,15 @@ def test_every_pixel_is_read_once_and_found_again(camera):
     raw = own.to_raw_image(marked)
     np.testing.assert_array_equal(np.sort(raw[raw > 0]), marked.ravel())
     data = own.to_raw_image(planes)
-    np.testing.assert_array_equal(data[own.data_section.slices], np.where(there, frame, 0))
+    # Prescan and overscan lie between the pixels in the files of HSC only.
+    assert (own.data_section is None) == (camera == "hsc")
+    if own.data_section is not None:
+        np.testing.assert_array_equal(data[own.data_section.slices], np.where(there, frame, 0))
     for number, amplifier in enumerate(own.amplifiers):
         np.testing.assert_array_equal(data[own.amplifier_data_section(number).slices], frame[amplifier.pixels.slices])
         bias = raw[own.amplifier_bias_section(number).slices]
-        height, pixels = own.height, own.prescan + own.width
-        read = marked[number, :height, pixels:] if own.overscan else marked[number, :height, : own.prescan]
+        rows, pixels = own.pixels_in_plane
+        read = marked[number, rows, pixels.stop :] if own.overscan else marked[number, rows, : own.prescan]
         np.testing.assert_array_equal(np.sort(bias, axis=None), np.sort(read, axis=None))
 
 
@@ -68,7 +71,7 @@ def test_the_first_pixel_to_be_read_is_at_its_corner(camera):
     frame = np.arange(96 * 80).reshape(80, 96)
     for plane, amplifier in zip(own.split(frame), own.amplifiers, strict=True):
         part = frame[amplifier.pixels.slices]
-        assert plane[0, own.prescan] == part[-int(amplifier.read_top), -int(amplifier.read_right)]
+        assert plane[own.prescan_rows, own.prescan] == part[-int(amplifier.read_top), -int(amplifier.read_right)]
 
 
 @pytest.mark.parametrize("camera", RAW)
@@ -81,7 +84,7 @@ def test_sensors_of_two_makers_have_different_gains():
     makers = {d.kind: d for d in detectors.detectors("lsstcam", MISSION)}
     e2v, itl = (layout_of(makers[kind]) for kind in ("e2v", "itl"))
     for own in (e2v, itl):
-        assert (own.width + own.scan_columns, own.height + own.overscan_rows) == (576, 2048)
+        assert (own.width + own.scan_columns, own.height + own.scan_rows) == (576, 2048)
         assert len(own.amplifiers) == 16
     still = resolve(overrides={"ext.lsstcam.gain_spread": (0.0, GAIN)})
     gains = [amplifiers.values("gain", GAIN, makers[k], still, own) for k, own in (("e2v", e2v), ("itl", itl))]

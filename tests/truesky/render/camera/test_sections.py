@@ -42,22 +42,39 @@ def test_no_two_detectors_share_a_pixel_and_all_are_inside(camera):
         assert apart.all()
 
 
-@pytest.mark.parametrize("camera", ["vis", "nisp", "decam", "megacam"])
+@pytest.mark.parametrize("camera", ["vis", "nisp", "decam", "megacam", "hsc"])
 def test_a_pixel_of_the_mosaic_lies_where_it_lies_in_the_focal_plane(camera):
     """The offset between mosaic and focal plane is the same for all detectors within 8 pixels.
 
-    The tolerance is needed because the rotation of mounted detectors has small errors.
+    The tolerance is needed because the rotation of mounted detectors has small errors. For HSC these are larger.
     """
-    every, corners = detectors(camera, MISSION), []
+    every, offsets = detectors(camera, MISSION), []
     for d in every:
         section = Section(3, 7, d.nx // 2, d.ny // 3)
-        x0, x1, y0, y1 = numbers(to_mosaic_section(d, section, every))
-        angle = np.radians(d.rotation)
-        u, v = (3 - (d.nx - 1) / 2, 7 - (d.ny - 1) / 2)
-        x = d.x / d.pixel_scale + np.cos(angle) * u - np.sin(angle) * v
-        y = d.y / d.pixel_scale + np.sin(angle) * u + np.cos(angle) * v
-        # The mosaic of DECam is rotated by 90 deg: its rows are parallel to columns of the detectors.
-        corners.append((x0 - y, y0 + x) if camera == "decam" else (x0 - x, y0 - y))
-        sign = -1 if d.upside_down and camera != "decam" else 1
+        place = to_mosaic_section(d, section, every)
+        if place is None:
+            continue
+        x0, x1, y0, y1 = numbers(place)
+        x, y = np.array(d.to_focal_plane(*(d.pixel_scale * np.array([3 - (d.nx - 1) / 2, 7 - (d.ny - 1) / 2]))))
+        x, y = x / d.pixel_scale, y / d.pixel_scale
+        # Directions of the columns and rows of the mosaic in the focal plane (x west, y north): south and east for
+        # DECam, as in its own headers, and north and west for HSC.
+        across, up = {"decam": (-y, -x), "hsc": (y, x)}.get(camera, (x, y))
+        offsets.append((x0 - across, y0 - up))
+        turned = {"decam": False, "hsc": d.name.startswith("1_")}.get(camera, d.upside_down)
+        sign = -1 if turned else 1
         assert (x1 - x0, y1 - y0) == (sign * (section.nx - 1), sign * (section.ny - 1))
-    assert np.ptp(np.array(corners), axis=0).max() < 8.0
+    assert np.ptp(np.array(offsets), axis=0).max() < 8.0
+
+
+def test_numbers_along_the_mosaic_of_decam_increase_as_in_its_headers():
+    """DETSEC of S1 is [12289:14336,1:4096] in raw headers: the lowest rows, and columns near the middle."""
+    every = detectors("decam", MISSION)
+    s1, n31, s29 = (next(d for d in every if d.name == name) for name in ("S1", "N31", "S29"))
+    x0, x1, y0, y1 = numbers(to_mosaic_section(s1, Section(0, 0, s1.nx, s1.ny), every))
+    assert (x1 - x0, y1 - y0) == (2047, 4095)
+    assert y0 < 10
+    _, right, *_ = numbers(mosaic_size(every))
+    assert x0 < right / 2 < x1 + 100
+    assert numbers(to_mosaic_section(s29, Section(0, 0, 1, 1), every))[0] < 10
+    assert numbers(to_mosaic_section(n31, Section(0, 0, 1, 1), every))[0] > right - 2060

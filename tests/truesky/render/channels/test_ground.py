@@ -109,13 +109,13 @@ def check_crosstalk(camera, nx, ny):
     own, count = scene.layout, len(scene.layout.amplifiers)
     # Rows per band. Each amplifier is illuminated in one band, and the last band is dark in all amplifiers.
     rows = own.height // (count + 1)
-    planes = np.zeros((count, own.height + own.overscan_rows, own.scan_columns + own.width))
-    bands = [slice(q * rows, (q + 1) * rows) for q in range(count)]
+    planes = np.zeros(own.planes_shape)
+    bands = [slice(own.prescan_rows + q * rows, own.prescan_rows + (q + 1) * rows) for q in range(count)]
     for q, band in enumerate(bands):
         planes[q, band, own.prescan : own.prescan + own.width] = 5e4
     found, decisions = apply_all(own.assemble(planes), ground.SKY, scene, lambda effect: stream(1, effect.name))
     assert {d.name for d in decisions if d.applied} >= {"crosstalk", "parallel_loss", "serial_loss", "amplifiers"}
-    level = found[:, count * rows + 6 : own.height].mean(axis=1, keepdims=True)
+    level = found[:, own.prescan_rows + count * rows + 6 : own.prescan_rows + own.height].mean(axis=1, keepdims=True)
     light = (found - level) * scene.amplifier_values("gain", "electron / adu")[:, None, None]
     # Pixel boundaries next to the light of another amplifier are displaced.
     pixels = slice(own.prescan + 4, own.prescan + own.width - 4)

@@ -61,7 +61,7 @@ def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
             assert header["GAIN"] == pytest.approx(whole[f"GAIN{n}"])
             assert header["RDNOISE"] == pytest.approx(whole[f"RDN{n}"])
             layout = rendered("raw").scene.layout
-            assert unit.data.shape == (layout.height + layout.overscan_rows, layout.scan_columns + layout.width)
+            assert unit.data.shape == (layout.height + layout.scan_rows, layout.scan_columns + layout.width)
             # Amplifiers of e2v: C1x are read from the upper right corner, C0x from the lower left one.
             assert (column_step, row_step) == ((-1, -1) if header["AMPNAME"][1] == "1" else (1, 1))
             assert header["DATASEC"] == header["TRIMSEC"] == f"[11:{10 + layout.width},1:{layout.height}]"
@@ -135,7 +135,7 @@ def test_electrons_are_what_the_raw_frame_was_before_it_was_read(files):
 def test_headers_are_in_the_words_of_the_survey(files, way):
     header = fits.getheader(files[way])
     assert (header["RAFTBAY"], header["CCDSLOT"], header["DETNUM"]) == ("R22", "S11", 94)
-    assert header["LSST_NUM"] == "E2V-094"
+    assert header["LSST_NUM"] == "E2V-CCD250-382"
     assert (header["IMGTYPE"], header["TIMESYS"], header["EXPTIME"]) == ("SKYEXP", "TAI", header["SHUTTIME"])
     assert (header["ROTPA"], header["AMSTART"]) == (33.0, 1.25)
     assert (header["RASTART"], header["DECSTART"]) == (header["RA"], header["DEC"])

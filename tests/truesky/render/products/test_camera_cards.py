@@ -86,10 +86,12 @@ def test_the_mosaic_is_of_both_amplifiers(decam):
 
 
 def test_amplifiers_are_read_from_their_own_sides(decam):
+    """In headers of raw frames of S1, AMPSECA is [2048:1025,4096:1] and AMPSECB is [1:1024,4096:1]."""
     _, header, _ = decam
+    assert header["DETPOS"].startswith("S")
     (a, rows), (b, _) = (ends(header[f"AMPSEC{letter}"]) for letter in "AB")
-    assert a[0] < a[1] < b[1] < b[0]
-    assert rows[0] < rows[1]
+    assert b[0] < b[1] < a[1] < a[0]
+    assert rows[0] > rows[1]
 
 
 def test_values_of_each_amplifier(decam):
@@ -215,8 +217,9 @@ def test_translated_properties_are_those_of_the_plan(camera, name):
     assert (found.instrument, found.physical_filter, found.observation_id) == WORDS[camera]
     assert found.exposure_id == found.visit_id == (2025081730727 if camera == "lsstcam" else row.exposure_id)
     assert found.object == header_of(one)["OBJECT"]
-    # DECam and MegaPrime cannot be rotated.
-    angle = {"decam": 90.0, "megacam": 0.0}.get(camera, row.position_angle)
+    # DECam and MegaPrime cannot be rotated. The y axis of the pipelines of DECam and HSC points east and west (90 and
+    # 270 deg) where the position angle is 0.
+    angle = {"decam": 90.0, "megacam": 0.0, "hsc": 270.0 + row.position_angle}.get(camera, row.position_angle)
     assert found.boresight_rotation_angle.deg == pytest.approx(angle, abs=1e-9)
 
 

@@ -99,7 +99,7 @@ def test_the_whole_of_it_is_galsim_s(camera):
     fried = atmosphere.fried_length(0.7, wave, telescope.outer)
     samples, step = 3, detector.pixel_scale / 3
     grid = ground._Grid.from_pixels(128, samples, detector.pixel_scale)
-    ratio = aberrations.TransferRatio.from_wavefront(nm, telescope, wave, fried, 0.0)
+    ratio = aberrations.TransferRatio.from_wavefront(nm, telescope, wave, fried, np.eye(2))
     ours = grid.image(grid.transfer(wave, fried, telescope, AIR) * grid.interpolate_ratio(ratio, wave))
     middle, half = len(ours) // 2, 60
     ours = ours[middle - half : middle + half + 1, middle - half : middle + half + 1]

@@ -13,11 +13,14 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
+from truesky.render.camera.detectors import Detector
 from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Lights, Scene
 
 # Number of samples along each side of a pixel, to compute the part of the pixel that a ghost covers.
 _SUBSAMPLES = 4
+# Stands for the detector of a scene without one, which has the axes of the focal plane.
+_WITHOUT_DETECTOR = Detector("", "", 0, 0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Pupil(NamedTuple):
@@ -151,8 +154,7 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
     the flux of its star. The offset (columns, rows) from a star to its ghost is along the y axis of the focal plane.
     The shape (`Pupil`) has gaps where the arms in the telescope's pupil block the light.
     """
-    rotation = scene.detector.rotation if scene.detector is not None else 0.0
-    cosine, sine = float(np.cos(np.radians(rotation))), float(np.sin(np.radians(rotation)))
+    detector = scene.detector or _WITHOUT_DETECTOR
     length = scene.value(f"{plate}.offset_y", "pix")
     radius = scene.value(f"{plate}.radius_out", "pix")
     aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
@@ -163,17 +165,18 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
     scale = radius / aperture
     reach = scale * pupil_value("spider_half_length", "mm")
     places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
-    # Rotate the arms from the axes of the focal plane to the axes of the detector.
+    # Convert the arms from the axes of the focal plane to the axes of the detector.
     arms = tuple(
-        (x * cosine + y * sine, y * cosine - x * sine, pupil_value(f"spider{number}.angle", "deg") - rotation, reach)
-        for number, (x, y) in enumerate(places, start=1)
+        (float(x), float(y), detector.own_degrees(pupil_value(f"spider{number}.angle", "deg")), reach)
+        for number, (x, y) in enumerate((detector.from_focal_plane(*place) for place in places), start=1)
     )
+    along, up = detector.from_focal_plane(0.0, length)
     width = scale * pupil_value("spider_width", "mm")
     ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
     return (
         noticeable_lights(scene, ratio, plate),
         ratio,
-        (length * sine, length * cosine),
+        (float(along), float(up)),
         Pupil(radius, hole, arms, width),
     )
 

@@ -85,19 +85,18 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
     half_x, half_y = _half_sides(scene)
     corner = float(np.hypot(half_x, half_y))
     detector = scene.detector
-    x0, y0, scale, turn = (0.0, 0.0, 1.0, 0.0)
+    x0, y0, scale, axes = 0.0, 0.0, 1.0, np.eye(2)
     if detector is not None:
-        x0, y0, scale, turn = detector.x, detector.y, detector.pixel_scale, np.radians(detector.rotation)
+        x0, y0, scale, axes = detector.x, detector.y, detector.pixel_scale, detector.axes
     along, up = scale * (np.arange(nx) - (nx - 1) / 2), scale * (np.arange(ny) - (ny - 1) / 2)
-    cosine, sine = np.cos(turn), np.sin(turn)
     sx, sy = slope[0] / half_x, slope[1] / half_y
     # A pixel at the offset d from the detector's centre c has the squared distance |c + R d|^2 = |c|^2 + 2 c . R d +
-    # |d|^2 from the centre of the focal plane, with the rotation R of the detector. This is a sum of a function of the
+    # |d|^2 from the centre of the focal plane, with the axes R of the detector. This is a sum of a function of the
     # column and a function of the row.
-    columns = -bowl * (2 * along * (x0 * cosine + y0 * sine) + along**2) / corner**2
-    rows = -bowl * (2 * up * (y0 * cosine - x0 * sine) + up**2) / corner**2
-    columns += along * (sx * cosine + sy * sine)
-    rows += up * (sy * cosine - sx * sine)
+    columns = -bowl * (2 * along * (x0 * axes[0, 0] + y0 * axes[1, 0]) + along**2) / corner**2
+    rows = -bowl * (2 * up * (y0 * axes[1, 1] + x0 * axes[0, 1]) + up**2) / corner**2
+    columns += along * (sx * axes[0, 0] + sy * axes[1, 0])
+    rows += up * (sy * axes[1, 1] + sx * axes[0, 1])
     return columns, rows + (x0 * sx + y0 * sy) - bowl * (x0**2 + y0**2) / corner**2
 
 

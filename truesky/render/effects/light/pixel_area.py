@@ -108,13 +108,12 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     d = scene.detector
     if d is None:
         return scene.sky_electrons, np.zeros(scene.nx), np.zeros(scene.ny), np.zeros((1, 1))
-    cosine, sine = np.cos(np.radians(d.rotation)), np.sin(np.radians(d.rotation))
-    u = np.arange(d.nx) - (d.nx - 1) / 2 + (cosine * d.x + sine * d.y) / d.pixel_scale
-    v = np.arange(d.ny) - (d.ny - 1) / 2 + (cosine * d.y - sine * d.x) / d.pixel_scale
-    matrix = d.pixel_scale * np.array([[cosine, -sine], [sine, cosine]])
+    along, up = d.from_focal_plane(d.x, d.y)
+    u = np.arange(d.nx) - (d.nx - 1) / 2 + along / d.pixel_scale
+    v = np.arange(d.ny) - (d.ny - 1) / 2 + up / d.pixel_scale
     stretch = np.zeros((3, 3))
     if d.distortion_terms:
-        stretch = distortion.area_change(d.distortion_terms, matrix)
+        stretch = distortion.area_change(d.distortion_terms, d.pixel_scale * d.axes)
     # An area on the tangent plane, at the distance r (rad) from the boresight, covers (1 + r^2)^(-3/2) of it on the
     # sky.
     flat = -1.5 * (d.pixel_scale * ARCSEC) ** 2

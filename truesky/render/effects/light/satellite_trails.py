@@ -170,10 +170,8 @@ def _path(
         return u + (shape[1] - 1) / 2, v + (shape[0] - 1) / 2
     if detector.distortion_terms:
         u, v = distortion.undo_sip(u, v, *distortion.sip(detector.distortion_terms, scale * np.eye(2)))
-    angle = np.radians(detector.rotation)
-    cosine, sine = float(np.cos(angle)), float(np.sin(angle))
-    x, y = u - detector.x / scale, v - detector.y / scale
-    return cosine * x + sine * y + (detector.nx - 1) / 2, cosine * y - sine * x + (detector.ny - 1) / 2
+    along, up = detector.from_focal_plane(u - detector.x / scale, v - detector.y / scale)
+    return along + (detector.nx - 1) / 2, up + (detector.ny - 1) / 2
 
 
 def profile(blur: Blur) -> Float:

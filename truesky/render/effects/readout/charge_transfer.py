@@ -314,7 +314,7 @@ def _max_deferred(scene: Scene, direction: str) -> float:
     if scene.layout is None:
         return 0.0
     layout = scene.layout
-    transfers = layout.height if direction == "parallel" else layout.prescan + layout.width
+    transfers = layout.prescan_rows + layout.height if direction == "parallel" else layout.prescan + layout.width
     packet = min(scene.brightest_electrons, scene.value("full_well", "electron"))
     return transfers * _transfer_loss(scene, direction) * packet
 

@@ -85,17 +85,18 @@ def add_to_scans(frame: Frame, scene: Scene, rng: np.random.Generator, out: Fram
     out = copy_frame(frame, out)
     if out.ndim == 3:
         sigmas = np.array(np.broadcast_to(_sigma(scene), len(out)), float)
-        _add_to_scans(out, sigmas, pixel_random.draw_key(rng), *scene.pixels_in_plane)
+        rows, columns = scene.pixels_in_plane
+        _add_to_scans(out, sigmas, pixel_random.draw_key(rng), (rows.start, rows.stop), (columns.start, columns.stop))
     return out
 
 
 @jit
-def _add_to_scans(planes: Any, sigmas: Any, key: Any, height: int, first_column: int, past_column: int) -> None:
+def _add_to_scans(planes: Any, sigmas: Any, key: Any, rows: tuple[int, int], columns: tuple[int, int]) -> None:
     """Add Gaussian noise to prescan and overscan of planes [amplifier, row, column], in place.
 
-    `sigmas` has the standard deviation of each amplifier in electrons. Pixels of the detector are the rows below
-    `height` and the columns from `first_column` on and below `past_column`. The random bits of a pixel derive from the
-    key `key` and the flat index of the pixel in `planes`.
+    `sigmas` has the standard deviation of each amplifier in electrons. Pixels of the detector are the rows from
+    `rows[0]` to `rows[1]` - 1 and the columns from `columns[0]` to `columns[1]` - 1. The random bits of a pixel derive
+    from the key `key` and the flat index of the pixel in `planes`.
     """
     normals, bits = np.empty(pixel_random.BLOCK), np.empty(pixel_random.BLOCK, np.uint64)
     _, ny, nx = planes.shape
@@ -103,7 +104,8 @@ def _add_to_scans(planes: Any, sigmas: Any, key: Any, height: int, first_column:
         for r in range(ny):
             # Columns of two runs without light: before and after the pixels, or the whole row in two parts.
             for run in range(2):
-                start, end = (0, first_column) if run == 0 else (past_column if r < height else first_column, nx)
+                second = columns[1] if rows[0] <= r < rows[1] else columns[0]
+                start, end = (0, columns[0]) if run == 0 else (second, nx)
                 for first in range(start, end, pixel_random.BLOCK):
                     noise = normals[: min(pixel_random.BLOCK, end - first)]
                     pixel_random.fill_normals(noise, bits, key, (q * ny + r) * nx + first)

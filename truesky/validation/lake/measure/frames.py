@@ -343,7 +343,8 @@ def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
     wcs_cards = {key: value for key, value in cards.items() if _WCS_KEYWORD.fullmatch(key)}
     all_cards = {**first, **header}
     names = ("DSEC1", "CSEC1") if "DSEC1" in all_cards else ("DATASEC", "CCDSEC")
-    if all(name in all_cards for name in names):
+    # Without DATASEC, prescan and overscan lie between the pixels, and the WCS is that of the pixels without them.
+    if "DATASEC" in all_cards and all(name in all_cards for name in names):
         _move_reference(wcs_cards, *(all_cards[name] for name in names))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)

@@ -44,9 +44,9 @@ def test_prescan_and_overscan_have_read_noise_under_a_bright_sky(camera):
     hidden, decision = read(scene)
     assert not decision.applied
     everywhere, _ = read(replace(scene, forced={"read_noise": True}))
-    height, first, past = scene.pixels_in_plane
+    rows, columns = scene.pixels_in_plane
     scans = np.ones(hidden.shape, bool)
-    scans[:, :height, first:past] = False
+    scans[:, rows, columns] = False
     # Pixels of the detector have no read noise, and all others have that of the full effect.
     assert not hidden[~scans].any()
     np.testing.assert_array_equal(hidden[scans], everywhere[scans])

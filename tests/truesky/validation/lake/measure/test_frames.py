@@ -11,9 +11,9 @@ from truesky.render.products import read_back
 from truesky.validation.lake.measure import frames
 
 # Sensors of LSSTCam by e2v and ITL, of which ITL reads all columns from the right; DECam, whose raw headers have a
-# pointing error.
+# pointing error and whose southern CCDs are read from the top; HSC, which has overscan between the pixels.
 SIDE = 256
-DETECTORS = {"lsstcam": ("R22_S11", "R10_S02"), "decam": ("N4",)}
+DETECTORS = {"lsstcam": ("R22_S11", "R10_S02"), "decam": ("N4", "S4"), "hsc": ("1_12", "0_05")}
 
 
 @pytest.mark.parametrize(("camera", "name"), [(camera, name) for camera, names in DETECTORS.items() for name in names])
