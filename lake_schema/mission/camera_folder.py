@@ -43,6 +43,8 @@ from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS, Parameter, convert, read_all_parameters
 
 _STATUS = "SIM"
+# Parameters that all ground cameras of the mission database have, but that a user's camera may omit.
+_OPTIONAL = frozenset({"first_light"})
 _MODEL_FILES = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAVEFRONT}
 
 
@@ -279,6 +281,7 @@ def parameter_units() -> dict[str, str]:
 def required_parameters() -> tuple[str, ...]:
     """Return the sorted names of the parameters that every ground camera must have, without the prefix of the camera.
 
-    They are the parameters that all ground cameras of the mission database have.
+    They are the parameters that all ground cameras of the mission database have, except those in `_OPTIONAL`.
     """
-    return tuple(sorted(set.intersection(*(set(units) for units in units_by_camera().values()))))
+    common = set.intersection(*(set(units) for units in units_by_camera().values()))
+    return tuple(sorted(common.difference(_OPTIONAL)))

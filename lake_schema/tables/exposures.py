@@ -144,6 +144,32 @@ EXPOSURES = Table(
             180.0,
             True,
         ),
+        Column(
+            "clouds",
+            "float64",
+            "mag",
+            "obs.atmos.extinction",
+            "extinction by clouds, averaged over the exposure, for ground cameras",
+            0.0,
+            50.0,
+            True,
+        ),
+        Column(
+            "sky_slope_x",
+            "float64",
+            "deg-1",
+            "instr.skyLevel;arith.grad",
+            "relative change of the sky along the focal plane's x axis, by twilight",
+            nullable=True,
+        ),
+        Column(
+            "sky_slope_y",
+            "float64",
+            "deg-1",
+            "instr.skyLevel;arith.grad",
+            "relative change of the sky along the focal plane's y axis, by twilight",
+            nullable=True,
+        ),
     ),
     "Exposures, in the order they are taken.",
     key=("exposure_id",),
@@ -183,6 +209,9 @@ class ExposureRow:
     realisation: int | None = None
     airmass: float | None = None
     zenith: float | None = None
+    clouds: float | None = None
+    sky_slope_x: float | None = None
+    sky_slope_y: float | None = None
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:

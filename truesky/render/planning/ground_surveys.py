@@ -17,6 +17,7 @@ import numpy as np
 
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.mission.configuration import MissionConfiguration
+from truesky.fluxes import passbands
 from truesky.randomness import rng
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.camera import pointing
@@ -40,6 +41,10 @@ _OVERHEAD_S = 30.0
 # Altitude of the Sun above the horizon at the end of nautical twilight, deg. Exposures of the sky with a higher Sun
 # cause a warning.
 _NIGHT_SUN_ALTITUDE = -12.0
+# Pivot wavelength (angstrom) below which exposures without a date are taken with the Moon below the horizon.
+_BLUE = 5500.0
+# Largest illuminated fraction of the Moon for exposures without a date in redder bands, while the Moon is up.
+_FAINT_MOON = 0.4
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -76,8 +81,8 @@ def exposures(
     -----
     Bands that the survey observes together share their pointings. Some surveys use these bands in turn, one per
     pointing. The exposures follow one another from `start`. If the block has no date, each exposure waits until its
-    field is next visible at night. The pointings have random errors, with the standard deviation that the mission
-    database has for the camera.
+    field is next high in a dark night (`max_moon`). The pointings have random errors, with the standard deviation that
+    the mission database has for the camera.
     """
     now = start
     rules = _rules(block.survey, mission)
@@ -100,7 +105,7 @@ def exposures(
             selected_bands = bands if all_bands else (bands[i % len(bands)],)
             for band in selected_bands:
                 seconds = _seconds(rule, band, mission) if block.exposure_time_s is None else block.exposure_time_s
-                now = next_dark_time(ra, dec, now, site) if block.mjd is None else now
+                now = next_dark_time(ra, dec, now, site, max_moon(band)) if block.mjd is None else now
                 actual = _with_pointing_error((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
                 yield Exposure(
                     channel="EXT",
@@ -115,6 +120,7 @@ def exposures(
                     survey=block.survey,
                     field=i + 1,
                     detectors=block.detectors,
+                    clouds=block.clouds,
                 )
                 now += (seconds + _OVERHEAD_S) / _DAY_S
 
@@ -314,33 +320,59 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     return exposures_of_rows
 
 
-def first_date(channel: str, camera: str, ra: float, dec: float, mission: MissionConfiguration) -> float:
-    """Return the first date after the launch of the mission at which a camera can observe a position well.
+def earliest_date(camera: str, mission: MissionConfiguration) -> float:
+    """Return the earliest MJD of exposures without a date: the launch of Euclid, or first light if that is later.
+
+    `camera` is a ground camera, or "vis" or "nisp". A camera without first light in the mission database existed before
+    the launch.
+    """
+    launch, key = mission.value("svm.launch", "d"), f"{image_types.section(camera)}.first_light"
+    return max(launch, mission.value(key, "d")) if key in mission else launch
+
+
+def max_moon(band: str) -> float:
+    """Return the illuminated fraction of the brightest Moon under which exposures without a date are taken.
+
+    The result is 0 (Moon below the horizon) in bands bluer than 5500 angstrom, such as u and g, and in bands with a
+    curve of the user. It is 0.4 in other bands.
+    """
+    is_red = band in passbands.names() and passbands.pivot_wavelength(passbands.load(band)) >= _BLUE
+    return _FAINT_MOON if is_red else 0.0
+
+
+def first_date(
+    instrument: tuple[str, str], band: str, place: tuple[float, float], mission: MissionConfiguration
+) -> float:
+    """Return the first date at which a camera can observe a position well.
 
     Parameters
     ----------
-    channel, camera : str
+    instrument : (str, str)
         Names of the channel and of the camera.
-    ra, dec : float
-        Position in degrees.
+    band : str
+        Name of the passband, on which the allowed Moon depends.
+    place : (float, float)
+        Right ascension and declination in degrees.
     mission : MissionConfiguration
-        Mission database, with the date of the launch.
+        Mission database, with the launch of Euclid and the first light of the camera.
 
     Returns
     -------
     float
-        MJD. Euclid observes when the Sun allows the position, a ground camera when the position crosses the meridian
-        at night, where the airmass is smallest.
+        MJD, after the launch and after first light of the camera. Euclid observes when the Sun allows the position. A
+        ground camera observes when the position crosses the meridian, where the airmass is smallest, in a dark night.
 
     Raises
     ------
     BadInput
         If the Sun allows the position at no date.
     """
-    launch = mission.value("svm.launch", "d")
+    channel, camera = instrument
+    earliest = earliest_date(camera, mission)
     if not registry.CHANNELS[channel].on_ground:
-        return next_allowed(ra, dec, launch, mission)
-    return next_dark_transit(ra, dec, launch, Site.from_mission(image_types.section(camera), mission))
+        return next_allowed(*place, earliest, mission)
+    site = Site.from_mission(image_types.section(camera), mission)
+    return next_dark_transit(*place, earliest, site, max_moon(band))
 
 
 def _exposure_of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
@@ -353,7 +385,7 @@ def _exposure_of_row(row: Row, number: int, block: Observation, mission: Mission
     mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
     is_euclid = row.channel != "EXT"
     if mjd is None:
-        mjd = first_date(row.channel, camera, row.ra, row.dec, mission)
+        mjd = first_date((row.channel, camera), row.band, (row.ra, row.dec), mission)
     if angle is None:
         angle = position_angle(row.ra, row.dec, mjd) if is_euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
@@ -373,6 +405,7 @@ def _exposure_of_row(row: Row, number: int, block: Observation, mission: Mission
         sky=row.sky,
         seeing=row.seeing,
         zero_point=row.zero_point,
+        clouds=block.clouds if row.clouds is None else row.clouds,
         psf=row.psf,
         detectors=row.detectors or block.detectors,
     )

@@ -304,6 +304,7 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         ("TIMESYS", place.time_scale, "time scale of DATE-OBS and MJD-OBS"),
         *astrometry.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] pixel scale at the boresight"),
+        *((("CLOUDS", exposure.clouds, "[mag] extinction by clouds, in ZEROPNT"),) if exposure.clouds else ()),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] PSF FWHM including the pixel"),
         ("SEEING", exposure.seeing, "[arcsec] FWHM of the atmospheric seeing"),

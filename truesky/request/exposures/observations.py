@@ -15,7 +15,7 @@ from truesky.request import area as areas
 from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
 from truesky.request.exposures import pointing_tables
-from truesky.request.exposures.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
+from truesky.request.exposures.pointing_tables import CHANNELS, CLOUDS_LIMITS, IMAGE_TYPES, Contents
 from truesky.request.exposures.pointings import MAX_REALISATIONS
 from truesky.request.toml_values import (
     Toml,
@@ -84,9 +84,12 @@ _BLOCKS_OF_KEY = {
     "bright": (_TIMED,),
     "macc": (_SURVEY, _USER_FIELD, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_USER_FIELD, _TIMED, _DITHERED, _TABLE),
+    "clouds": (_GROUND, _GROUND_USER_FIELD, _TABLE),
 }
 # Channels that use a key. A key that is not listed is used by all channels.
-_CHANNELS_OF_KEY = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
+_CHANNELS_OF_KEY = {
+    "short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S"), "clouds": ("EXT",),
+}  # fmt: skip
 # Image types that use a key. A key that is not listed is used by all image types.
 _TYPES_OF_KEY = {
     "lamps": ("flat", "persistence"),
@@ -156,6 +159,8 @@ class Observation:
         when earlier NISP observations without a date, or of calibrations, have ended and their persistence has faded.
     exposure_time_s : float, optional
         Exposure time in seconds; None for the mission's value.
+    clouds : float
+        Mean extinction in magnitudes by clouds that drift over a ground camera; 0 for a clear sky.
     realisations : int
         Number of copies of each exposure that differ only in their noise.
     lamps : tuple of int
@@ -204,6 +209,7 @@ class Observation:
     detectors: tuple[str, ...] = ()
     mjd: float | None = None
     exposure_time_s: float | None = None
+    clouds: float = 0.0
     realisations: int = 1
     lamps: tuple[int, ...] = ()
     macc: tuple[int, ...] = ()
@@ -291,6 +297,7 @@ def _observation(
             blue=read(boolean, table, f"{path}.blue", False),
             mjd=read(sky_notation.optional_mjd, table, f"{path}.mjd"),
             exposure_time_s=read(optional_number, table, f"{path}.exposure_time_s", 0.0, 1e6, "s"),
+            clouds=read(optional_number, table, f"{path}.clouds", *CLOUDS_LIMITS, "mag") or 0.0,
             realisations=read(integer, table, f"{path}.realisations", 1, MAX_REALISATIONS, 1),
             macc=read(_macc, table, f"{path}.macc"),
             phase_times_s=read(_numbers, table, f"{path}.phase_times_s", 1e-6, 100.0),

@@ -50,9 +50,12 @@ COLUMNS = (
     ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
     ("seeing", "arcsec", "FWHM of the atmosphere for ground cameras", "drawn around the mission's value"),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
+    ("clouds", "mag", "mean extinction by clouds of the night, for ground cameras", "the observation's, else 0"),
     ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
     ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0"),
 )
+# Smallest and largest mean extinction by clouds, mag. A sky with thicker clouds is not observed.
+CLOUDS_LIMITS = (0.0, 5.0)
 # Smallest and largest allowed number of each column of numbers.
 BOUNDS = {
     "ra": sky_notation.RA_LIMITS,
@@ -63,6 +66,7 @@ BOUNDS = {
     "sky": (0.0, 1e6),
     "seeing": (0.01, 10.0),
     "zero_point": (0.0, 50.0),
+    "clouds": CLOUDS_LIMITS,
     "grism_angle": (-360.0, 360.0),
 }
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
@@ -113,6 +117,8 @@ class Row:
         FWHM of the atmosphere's PSF in arcsec; always None for Euclid.
     zero_point : float, optional
         AB magnitude of a source that gives 1 electron per second.
+    clouds : float, optional
+        Mean extinction by clouds in magnitudes; always None for Euclid.
     psf : str, optional
         Path of a PSF file.
     grism_angle : float, optional
@@ -134,6 +140,7 @@ class Row:
     sky: float | None
     seeing: float | None
     zero_point: float | None
+    clouds: float | None
     psf: str | None
     grism_angle: float | None
     detectors: tuple[str, ...]
@@ -307,6 +314,7 @@ def _row_from_line(
             sky=read(_number, row, "sky", location),
             seeing=read(_number, row, "seeing", location) if channel == "EXT" else None,
             zero_point=read(_number, row, "zero_point", location),
+            clouds=read(_number, row, "clouds", location) if channel == "EXT" else None,
             psf=str(read(user_files.expand_path, row["psf"], path.parent)) if row.get("psf") else None,
             grism_angle=read(_number, row, "grism_angle", location),
             detectors=tuple(row.get("detectors", "").split()),

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.coordinates import AltAz, EarthLocation, get_sun
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body, get_sun
 from astropy.time import Time
 
 from lake_schema.errors import BadInput
@@ -114,6 +114,45 @@ def test_warning_about_dates_in_daylight():
     assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -12 deg")
     assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
     assert "\n" not in line
+
+
+FIRST_LIGHT = {"lsstcam": "2025-04-15", "jpcam": "2020-06-29", "megacam": "2003-01-10", "decam": "2012-09-12"}
+
+
+@pytest.mark.parametrize(
+    ("survey", "camera", "band"),
+    [
+        ("lsst", "lsstcam", "lsst_u"), ("lsst", "lsstcam", "lsst_r"), ("cfis", "megacam", "cfis_u"),
+        ("cfis", "megacam", "cfis_r"), ("jedis", "jpcam", "jedis_g"), ("des", "decam", "des_z"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("ra", [40.0, 190.0])
+def test_exposures_without_a_date_have_a_dark_sky(survey, camera, band, ra):
+    """Astropy gives Sun and Moon: the Moon is down in blue bands, and down or less than 40 % lit in red bands."""
+    site = ground_surveys.Site.from_mission(f"ext.{camera}", MISSION)
+    place = (ra, float(np.clip(site.latitude + 15.0, -60.0, 50.0)))
+    block = Observation(("EXT",), survey=survey, ra=place[0], dec=place[1], bands=(band,), exposures=3, dither="none")
+    start = ground_surveys.earliest_date(camera, MISSION)
+    dates = [one.mjd for one in ground_surveys.exposures(block, Area(ra=0.0, dec=0.0, radius=1.0), MISSION, 3, start)]
+    dates.append(ground_surveys.first_date(("EXT", camera), band, place, MISSION))
+    where = EarthLocation.from_geodetic(site.longitude, site.latitude, site.height)
+    for mjd in dates:
+        when = Time(mjd, format="mjd")
+        assert mjd >= max(60126.0, Time(FIRST_LIGHT[camera]).mjd)
+        frame = AltAz(obstime=when, location=where)
+        moon, sun = (get_body(name, when, where) for name in ("moon", "sun"))
+        assert sun.transform_to(frame).alt.deg < -17.5
+        phase = np.arctan2(
+            sun.distance * np.sin(sun.separation(moon)),
+            moon.distance - sun.distance * np.cos(sun.separation(moon)),
+        )
+        lit = 0.5 * (1.0 + np.cos(phase.value))
+        field = SkyCoord(*place, unit="deg")
+        if moon.transform_to(frame).alt.deg > -1.0:
+            assert band not in ("lsst_u", "cfis_u", "jedis_g")
+            assert lit < 0.41
+            assert field.separation(moon, origin_mismatch="ignore").deg > 29.0
+        assert field.transform_to(frame).secz < 1.3
 
 
 def test_seeing_is_drawn_for_each_exposure():
