@@ -49,7 +49,7 @@ _MAX_AIRMASS, _MAX_RELATIVE_AIRMASS = 2.0, 1.2
 # Largest airmass with which an exposure is simulated. A field that is lower is simulated at its highest altitude.
 HIGHEST_AIRMASS = 3.0
 # Altitude (deg) at which the airmass is `HIGHEST_AIRMASS`.
-_LOWEST_ALTITUDE = 19.3168
+LOWEST_ALTITUDE = 19.3168
 # Step in days with which dark time is searched: a quarter of an hour.
 _STEP = 1.0 / 96.0
 # Number of days after the earliest date in which dark time is searched.
@@ -223,7 +223,7 @@ def altitude_and_azimuth(ra: float, dec: float, mjd: float, site: Site) -> tuple
     altitude = float(site.altitude(ra, dec, mjd))
     if altitude > 0.0 and float(airmass(altitude)) <= HIGHEST_AIRMASS:
         return altitude, site.azimuth(ra, dec, mjd)
-    return max(90.0 - abs(dec - site.latitude), _LOWEST_ALTITUDE), 180.0 if dec < site.latitude else 0.0
+    return max(90.0 - abs(dec - site.latitude), LOWEST_ALTITUDE), 180.0 if dec < site.latitude else 0.0
 
 
 def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:

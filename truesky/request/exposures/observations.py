@@ -14,7 +14,7 @@ from lake_schema.texts import spelling
 from truesky.request import area as areas
 from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
-from truesky.request.exposures import pointing_tables
+from truesky.request.exposures import pointing_tables, visit_tables
 from truesky.request.exposures.pointing_tables import CHANNELS, CLOUDS_LIMITS, IMAGE_TYPES, Contents
 from truesky.request.exposures.pointings import MAX_REALISATIONS
 from truesky.request.toml_values import (
@@ -282,7 +282,8 @@ def _observation(
         if kind is not None and places is not None:
             # A second place is one mistake: neither its keys nor a table of pointings are mistakes, too.
             read(_refuse_unused, table, *kind, path)
-            values = {**(values or {}), **(read(_table_of_pointings, table, path, kind, folder) or {})}
+            survey = (values or {}).get("survey")
+            values = {**(values or {}), **(read(_table_of_pointings, table, path, (*kind, survey), folder, mission) or {})}
         observation = Observation(
             channels=(),
             ra=read(sky_notation.optional_ra, table, f"{path}.ra"),
@@ -372,10 +373,19 @@ def _values_of_kind(
     return values
 
 
-def _table_of_pointings(table: Toml, path: str, kind: tuple[tuple[str, ...], str], folder: Path) -> dict[str, Any]:
-    """Read the table of pointings of an observation, and return its file and its summary by key; {} without a table."""
+def _table_of_pointings(
+    table: Toml,
+    path: str,
+    kind: tuple[tuple[str, ...], str, str | None],
+    folder: Path,
+    mission: MissionConfiguration | None,
+) -> dict[str, Any]:
+    """Read the table of pointings of an observation, and return its file and its summary by key; {} without a table.
+
+    `kind` has the channels, the image type and the survey; the survey is None if it is wrong.
+    """
     file = _pointings_file(table, path, folder)
-    return {} if file is None else {"pointings": str(file), "table": _contents(file, *kind, path)}
+    return {} if file is None else {"pointings": str(file), "table": _contents(file, kind, path, mission)}
 
 
 def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: MissionConfiguration, path: str) -> None:
@@ -513,9 +523,21 @@ def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
         raise error.with_prefix(f"{path}.pointings") from None
 
 
-def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str) -> Contents:
+def _contents(
+    file: Path, kind: tuple[tuple[str, ...], str, str | None], path: str, mission: MissionConfiguration | None
+) -> Contents | None:
+    """Return the summary of a table of pointings or of visits; None if it cannot be read because of other mistakes."""
+    channels, image_type, survey = kind
     try:
-        return pointing_tables.contents(file, channels, image_type)
+        if not visit_tables.is_table_of_visits(file):
+            return pointing_tables.contents(file, channels, image_type)
+        if channels != (instruments.GROUND_CHANNEL,):
+            raise BadInput(f"{file} is a table of visits, which is only for channel {instruments.GROUND_CHANNEL}")
+        if survey is None or mission is None:
+            return None
+        camera = instruments.survey_camera(survey, mission)
+        bands = instruments.band_names(instruments.GROUND_CHANNEL, camera, mission)
+        return pointing_tables.summarise(file, visit_tables.read(file, bands, image_type))
     except BadInput as error:
         raise error.with_prefix(f"{path}.pointings") from None
 

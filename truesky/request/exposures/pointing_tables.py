@@ -85,6 +85,38 @@ _MAX_MISTAKES = 20
 
 
 @dataclass(frozen=True, slots=True)
+class Visit:
+    """Values of a visit of the Rubin Observatory's scheduler from which the planner computes those of its exposures.
+
+    Attributes
+    ----------
+    exposures : int
+        Number of exposures of the visit, which have the exposure time of the row.
+    overhead_s : float
+        Seconds from the end of an exposure of the visit to the start of the next one.
+    seeing_eff : float
+        FWHM in arcsec of the Gaussian with the same effective area as the PSF.
+    airmass : float
+        Airmass to which `seeing_eff` belongs.
+    sky_brightness : float
+        Surface brightness of the sky, AB mag per arcsec2.
+    rot_sky, rot_tel : float, optional
+        Rotation of the camera relative to the sky and to the telescope in degrees; one of them may be None.
+    parallactic : float, optional
+        Position angle of the zenith in degrees; None to compute it.
+    """
+
+    exposures: int
+    overhead_s: float
+    seeing_eff: float
+    airmass: float
+    sky_brightness: float
+    rot_sky: float | None
+    rot_tel: float | None
+    parallactic: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Row:
     """One exposure of a table of pointings.
 
@@ -125,6 +157,8 @@ class Row:
         Direction of NISP-S spectra in the focal plane in degrees.
     detectors : tuple of str
         Names of detectors to render; () for the detectors of the observation.
+    visit : Visit, optional
+        Values of a visit, from which the planner computes sky, seeing and position angle; None for a pointing.
     """
 
     location: str
@@ -144,6 +178,7 @@ class Row:
     psf: str | None
     grism_angle: float | None
     detectors: tuple[str, ...]
+    visit: Visit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +222,11 @@ def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
     BadInput
         If the file does not exist or the table is not valid, see `read`.
     """
-    rows = read(path, channels, image_type)
+    return summarise(path, read(path, channels, image_type))
+
+
+def summarise(path: Path, rows: Sequence[Row]) -> Contents:
+    """Return the summary of the table in a file, whose rows have been read."""
     bands = tuple(dict.fromkeys(row.band for row in rows))
     return Contents(file_sha256(path), bands, tuple(dict.fromkeys((row.channel, row.image_type) for row in rows)))
 
