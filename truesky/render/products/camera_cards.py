@@ -51,6 +51,9 @@ _IMAGE_TYPES: Mapping[str, Mapping[str, str]] = {
     "megacam": {"science": "OBJECT", "deep": "OBJECT", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"},
     "lsstcam": {"science": "SKYEXP", "deep": "SKYEXP", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"},
 }
+# Nights (YYYYMMDD) between which ROTPA of LSSTCam was 90 deg too large, and exposure of the last night before which it
+# was wrong by 180 deg (obs_lsst, translator of LSSTCam).
+_FIRST_ROTPA_NIGHT, _LAST_ROTPA_NIGHT, _LAST_ROTPA_SEQUENCE = "20250301", "20250422", 251
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +245,7 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("DATE-END", conditions.end, "end of the exposure"),
         ("MJD-END", conditions.end_mjd, "[d] end of the exposure"),
         ("TRACKSYS", "RADEC", "coordinates that the telescope tracks"),
-        ("ROTPA", conditions.position_angle, "[deg] position angle of y, north through east"),
+        ("ROTPA", _rotator_angle(conditions.position_angle, night, sequence), "[deg] position angle of y"),
         ("ROTCOORD", "sky", "reference of ROTPA"),
         ("RASTART", conditions.ra, "[deg] boresight RA at exposure start"),
         ("DECSTART", conditions.dec, "[deg] boresight Dec at exposure start"),
@@ -261,6 +264,19 @@ def _lsstcam(rendered: RenderedDetector, conditions: _Conditions) -> tuple[Card,
         ("FOCUSZ", 0.0, f"[mm] {_FOCUS_TEXT}"),
         *_file_name(rendered),
     )
+
+
+def _rotator_angle(position_angle: float, night: str, sequence: int) -> float:
+    """Return ROTPA of LSSTCam for a position angle (deg), as real headers of a night (YYYYMMDD) have it.
+
+    In its first nights the camera wrote other angles, which the translator of obs_lsst corrects in all frames of these
+    nights.
+    """
+    if _FIRST_ROTPA_NIGHT < night < _LAST_ROTPA_NIGHT:
+        return position_angle + 90.0
+    if night == _LAST_ROTPA_NIGHT and sequence < _LAST_ROTPA_SEQUENCE:
+        return (position_angle + 360.0) % 360.0 - 180.0
+    return position_angle
 
 
 def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:

@@ -68,10 +68,10 @@ def test_errors_name_the_line(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
-def survey_of(name, number, seed=3, **changes):
+def survey_of(name, number, seed=3, start=60500.0, **changes):
     block = Observation(("EXT",), survey=name, exposures=number, **changes)
     area = Area(ra=60.0, dec=-35.0, radius=2.0) if name != "cfis" else Area(ra=200.0, dec=40.0, radius=2.0)
-    return [*ground_surveys.exposures(block, area, MISSION, seed, 60500.0)]
+    return [*ground_surveys.exposures(block, area, MISSION, seed, start)]
 
 
 @nightly.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)], (0, 2))
@@ -100,20 +100,25 @@ def test_bands_outside_the_challenge_can_be_planned(name, camera, band):
     assert min(table["sky"].to_pylist()) > 0.0
 
 
-def test_warning_about_dates_in_daylight():
+def test_warnings_about_impossible_dates():
     """Compare the Sun's altitude with astropy."""
-    none = survey_of("lsst", 4, bands=("lsst_r",))
-    assert ground_surveys.daylight_warning(none, MISSION) == ""
+    none = survey_of("lsst", 4, start=60850.0, bands=("lsst_r",))
+    assert list(ground_surveys.date_warnings(none, MISSION)) == []
     # 11:30 local time.
-    dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
+    dated = [replace(one, mjd=60850.68 if i else one.mjd) for i, one in enumerate(none[:2])]
     dated.append(replace(dated[1], image_type="flat"))
-    line = ground_surveys.daylight_warning(dated, MISSION)
+    (line,) = (line for line in ground_surveys.date_warnings(dated, MISSION) if "Sun" in line)
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
-    when = Time(60500.68, format="mjd")
+    when = Time(60850.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
-    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -12 deg")
+    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -8 deg")
     assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
     assert "\n" not in line
+    # At the antipodes of the field's meridian, the field is below the horizon. LSSTCam was not there in 2024.
+    low, early = replace(none[0], mjd=none[0].mjd + 0.5), replace(none[0], mjd=60500.2)
+    lines = list(ground_surveys.date_warnings([low, early], MISSION))
+    assert any("2 exposures of the sky have dates when the field is lower than 19 deg" in line for line in lines)
+    assert "1 of 2 exposures of the sky have dates before first light of the camera" in lines[-1]
 
 
 FIRST_LIGHT = {"lsstcam": "2025-04-15", "jpcam": "2020-06-29", "megacam": "2003-01-10", "decam": "2012-09-12"}
