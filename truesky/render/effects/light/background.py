@@ -13,6 +13,7 @@ def apply(
     frame: Frame,
     electrons: float,
     slopes: tuple[float, float] = (0.0, 0.0),
+    start: tuple[float, float] = (0.0, 0.0),
     rng: np.random.Generator | None = None,
     out: Frame | None = None,
 ) -> Frame:
@@ -23,9 +24,11 @@ def apply(
     frame : float array, shape (ny, nx)
         Expected electrons.
     electrons : float
-        Expected electrons of the sky per pixel in the middle of the frame, 0 or more.
+        Expected electrons of the sky per pixel in the middle of the detector, 0 or more.
     slopes : (float, float), optional
         Relative change of the sky per column and per row. By default the sky is constant.
+    start : (float, float), optional
+        Column and row of the first pixel of the frame, relative to the middle of the detector.
     rng : numpy.random.Generator, optional
         Not used.
     out : float64 array, shape of `frame`, optional
@@ -46,7 +49,7 @@ def apply(
     if slopes == (0.0, 0.0):
         return np.asarray(np.add(frame, electrons, out=out))
     out = copy_frame(frame, out)
-    rows, columns = (np.arange(n) - (n - 1) / 2 for n in frame.shape)
+    rows, columns = (first + np.arange(n) for first, n in zip(start[::-1], frame.shape, strict=True))
     along_rows = electrons * slopes[0] * columns
     for block in row_blocks(out):
         # The sky cannot be negative, even where a plane is far from its tangent point.
@@ -54,17 +57,14 @@ def apply(
     return out
 
 
-def parameters(scene: Scene) -> tuple[float, tuple[float, float]]:
-    """Return the parameters of `apply` for a scene: electrons of the sky in the middle of the drawn pixels, and slopes.
+def parameters(scene: Scene) -> tuple[float, tuple[float, float], tuple[float, float]]:
+    """Return the parameters of `apply` for a scene: electrons of the sky, slopes, and position of the first pixel.
 
     The sky of a window is that of the same pixels of the detector.
     """
-    slopes, electrons, detector = scene.sky_slopes, scene.sky_electrons, scene.detector
-    if scene.window is None or detector is None or slopes == (0.0, 0.0):
-        return electrons, slopes
-    column, row = scene.window.middle
-    middle = 1.0 + slopes[0] * (column - (detector.nx - 1) / 2) + slopes[1] * (row - (detector.ny - 1) / 2)
-    return max(electrons * middle, 0.0), (slopes[0] / middle, slopes[1] / middle)
+    shape = (scene.nx, scene.ny) if scene.detector is None else (scene.detector.nx, scene.detector.ny)
+    first = (0, 0) if scene.window is None else (scene.window.column, scene.window.row)
+    return scene.sky_electrons, scene.sky_slopes, (first[0] - (shape[0] - 1) / 2, first[1] - (shape[1] - 1) / 2)
 
 
 EFFECT = Effect(
