@@ -221,8 +221,8 @@ def forecast_images(lake: Path, request: Request, parts: Iterable[PlanRows]) -> 
 
     Notes
     -----
-    Ground exposures with impossible dates cause warnings. BadInput is raised if the catalogues of the lake belong to another
-    request.
+    Ground exposures with impossible dates cause warnings. BadInput is raised if the catalogues of the lake belong to
+    another request.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     machine = speed.estimate_speed(lake)

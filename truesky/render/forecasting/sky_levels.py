@@ -60,11 +60,11 @@ class SkyLevels:
             rows = table.filter(pc.and_(pc.equal(table["camera"], camera), pc.equal(table["band"], band)))
             rates = rows["sky"].to_numpy()
             brightest = rows.slice(int(np.argmax(rates)), 1).to_pylist()[0]
-            known = self._bands.get((camera, band), _BandSky(0, brightest, float("inf")))
-            if known.brightest["sky"] >= brightest["sky"]:
-                brightest = known.brightest
+            previous = self._bands.get((camera, band), _BandSky(0, brightest, float("inf")))
+            if previous.brightest["sky"] >= brightest["sky"]:
+                brightest = previous.brightest
             self._bands[camera, band] = _BandSky(
-                known.count + len(rates), brightest, min(known.faintest, float(rates.min()))
+                previous.count + len(rates), brightest, min(previous.faintest, float(rates.min()))
             )
 
     def lines(self) -> Iterator[str]:
@@ -83,11 +83,11 @@ class SkyLevels:
                 diffuse_light.brightness_of_rate(rate, detector, band, zero_point, mission)
                 for rate in (row["sky"], sky.faintest)
             ]
-            others = f"; brightest of {sky.count} exposures, faintest {levels[1]:.2f}" if sky.count > 1 else ""
+            range_text = f"; brightest of {sky.count} exposures, faintest {levels[1]:.2f}" if sky.count > 1 else ""
             cause = describe_cause(row, curve or passbands.load(band), zero_point, mission)
             yield (
                 f"sky of {band}: {levels[0]:.2f} mag/arcsec2, {row['sky']:.4g} electron/s/pixel on MJD "
-                f"{row['mjd']:.3f}: {cause}{others}"
+                f"{row['mjd']:.3f}: {cause}{range_text}"
             )
 
 

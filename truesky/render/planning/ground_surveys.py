@@ -295,10 +295,10 @@ def date_warnings(exposures: Iterable[Exposure], mission: MissionConfiguration) 
         ),
         "early": ("before first light of the camera", "the camera was not on its telescope"),
     }
-    for name, found in problems.items():
-        if found:
+    for name, examples in problems.items():
+        if examples:
             when, consequence = texts[name]
-            summary = f"{len(found)} of {count} exposures of the sky have dates {when} ({max(found)[1]})"
+            summary = f"{len(examples)} of {count} exposures of the sky have dates {when} ({max(examples)[1]})"
             yield f"EXT: {summary}: {consequence}; omit the date to observe in a dark night"
 
 
@@ -408,7 +408,7 @@ def _exposures_of_visit(
 ) -> list[Exposure]:
     """Return the exposures of a visit, one after the other.
 
-    Sky and seeing are those of the table. `number` is the number of the visit in the table, from 1.
+    The table gives sky and seeing. `number` is the number of the visit in the table, from 1.
     """
     camera, mjd, seconds = camera_of(block.survey, mission), row.mjd or 0.0, row.exposure_time_s or 0.0
     section = image_types.section(camera)

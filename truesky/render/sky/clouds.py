@@ -20,7 +20,7 @@ _INSTANTS = 64
 
 
 def extinction(mean: float, mjd: float, seconds: float, longitude: float, seed: int) -> float:
-    """Return the extinction that an exposure has in all: that of its mean transmission.
+    """Return the extinction of an exposure in magnitudes, from the mean of its transmission.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def extinction(mean: float, mjd: float, seconds: float, longitude: float, seed: 
     if mean == 0.0:
         return 0.0
     noon = float(np.floor(mjd + longitude / 360.0 - 0.5)) + 0.5 - longitude / 360.0
-    phases = rng.stream(seed, "exposures.clouds", int(round(noon * 2.0))).uniform(0.0, 2.0 * np.pi, _WAVES)
+    phases = rng.stream(seed, "exposures.clouds", round(noon * 2.0)).uniform(0.0, 2.0 * np.pi, _WAVES)
     periods = np.geomspace(*_PERIODS, _WAVES)
     amplitudes = np.sqrt(periods)
     amplitudes *= _SCATTER * np.sqrt(2.0 / np.sum(amplitudes**2))

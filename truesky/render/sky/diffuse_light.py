@@ -179,7 +179,7 @@ def brightness_of_rate(
 ) -> float:
     """Convert a rate of electrons per second and pixel to the surface brightness of the sky in AB mag per arcsec2.
 
-    The parameters are those of `rate_of_brightness`, whose inverse this is; the rate must be positive.
+    This is the inverse of `rate_of_brightness` and has the same parameters; the rate must be positive.
     """
     return float(-2.5 * np.log10(rate / _rate_of_zero_brightness(detector, band, zero_point, mission)))
 

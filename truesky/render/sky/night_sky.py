@@ -18,8 +18,8 @@ from lake_schema.sky import separation
 from lake_schema.sky.ecliptic import equatorial
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
-from truesky.render.camera.detectors import Detector
 from truesky.render.camera import pointing
+from truesky.render.camera.detectors import Detector
 from truesky.render.sky import diffuse_light, observatory, twilight
 from truesky.render.sky.diffuse_light import SkyBand
 from truesky.render.sky.observatory import Site
@@ -230,9 +230,9 @@ def twilight_slopes(
         return 0.0, 0.0
     steps = _GRADIENT_STEP * np.array([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
     ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *place, position_angle)
-    around = [_twilight_rate(night, float(lon), float(lat), mjd) for lon, lat in zip(ra, dec, strict=True)]
+    rates = [_twilight_rate(night, float(lon), float(lat), mjd) for lon, lat in zip(ra, dec, strict=True)]
     scale = 2.0 * _GRADIENT_STEP / 3600.0 * sky_rate(night, *place, mjd, mission)
-    return (around[1] - around[0]) / scale, (around[3] - around[2]) / scale
+    return (rates[1] - rates[0]) / scale, (rates[3] - rates[2]) / scale
 
 
 def _twilight_rate(night: Night, ra: float, dec: float, mjd: float) -> float:

@@ -314,8 +314,8 @@ def next_dark_transit(ra: float, dec: float, start: float, site: Site, max_moon:
     """
     first = (-float(site.hour_angle(ra, start)) / (2.0 * np.pi)) % 1.0
     transits = start + (first + np.arange(float(_DAYS))) / _TURNS_A_DAY
-    around = [_is_dark(ra, dec, transits + hours / 24.0, site, max_moon) for hours in (-1.0, 0.0, 1.0)]
-    is_dark = np.all(around, axis=0)
+    hours_around = [_is_dark(ra, dec, transits + hours / 24.0, site, max_moon) for hours in (-1.0, 0.0, 1.0)]
+    is_dark = np.all(hours_around, axis=0)
     return float(transits[np.argmax(is_dark)]) if is_dark.any() else start
 
 

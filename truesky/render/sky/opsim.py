@@ -49,7 +49,9 @@ def zenith_seeing(effective_fwhm: float, airmass: float, wavelength: float) -> f
     at_zenith = effective_fwhm / (_EFFECTIVE * airmass**_AIRMASS_POWER)
     if at_zenith <= SYSTEM_WIDTH:
         smallest = SYSTEM_WIDTH * _EFFECTIVE * airmass**_AIRMASS_POWER
-        raise BadInput(f"seeingFwhmEff = {effective_fwhm:g} arcsec: telescope and camera alone have {smallest:.3f} arcsec")
+        raise BadInput(
+            f"seeingFwhmEff = {effective_fwhm:g} arcsec: telescope and camera alone have {smallest:.3f} arcsec"
+        )
     air = np.sqrt((at_zenith**2 - SYSTEM_WIDTH**2) / _AIR)
     return float(air * (wavelength / _REFERENCE_WAVELENGTH) ** -_WAVELENGTH_POWER)
 

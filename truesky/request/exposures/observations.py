@@ -283,7 +283,10 @@ def _observation(
             # A second place is one mistake: neither its keys nor a table of pointings are mistakes, too.
             read(_refuse_unused, table, *kind, path)
             survey = (values or {}).get("survey")
-            values = {**(values or {}), **(read(_table_of_pointings, table, path, (*kind, survey), folder, mission) or {})}
+            values = {
+                **(values or {}),
+                **(read(_table_of_pointings, table, path, (*kind, survey), folder, mission) or {}),
+            }
         observation = Observation(
             channels=(),
             ra=read(sky_notation.optional_ra, table, f"{path}.ra"),

@@ -183,8 +183,8 @@ def _read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
     arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
     find_out_of_bounds(path, {name: arrays[name] for name in BOUNDS}, BOUNDS).refuse()
     limits = {name: bound for name, bound in {**ANGLES, **_OPTIONAL}.items() if name in arrays}
-    known = {name: np.where(np.isnan(arrays[name]), limits[name][1], arrays[name]) for name in limits}
-    find_out_of_bounds(path, known, limits).refuse()
+    filled = {name: np.where(np.isnan(arrays[name]), limits[name][1], arrays[name]) for name in limits}
+    find_out_of_bounds(path, filled, limits).refuse()
     return arrays, filters
 
 
@@ -266,6 +266,8 @@ def _as_numbers(path: Path, first_row: int, name: str, values: Sequence[object])
     numbers = []
     for row, value in enumerate(values, start=first_row):
         if value is not None and not isinstance(value, int | float):
-            raise BadInput(f"{user_files.format_path(path)}: column {name} of row {row} is {str(value)[:40]!r}, no number")
+            raise BadInput(
+                f"{user_files.format_path(path)}: column {name} of row {row} is {str(value)[:40]!r}, no number"
+            )
         numbers.append(np.nan if value is None else float(value))
     return numbers

@@ -64,7 +64,9 @@ def test_slopes_are_those_of_the_sky(angle):
         assert slopes[0] * at_x + slopes[1] * at_y == pytest.approx(change, abs=0.006)
     sun_azimuth = observatory.sun_direction(mjd, own.site)[1]
     step = 0.5 / np.hypot(*slopes)
-    ra, dec = (float(v[0]) for v in pointing.sky_of_plane([3600 * step * slopes[0]], [3600 * step * slopes[1]], *place, angle))
+    ra, dec = (
+        float(v[0]) for v in pointing.sky_of_plane([3600 * step * slopes[0]], [3600 * step * slopes[1]], *place, angle)
+    )
     bright, here = (own.site.azimuth(*at, mjd) for at in ((ra, dec), place))
     nearer = [abs((azimuth - sun_azimuth + 180.0) % 360.0 - 180.0) for azimuth in (bright, here)]
     lower = own.site.altitude(ra, dec, mjd) < own.site.altitude(*place, mjd)

@@ -25,9 +25,7 @@ def table():
     """The visits as columns of numbers and of texts."""
     with FILE.open() as stream:
         rows = list(csv.DictReader(stream))
-    return {
-        name: [row[name] if name == "filter" else float(row[name]) for row in rows] for name in rows[0]
-    }
+    return {name: [row[name] if name == "filter" else float(row[name]) for row in rows] for name in rows[0]}
 
 
 def write_sqlite(path, table, name="observations"):
@@ -35,7 +33,7 @@ def write_sqlite(path, table, name="observations"):
         kinds = ", ".join(f'"{column}" {"TEXT" if column == "filter" else "REAL"}' for column in table)
         connection.execute(f"CREATE TABLE {name} ({kinds})")
         marks = ", ".join("?" * len(table))
-        connection.executemany(f"INSERT INTO {name} VALUES ({marks})", zip(*table.values(), strict=True))  # noqa: S608
+        connection.executemany(f"INSERT INTO {name} VALUES ({marks})", zip(*table.values(), strict=True))
     return path
 
 
