@@ -177,9 +177,25 @@ def rate_of_brightness(
 def brightness_of_rate(
     rate: float, detector: Detector, band: str, zero_point: float, mission: MissionConfiguration
 ) -> float:
-    """Convert a rate of electrons per second and pixel to the surface brightness of the sky in AB mag per arcsec2.
+    """Convert a rate of electrons to the surface brightness of the sky; the inverse of `rate_of_brightness`.
 
-    This is the inverse of `rate_of_brightness` and has the same parameters; the rate must be positive.
+    Parameters
+    ----------
+    rate : float
+        Electrons per second and pixel, more than 0.
+    detector : Detector
+        Any detector of the camera.
+    band : str
+        Name of the band.
+    zero_point : float
+        AB magnitude of a source with one electron per second, if it is needed.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        AB mag per arcsec2.
     """
     return float(-2.5 * np.log10(rate / _rate_of_zero_brightness(detector, band, zero_point, mission)))
 

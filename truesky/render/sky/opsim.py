@@ -57,9 +57,21 @@ def zenith_seeing(effective_fwhm: float, airmass: float, wavelength: float) -> f
 
 
 def atmospheric_fwhm(seeing: float, airmass: float, wavelength: float) -> float:
-    """Return the FWHM of the atmosphere in a band, from the seeing at the zenith and 500 nm (all widths in arcsec).
+    """Return the FWHM of the atmosphere in a band and at an airmass.
 
-    `wavelength` is in angstrom.
+    Parameters
+    ----------
+    seeing : float
+        FWHM of the atmosphere at the zenith and 500 nm, arcsec.
+    airmass : float
+        Airmass.
+    wavelength : float
+        Effective wavelength of the band, angstrom.
+
+    Returns
+    -------
+    float
+        FWHM in arcsec.
     """
     return float(seeing * airmass**_AIRMASS_POWER * (wavelength / _REFERENCE_WAVELENGTH) ** _WAVELENGTH_POWER)
 
@@ -104,7 +116,7 @@ def position_angle(
     key = f"{section}.rotator"
     if f"{key}.limit" not in mission:
         if rot_sky is None:
-            raise BadInput(f"rotTelPos: {section.removeprefix('ext.')} has no rotator in the mission database")
+            raise BadInput(f"rotTelPos: {section.rpartition('.')[2]} has no rotator in the mission database")
         return rot_sky % 360.0
     if rot_tel is None:
         return (rot_sky or 0.0) % 360.0

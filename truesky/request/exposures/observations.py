@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lake_schema import ramps, user_files
+from lake_schema import ramps
 from lake_schema.errors import BadInput, Mistakes
-from lake_schema.store import layout
 from lake_schema.texts import spelling
 from truesky.request import area as areas
 from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
-from truesky.request.exposures import pointing_tables, visit_tables
+from truesky.request.exposures import named_tables
 from truesky.request.exposures.pointing_tables import CHANNELS, CLOUDS_LIMITS, IMAGE_TYPES, Contents
 from truesky.request.exposures.pointings import MAX_REALISATIONS
 from truesky.request.toml_values import (
@@ -285,7 +284,7 @@ def _observation(
             survey = (values or {}).get("survey")
             values = {
                 **(values or {}),
-                **(read(_table_of_pointings, table, path, (*kind, survey), folder, mission) or {}),
+                **(read(named_tables.read_table, table, path, (*kind, survey), folder, mission) or {}),
             }
         observation = Observation(
             channels=(),
@@ -374,21 +373,6 @@ def _values_of_kind(
             names = {**values, "bands": [band for band in values["bands"] if band not in of_user]}
             read(_check_names, names, table.get("blue") is True, mission, path)
     return values
-
-
-def _table_of_pointings(
-    table: Toml,
-    path: str,
-    kind: tuple[tuple[str, ...], str, str | None],
-    folder: Path,
-    mission: MissionConfiguration | None,
-) -> dict[str, Any]:
-    """Read the table of pointings of an observation, and return its file and its summary by key; {} without a table.
-
-    `kind` has the channels, the image type and the survey; the survey is None if it is wrong.
-    """
-    file = _pointings_file(table, path, folder)
-    return {} if file is None else {"pointings": str(file), "table": _contents(file, kind, path, mission)}
 
 
 def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: MissionConfiguration, path: str) -> None:
@@ -510,39 +494,6 @@ def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
     if ground:
         return _GROUND_USER_FIELD if "ra" in table else _GROUND
     return _USER_FIELD if "ra" in table else _SURVEY
-
-
-def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
-    """Return the path of an observation's table of pointings, or None if it has none.
-
-    Raises BadInput if the file is not in `folder` (the folder of the request) or below, or does not exist.
-    """
-    if not string(table, f"{path}.pointings", default=""):
-        return None
-    file = folder / string(table, f"{path}.pointings")
-    try:
-        return user_files.check_file(layout.check_inside(folder, file), "table of pointings")
-    except BadInput as error:
-        raise error.with_prefix(f"{path}.pointings") from None
-
-
-def _contents(
-    file: Path, kind: tuple[tuple[str, ...], str, str | None], path: str, mission: MissionConfiguration | None
-) -> Contents | None:
-    """Return the summary of a table of pointings or of visits; None if it cannot be read because of other mistakes."""
-    channels, image_type, survey = kind
-    try:
-        if not visit_tables.is_table_of_visits(file):
-            return pointing_tables.contents(file, channels, image_type)
-        if channels != (instruments.GROUND_CHANNEL,):
-            raise BadInput(f"{file} is a table of visits, which is only for channel {instruments.GROUND_CHANNEL}")
-        if survey is None or mission is None:
-            return None
-        camera = instruments.survey_camera(survey, mission)
-        bands = instruments.band_names(instruments.GROUND_CHANNEL, camera, mission)
-        return pointing_tables.summarise(file, visit_tables.read(file, bands, image_type))
-    except BadInput as error:
-        raise error.with_prefix(f"{path}.pointings") from None
 
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:

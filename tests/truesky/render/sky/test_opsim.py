@@ -1,7 +1,7 @@
 """Visits of OpSim: seeing, sky, depth and rotation agree with its published formulas and with its tables.
 
 The file opsim_visits.csv has 20 visits of surveys that OpSim simulated (versions 3 to 4). The package imSim of the LSST
-Dark Energy Science Collaboration contains them (tests/data/small_opsim_9683.db and data/small_opsim.db).
+Dark Energy Science Collaboration contains them as test data (small_opsim and small_opsim_9683).
 """
 
 import csv
