@@ -6,7 +6,7 @@ contains::
     my_camera/parameters.csv    name, value, unit, source            numbers of the camera
     my_camera/layout.csv        detector, type, nx, ny, x_mm, y_mm, rotation_deg     positions of detectors
     my_camera/amplifiers.csv    type, amplifier, x, y, nx, ny, ...   areas of a detector of each type
-    my_camera/bands.csv         band, curve, medium, zero_point, sky_brightness, seeing, extinction, fringes
+    my_camera/bands.csv         band, curve, medium, zero_point, sky_brightness, extinction, fringes
     my_camera/wavefront.csv     noll, x_power, y_power, coefficient_nm     optional, aberrations of the telescope
 
 The folder's name is the camera's name. Gain, read noise and full well are given in amplifiers.csv only. Blank values

@@ -33,7 +33,6 @@ _MAX_SCAN = 512
 BAND_UNITS = {
     "zero_point": "mag",
     "sky_brightness": "mag / arcsec2",
-    "seeing": "arcsec",
     "extinction": "mag",
 }
 OPTIONAL_BAND_UNITS = {"fringes": ""}

@@ -164,7 +164,8 @@ class Scene:
     neighbour_charge : NeighbourCharge, optional
         Charge on neighbouring detectors that are read at the same time. None if it is negligible.
     seeing : float
-        FWHM of the seeing in arcsec. Only used for ground cameras.
+        FWHM of stars in arcsec, without aberrations and pixels: air, telescope and camera. Only used for ground
+        cameras.
     zero_point : float
         AB magnitude of a source that gives 1 electron per second. Only used for ground cameras.
     window : Window, optional

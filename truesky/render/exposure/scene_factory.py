@@ -16,6 +16,7 @@ from truesky.render.effects.charge import cosmic_rays, ramp
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.exposure.records import Variant
+from truesky.render.psf import seeing
 from truesky.request.accuracy import Accuracy
 
 # Smallest sky in the middle of a detector relative to that at the field centre, if the sky has a gradient.
@@ -87,7 +88,7 @@ def from_exposure(
     scene = Scene(
         mission, detector.section, exposure.exposure_time_s, exposure.sky * level, 0.0, detector,
         lamp=exposure.lamp or 1, accuracy=accuracy, ramp=channel.ramp_name if channel else "",
-        seeing=exposure.seeing, zero_point=exposure.zero_point, sky_slopes=(slopes[0], slopes[1]),
+        zero_point=exposure.zero_point, sky_slopes=(slopes[0], slopes[1]),
     )  # fmt: skip
     if scene.ramp:
         ramp.mode_of_scene(scene)
@@ -111,13 +112,14 @@ def _sky_plane(exposure: ExposureRow, detector: Detector) -> tuple[float, float,
 
 
 def from_aim(aim: Aim, variant: Variant) -> Scene:
-    """Create the scene of a detector before anything is drawn, with its passband and the switched effects.
+    """Create the scene of a detector before anything is drawn, with its passband, seeing and the switched effects.
 
     `aim` is an exposure and a detector. `variant` contains the mission database, the accuracy, and the effects that the
     request switches on or off. `ramp.find_mode` raises BadInput if the exposure time does not fit the channel's ramp.
     """
     scene = from_exposure(aim.exposure, aim.detector, variant.mission, variant.accuracy)
-    return replace(scene, band=aim.band, forced=variant.forced)
+    fwhm = seeing.image_fwhm(aim.exposure, aim.detector, aim.band, variant.mission) if aim.channel.on_ground else 0.0
+    return replace(scene, band=aim.band, forced=variant.forced, seeing=fwhm)
 
 
 def with_peak_electrons(scene: Scene, frame: Frame) -> Scene:

@@ -437,7 +437,7 @@ def _exposures_of_visit(
         survey=block.survey,
         field=number,
         sky=diffuse_light.rate_of_brightness(visit.sky_brightness, detector, row.band, zero_point, mission),
-        seeing=opsim.atmospheric_fwhm(seeing, visit.airmass, wavelength),
+        seeing=seeing,
         detectors=block.detectors,
         clouds=block.clouds,
     )

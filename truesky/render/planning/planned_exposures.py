@@ -76,7 +76,8 @@ class Exposure:
     sky : float, optional
         Sky background in electrons per second and pixel; None means that it is computed.
     seeing : float, optional
-        Seeing in arcsec; None means that it is drawn at random for ground cameras, and 0 in space.
+        Seeing in arcsec, at the zenith and at 500 nm; None means that it is drawn at random for ground cameras, and 0
+        in space.
     zero_point : float, optional
         AB magnitude of a source with one electron per second without clouds; None means that it is computed.
     clouds : float
@@ -343,8 +344,9 @@ class _Band:
     """Properties shared by all exposures of a channel and camera in a band.
 
     `zero_point` is the AB magnitude of one electron per second, and `sky` the model of the sky brightness. `seeing` is
-    the median FWHM (arcsec), and `scatter` its log-normal scatter (dex). Three fields are None for cameras in space:
-    `night` (night sky of the site), `detector` (first one of the camera) and `curve` (passband).
+    the median FWHM (arcsec) of the air at the zenith and at 500 nm, and `scatter` its log-normal scatter (dex). Three
+    fields are None for cameras in space: `night` (night sky of the site), `detector` (first one of the camera) and
+    `curve` (passband).
     """
 
     zero_point: float
@@ -364,7 +366,7 @@ class _Band:
         zero_point = zero_point_of(prefix, band, mission, curve)
         if camera in SPACE_CAMERAS:
             return cls(zero_point, sky)
-        seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
+        seeing = mission.value(f"{prefix}.seeing", "arcsec")
         curve = curve or passbands.load(band)
         night = Night.from_detector(first, band, (zero_point, sky.constant), mission, curve)
         return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first, curve)
@@ -384,9 +386,9 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
     slopes: tuple[float | None, float | None] = (None, None)
     seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
     if night is not None and band.detector is not None and band.curve is not None:
-        if e.psf is None:
-            ground_psf.check(seeing, band.detector, band.curve, mission)
         airmass, zenith = observatory.airmass_and_zenith(e.ra, e.dec, e.mjd, night.site)
+        if e.psf is None:
+            ground_psf.check(seeing, airmass, band.detector, band.curve, mission)
         extinction_mag = night_sky.extra_extinction(night, airmass)
         if registry.CHANNELS[e.channel].sees_sky(e.image_type):
             cloud_mag = clouds.extinction(e.clouds, e.mjd, e.exposure_time_s, night.site.longitude, seed)
@@ -415,8 +417,9 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
 
 
 def _seeing(e: Exposure, band: _Band, seed: int) -> float:
-    """Draw the seeing (arcsec) of a ground camera from a log-normal distribution, limited to 3 sigma.
+    """Draw the seeing (arcsec, at the zenith and at 500 nm) of a ground camera.
 
+    It has a log-normal distribution, limited to 3 sigma.
     The result is 0 in space. The same seed, camera, band, position and date always give the same seeing.
     """
     if band.scatter == 0.0:

@@ -56,26 +56,6 @@ def zenith_seeing(effective_fwhm: float, airmass: float, wavelength: float) -> f
     return float(air * (wavelength / _REFERENCE_WAVELENGTH) ** -_WAVELENGTH_POWER)
 
 
-def atmospheric_fwhm(seeing: float, airmass: float, wavelength: float) -> float:
-    """Return the FWHM of the atmosphere in a band and at an airmass.
-
-    Parameters
-    ----------
-    seeing : float
-        FWHM of the atmosphere at the zenith and 500 nm, arcsec.
-    airmass : float
-        Airmass.
-    wavelength : float
-        Effective wavelength of the band, angstrom.
-
-    Returns
-    -------
-    float
-        FWHM in arcsec.
-    """
-    return float(seeing * airmass**_AIRMASS_POWER * (wavelength / _REFERENCE_WAVELENGTH) ** _WAVELENGTH_POWER)
-
-
 def position_angle(
     angles: tuple[float | None, float | None], parallactic: float, altitude: float, section: str,
     mission: MissionConfiguration,

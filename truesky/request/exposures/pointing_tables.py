@@ -48,7 +48,12 @@ COLUMNS = (
     ("image_type", "", "image type, as in a request", "the observation's"),
     ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
     ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
-    ("seeing", "arcsec", "FWHM of the atmosphere for ground cameras", "drawn around the mission's value"),
+    (
+        "seeing",
+        "arcsec",
+        "FWHM of the air at zenith and 500 nm, for ground cameras",
+        "drawn around the mission's value",
+    ),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
     ("clouds", "mag", "mean extinction by clouds of the night, for ground cameras", "the observation's, else 0"),
     ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
@@ -74,7 +79,7 @@ _NAMES = tuple(name for name, *_ in COLUMNS)
 # Names that other programs give to the columns, in lower case.
 _OTHER_NAMES = {
     "filter": "band", "exptime": "exposure_time_s", "exposure": "exposure_time_s", "date": "mjd", "date-obs": "mjd",
-    "pa": "position_angle", "rotation": "position_angle", "instrument": "camera", "fwhm": "seeing",
+    "pa": "position_angle", "rotation": "position_angle", "instrument": "camera", "seeingfwhm500": "seeing",
 }  # fmt: skip
 _MAX_ROWS, _MAX_LENGTH = 1_000_000, 1000
 # Largest number of messages about the names of columns.
@@ -146,7 +151,7 @@ class Row:
     sky : float, optional
         Diffuse sky brightness in electrons per pixel and second.
     seeing : float, optional
-        FWHM of the atmosphere's PSF in arcsec; always None for Euclid.
+        FWHM of the air at the zenith and at 500 nm, arcsec; always None for Euclid.
     zero_point : float, optional
         AB magnitude of a source that gives 1 electron per second.
     clouds : float, optional

@@ -165,17 +165,17 @@ def test_seeing_is_drawn_for_each_exposure():
     found = survey_of("lsst", 300)
     found = [one for one in found if one.band == "lsst_r"]
     seeing = np.array(planned_exposures.table(found, [MISSION] * len(found), seed=5)["seeing"])
-    assert np.median(seeing) == pytest.approx(0.73, rel=0.05)
+    assert np.median(seeing) == pytest.approx(0.62, rel=0.05)
     assert np.std(np.log10(seeing)) == pytest.approx(0.09, rel=0.2)
     backwards = planned_exposures.table(found[::-1], [MISSION] * len(found), seed=5)["seeing"].to_pylist()
     assert backwards[::-1] == seeing.tolist()
     assert planned_exposures.table(found[:1], [MISSION], seed=6)["seeing"].to_pylist()[0] != seeing[0]
     still = resolve(overrides={"ext.lsstcam.seeing_scatter": (0.0, "dex")})
-    assert set(planned_exposures.table(found, [still] * len(found))["seeing"].to_pylist()) == {0.73}
+    assert set(planned_exposures.table(found, [still] * len(found))["seeing"].to_pylist()) == {0.62}
     own = [replace(found[0], seeing=1.4, zero_point=28.0, sky=5.0)]
     (row,) = planned_exposures.table(own, [MISSION]).to_pylist()
     assert (row["seeing"], row["zero_point"], row["sky"]) == (1.4, 28.0, 5.0)
-    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam .*0.1 is outside"):
+    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam in lsst_r .*0.09\d+ is outside"):
         planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])
     own = replace(found[0], seeing=0.1, psf="own.psf")
     assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]
