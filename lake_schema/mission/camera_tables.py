@@ -60,8 +60,8 @@ INTEGER_BOUNDS = {
     "overscan": (0, _MAX_SCAN),
     "overscan_rows": (0, _MAX_SCAN),
     "noll": (4, 66),
-    "x_power": (0, 10),
-    "y_power": (0, 10),
+    "x_power": (0, 12),
+    "y_power": (0, 12),
 }
 # The same of columns of numbers that need not be whole.
 NUMBER_BOUNDS = {
@@ -71,7 +71,7 @@ NUMBER_BOUNDS = {
     "gain": (1e-3, 1e3),
     "read_noise": (0.0, 1e4),
     "full_well": (1.0, 1e8),
-    "coefficient_nm": (-1e4, 1e4),
+    "coefficient_nm": (-1e6, 1e6),
 }
 # Largest number of characters of an entry of a table.
 _MAX_TEXT_LENGTH = 1000

@@ -419,7 +419,7 @@ def _exposures_of_visit(
         parallactic = site.zenith(row.ra, row.dec, mjd) if visit.parallactic is None else visit.parallactic
         altitude = float(site.altitude(row.ra, row.dec, mjd))
         angle = opsim.position_angle((visit.rot_sky, visit.rot_tel), parallactic, altitude, section, mission)
-        seeing = opsim.zenith_seeing(visit.seeing_eff, visit.airmass, wavelength)
+        seeing = opsim.zenith_seeing(visit.seeing_eff, visit.airmass, wavelength, opsim.WIDTH_RATIO)
     except BadInput as error:
         raise error.with_prefix(row.location) from None
     zero_point = zero_point_of(section, row.band, mission)

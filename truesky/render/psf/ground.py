@@ -70,6 +70,9 @@ _TABLE = 4000
 _SEEING_WAVELENGTH = 5000.0
 # Exponent of the airmass in the FWHM of seeing (Roddier 1981).
 _AIRMASS_POWER = 0.6
+# Degree of the polynomial by which the PSF changes across a detector, for the keys of `euclid.DEGREES`. With degree 3,
+# sizes and ellipticities in the outermost detectors are wrong by 2e-5 (LSST, DECam); in HSC, by 2e-3 and 5e-4.
+_DEGREES = {1: 0, 4: 2, 9: 3, 25: 3}
 # FWHM of a Gaussian in units of its standard deviation.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -237,8 +240,8 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions on the detector at which the aberrations are computed: 1, 4, 9 or 25 (keys of
-        `euclid.DEGREES`); 25 is treated as 9. Polynomials describe the changes between them.
+        Number that selects the degree of the polynomials by which the PSF changes across the detector: 1, 4, 9 or 25
+        (keys of `euclid.DEGREES`); 25 is treated as 9.
 
     Returns
     -------
@@ -443,12 +446,11 @@ def _spline(lags: Float, at: Float) -> Float:
 
 
 def _degree(positions: int) -> int:
-    """Return the degree of the polynomial by which the PSF changes across a detector: 0 (no change), 1 or 2.
+    """Return the degree of the polynomial by which the PSF changes across a detector: 0 (no change), 2 or 3.
 
-    `positions` is a key of `euclid.DEGREES`. Terms of higher degree are neglected. They would change the sizes of
-    sources by less than 1e-5.
+    `positions` is a key of `euclid.DEGREES`. Terms of higher degree are neglected.
     """
-    return min(euclid.DEGREES[positions][0], 2)
+    return _DEGREES[positions]
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:

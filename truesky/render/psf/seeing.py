@@ -34,7 +34,7 @@ def exposure_psf(
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras), which selects the kind of profile.
     positions : int
-        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of `euclid.DEGREES`); 25
+        Number that selects how the PSF changes across the detector: 1, 4, 9 or 25 (keys of `euclid.DEGREES`); 25
         is treated as 9. It is ignored for a Gaussian or Moffat profile, which is the same on the whole detector.
 
     Returns

@@ -19,7 +19,7 @@ from truesky.render.psf.aberrations import Telescope, TransferRatio
 MISSION = resolve()
 # Largest difference (nm, root of the sum over modes) of a table from traced rays. Modes of a vignetted pupil change
 # fast.
-WITHIN = {"lsstcam": 40.0, "decam": 8.0, "hsc": 110.0}
+WITHIN = {"lsstcam": 60.0, "decam": 8.0, "hsc": 110.0}
 
 
 def rows(name):
@@ -94,8 +94,9 @@ def test_images_point_where_batoid_s_rays_go(camera):
             * np.stack([slope(*numbers[:, :2].T) for slope in (front.gradX, front.gradY)], axis=1)
         )
         moved -= moved.mean(axis=0)
-        assert (moved * rays).sum() / np.sqrt((moved**2).sum() * (rays**2).sum()) > 0.9
-        assert (moved * rays).sum() / (rays**2).sum() == pytest.approx(1.0, abs=0.15)
+        # Modes beyond Noll 22 are missing, and the wavefront is smaller near parts of the pupil that are dark.
+        assert (moved * rays).sum() / np.sqrt((moved**2).sum() * (rays**2).sum()) > 0.85
+        assert 0.7 < (moved * rays).sum() / (rays**2).sum() < 1.1
         images = [
             grid.image(
                 air * grid.interpolate_ratio(TransferRatio.from_wavefront(one, telescope, wave, fried, 0.0), wave)
