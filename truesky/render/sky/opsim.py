@@ -17,8 +17,8 @@ from lake_schema.mission.configuration import MissionConfiguration
 SYSTEM_WIDTH = float(np.sqrt(0.25**2 + 0.08**2 + 0.3**2))
 # Effective FWHM = 1.16 sqrt(system^2 + 1.04 atmosphere^2), and power of airmass and of wavelength in both widths.
 _EFFECTIVE, _AIR, _AIRMASS_POWER, _WAVELENGTH_POWER = 1.16, 1.04, 0.6, -0.3
-# Effective width of the PSF of truesky relative to this formula, for the same atmosphere: it has an aureole and an outer
-# scale, so that its effective area is larger by 3 % (poor seeing in u) to 16 % (y), and by 10 % on average.
+# Effective width of the PSF of truesky relative to this formula, for the same atmosphere. It has an aureole and an
+# outer scale, so that its effective area is larger by 3 % (poor seeing in u) to 16 % (y), and by 10 % on average.
 WIDTH_RATIO = float(np.sqrt(1.10))
 # Wavelength of the seeing at the zenith, angstrom.
 _REFERENCE_WAVELENGTH = 5000.0
