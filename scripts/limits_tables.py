@@ -23,7 +23,7 @@ from truesky.catalogue.external import mapping
 from truesky.catalogue.stars import bright_stars, from_catalogue
 from truesky.cosmology import MIN_M_NU
 from truesky.render.sources import ephemerides
-from truesky.request.exposures import pointing_tables
+from truesky.request.exposures import pointing_tables, visit_tables
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HEAD = f"""# Limits of all numbers
@@ -46,6 +46,7 @@ these arguments have the same limits.
 # Columns of numbers in the files of users: kind of file, key of the request or command, and limits by column.
 _FILES: tuple[tuple[str, str, Mapping[str, tuple[float, float]]], ...] = (
     ("Table of pointings", "[[observation]] pointings", pointing_tables.BOUNDS),
+    ("Table of visits", "[[observation]] pointings", {**visit_tables.BOUNDS, **visit_tables.ANGLES}),
     ("Tables of a camera", "[mission] cameras", {**camera_tables.INTEGER_BOUNDS, **camera_tables.NUMBER_BOUNDS}),
     ("Galaxies", "[ingest.galaxies]", mapping.GALAXY_BOUNDS),
     ("Haloes", "[ingest.halos]", mapping.HALO_BOUNDS),

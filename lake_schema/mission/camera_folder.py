@@ -6,7 +6,7 @@ contains::
     my_camera/parameters.csv    name, value, unit, source            numbers of the camera
     my_camera/layout.csv        detector, type, nx, ny, x_mm, y_mm, rotation_deg     positions of detectors
     my_camera/amplifiers.csv    type, amplifier, x, y, nx, ny, ...   areas of a detector of each type
-    my_camera/bands.csv         band, curve, medium, zero_point, sky_brightness, seeing, extinction, fringes
+    my_camera/bands.csv         band, curve, medium, zero_point, sky_brightness, extinction, fringes
     my_camera/wavefront.csv     noll, x_power, y_power, coefficient_nm     optional, aberrations of the telescope
 
 The folder's name is the camera's name. Gain, read noise and full well are given in amplifiers.csv only. Blank values
@@ -44,6 +44,8 @@ from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS, Parameter, convert, read_all_parameters
 
 _STATUS = "SIM"
+# Parameters that all ground cameras of the mission database have, but that a user's camera may omit.
+_OPTIONAL = frozenset({"first_light"})
 _MODEL_FILES = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAVEFRONT}
 
 
@@ -280,6 +282,7 @@ def parameter_units() -> dict[str, str]:
 def required_parameters() -> tuple[str, ...]:
     """Return the sorted names of the parameters that every ground camera must have, without the prefix of the camera.
 
-    They are the parameters that all ground cameras of the mission database have.
+    They are the parameters that all ground cameras of the mission database have, except those in `_OPTIONAL`.
     """
-    return tuple(sorted(set.intersection(*(set(units) for units in units_by_camera().values()))))
+    common = set.intersection(*(set(units) for units in units_by_camera().values()))
+    return tuple(sorted(common.difference(_OPTIONAL)))

@@ -33,7 +33,6 @@ _MAX_SCAN = 512
 BAND_UNITS = {
     "zero_point": "mag",
     "sky_brightness": "mag / arcsec2",
-    "seeing": "arcsec",
     "extinction": "mag",
 }
 OPTIONAL_BAND_UNITS = {"fringes": ""}
@@ -66,8 +65,8 @@ INTEGER_BOUNDS = {
     "interleaved": (0, 1),
     "flip": (0, 1),
     "noll": (4, 66),
-    "x_power": (0, 10),
-    "y_power": (0, 10),
+    "x_power": (0, 12),
+    "y_power": (0, 12),
 }
 # The same of columns of numbers that need not be whole.
 NUMBER_BOUNDS = {
@@ -77,7 +76,7 @@ NUMBER_BOUNDS = {
     "gain": (1e-3, 1e3),
     "read_noise": (0.0, 1e4),
     "full_well": (1.0, 1e8),
-    "coefficient_nm": (-1e4, 1e4),
+    "coefficient_nm": (-1e6, 1e6),
 }
 # Largest number of characters of an entry of a table.
 _MAX_TEXT_LENGTH = 1000

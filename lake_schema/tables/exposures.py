@@ -96,7 +96,15 @@ EXPOSURES = Table(
             "rate of the diffuse sky per pixel at the field centre",
             0.0,
         ),
-        Column("seeing", "float64", "arcsec", "instr.obsty.seeing", "FWHM of the atmosphere, 0 in space", 0.0, 10.0),
+        Column(
+            "seeing",
+            "float64",
+            "arcsec",
+            "instr.obsty.seeing",
+            "FWHM of the air at zenith and 500 nm, 0 in space",
+            0.0,
+            10.0,
+        ),
         Column("zero_point", "float64", "mag", "phot.mag;arith.zp", "AB magnitude of 1 electron/s", 0.0, 50.0),
         Column("survey", "string", ucd="meta.id", doc="survey or request of the exposure"),
         Column("field", "int64", "", "meta.id;obs", "field of the survey, from 1", 1, nullable=True),
@@ -144,6 +152,32 @@ EXPOSURES = Table(
             180.0,
             True,
         ),
+        Column(
+            "clouds",
+            "float64",
+            "mag",
+            "obs.atmos.extinction",
+            "extinction by clouds, averaged over the exposure, for ground cameras",
+            0.0,
+            50.0,
+            True,
+        ),
+        Column(
+            "sky_slope_x",
+            "float64",
+            "deg-1",
+            "instr.skyLevel;arith.grad",
+            "relative change of the sky along the focal plane's x axis, by twilight",
+            nullable=True,
+        ),
+        Column(
+            "sky_slope_y",
+            "float64",
+            "deg-1",
+            "instr.skyLevel;arith.grad",
+            "relative change of the sky along the focal plane's y axis, by twilight",
+            nullable=True,
+        ),
     ),
     "Exposures, in the order they are taken.",
     key=("exposure_id",),
@@ -183,6 +217,9 @@ class ExposureRow:
     realisation: int | None = None
     airmass: float | None = None
     zenith: float | None = None
+    clouds: float | None = None
+    sky_slope_x: float | None = None
+    sky_slope_y: float | None = None
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:

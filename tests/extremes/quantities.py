@@ -210,7 +210,7 @@ SUBJECTS = (
     Subject(
         "seeing through turbulent air",
         (
-            _parameter("ext.lsstcam.lsst_r.seeing", "seeing", log=True, usual=(0.5, 5.0)),
+            _parameter("ext.lsstcam.seeing", "seeing", log=True, usual=(0.5, 5.0)),
             _parameter("ext.lsstcam.psf.outer_scale", "outer_scale", log=True, usual=(10.0, 500.0)),
             Quantity("wavelength", 3000.0, 11000.0, "A", IMPOSSIBLE),
         ),

@@ -345,10 +345,10 @@ def field_above_a_telescope(values):
 def seeing_through_air(values):
     wide, outer, wavelength = (values[name] for name in ("seeing", "outer_scale", "wavelength"))
     mission = resolve(overrides={
-        "ext.lsstcam.lsst_r.seeing": (wide, "arcsec"), "ext.lsstcam.psf.outer_scale": (outer, "m"),
+        "ext.lsstcam.seeing": (wide, "arcsec"), "ext.lsstcam.psf.outer_scale": (outer, "m"),
     })  # fmt: skip
     detector = small("lsstcam", "R22_S11")
-    seeing.check(mission.value("ext.lsstcam.lsst_r.seeing", "arcsec"), detector, passbands.load("lsst_r"), mission)
+    seeing.check(mission.value("ext.lsstcam.seeing", "arcsec"), 1.0, detector, passbands.load("lsst_r"), mission)
     fried = atmosphere.fried_length(wide, wavelength, outer)
     theirs = galsim.VonKarman(lam=wavelength / 10.0, r0=fried, L0=outer)
     middle, half = (theirs.xValue(r, 0.0) for r in (0.0, 0.5 * wide))

@@ -45,7 +45,7 @@ def write_camera(folder, nx, ny):
         "layout": f"detector,type,nx,ny,x_mm,y_mm,rotation_deg\nchip,mini,{nx},{ny},0,0,0\n",
         "amplifiers": "type,amplifier,x,y,nx,ny,read_right,read_top,prescan,overscan,overscan_rows,gain,read_noise,"
         f"full_well\nmini,A,0,0,{nx},{ny},0,0,4,16,8,1.7,5.0,100000\n",
-        "bands": "band,curve,medium,zero_point,sky_brightness,seeing,extinction,fringes\ndes_r,,,25.3,21.0,1.1,0.1,\n",
+        "bands": "band,curve,medium,zero_point,sky_brightness,extinction,fringes\ndes_r,,,25.3,21.0,0.1,\n",
     }
     for name, text in tables.items():
         (folder / f"{name}.csv").write_text(text)

@@ -1,7 +1,7 @@
 """Check a request (a user's TOML file) as completely as the jobs that run it: truesky check REQUEST [--plan] [--json].
 
-The output ends with the forecast cost of the request. With --plan only the checks of the plan of exposures are made,
-not those of the catalogues, and no cost is printed.
+The output has the sky of each band with its causes, and ends with the forecast cost of the request. With --plan only
+the checks of the plan of exposures are made, not those of the catalogues, and neither sky nor cost is printed.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def run_command(options: argparse.Namespace) -> int:
     print(f"{request.name}: good: {', '.join(f'{count} {name}' for name, count in counts.items())}")
     if not request.pointings and not request.observations:
         understood.append(f"no exposures; fluxes in {', '.join(request.bands)}")
-    for line in (*understood, *([skipped] if skipped else [])):
+    for line in (*understood, *([skipped] if skipped else []), *(() if cost is None else cost.sky)):
         print(f"{request.name}: {line}")
     if cost is not None:
         from truesky.render.forecasting import request_cost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -10,6 +11,7 @@ from truesky.commands import plan
 from truesky.render.forecasting import request_cost, speed
 from truesky.render.forecasting.image_costs import ImageCosts
 from truesky.render.forecasting.request_cost import RequestCost
+from truesky.render.forecasting.sky_levels import SkyLevels
 from truesky.request.schema import Request
 
 
@@ -26,20 +28,20 @@ def check_and_forecast(request: Request, lake: Path | None = None) -> RequestCos
     Returns
     -------
     RequestCost
-        The forecast for a new lake, with the cache as it is now.
+        The forecast for a new lake, with the cache as it is now, and the sky of each band.
 
     Raises
     ------
     BadInput
         If a job would refuse the request. The message names the key.
     """
-    images = ImageCosts(request)
+    images, sky = ImageCosts(request), SkyLevels(request)
     if request.pointings or request.observations:
-        for _ in images.watch(plan.checked_chunks(request, lake)):
-            pass
+        for exposures, _ in images.watch(plan.checked_chunks(request, lake)):
+            sky.add(exposures)
     else:
         plan.check_catalogues(request)
-    return request_cost.forecast(request, images, speed.estimate_speed(lake))
+    return replace(request_cost.forecast(request, images, speed.estimate_speed(lake)), sky=tuple(sky.lines()))
 
 
 def forecast_plan(root: Path, request: Request, rows: tuple[pa.Table, pa.Table] | None) -> RequestCost:

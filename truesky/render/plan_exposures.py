@@ -156,7 +156,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     planner = Planner.from_request(lake, request)
-    _warn_daylight(planner)
+    _warn_of_dates(planner)
     facts = {
         **common_facts(request, *PLAN_SECTIONS),
         "mission": planner.mission.fingerprint,
@@ -221,13 +221,13 @@ def forecast_images(lake: Path, request: Request, parts: Iterable[PlanRows]) -> 
 
     Notes
     -----
-    Ground exposures in daylight cause a warning. BadInput is raised if the catalogues of the lake belong to another
-    request.
+    Ground exposures with impossible dates cause warnings. BadInput is raised if the catalogues of the lake belong to
+    another request.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     machine = speed.estimate_speed(lake)
     lines = forecast.summarise_chunks(parts, machine.factor)
-    _warn_daylight(Planner.from_request(lake, request))
+    _warn_of_dates(Planner.from_request(lake, request))
     return lines, machine
 
 
@@ -237,10 +237,9 @@ def _print_forecast(lake: Path, parts: Iterable[PlanRows]) -> None:
         print(line)
 
 
-def _warn_daylight(planner: Planner) -> None:
-    if line := ground_surveys.daylight_warning(
-        (exposure for exposure, _ in planner.layout.representative_exposures()), planner.mission
-    ):
+def _warn_of_dates(planner: Planner) -> None:
+    exposures = (exposure for exposure, _ in planner.layout.representative_exposures())
+    for line in ground_surveys.date_warnings(exposures, planner.mission):
         command.print_error("plan_exposures", line, 0)
 
 

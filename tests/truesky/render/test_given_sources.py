@@ -100,7 +100,7 @@ def test_sources_agree_with_galsim(images, row, body):
     wcs = galsim.AstropyWCS(header=header)
     # FITS counts pixels from 1.
     place = wcs.toImage(galsim.CelestialCoord(row["ra"] * galsim.degrees, row["dec"] * galsim.degrees))
-    seeing = galsim.Moffat(beta=3.0, fwhm=header["SEEING"], gsparams=galsim.GSParams(xvalue_accuracy=1e-12))
+    seeing = galsim.Moffat(beta=3.0, fwhm=header["SEEIMAGE"], gsparams=galsim.GSParams(xvalue_accuracy=1e-12))
     fine = galsim.GSParams(folding_threshold=1e-4, maxk_threshold=1e-4, kvalue_accuracy=1e-7, maximum_fft_size=16384)
     electrons = header["EXPTIME"] * 10 ** (0.4 * (header["ZEROPNT"] - row["mag"]))
     whole = electrons * (seeing if body is None else galsim.Convolve([body, seeing], gsparams=fine))

@@ -29,9 +29,9 @@ AMPLIFIERS = """type,amplifier,x,y,nx,ny,read_right,read_top,prescan,overscan,ov
 mini,A,0,0,150,260,0,0,4,16,8,1.7,5.0,100000
 mini,B,150,0,150,260,1,0,4,16,8,1.7,5.0,100000
 """
-BANDS = f"""band,curve,medium,zero_point,sky_brightness,seeing,extinction,fringes
-narrow,narrow.dat,air,{ZERO_POINT},21.0,1.1,0.1,
-sdss_r,,,26.0,21.0,1.0,0.1,
+BANDS = f"""band,curve,medium,zero_point,sky_brightness,extinction,fringes
+narrow,narrow.dat,air,{ZERO_POINT},21.0,0.1,
+sdss_r,,,26.0,21.0,0.1,
 """
 REQUEST = f"""
 accuracy = "draft"

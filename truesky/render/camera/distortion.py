@@ -12,6 +12,7 @@ Shupe et al. 2005 (SIP).
 from __future__ import annotations
 
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 import numpy.typing as npt
@@ -71,7 +72,7 @@ def terms(section: str, mission: MissionConfiguration) -> Terms:
 
 
 def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
-    """Return a radial distortion from the mission database: the sum of P k r^n for the powers n = 2 and 4.
+    """Return a radial distortion from the mission database: the sum of P k r^n for the powers n = 2, 4 and 6.
 
     P is the focal-plane position, r its distance from the boresight, and k the coefficient of the power n (1 / mm^n in
     the database). The result is () if the database has no coefficient, or only coefficients of 0.
@@ -79,11 +80,11 @@ def _radial_terms(section: str, mission: MissionConfiguration) -> Terms:
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     radial_terms: Terms = ()
-    for power in (2, 4):
+    for power in (2, 4, 6):
         key = f"{section}.fpa.distortion_r{power}"
         k = mission.value(key, f"1 / mm{power}") / plate_scale**power if key in mission else 0.0
         if k:
-            radial_terms = add_terms(radial_terms, _RADIAL_TERMS[power](k))
+            radial_terms = add_terms(radial_terms, _power_terms(power, k))
     return radial_terms
 
 
@@ -112,16 +113,11 @@ def require_invertible(distortion_terms: Terms, radius: float, scale: float, cam
         )
 
 
-def _terms_r2(k: float) -> Terms:
-    return (3, 0, k, 0.0), (1, 2, k, 0.0), (2, 1, 0.0, k), (0, 3, 0.0, k)
-
-
-def _terms_r4(k: float) -> Terms:
-    of_x, of_y = ((5, 0, k), (3, 2, 2.0 * k), (1, 4, k)), ((4, 1, k), (2, 3, 2.0 * k), (0, 5, k))
-    return (*((i, j, a, 0.0) for i, j, a in of_x), *((i, j, 0.0, a) for i, j, a in of_y))
-
-
-_RADIAL_TERMS = {2: _terms_r2, 4: _terms_r4}
+def _power_terms(power: int, k: float) -> Terms:
+    """Return the polynomial k r^power (x, y) with r^2 = x^2 + y^2, for an even power."""
+    half = power // 2
+    parts = [(power - 2 * i, 2 * i, k * comb(half, i)) for i in range(half + 1)]
+    return (*((i + 1, j, a, 0.0) for i, j, a in parts), *((i, j + 1, 0.0, a) for i, j, a in parts))
 
 
 def add_terms(first: Terms, second: Terms) -> Terms:

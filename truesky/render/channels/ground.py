@@ -22,6 +22,7 @@ from truesky.render.effects.light import (
     background,
     calibration_lamp,
     fringes,
+    ground_ghosts,
     illumination,
     pixel_area,
     satellite_trails,
@@ -40,6 +41,7 @@ from truesky.render.psf import seeing
 from truesky.render.sky import diffuse_light
 
 SKY = (
+    ground_ghosts.EFFECT,
     satellite_trails.EFFECT,
     background.EFFECT,
     pixel_area.EFFECT,
@@ -111,5 +113,6 @@ CHANNEL = Channel(
     non_source_effects=(calibration_lamp.EFFECT, satellite_trails.EFFECT),
     track_effects=(cosmic_rays.EFFECT,),
     diffraction_edges=seeing.typical_edges,
+    has_scattered_light=True,
     alternative_readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},
 )

@@ -127,7 +127,7 @@ class Scene:
     exposure_time_s : float
         Exposure time in seconds.
     sky_rate : float
-        Sky background in electrons per second per pixel.
+        Sky background in electrons per second per pixel, in the middle of the detector.
     peak_electrons : float
         Electrons expected in the brightest pixel, without sky: the brightest pixel of the sources, plus the largest
         charge by each effect that fills pixels without sources, such as a lamp, satellite trails or injected charge.
@@ -164,13 +164,16 @@ class Scene:
     neighbour_charge : NeighbourCharge, optional
         Charge on neighbouring detectors that are read at the same time. None if it is negligible.
     seeing : float
-        FWHM of the seeing in arcsec. Only used for ground cameras.
+        FWHM of stars in arcsec, without aberrations and pixels: air, telescope and camera. Only used for ground
+        cameras.
     zero_point : float
         AB magnitude of a source that gives 1 electron per second. Only used for ground cameras.
     window : Window, optional
         Part of the detector that is drawn; None for the whole detector.
     amplifier : int
         Number of the amplifier, from 0, that reads the window. All pixels of a window are read by one amplifier.
+    sky_slopes : (float, float)
+        Relative change of the sky background per pixel along rows (with the column) and along columns (with the row).
     """
 
     mission: MissionConfiguration
@@ -195,6 +198,7 @@ class Scene:
     zero_point: float = 0.0
     window: Window | None = None
     amplifier: int = 0
+    sky_slopes: tuple[float, float] = (0.0, 0.0)
 
     def value(self, key: str, unit: str) -> float:
         """Return a parameter of the detector in the given unit.

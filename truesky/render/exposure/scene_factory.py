@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
+from truesky.render.camera import pointing
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim
@@ -15,7 +16,11 @@ from truesky.render.effects.charge import cosmic_rays, ramp
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.exposure.records import Variant
+from truesky.render.psf import seeing
 from truesky.request.accuracy import Accuracy
+
+# Smallest sky in the middle of a detector relative to that at the field centre, if the sky has a gradient.
+_MIN_SKY = 0.01
 
 
 def with_non_source_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) -> Scene:
@@ -79,24 +84,42 @@ def from_exposure(
     BadInput is raised by `ramp.find_mode` if the exposure time does not fit the channel's ramp.
     """
     channel = registry.CHANNELS.get(exposure.channel)
+    level, *slopes = _sky_plane(exposure, detector)
     scene = Scene(
-        mission, detector.section, exposure.exposure_time_s, exposure.sky, 0.0, detector,
+        mission, detector.section, exposure.exposure_time_s, exposure.sky * level, 0.0, detector,
         lamp=exposure.lamp or 1, accuracy=accuracy, ramp=channel.ramp_name if channel else "",
-        seeing=exposure.seeing, zero_point=exposure.zero_point,
+        zero_point=exposure.zero_point, sky_slopes=(slopes[0], slopes[1]),
     )  # fmt: skip
     if scene.ramp:
         ramp.mode_of_scene(scene)
     return scene
 
 
+def _sky_plane(exposure: ExposureRow, detector: Detector) -> tuple[float, float, float]:
+    """Return the sky in the middle of a detector relative to the field centre, and its relative slopes per pixel.
+
+    The slopes are those along rows and along columns of pixels. The sky is a plane in the focal plane.
+    """
+    if not exposure.sky_slope_x and not exposure.sky_slope_y:
+        return 1.0, 0.0, 0.0
+    x, y = (axis[0] / 3600.0 for axis in pointing.outline((detector,)))
+    middle, *corners = 1.0 + (exposure.sky_slope_x or 0.0) * x + (exposure.sky_slope_y or 0.0) * y
+    # Corners have the order (first column, first row), (last, first), (last, last), (first, last).
+    along_rows = (corners[1] + corners[2] - corners[0] - corners[3]) / (2.0 * detector.nx)
+    along_columns = (corners[2] + corners[3] - corners[0] - corners[1]) / (2.0 * detector.ny)
+    level = max(float(middle), _MIN_SKY)
+    return level, float(along_rows) / level, float(along_columns) / level
+
+
 def from_aim(aim: Aim, variant: Variant) -> Scene:
-    """Create the scene of a detector before anything is drawn, with its passband and the switched effects.
+    """Create the scene of a detector before anything is drawn, with its passband, seeing and the switched effects.
 
     `aim` is an exposure and a detector. `variant` contains the mission database, the accuracy, and the effects that the
     request switches on or off. `ramp.find_mode` raises BadInput if the exposure time does not fit the channel's ramp.
     """
     scene = from_exposure(aim.exposure, aim.detector, variant.mission, variant.accuracy)
-    return replace(scene, band=aim.band, forced=variant.forced)
+    fwhm = seeing.image_fwhm(aim.exposure, aim.detector, aim.band, variant.mission) if aim.channel.on_ground else 0.0
+    return replace(scene, band=aim.band, forced=variant.forced, seeing=fwhm)
 
 
 def with_peak_electrons(scene: Scene, frame: Frame) -> Scene:

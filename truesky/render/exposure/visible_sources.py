@@ -24,6 +24,7 @@ from truesky.render.dispersing.draw import DispersedSources
 from truesky.render.drawing import outskirts, stamp_sizes, wings
 from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.effects.effect import Decision, decide
+from truesky.render.effects.light import ground_ghosts
 from truesky.render.effects.scene import NOTICEABLE, Lights, Scene
 from truesky.render.exposure import bright_lights, scene_factory, standard_stars
 from truesky.render.exposure.records import Rows, Variant
@@ -299,8 +300,8 @@ class FluxLimits:
         read. A fainter source would add less than the fraction `settings.Settings.edge` of the noise to a pixel. For
         spectra: flux of the faintest noticeable spectrum.
     spikes : float
-        Flux of the faintest star whose diffraction spikes are noticeable on the detector if it is more than 2048 pixels
-        away (`stamp_sizes.reach`).
+        Flux of the faintest star whose diffraction spikes or ghosts are noticeable on the detector if it is more than
+        2048 pixels away (`stamp_sizes.reach`).
     far_galaxy : float
         Flux of the faintest galaxy whose outskirts are noticeable on the detector if it is more than 2048 pixels away.
     """
@@ -332,9 +333,11 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
     time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
     if time == 0.0 or not channel.sees_sky(exposure.image_type):
         return FluxLimits()
-    noise = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy).pixel_noise
-    electrons = electron_rate(exposure) * time
+    scene = replace(scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy), band=band)
+    noise, electrons = scene.pixel_noise, electron_rate(exposure) * time
     spikes_ = _spike_electrons(exposure, detector, band, variant.mission, noise) / electrons
+    if channel.on_ground:
+        spikes_ = min(spikes_, ground_ghosts.min_noticeable_electrons(scene) / electrons)
     if channel.dispersion is not None:
         return FluxLimits(MIN_SPECTRUM_NOISE * noise / electrons, spikes_)
     margin, scale = variant.mission.value("survey.selection_margin", "arcsec"), detector.pixel_scale

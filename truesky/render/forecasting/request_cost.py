@@ -66,6 +66,8 @@ class RequestCost:
         Peak memory in GB of one worker, and of all processes together.
     speed : str
         How the speed of this machine was found.
+    sky : tuple of str
+        One line per camera and band about the sky of the exposures; () if it was not computed.
     """
 
     jobs: tuple[JobCost, ...]
@@ -79,6 +81,7 @@ class RequestCost:
     worker_gb: float
     total_gb: float
     speed: str
+    sky: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON values by name."""

@@ -11,25 +11,34 @@ Serrano et al. 2024, appendix on the survey files of the eighth science challeng
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lake_schema.errors import BadInput, Mistakes
 from lake_schema.mission.configuration import MissionConfiguration
+from truesky.fluxes import passbands
 from truesky.randomness import rng
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.camera import pointing
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.planning import calibration_frames
-from truesky.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
-from truesky.render.sky.observatory import Site, next_dark_time, next_dark_transit, sun_altitude
+from truesky.render.planning.planned_exposures import (
+    Exposure,
+    bands_of,
+    exposure_time,
+    through_grism,
+    zero_point_of,
+)
+from truesky.render.sky import diffuse_light, opsim, twilight
+from truesky.render.sky.observatory import LOWEST_ALTITUDE, Site, next_dark_time, next_dark_transit, sun_direction
 from truesky.render.sky.solar_aspect import next_allowed, position_angle
 from truesky.request.area import Area
-from truesky.request.exposures import pointing_tables
+from truesky.request.exposures import pointing_tables, visit_tables
 from truesky.request.exposures.observations import Observation
-from truesky.request.exposures.pointing_tables import Row
+from truesky.request.exposures.pointing_tables import Row, Visit
 from truesky.request.instruments import check_band
 
 # Number of mistakes in a table of pointings after which the rest of its rows are not read.
@@ -37,9 +46,10 @@ _MAX_MISTAKES = 20
 _DAY_S = 86400.0
 # Seconds from the end of an exposure to the start of the next one.
 _OVERHEAD_S = 30.0
-# Altitude of the Sun above the horizon at the end of nautical twilight, deg. Exposures of the sky with a higher Sun
-# cause a warning.
-_NIGHT_SUN_ALTITUDE = -12.0
+# Pivot wavelength (angstrom) below which exposures without a date are taken with the Moon below the horizon.
+_BLUE = 5500.0
+# Largest illuminated fraction of the Moon for exposures without a date in redder bands, while the Moon is up.
+_FAINT_MOON = 0.4
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -76,8 +86,8 @@ def exposures(
     -----
     Bands that the survey observes together share their pointings. Some surveys use these bands in turn, one per
     pointing. The exposures follow one another from `start`. If the block has no date, each exposure waits until its
-    field is next visible at night. The pointings have random errors, with the standard deviation that the mission
-    database has for the camera.
+    field is next high in a dark night (`max_moon`). The pointings have random errors, with the standard deviation that
+    the mission database has for the camera.
     """
     now = start
     rules = _rules(block.survey, mission)
@@ -100,7 +110,7 @@ def exposures(
             selected_bands = bands if all_bands else (bands[i % len(bands)],)
             for band in selected_bands:
                 seconds = _seconds(rule, band, mission) if block.exposure_time_s is None else block.exposure_time_s
-                now = next_dark_time(ra, dec, now, site) if block.mjd is None else now
+                now = next_dark_time(ra, dec, now, site, max_moon(band)) if block.mjd is None else now
                 actual = _with_pointing_error((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
                 yield Exposure(
                     channel="EXT",
@@ -115,6 +125,7 @@ def exposures(
                     survey=block.survey,
                     field=i + 1,
                     detectors=block.detectors,
+                    clouds=block.clouds,
                 )
                 now += (seconds + _OVERHEAD_S) / _DAY_S
 
@@ -249,13 +260,14 @@ def _chip_pointings(
     return places[:count] if count else places
 
 
-def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
-    """Return one line that warns of ground exposures of the sky whose dates are in daylight or twilight.
+def date_warnings(exposures: Iterable[Exposure], mission: MissionConfiguration) -> Iterator[str]:
+    """Yield lines that warn of ground exposures of the sky whose dates are not possible.
 
-    The line has the number of these exposures, and an example with the altitude of the Sun. It is "" if no exposure has
-    such a date.
+    There is one line for exposures in daylight, one for those below the horizon or lower than an airmass of 3, and one
+    for those before first light of their camera. A line has the number of these exposures, and an example.
     """
-    daytime, count = [], 0
+    count = 0
+    problems: dict[str, list[tuple[float, str]]] = {"Sun": [], "low": [], "early": []}
     sites: dict[str, Site] = {}
     for exposure in exposures:
         channel = registry.CHANNELS[exposure.channel]
@@ -264,26 +276,40 @@ def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguratio
         count += 1
         if exposure.camera not in sites:
             sites[exposure.camera] = Site.from_mission(image_types.section(exposure.camera), mission)
-        altitude = float(sun_altitude(np.array([exposure.mjd]), sites[exposure.camera])[0])
-        if altitude > _NIGHT_SUN_ALTITUDE:
-            daytime.append((altitude, exposure))
-    if not daytime:
-        return ""
-    altitude, exposure = max(daytime, key=lambda entry: entry[0])
-    summary = (
-        f"{len(daytime)} of {count} exposures of the sky have dates when the Sun is above {_NIGHT_SUN_ALTITUDE:g} deg"
-    )
-    example = f"{exposure.camera} on MJD {exposure.mjd:.3f}, the Sun at {altitude:+.0f} deg"
-    return f"EXT: {summary} ({example}): sunlight is not simulated; omit the date to observe at night"
+        site, place = sites[exposure.camera], f"{exposure.camera} on MJD {exposure.mjd:.3f}"
+        sun, _ = sun_direction(exposure.mjd, site)
+        if sun > twilight.LIMITS[1]:
+            problems["Sun"].append((sun, f"{place}, the Sun at {sun:+.0f} deg"))
+        altitude = float(site.altitude(exposure.ra, exposure.dec, exposure.mjd))
+        if altitude < LOWEST_ALTITUDE:
+            problems["low"].append((-altitude, f"{place}, the field at {altitude:+.0f} deg"))
+        key = f"{image_types.section(exposure.camera)}.first_light"
+        if key in mission and exposure.mjd < mission.value(key, "d"):
+            light = mission.value(key, "d")
+            problems["early"].append((light - exposure.mjd, f"{place}, first light on MJD {light:g}"))
+    texts = {
+        "Sun": (f"when the Sun is above {twilight.LIMITS[1]:g} deg", "sunlight is not simulated"),
+        "low": (
+            f"when the field is lower than {LOWEST_ALTITUDE:.0f} deg",
+            "it is simulated on the meridian, at an airmass of at most 3",
+        ),
+        "early": ("before first light of the camera", "the camera was not on its telescope"),
+    }
+    for name, examples in problems.items():
+        if examples:
+            when, consequence = texts[name]
+            summary = f"{len(examples)} of {count} exposures of the sky have dates {when} ({max(examples)[1]})"
+            yield f"EXT: {summary}: {consequence}; omit the date to observe in a dark night"
 
 
 def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
-    """Read the exposures of a user's table of pointings.
+    """Read the exposures of a user's table of pointings or of visits.
 
     Parameters
     ----------
     path : Path
-        CSV table of pointings (`truesky.request.exposures.pointing_tables`), of ground or Euclid cameras.
+        CSV table of pointings (`truesky.request.exposures.pointing_tables`), of ground or Euclid cameras; or table of
+        visits of the Rubin Observatory's scheduler (`visit_tables`), for the camera of the observation's survey.
     block : Observation
         Observation block of the request that names the table; gives the values that a row leaves empty.
     mission : MissionConfiguration
@@ -292,55 +318,149 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     Returns
     -------
     list of Exposure
-        One exposure per row.
+        One exposure per row of a table of pointings, and one or more per visit.
 
     Raises
     ------
     BadInput
-        If a row is invalid, for example if its camera lacks the band; the message names the file and the line.
+        If a row is invalid, for example if its camera lacks the band, or if a visit is before first light of the
+        camera, in daylight or below the horizon. The message names the file and the line.
 
     Notes
     -----
     Without a date, a Euclid exposure begins when the Sun constraints allow it, and a ground exposure when its field
     next crosses the meridian at night.
     """
-    rows = pointing_tables.read(path, block.channels, block.image_type)
+    if visit_tables.is_table_of_visits(path):
+        bands = bands_of("EXT", camera_of(block.survey, mission), mission)
+        rows = visit_tables.read(path, bands, block.image_type)
+    else:
+        rows = pointing_tables.read(path, block.channels, block.image_type)
     with Mistakes() as mistakes:
-        exposures_of_rows = []
+        exposures_of_rows: list[Exposure] = []
         for number, row in enumerate(rows, start=1):
-            exposures_of_rows.append(mistakes.read(_exposure_of_row, row, number, block, mission))
+            if row.visit is None:
+                exposures_of_rows.append(mistakes.read(_exposure_of_row, row, number, block, mission))
+            else:
+                exposures_of_rows += mistakes.read(_exposures_of_visit, row, row.visit, number, block, mission) or ()
             if len(mistakes) >= _MAX_MISTAKES:
                 break
     return exposures_of_rows
 
 
-def first_date(channel: str, camera: str, ra: float, dec: float, mission: MissionConfiguration) -> float:
-    """Return the first date after the launch of the mission at which a camera can observe a position well.
+def earliest_date(camera: str, mission: MissionConfiguration) -> float:
+    """Return the earliest MJD of exposures without a date: the launch of Euclid, or first light if that is later.
+
+    `camera` is a ground camera, or "vis" or "nisp". A camera without first light in the mission database existed before
+    the launch.
+    """
+    launch, key = mission.value("svm.launch", "d"), f"{image_types.section(camera)}.first_light"
+    return max(launch, mission.value(key, "d")) if key in mission else launch
+
+
+def max_moon(band: str) -> float:
+    """Return the illuminated fraction of the brightest Moon under which exposures without a date are taken.
+
+    The result is 0 (Moon below the horizon) in bands bluer than 5500 angstrom, such as u and g, and in bands with a
+    curve of the user. It is 0.4 in other bands.
+    """
+    is_red = band in passbands.names() and passbands.pivot_wavelength(passbands.load(band)) >= _BLUE
+    return _FAINT_MOON if is_red else 0.0
+
+
+def first_date(
+    instrument: tuple[str, str], band: str, place: tuple[float, float], mission: MissionConfiguration
+) -> float:
+    """Return the first date at which a camera can observe a position well.
 
     Parameters
     ----------
-    channel, camera : str
+    instrument : (str, str)
         Names of the channel and of the camera.
-    ra, dec : float
-        Position in degrees.
+    band : str
+        Name of the passband, on which the allowed Moon depends.
+    place : (float, float)
+        Right ascension and declination in degrees.
     mission : MissionConfiguration
-        Mission database, with the date of the launch.
+        Mission database, with the launch of Euclid and the first light of the camera.
 
     Returns
     -------
     float
-        MJD. Euclid observes when the Sun allows the position, a ground camera when the position crosses the meridian
-        at night, where the airmass is smallest.
+        MJD, after the launch and after first light of the camera. Euclid observes when the Sun allows the position. A
+        ground camera observes when the position crosses the meridian, where the airmass is smallest, in a dark night.
 
     Raises
     ------
     BadInput
         If the Sun allows the position at no date.
     """
-    launch = mission.value("svm.launch", "d")
+    channel, camera = instrument
+    earliest = earliest_date(camera, mission)
     if not registry.CHANNELS[channel].on_ground:
-        return next_allowed(ra, dec, launch, mission)
-    return next_dark_transit(ra, dec, launch, Site.from_mission(image_types.section(camera), mission))
+        return next_allowed(*place, earliest, mission)
+    site = Site.from_mission(image_types.section(camera), mission)
+    return next_dark_transit(*place, earliest, site, max_moon(band))
+
+
+def _exposures_of_visit(
+    row: Row, visit: Visit, number: int, block: Observation, mission: MissionConfiguration
+) -> list[Exposure]:
+    """Return the exposures of a visit, one after the other.
+
+    The table gives sky and seeing. `number` is the number of the visit in the table, from 1.
+    """
+    camera, mjd, seconds = camera_of(block.survey, mission), row.mjd or 0.0, row.exposure_time_s or 0.0
+    section = image_types.section(camera)
+    site = Site.from_mission(section, mission)
+    wavelength = passbands.pivot_wavelength(passbands.load(row.band))
+    try:
+        _check_visit(row, camera, site, mission)
+        parallactic = site.zenith(row.ra, row.dec, mjd) if visit.parallactic is None else visit.parallactic
+        altitude = float(site.altitude(row.ra, row.dec, mjd))
+        angle = opsim.position_angle((visit.rot_sky, visit.rot_tel), parallactic, altitude, section, mission)
+        seeing = opsim.zenith_seeing(visit.seeing_eff, visit.airmass, wavelength, opsim.WIDTH_RATIO)
+    except BadInput as error:
+        raise error.with_prefix(row.location) from None
+    zero_point = zero_point_of(section, row.band, mission)
+    detector = camera_detectors.detectors(camera, mission)[0]
+    exposure = Exposure(
+        channel=row.channel,
+        camera=camera,
+        band=row.band,
+        image_type=row.image_type,
+        ra=row.ra,
+        dec=row.dec,
+        position_angle=angle,
+        mjd=mjd,
+        exposure_time_s=seconds,
+        survey=block.survey,
+        field=number,
+        sky=diffuse_light.rate_of_brightness(visit.sky_brightness, detector, row.band, zero_point, mission),
+        seeing=seeing,
+        detectors=block.detectors,
+        clouds=block.clouds,
+    )
+    step = (seconds + visit.overhead_s) / _DAY_S
+    return [
+        replace(exposure, mjd=mjd + i * step, dither=i + 1 if visit.exposures > 1 else None)
+        for i in range(visit.exposures)
+    ]
+
+
+def _check_visit(row: Row, camera: str, site: Site, mission: MissionConfiguration) -> None:
+    """Raise BadInput if a visit is before first light of the camera, in daylight, or too low for the simulation."""
+    key, mjd = f"{image_types.section(camera)}.first_light", row.mjd or 0.0
+    if key in mission and mjd < mission.value(key, "d"):
+        light = mission.value(key, "d")
+        raise BadInput(f"MJD {mjd:.3f} is before first light of {camera} on MJD {light:g} (mission parameter {key})")
+    sun, _ = sun_direction(mjd, site)
+    if sun > twilight.LIMITS[1]:
+        raise BadInput(f"on MJD {mjd:.3f} the Sun is at {sun:+.1f} deg, but must be below {twilight.LIMITS[1]:g} deg")
+    altitude = float(site.altitude(row.ra, row.dec, mjd))
+    if altitude < LOWEST_ALTITUDE:
+        below = "below the horizon" if altitude < 0.0 else f"lower than {LOWEST_ALTITUDE:.1f} deg"
+        raise BadInput(f"on MJD {mjd:.3f} the field has an altitude of {altitude:.1f} deg, {below}")
 
 
 def _exposure_of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
@@ -353,7 +473,7 @@ def _exposure_of_row(row: Row, number: int, block: Observation, mission: Mission
     mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
     is_euclid = row.channel != "EXT"
     if mjd is None:
-        mjd = first_date(row.channel, camera, row.ra, row.dec, mission)
+        mjd = first_date((row.channel, camera), row.band, (row.ra, row.dec), mission)
     if angle is None:
         angle = position_angle(row.ra, row.dec, mjd) if is_euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
@@ -373,6 +493,7 @@ def _exposure_of_row(row: Row, number: int, block: Observation, mission: Mission
         sky=row.sky,
         seeing=row.seeing,
         zero_point=row.zero_point,
+        clouds=block.clouds if row.clouds is None else row.clouds,
         psf=row.psf,
         detectors=row.detectors or block.detectors,
     )

@@ -26,7 +26,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.effects.charge import ramp
 from truesky.render.psf import seeing as ground_psf
-from truesky.render.sky import night_sky, observatory
+from truesky.render.sky import clouds, night_sky, observatory
 from truesky.render.sky.diffuse_light import SkyBand, sky_rate
 from truesky.render.sky.night_sky import Night
 from truesky.request.exposures.observations import Observation
@@ -36,7 +36,7 @@ GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp
 # Image types whose exposures contain no light of the sky, so that their column `sky` is 0.
 _DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
 # Columns of the table `exposures` that are not attributes of `Exposure`, because the function `table` computes them.
-_COMPUTED_COLUMNS = ("exposure_id", "realisation", "airmass", "zenith")
+_COMPUTED_COLUMNS = ("exposure_id", "realisation", "airmass", "zenith", "clouds", "sky_slope_x", "sky_slope_y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +76,12 @@ class Exposure:
     sky : float, optional
         Sky background in electrons per second and pixel; None means that it is computed.
     seeing : float, optional
-        Seeing in arcsec; None means that it is drawn at random for ground cameras, and 0 in space.
+        Seeing in arcsec, at the zenith and at 500 nm; None means that it is drawn at random for ground cameras, and 0
+        in space.
     zero_point : float, optional
-        AB magnitude of a source with one electron per second; None means that it is computed.
+        AB magnitude of a source with one electron per second without clouds; None means that it is computed.
+    clouds : float
+        Mean extinction by clouds of the night in magnitudes, for ground cameras; 0 for a clear night.
     settings : str, optional
         JSON table of parameters that replace the values of the request; None if nothing is replaced.
     parameters : tuple of (str, float, str)
@@ -107,6 +110,7 @@ class Exposure:
     sky: float | None = None
     seeing: float | None = None
     zero_point: float | None = None
+    clouds: float = 0.0
     settings: str | None = None
     parameters: tuple[tuple[str, float, str], ...] = ()
 
@@ -340,8 +344,9 @@ class _Band:
     """Properties shared by all exposures of a channel and camera in a band.
 
     `zero_point` is the AB magnitude of one electron per second, and `sky` the model of the sky brightness. `seeing` is
-    the median FWHM (arcsec), and `scatter` its log-normal scatter (dex). Three fields are None for cameras in space:
-    `night` (night sky of the site), `detector` (first one of the camera) and `curve` (passband).
+    the median FWHM (arcsec) of the air at the zenith and at 500 nm, and `scatter` its log-normal scatter (dex). Three
+    fields are None for cameras in space: `night` (night sky of the site), `detector` (first one of the camera) and
+    `curve` (passband).
     """
 
     zero_point: float
@@ -361,7 +366,7 @@ class _Band:
         zero_point = zero_point_of(prefix, band, mission, curve)
         if camera in SPACE_CAMERAS:
             return cls(zero_point, sky)
-        seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
+        seeing = mission.value(f"{prefix}.seeing", "arcsec")
         curve = curve or passbands.load(band)
         night = Night.from_detector(first, band, (zero_point, sky.constant), mission, curve)
         return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first, curve)
@@ -377,12 +382,17 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
     sky, night, extinction_mag = e.sky, band.night, 0.0
     airmass: float | None = None
     zenith: float | None = None
+    cloud_mag: float | None = None
+    slopes: tuple[float | None, float | None] = (None, None)
     seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
     if night is not None and band.detector is not None and band.curve is not None:
-        if e.psf is None:
-            ground_psf.check(seeing, band.detector, band.curve, mission)
         airmass, zenith = observatory.airmass_and_zenith(e.ra, e.dec, e.mjd, night.site)
+        if e.psf is None:
+            ground_psf.check(seeing, airmass, band.detector, band.curve, mission)
         extinction_mag = night_sky.extra_extinction(night, airmass)
+        if registry.CHANNELS[e.channel].sees_sky(e.image_type):
+            cloud_mag = clouds.extinction(e.clouds, e.mjd, e.exposure_time_s, night.site.longitude, seed)
+            slopes = night_sky.twilight_slopes(night, (e.ra, e.dec), e.position_angle, e.mjd, mission)
     channel = registry.CHANNELS[e.channel]
     if e.image_type in _DARK_TYPES or (channel.on_ground and not channel.sees_sky(e.image_type)):
         sky = 0.0
@@ -397,15 +407,19 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
         "position_angle": _wrap_angle(e.position_angle),
         "sky": sky,
         "seeing": seeing,
-        "zero_point": band.zero_point - extinction_mag if e.zero_point is None else e.zero_point,
+        "zero_point": (band.zero_point - extinction_mag if e.zero_point is None else e.zero_point) - (cloud_mag or 0.0),
         "airmass": airmass,
         "zenith": zenith,
+        "clouds": cloud_mag,
+        "sky_slope_x": slopes[0],
+        "sky_slope_y": slopes[1],
     }
 
 
 def _seeing(e: Exposure, band: _Band, seed: int) -> float:
-    """Draw the seeing (arcsec) of a ground camera from a log-normal distribution, limited to 3 sigma.
+    """Draw the seeing (arcsec, at the zenith and at 500 nm) of a ground camera.
 
+    It has a log-normal distribution, limited to 3 sigma.
     The result is 0 in space. The same seed, camera, band, position and date always give the same seeing.
     """
     if band.scatter == 0.0:

@@ -317,7 +317,8 @@ def _exposure_of_pointing(pointing: Pointing, where: str, request: Request, miss
     mjd = pointing.mjd
     if mjd is None:
         try:
-            mjd = ground_surveys.first_date(pointing.channel, pointing.camera, ra, dec, mission)
+            instrument = (pointing.channel, pointing.camera)
+            mjd = ground_surveys.first_date(instrument, pointing.band, (ra, dec), mission)
         except BadInput as error:
             raise error.with_prefix(where) from None
     elif not registry.CHANNELS[pointing.channel].on_ground:
@@ -328,7 +329,7 @@ def _exposure_of_pointing(pointing: Pointing, where: str, request: Request, miss
     check_ramp(pointing.channel, pointing.camera, seconds, mission, f"{where}.exposure_time_s")
     exposure = Exposure(
         pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, mjd, seconds,
-        request.name, detectors=pointing.detectors,
+        request.name, detectors=pointing.detectors, clouds=pointing.clouds,
     )  # fmt: skip
     return through_grism(exposure, pointing.grism_angle, mission, f"{where}.grism_angle")
 
@@ -364,11 +365,15 @@ def _schedule_block(
 ) -> _ScheduledBlock:
     """Plan the exposures of an observation and check detectors, ramps and Sun constraints.
 
-    An undated observation with NISP begins at MJD `nisp_free_mjd`, any other at its date or at the launch. Raises
-    BadInput with `where` (the observation in the request) if an exposure cannot be taken.
+    An undated observation with NISP begins at MJD `nisp_free_mjd`, any other at its date, or after the launch and after
+    first light of the camera. Raises BadInput with `where` (the observation in the request) if an exposure cannot be
+    taken.
     """
     area = block.area or request.area
-    start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
+    start = block.mjd
+    if start is None:
+        camera = ground_surveys.camera_of(block.survey, mission) if "EXT" in block.channels else "vis"
+        start = ground_surveys.earliest_date(camera, mission)
     if _is_undated(block) and {"NISP-P", "NISP-S"} & {*block.channels}:
         start = nisp_free_mjd
     try:

@@ -222,7 +222,7 @@ def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: Miss
     return spikes.from_euclid_pupil(parts, blur, detector.pixel_scale, sampling.transform / sampling.samples, mission)
 
 
-def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -> Float:
+def wavefront(x: float, y: float, section: str, mission: MissionConfiguration, key: str = "") -> Float:
     """Return the Zernike coefficients of the wavefront at a position in the focal plane.
 
     Parameters
@@ -235,13 +235,16 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
         Prefix of the camera's parameters in the mission database, such as "vis".
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras).
+    key : str, optional
+        Name of the table of the wavefront in the mission database, such as that of a band. If the database has no such
+        table, that of the camera is used.
 
     Returns
     -------
     float array, shape (highest Noll number + 1,)
         Coefficients, nm rms; the index is the Noll number, and element 0 is 0.
     """
-    terms = mission.numbers(f"{section}.psf.wavefront")
+    terms = mission.numbers(key if key in mission else f"{section}.psf.wavefront")
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
     for noll, x_power, y_power, coefficient in terms:
         nm[int(noll)] += coefficient * x**x_power * y**y_power

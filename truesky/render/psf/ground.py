@@ -7,6 +7,12 @@ frequency. They are expressed by a distance rho in the pupil, the wavelength (m)
     clear(rho)          overlap of an annular pupil without aberrations with itself after a shift by rho
     ratio(rho)          mean of exp(i phase difference) over that overlap: the aberrations of the optics
 
+and of a Gaussian: the blur by the dome, the telescope's tracking, and the diffusion of charge in the detector.
+
+Seeing is given as astronomers measure it: the FWHM of a star through the air alone, at the zenith and at a wavelength
+of 500 nm. In a band, it is proportional to airmass^0.6 and to wavelength^slope, with the slope from the mission
+database.
+
 The air transmits practically nothing if rho is more than a few Fried lengths, which are a small part of the pupil. Up
 to there the ratio is smooth and is interpolated from a coarse lattice. The phase of the ratio at small rho, which would
 shift the image, is removed, since astrometry is calibrated with centroids.
@@ -60,6 +66,13 @@ _WORST = 10.0
 # Number of distances in the pupil, from 0 to 3 Fried lengths, at which the transfer function of the air and of optics
 # without aberrations is tabulated. It is interpolated linearly between them.
 _TABLE = 4000
+# Wavelength at which seeing is given, Angstrom.
+_SEEING_WAVELENGTH = 5000.0
+# Exponent of the airmass in the FWHM of seeing (Roddier 1981).
+_AIRMASS_POWER = 0.6
+# Degree of the polynomial by which the PSF changes across a detector, for the keys of `euclid.DEGREES`. With degree 3,
+# sizes and ellipticities in the outermost detectors are wrong by 2e-5 (LSST, DECam); in HSC, by 2e-3 and 5e-4.
+_DEGREES = {1: 0, 4: 2, 9: 3, 25: 3}
 # FWHM of a Gaussian in units of its standard deviation.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -71,7 +84,8 @@ class Air:
     Attributes
     ----------
     seeing : float
-        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
+        FWHM of the image of a star through the air at the mean wavelength of the band and the airmass of the exposure,
+        arcsec.
     shear : (float, float)
         Ellipticity (e1, e2) of the PSF that is caused by the air. The PSF is stretched along x for positive e1, and
         along the diagonal x = y for positive e2. The squared axis ratio is (1 - e) / (1 + e) with e^2 = e1^2 + e2^2.
@@ -84,6 +98,8 @@ class Air:
         Direction of the zenith on the detector, radian, from the x axis, positive towards y.
     height : float
         Height of the observatory above sea level, m.
+    system : float
+        FWHM of the Gaussian blur by telescope and camera, arcsec.
     """
 
     seeing: float
@@ -92,9 +108,46 @@ class Air:
     tan_zenith_distance: float = 0.0
     zenith: float = 0.0
     height: float = 0.0
+    system: float = 0.0
+
+    @property
+    def fwhm(self) -> float:
+        """Approximate FWHM of a star's image without aberrations, arcsec: air and system, added in quadrature."""
+        return float(np.hypot(self.seeing, self.system))
 
 
-def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
+def air_in_band(seeing: float, airmass: float, section: str, band: Passband, mission: MissionConfiguration) -> Air:
+    """Return the state of round, undispersed air with a given seeing, as it appears in a band.
+
+    Parameters
+    ----------
+    seeing : float
+        FWHM of the image of a star through the air at the zenith and at 500 nm, arcsec.
+    airmass : float
+        Airmass.
+    section : str
+        Prefix of the camera's parameters in the mission database, such as "ext.lsstcam".
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database (parameters of telescopes and cameras).
+
+    Returns
+    -------
+    Air
+        Seeing at the mean wavelength of the band, its slope, and the blur by telescope and camera.
+    """
+    slope = mission.value(f"{section}.psf.seeing_slope", "")
+    mean = float(_waves(band, Air(seeing, slope=slope, tan_zenith_distance=1.0)).mean())
+    system = mission.value(f"{section}.psf.system_fwhm", "arcsec")
+    return Air(
+        seeing * airmass**_AIRMASS_POWER * (mean / _SEEING_WAVELENGTH) ** slope,
+        slope=slope,
+        system=system * airmass ** mission.value(f"{section}.psf.system_airmass_power", ""),
+    )
+
+
+def exposure_air(exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration) -> Air:
     """Return the state of the air during an exposure, with a random ellipticity that is the same for all detectors.
 
     Parameters
@@ -103,6 +156,8 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
         Row of the table `exposures`. If it has no airmass or no direction of the zenith, there is no refraction.
     detector : Detector
         Detector of the camera of this exposure.
+    band : Passband
+        The passband.
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras).
 
@@ -123,9 +178,10 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
     size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
     angle = 2.0 * detector.own_radians(np.pi * float(turn))
     shear = size * float(np.cos(angle)), size * float(np.sin(angle))
-    slope = mission.value(f"{section}.psf.seeing_slope", "")
+    airmass = 1.0 if exposure.airmass is None else exposure.airmass
+    air = replace(air_in_band(exposure.seeing, airmass, section, band, mission), shear=shear)
     if exposure.airmass is None or exposure.zenith is None:
-        return Air(exposure.seeing, shear, slope)
+        return air
     # Angle on the detector from the x axis to the zenith, positive towards y. For the position angle 0 the x axis of
     # the focal plane points west and the y axis north, so north is at 90 deg. Position angles, from north to east, are
     # counted in the same direction as angles from x to y.
@@ -133,7 +189,8 @@ def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConf
     tan_zenith_distance = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(
         f"{section}.psf.refraction", ""
     )
-    return Air(exposure.seeing, shear, slope, tan_zenith_distance, zenith, mission.value(f"{section}.site.height", "m"))
+    height = mission.value(f"{section}.site.height", "m")
+    return replace(air, tan_zenith_distance=tan_zenith_distance, zenith=zenith, height=height)
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
@@ -142,7 +199,8 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
     Parameters
     ----------
     seeing : float
-        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
+        FWHM of the image of a star through the air at the mean wavelength of the band and the airmass of the exposure,
+        arcsec.
     detector : Detector
         Detector of the camera.
     band : Passband
@@ -164,7 +222,7 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
     waves = _waves(band, Air(seeing, slope=slope, tan_zenith_distance=1.0))
     best = max(atmosphere.finest_seeing(wave, outer) * (wave / waves.mean()) ** -slope for wave in waves.tolist())
     if not max(best, detector.pixel_scale) <= seeing <= _WORST:
-        name = f"seeing of {detector.section} through a turbulent atmosphere, arcsec"
+        name = f"seeing of {detector.section} in {band.name} through a turbulent atmosphere, arcsec"
         raise OutOfRange(name, seeing, max(best, detector.pixel_scale), _WORST)
 
 
@@ -182,8 +240,8 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras).
     positions : int
-        Number of positions on the detector at which the aberrations are computed: 1, 4, 9 or 25 (keys of
-        `euclid.DEGREES`); 25 is treated as 9. Polynomials describe the changes between them.
+        Number that selects the degree of the polynomials by which the PSF changes across the detector: 1, 4, 9 or 25
+        (keys of `euclid.DEGREES`); 25 is treated as 9.
 
     Returns
     -------
@@ -205,12 +263,15 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
     ]
     samples = int(np.clip(np.ceil(_SAMPLES_OF_FWHM * scale / widths.min()), _LEAST_SAMPLES, _MOST_SAMPLES))
     grid = _Grid.from_pixels(SIDE, samples, scale)
+    blur = grid.gaussian(air.system)
     lifts = atmosphere.refraction(waves, air.height) * air.tan_zenith_distance
-    middle = _wavefront(detector, 0.0, 0.0, mission)
+    middle = _wavefront(detector, band.name, 0.0, 0.0, mission)
     images = []
     for wave, length, lift in zip(waves, fried, lifts - lifts.mean(), strict=True):
         ratio = TransferRatio.from_wavefront(middle, telescope, float(wave), length, detector.axes)
-        plane_transfer = grid.transfer(float(wave), length, telescope, air) * grid.interpolate_ratio(ratio, float(wave))
+        plane_transfer = (
+            blur * grid.transfer(float(wave), length, telescope, air) * grid.interpolate_ratio(ratio, float(wave))
+        )
         if lift != 0.0:
             plane_transfer *= grid.phase_shift(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
         images.append(grid.image(plane_transfer))
@@ -218,7 +279,7 @@ def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: Missi
     total = 1.0 + float(outer_light.sum())
     pupil_edges = _match_rings(pupil_edges, np.mean(images, axis=0), samples)
     planes = ((np.stack(images) + outer_light) / total).astype(np.float32)
-    drift = _drift(air, detector, float(waves.mean()), positions, telescope, samples, mission) / total
+    drift = _drift(air, detector, band, positions, telescope, samples, mission) / total
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
     psf_planes = Planes(waves, planes, drift.astype(np.float32), half, _powers(positions), samples)
     psf = model.from_planes(psf_planes, scale, has_pixel=False, side=SIDE)
@@ -260,7 +321,7 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
     circles = 2e3 * np.pi * (telescope.radius + telescope.inner)
     halo = tuple(mission.value(f"{section}.psf.aureole{part}", unit) for part, unit in (("", ""), ("_core", "arcsec")))
     return Edges(
-        spikes.wavelengths(sub_bands(band)), area, circles, bars, air.seeing / _FWHM, detector.pixel_scale, 0.0,
+        spikes.wavelengths(sub_bands(band)), area, circles, bars, air.fwhm / _FWHM, detector.pixel_scale, 0.0,
         (halo[0], halo[1]),
     )  # fmt: skip
 
@@ -285,15 +346,17 @@ def _waves(band: Passband, air: Air) -> Float:
     return np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
 
 
-def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> Float:
+def _wavefront(detector: Detector, band: str, x: float, y: float, mission: MissionConfiguration) -> Float:
     """Return the Zernike coefficients of the wavefront, nm rms by Noll number, at a position on a detector.
 
-    `x` and `y` are measured from the centre of the detector along its own axes, in units of half of its sides.
+    `x` and `y` are measured from the centre of the detector along its own axes, in units of half of its sides. `band`
+    is the name of the passband. If the mission database has no wavefront for it, that of the camera is used.
     """
     scale = detector.pixel_scale
     at = detector.to_focal_plane(x * detector.nx * scale / 2, y * detector.ny * scale / 2)
     reach = max(np.hypot(abs(d.x), abs(d.y)) + d.half_diagonal for d in detectors(detector.section[4:], mission))
-    return euclid.wavefront(float(at[0] / reach), float(at[1] / reach), detector.section, mission)
+    key = f"{detector.section}.{band}.psf.wavefront"
+    return euclid.wavefront(float(at[0] / reach), float(at[1] / reach), detector.section, mission, key)
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,6 +395,12 @@ class _Grid:
         x, y = metres * self.across, metres * self.along[:, None]
         distance = np.sqrt((1.0 + e1) * x * x + (1.0 - e1) * y * y + 2.0 * e2 * x * y)
         return np.interp(distance, rho, table, right=0.0)
+
+    def gaussian(self, fwhm: float) -> Float:
+        """Return the transform [n, n / 2 + 1] of a round Gaussian with the sum 1 and a given FWHM in arcsec."""
+        variance = (fwhm * ARCSEC / _FWHM) ** 2
+        along, across = (np.exp(-2.0 * np.pi**2 * variance * axis**2) for axis in (self.along, self.across))
+        return np.asarray(along[:, None] * across)
 
     def interpolate_ratio(self, ratio: TransferRatio, wave: float) -> Complex:
         """Interpolate a `TransferRatio` at all frequencies [n, n / 2 + 1].
@@ -379,12 +448,11 @@ def _spline(lags: Float, at: Float) -> Float:
 
 
 def _degree(positions: int) -> int:
-    """Return the degree of the polynomial by which the PSF changes across a detector: 0 (no change), 1 or 2.
+    """Return the degree of the polynomial by which the PSF changes across a detector: 0 (no change), 2 or 3.
 
-    `positions` is a key of `euclid.DEGREES`. Terms of higher degree are neglected. They would change the sizes of
-    sources by less than 1e-5.
+    `positions` is a key of `euclid.DEGREES`. Terms of higher degree are neglected.
     """
-    return min(euclid.DEGREES[positions][0], 2)
+    return _DEGREES[positions]
 
 
 def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
@@ -407,28 +475,28 @@ def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
 
 
 def _drift(
-    air: Air, detector: Detector, wave: float, positions: int, telescope: Telescope, samples: int,
+    air: Air, detector: Detector, band: Passband, positions: int, telescope: Telescope, samples: int,
     mission: MissionConfiguration,
 ) -> Float:  # fmt: skip
     """Return one image per term of the polynomial in position that describes how the PSF changes across a detector.
 
     These are the images of `Planes.drift`. The polynomial is fitted by least squares to the transfer functions of the
-    optics at several positions. As an approximation, all are computed at the mean wavelength `wave` (Angstrom) of the
-    band. `samples` is the number of samples per pixel.
+    optics at several positions. As an approximation, all are computed at the mean wavelength of the band. `samples` is
+    the number of samples per pixel.
     """
-    powers, nodes = _powers(positions), _nodes(positions)
+    powers, nodes, wave = _powers(positions), _nodes(positions), float(_waves(band, air).mean())
     grid = _Grid.from_pixels(_DRIFT_SIDE, samples, detector.pixel_scale)
     if not powers:
         return np.zeros((0, len(grid.along) + 1, len(grid.along) + 1))
     fried = atmosphere.fried_length(air.seeing, wave, telescope.outer)
-    fronts = [_wavefront(detector, *at, mission) for at in ((0.0, 0.0), *nodes)]
+    fronts = [_wavefront(detector, band.name, *at, mission) for at in ((0.0, 0.0), *nodes)]
     ratios = [TransferRatio.from_wavefront(front, telescope, wave, fried, detector.axes) for front in fronts]
     x, y = np.array(nodes).T
     from_nodes = matrices.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
     off = np.stack([r.values - ratios[0].values for r in ratios[1:]])
     flat = off.reshape(len(nodes), -1)
     terms = matrices.matmul(from_nodes, flat.real) + 1j * matrices.matmul(from_nodes, flat.imag)
-    plane_transfer = grid.transfer(wave, fried, telescope, air)
+    plane_transfer = grid.gaussian(air.system) * grid.transfer(wave, fried, telescope, air)
     changes = terms.reshape(-1, *off.shape[1:])
     return np.stack(
         [

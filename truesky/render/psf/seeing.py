@@ -34,7 +34,7 @@ def exposure_psf(
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras), which selects the kind of profile.
     positions : int
-        Number of positions on the detector at which the PSF is computed: 1, 4, 9 or 25 (keys of `euclid.DEGREES`); 25
+        Number that selects how the PSF changes across the detector: 1, 4, 9 or 25 (keys of `euclid.DEGREES`); 25
         is treated as 9. It is ignored for a Gaussian or Moffat profile, which is the same on the whole detector.
 
     Returns
@@ -47,19 +47,46 @@ def exposure_psf(
     section, scale = detector.section, detector.pixel_scale
     profile = mission.value(f"{section}.psf.profile")
     if profile == _GAUSSIAN:
-        return model.from_profile(galsim.Gaussian(fwhm=exposure.seeing), scale)
+        return model.from_profile(galsim.Gaussian(fwhm=image_fwhm(exposure, detector, band, mission)), scale)
     if profile == _MOFFAT:
-        return moffat_psf(exposure.seeing, mission.value(f"{section}.psf.moffat_beta"), scale)
-    return ground.atmospheric_psf(ground.exposure_air(exposure, detector, mission), detector, band, mission, positions)
+        fwhm = image_fwhm(exposure, detector, band, mission)
+        return moffat_psf(fwhm, mission.value(f"{section}.psf.moffat_beta"), scale)
+    air = ground.exposure_air(exposure, detector, band, mission)
+    return ground.atmospheric_psf(air, detector, band, mission, positions)
 
 
-def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
+def image_fwhm(exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration) -> float:
+    """Return the FWHM (arcsec) of stars in an exposure, without aberrations and pixels: air, telescope and camera.
+
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the table `exposures`, which contains the seeing at the zenith and at 500 nm, and the airmass.
+    detector : Detector
+        Detector of the camera of this exposure.
+    band : Passband
+        The passband.
+    mission : MissionConfiguration
+        Mission database (parameters of telescopes and cameras).
+
+    Returns
+    -------
+    float
+        FWHM, arcsec; widths are added in quadrature.
+    """
+    airmass = 1.0 if exposure.airmass is None else exposure.airmass
+    return ground.air_in_band(exposure.seeing, airmass, detector.section, band, mission).fwhm
+
+
+def check(seeing: float, airmass: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
     """Check that a PSF can be computed for a seeing and for the pupil of a ground camera.
 
     Parameters
     ----------
     seeing : float
-        FWHM of the image of a star through the air at the mean wavelength of the band, arcsec.
+        FWHM of the image of a star through the air at the zenith and at 500 nm, arcsec.
+    airmass : float
+        Airmass of the exposure.
     detector : Detector
         Detector of a ground camera.
     band : Passband
@@ -74,11 +101,12 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
         Moffat profiles are not checked.
     """
     if mission.value(f"{detector.section}.psf.profile") not in (_GAUSSIAN, _MOFFAT):
-        ground.check(seeing, detector, band, mission)
+        air = ground.air_in_band(seeing, airmass, detector.section, band, mission)
+        ground.check(air.seeing, detector, band, mission)
 
 
 def typical_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
-    """Return what causes light beyond the border of the PSF images, for the typical seeing of a band.
+    """Return what causes light beyond the border of the PSF images, for the typical seeing at the zenith.
 
     Parameters
     ----------
@@ -87,7 +115,7 @@ def typical_edges(detector: Detector, band: Passband, mission: MissionConfigurat
     band : Passband
         The passband.
     mission : MissionConfiguration
-        Mission database (parameters of telescopes and cameras). If it has no seeing for the band, 1 arcsec is used.
+        Mission database (parameters of telescopes and cameras).
 
     Returns
     -------
@@ -97,9 +125,8 @@ def typical_edges(detector: Detector, band: Passband, mission: MissionConfigurat
     section = detector.section
     if mission.value(f"{section}.psf.profile") in (_GAUSSIAN, _MOFFAT):
         return None
-    key = f"{section}.{band.name}.seeing"
-    typical_seeing = mission.value(key, "arcsec") if key in mission else 1.0
-    return ground.edges(ground.Air(typical_seeing), detector, band, mission)
+    air = ground.air_in_band(mission.value(f"{section}.seeing", "arcsec"), 1.0, section, band, mission)
+    return ground.edges(air, detector, band, mission)
 
 
 def moffat_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:

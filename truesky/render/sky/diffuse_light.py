@@ -141,9 +141,72 @@ def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, cur
     section = detector.section
     if f"{section}.{band}.sky" in mission:
         return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
+    brightness = mission.value(f"{section}.{band}.sky_brightness", "mag / arcsec2")
     zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
-    contrast = zero_point - mission.value(f"{section}.{band}.sky_brightness", "mag / arcsec2")
-    return SkyBand(float(10.0 ** (0.4 * contrast) * detector.pixel_scale**2))
+    return SkyBand(rate_of_brightness(brightness, detector, band, zero_point, mission))
+
+
+def rate_of_brightness(
+    brightness: float, detector: Detector, band: str, zero_point: float, mission: MissionConfiguration
+) -> float:
+    """Convert the surface brightness of the sky to a rate of electrons.
+
+    Parameters
+    ----------
+    brightness : float
+        AB mag per arcsec2.
+    detector : Detector
+        Any detector of the camera.
+    band : str
+        Name of the band.
+    zero_point : float
+        AB magnitude of a source with one electron per second. It is not used if the mission database has the surface
+        brightness that belongs to a rate (`sky_reference`). Air dims sources, but not the sky in published values of
+        its surface brightness, so that this conversion is more accurate.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Electrons per second and pixel.
+    """
+    return float(10.0 ** (-0.4 * brightness) * _rate_of_zero_brightness(detector, band, zero_point, mission))
+
+
+def brightness_of_rate(
+    rate: float, detector: Detector, band: str, zero_point: float, mission: MissionConfiguration
+) -> float:
+    """Convert a rate of electrons to the surface brightness of the sky; the inverse of `rate_of_brightness`.
+
+    Parameters
+    ----------
+    rate : float
+        Electrons per second and pixel, more than 0.
+    detector : Detector
+        Any detector of the camera.
+    band : str
+        Name of the band.
+    zero_point : float
+        AB magnitude of a source with one electron per second, if it is needed.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        AB mag per arcsec2.
+    """
+    return float(-2.5 * np.log10(rate / _rate_of_zero_brightness(detector, band, zero_point, mission)))
+
+
+def _rate_of_zero_brightness(detector: Detector, band: str, zero_point: float, mission: MissionConfiguration) -> float:
+    """Return the rate, in electrons per second and pixel, of a sky of 0 mag per arcsec2."""
+    key = f"{detector.section}.{band}"
+    if f"{key}.sky" in mission and f"{key}.sky_reference" in mission:
+        reference = mission.value(f"{key}.sky_reference", "mag / arcsec2")
+        return float(mission.value(f"{key}.sky", "electron / (s pix)") * 10.0 ** (0.4 * reference))
+    return float(10.0 ** (0.4 * zero_point) * detector.pixel_scale**2)
 
 
 def sky_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:

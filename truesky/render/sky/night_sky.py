@@ -1,8 +1,8 @@
-"""Night sky of a ground camera (airglow, zodiacal light and moonlight), and atmospheric extinction of sources.
+"""Night sky of a ground camera (airglow, zodiacal light, moonlight, twilight), and extinction of sources.
 
 The mission database has one sky level per band. If it is the mean of a survey (parameter `sky_model` 0), it is used
 unchanged. Otherwise it is the level at the zenith of a dark night, from which the sky at other airmasses, dates and
-Moon phases is computed.
+Moon phases, and in twilight, is computed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from lake_schema.sky import separation
 from lake_schema.sky.ecliptic import equatorial
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
+from truesky.render.camera import pointing
 from truesky.render.camera.detectors import Detector
-from truesky.render.sky import diffuse_light, observatory
+from truesky.render.sky import diffuse_light, observatory, twilight
 from truesky.render.sky.diffuse_light import SkyBand
 from truesky.render.sky.observatory import Site
 
@@ -37,6 +38,8 @@ _V_ZERO = 20.7233
 _V = 5510.0
 # Smallest distance from the Moon (deg) for which moonlight is computed; nearer fields have the light at this distance.
 _NEAREST_MOON = 5.0
+# Distance from the field centre (arcsec) at which the gradient of the sky is measured.
+_GRADIENT_STEP = 1800.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +68,8 @@ class Night:
         Airmass for which the published zero point is valid.
     site : Site
         The observatory.
+    curve : Passband
+        Response of the band.
     """
 
     level: float
@@ -76,6 +81,7 @@ class Night:
     extinction: float
     reference_airmass: float
     site: Site
+    curve: Passband
 
     @classmethod
     def from_detector(
@@ -115,7 +121,26 @@ class Night:
         return cls(
             level, mission.value(f"{section}.sky_model") == 1.0, min(pole, (1.0 - _MIN_AIRGLOW) * level), float(moon),
             sky, scale, extinction, mission.value(f"{section}.zero_point_airmass"), Site.from_mission(section, mission),
+            curve,
         )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """Light of which the sky of a ground exposure consists, in electrons per second and pixel.
+
+    `dark` is airglow and zodiacal light, or the mean sky of a survey. `moon` and `twilight` are scattered moonlight and
+    sunlight.
+    """
+
+    dark: float
+    moon: float = 0.0
+    twilight: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Sum of all light."""
+        return self.dark + self.moon + self.twilight
 
 
 def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
@@ -135,8 +160,29 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
     Returns
     -------
     float
-        Electrons per second and pixel: airglow, zodiacal light and moonlight, or `night.level` unless
-        `night.modelled`.
+        Electrons per second and pixel: the sum of `sky_components`.
+    """
+    return sky_components(night, ra, dec, mjd, mission).total
+
+
+def sky_components(night: Night, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> Components:
+    """Return the light of which the night sky of a ground exposure consists.
+
+    Parameters
+    ----------
+    night : Night
+        Properties of camera and band.
+    ra, dec : float
+        ICRS position of the field in degrees.
+    mjd : float
+        Date (MJD).
+    mission : MissionConfiguration
+        Mission database, with the table of zodiacal light.
+
+    Returns
+    -------
+    Components
+        Airglow and zodiacal light, moonlight and twilight. Only the dark sky, `night.level`, unless `night.modelled`.
 
     Notes
     -----
@@ -148,12 +194,53 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
     Krisciunas & Schaefer 1991, PASP 103, 1033; zodiacal light, Leinert et al. 1998.
     """
     if not night.modelled:
-        return night.level
+        return Components(night.level)
     airmass, _ = observatory.airmass_and_zenith(ra, dec, mjd, night.site)
     dimmed = 10.0 ** (-0.4 * night.extinction * (airmass - 1.0))
     airglow = (night.level - night.zodiacal) * _path_length(float(np.arcsin(1.0 / airmass))) * dimmed
     zodiacal = night.scale * diffuse_light.sky_rate(night.sky, ra, dec, mjd, mission)
-    return float(airglow + zodiacal * dimmed + night.moon * moonlight(night, ra, dec, mjd, airmass))
+    moon = night.moon * moonlight(night, ra, dec, mjd, airmass)
+    return Components(float(airglow + zodiacal * dimmed), float(moon), _twilight_rate(night, ra, dec, mjd))
+
+
+def twilight_slopes(
+    night: Night, place: tuple[float, float], position_angle: float, mjd: float, mission: MissionConfiguration
+) -> tuple[float, float]:
+    """Return the change of the sky over the field of view by the gradient of twilight.
+
+    Parameters
+    ----------
+    night : Night
+        Properties of camera and band.
+    place : (float, float)
+        ICRS right ascension and declination of the field centre in degrees.
+    position_angle : float
+        Position angle of the y axis of the focal plane in degrees.
+    mjd : float
+        Date (MJD).
+    mission : MissionConfiguration
+        Mission database, with the table of zodiacal light.
+
+    Returns
+    -------
+    (float, float)
+        Relative change of the whole sky per degree along the x and y axes of the focal plane; 0 without twilight.
+    """
+    if not night.modelled or _twilight_rate(night, *place, mjd) == 0.0:
+        return 0.0, 0.0
+    steps = _GRADIENT_STEP * np.array([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *place, position_angle)
+    rates = [_twilight_rate(night, float(lon), float(lat), mjd) for lon, lat in zip(ra, dec, strict=True)]
+    scale = 2.0 * _GRADIENT_STEP / 3600.0 * sky_rate(night, *place, mjd, mission)
+    return (rates[1] - rates[0]) / scale, (rates[3] - rates[2]) / scale
+
+
+def _twilight_rate(night: Night, ra: float, dec: float, mjd: float) -> float:
+    """Return the light of twilight in a direction in electrons per second and pixel."""
+    sun_altitude, sun_azimuth = observatory.sun_direction(mjd, night.site)
+    altitude, azimuth = observatory.altitude_and_azimuth(ra, dec, mjd, night.site)
+    airmass = float(observatory.airmass(altitude))
+    return night.level * twilight.ratio(night.curve, sun_altitude, azimuth - sun_azimuth, airmass)
 
 
 def extra_extinction(night: Night, airmass: float) -> float:

@@ -36,19 +36,23 @@ _MOON_MEAN = (218.32, 481267.881)
 _PRECESSION = 1.39697
 # Mean horizontal parallax of the Moon, deg: by how much it appears lower on the horizon than from the Earth's centre.
 _PARALLAX = 0.95
-# Largest altitude of the Sun (deg) at which a ground exposure is scheduled.
-_TWILIGHT = -15.0
+# Largest altitude of the Sun (deg) at which a ground exposure is scheduled: the end of astronomical twilight.
+_TWILIGHT = -18.0
+# Altitude (deg) below which the Moon counts as set. It allows for the error of its position and for the time that an
+# exposure takes.
+_MOON_SET = -2.0
 # Smallest distance from the Moon (deg) at which a ground exposure is scheduled while the Moon is up.
 _FROM_MOON = 30.0
-# Largest airmass at which a ground exposure is scheduled.
-_MAX_AIRMASS = 2.0
+# Largest airmass at which a ground exposure is scheduled, and largest ratio of this airmass to that of the field on the
+# meridian. The second limit keeps fields high.
+_MAX_AIRMASS, _MAX_RELATIVE_AIRMASS = 2.0, 1.2
 # Largest airmass with which an exposure is simulated. A field that is lower is simulated at its highest altitude.
 HIGHEST_AIRMASS = 3.0
 # Altitude (deg) at which the airmass is `HIGHEST_AIRMASS`.
-_LOWEST_ALTITUDE = 19.3168
-# Step in days with which dark time (night with the Moon down or far away) is searched: a quarter of an hour.
+LOWEST_ALTITUDE = 19.3168
+# Step in days with which dark time is searched: a quarter of an hour.
 _STEP = 1.0 / 96.0
-# Number of days after the earliest date in which dark time (night with the Moon down or far away) is searched.
+# Number of days after the earliest date in which dark time is searched.
 _DAYS = 400
 
 
@@ -149,6 +153,12 @@ def sun_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     return site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd)
 
 
+def sun_direction(mjd: float, site: Site) -> tuple[float, float]:
+    """Return the altitude and the azimuth of the Sun in degrees at an observatory and a date (MJD)."""
+    ra, dec = (float(x) for x in equatorial(sun_longitude(mjd), 0.0))
+    return float(site.altitude(ra, dec, mjd)), site.azimuth(ra, dec, mjd)
+
+
 def airmass(altitude: npt.ArrayLike) -> Float:
     """Return the airmass at altitudes in degrees. Below the horizon it is that of the horizon (about 38).
 
@@ -213,7 +223,7 @@ def altitude_and_azimuth(ra: float, dec: float, mjd: float, site: Site) -> tuple
     altitude = float(site.altitude(ra, dec, mjd))
     if altitude > 0.0 and float(airmass(altitude)) <= HIGHEST_AIRMASS:
         return altitude, site.azimuth(ra, dec, mjd)
-    return max(90.0 - abs(dec - site.latitude), _LOWEST_ALTITUDE), 180.0 if dec < site.latitude else 0.0
+    return max(90.0 - abs(dec - site.latitude), LOWEST_ALTITUDE), 180.0 if dec < site.latitude else 0.0
 
 
 def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
@@ -243,11 +253,13 @@ def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     return np.asarray(high - _PARALLAX * np.cos(np.radians(high)))
 
 
-def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
-    """Return the first date at which a field can be observed in the dark.
+def moon_lit_fraction(mjd: npt.ArrayLike) -> Float:
+    """Return the illuminated fraction of the Moon's disc, from 0 (new) to 1 (full), for an array of dates (MJD)."""
+    return np.asarray(0.5 * (1.0 + np.cos(np.radians(moon_position(mjd)[2]))))
 
-    The Sun must be more than 15 deg below the horizon, the airmass at most 2, and the Moon below the horizon or more
-    than 30 deg away.
+
+def next_dark_time(ra: float, dec: float, start: float, site: Site, max_moon: float) -> float:
+    """Return the first date at which a field is high in a dark sky.
 
     Parameters
     ----------
@@ -257,26 +269,29 @@ def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
         Earliest date (MJD).
     site : Site
         The observatory.
+    max_moon : float
+        Largest illuminated fraction of the Moon while it is above the horizon and more than 30 deg away. With 0 the
+        Moon is always below the horizon.
 
     Returns
     -------
     float
-        MJD, found in steps of a quarter of an hour; `start` if there is no such date within 400 days.
+        MJD, found in steps of a quarter of an hour; `start` if there is no such date within 400 days. The Sun is more
+        than 18 deg below the horizon. The airmass is at most 1.2 times that on the meridian, and at most 2. A field
+        with a higher airmass on the meridian is too low at all times; its date is in the first dark time.
     """
-    if float(airmass(90.0 - abs(dec - site.latitude))) > _MAX_AIRMASS:
-        return start
     # Test `start` before the search: most exposures directly follow another one in the same night.
-    if _is_observable(ra, dec, np.array([start]), site)[0]:
+    if _is_observable(ra, dec, np.array([start]), site, max_moon)[0]:
         return start
     for day in range(_DAYS):
         times: Float = start + day + _STEP * np.arange(float(round(1.0 / _STEP)))
-        good = np.flatnonzero(_is_observable(ra, dec, times, site))
+        good = np.flatnonzero(_is_observable(ra, dec, times, site, max_moon))
         if len(good):
             return float(times[good[0]])
     return start
 
 
-def next_dark_transit(ra: float, dec: float, start: float, site: Site) -> float:
+def next_dark_transit(ra: float, dec: float, start: float, site: Site, max_moon: float) -> float:
     """Return the first date at which a field crosses the meridian in the dark, where it is highest.
 
     Parameters
@@ -287,17 +302,20 @@ def next_dark_transit(ra: float, dec: float, start: float, site: Site) -> float:
         Earliest date (MJD).
     site : Site
         The observatory.
+    max_moon : float
+        Largest illuminated fraction of the Moon while it is above the horizon, as in `next_dark_time`.
 
     Returns
     -------
     float
-        MJD of the transit. The Sun is more than 15 deg below the horizon for an hour before and after it, and the Moon
-        is below the horizon or more than 30 deg away. `start` if there is no such date within 400 days. The field may
-        be low, or never rise.
+        MJD of the transit. For an hour before and after it, the Sun is more than 18 deg below the horizon, and the Moon
+        is below the horizon, or faint and more than 30 deg away. `start` if there is no such date within 400 days. The
+        field may be low, or never rise.
     """
     first = (-float(site.hour_angle(ra, start)) / (2.0 * np.pi)) % 1.0
     transits = start + (first + np.arange(float(_DAYS))) / _TURNS_A_DAY
-    is_dark = np.all([_is_dark(ra, dec, transits + hours / 24.0, site) for hours in (-1.0, 0.0, 1.0)], axis=0)
+    hours_around = [_is_dark(ra, dec, transits + hours / 24.0, site, max_moon) for hours in (-1.0, 0.0, 1.0)]
+    is_dark = np.all(hours_around, axis=0)
     return float(transits[np.argmax(is_dark)]) if is_dark.any() else start
 
 
@@ -306,15 +324,19 @@ def _sun_longitudes(mjd: Float) -> Float:
     return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
 
 
-def _is_observable(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
-    is_up = airmass(site.altitude(ra, dec, mjd)) <= _MAX_AIRMASS
-    return np.asarray(is_up & _is_dark(ra, dec, mjd, site)) if is_up.any() else is_up
+def _is_observable(ra: float, dec: float, mjd: Float, site: Site, max_moon: float) -> Bool:
+    lowest = float(airmass(90.0 - abs(dec - site.latitude)))
+    if lowest > _MAX_AIRMASS:
+        return _is_dark(ra, dec, mjd, site, max_moon)
+    is_high = airmass(site.altitude(ra, dec, mjd)) <= min(_MAX_AIRMASS, _MAX_RELATIVE_AIRMASS * lowest)
+    return np.asarray(is_high & _is_dark(ra, dec, mjd, site, max_moon)) if is_high.any() else is_high
 
 
-def _is_dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
+def _is_dark(ra: float, dec: float, mjd: Float, site: Site, max_moon: float) -> Bool:
     night = sun_altitude(mjd, site) < _TWILIGHT
     if not night.any():
         return night
     moon_ra, moon_dec, _ = moon_position(mjd)
     away = separation(np.full(len(mjd), ra), np.full(len(mjd), dec), moon_ra, moon_dec) > _FROM_MOON
-    return np.asarray(night & (away | (moon_altitude(mjd, site) < 0.0)))
+    is_faint = away & (moon_lit_fraction(mjd) <= max_moon)
+    return np.asarray(night & (is_faint | (moon_altitude(mjd, site) < _MOON_SET)))

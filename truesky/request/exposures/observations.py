@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lake_schema import ramps, user_files
+from lake_schema import ramps
 from lake_schema.errors import BadInput, Mistakes
-from lake_schema.store import layout
 from lake_schema.texts import spelling
 from truesky.request import area as areas
 from truesky.request import instruments, sky_notation
 from truesky.request.area import Area
-from truesky.request.exposures import pointing_tables
-from truesky.request.exposures.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
+from truesky.request.exposures import named_tables
+from truesky.request.exposures.pointing_tables import CHANNELS, CLOUDS_LIMITS, IMAGE_TYPES, Contents
 from truesky.request.exposures.pointings import MAX_REALISATIONS
 from truesky.request.toml_values import (
     Toml,
@@ -84,9 +83,12 @@ _BLOCKS_OF_KEY = {
     "bright": (_TIMED,),
     "macc": (_SURVEY, _USER_FIELD, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_USER_FIELD, _TIMED, _DITHERED, _TABLE),
+    "clouds": (_GROUND, _GROUND_USER_FIELD, _TABLE),
 }
 # Channels that use a key. A key that is not listed is used by all channels.
-_CHANNELS_OF_KEY = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
+_CHANNELS_OF_KEY = {
+    "short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S"), "clouds": ("EXT",),
+}  # fmt: skip
 # Image types that use a key. A key that is not listed is used by all image types.
 _TYPES_OF_KEY = {
     "lamps": ("flat", "persistence"),
@@ -156,6 +158,8 @@ class Observation:
         when earlier NISP observations without a date, or of calibrations, have ended and their persistence has faded.
     exposure_time_s : float, optional
         Exposure time in seconds; None for the mission's value.
+    clouds : float
+        Mean extinction in magnitudes by clouds that drift over a ground camera; 0 for a clear sky.
     realisations : int
         Number of copies of each exposure that differ only in their noise.
     lamps : tuple of int
@@ -204,6 +208,7 @@ class Observation:
     detectors: tuple[str, ...] = ()
     mjd: float | None = None
     exposure_time_s: float | None = None
+    clouds: float = 0.0
     realisations: int = 1
     lamps: tuple[int, ...] = ()
     macc: tuple[int, ...] = ()
@@ -276,7 +281,11 @@ def _observation(
         if kind is not None and places is not None:
             # A second place is one mistake: neither its keys nor a table of pointings are mistakes, too.
             read(_refuse_unused, table, *kind, path)
-            values = {**(values or {}), **(read(_table_of_pointings, table, path, kind, folder) or {})}
+            survey = (values or {}).get("survey")
+            values = {
+                **(values or {}),
+                **(read(named_tables.read_table, table, path, (*kind, survey), folder, mission) or {}),
+            }
         observation = Observation(
             channels=(),
             ra=read(sky_notation.optional_ra, table, f"{path}.ra"),
@@ -291,6 +300,7 @@ def _observation(
             blue=read(boolean, table, f"{path}.blue", False),
             mjd=read(sky_notation.optional_mjd, table, f"{path}.mjd"),
             exposure_time_s=read(optional_number, table, f"{path}.exposure_time_s", 0.0, 1e6, "s"),
+            clouds=read(optional_number, table, f"{path}.clouds", *CLOUDS_LIMITS, "mag") or 0.0,
             realisations=read(integer, table, f"{path}.realisations", 1, MAX_REALISATIONS, 1),
             macc=read(_macc, table, f"{path}.macc"),
             phase_times_s=read(_numbers, table, f"{path}.phase_times_s", 1e-6, 100.0),
@@ -363,12 +373,6 @@ def _values_of_kind(
             names = {**values, "bands": [band for band in values["bands"] if band not in of_user]}
             read(_check_names, names, table.get("blue") is True, mission, path)
     return values
-
-
-def _table_of_pointings(table: Toml, path: str, kind: tuple[tuple[str, ...], str], folder: Path) -> dict[str, Any]:
-    """Read the table of pointings of an observation, and return its file and its summary by key; {} without a table."""
-    file = _pointings_file(table, path, folder)
-    return {} if file is None else {"pointings": str(file), "table": _contents(file, *kind, path)}
 
 
 def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: MissionConfiguration, path: str) -> None:
@@ -490,27 +494,6 @@ def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
     if ground:
         return _GROUND_USER_FIELD if "ra" in table else _GROUND
     return _USER_FIELD if "ra" in table else _SURVEY
-
-
-def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
-    """Return the path of an observation's table of pointings, or None if it has none.
-
-    Raises BadInput if the file is not in `folder` (the folder of the request) or below, or does not exist.
-    """
-    if not string(table, f"{path}.pointings", default=""):
-        return None
-    file = folder / string(table, f"{path}.pointings")
-    try:
-        return user_files.check_file(layout.check_inside(folder, file), "table of pointings")
-    except BadInput as error:
-        raise error.with_prefix(f"{path}.pointings") from None
-
-
-def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str) -> Contents:
-    try:
-        return pointing_tables.contents(file, channels, image_type)
-    except BadInput as error:
-        raise error.with_prefix(f"{path}.pointings") from None
 
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:

@@ -48,11 +48,19 @@ COLUMNS = (
     ("image_type", "", "image type, as in a request", "the observation's"),
     ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
     ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
-    ("seeing", "arcsec", "FWHM of the atmosphere for ground cameras", "drawn around the mission's value"),
+    (
+        "seeing",
+        "arcsec",
+        "FWHM of the air at zenith and 500 nm, for ground cameras",
+        "drawn around the mission's value",
+    ),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
+    ("clouds", "mag", "mean extinction by clouds of the night, for ground cameras", "the observation's, else 0"),
     ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
     ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0"),
 )
+# Smallest and largest mean extinction by clouds, mag. A sky with thicker clouds is not observed.
+CLOUDS_LIMITS = (0.0, 5.0)
 # Smallest and largest allowed number of each column of numbers.
 BOUNDS = {
     "ra": sky_notation.RA_LIMITS,
@@ -63,6 +71,7 @@ BOUNDS = {
     "sky": (0.0, 1e6),
     "seeing": (0.01, 10.0),
     "zero_point": (0.0, 50.0),
+    "clouds": CLOUDS_LIMITS,
     "grism_angle": (-360.0, 360.0),
 }
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
@@ -70,7 +79,7 @@ _NAMES = tuple(name for name, *_ in COLUMNS)
 # Names that other programs give to the columns, in lower case.
 _OTHER_NAMES = {
     "filter": "band", "exptime": "exposure_time_s", "exposure": "exposure_time_s", "date": "mjd", "date-obs": "mjd",
-    "pa": "position_angle", "rotation": "position_angle", "instrument": "camera", "fwhm": "seeing",
+    "pa": "position_angle", "rotation": "position_angle", "instrument": "camera", "seeingfwhm500": "seeing",
 }  # fmt: skip
 _MAX_ROWS, _MAX_LENGTH = 1_000_000, 1000
 # Largest number of messages about the names of columns.
@@ -78,6 +87,38 @@ _MAX_MESSAGES = 20
 _MAX_LINES, _MAX_LINE_LENGTH = 2 * _MAX_ROWS, 20 * _MAX_LENGTH
 # Number of mistakes after which the rest of a table is not read.
 _MAX_MISTAKES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """Values of a visit of the Rubin Observatory's scheduler from which the planner computes those of its exposures.
+
+    Attributes
+    ----------
+    exposures : int
+        Number of exposures of the visit, which have the exposure time of the row.
+    overhead_s : float
+        Seconds from the end of an exposure of the visit to the start of the next one.
+    seeing_eff : float
+        FWHM in arcsec of the Gaussian with the same effective area as the PSF.
+    airmass : float
+        Airmass to which `seeing_eff` belongs.
+    sky_brightness : float
+        Surface brightness of the sky, AB mag per arcsec2.
+    rot_sky, rot_tel : float, optional
+        Rotation of the camera relative to the sky and to the telescope in degrees; one of them may be None.
+    parallactic : float, optional
+        Position angle of the zenith in degrees; None to compute it.
+    """
+
+    exposures: int
+    overhead_s: float
+    seeing_eff: float
+    airmass: float
+    sky_brightness: float
+    rot_sky: float | None
+    rot_tel: float | None
+    parallactic: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +151,19 @@ class Row:
     sky : float, optional
         Diffuse sky brightness in electrons per pixel and second.
     seeing : float, optional
-        FWHM of the atmosphere's PSF in arcsec; always None for Euclid.
+        FWHM of the air at the zenith and at 500 nm, arcsec; always None for Euclid.
     zero_point : float, optional
         AB magnitude of a source that gives 1 electron per second.
+    clouds : float, optional
+        Mean extinction by clouds in magnitudes; always None for Euclid.
     psf : str, optional
         Path of a PSF file.
     grism_angle : float, optional
         Direction of NISP-S spectra in the focal plane in degrees.
     detectors : tuple of str
         Names of detectors to render; () for the detectors of the observation.
+    visit : Visit, optional
+        Values of a visit, from which the planner computes sky, seeing and position angle; None for a pointing.
     """
 
     location: str
@@ -134,9 +179,11 @@ class Row:
     sky: float | None
     seeing: float | None
     zero_point: float | None
+    clouds: float | None
     psf: str | None
     grism_angle: float | None
     detectors: tuple[str, ...]
+    visit: Visit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +227,11 @@ def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
     BadInput
         If the file does not exist or the table is not valid, see `read`.
     """
-    rows = read(path, channels, image_type)
+    return summarise(path, read(path, channels, image_type))
+
+
+def summarise(path: Path, rows: Sequence[Row]) -> Contents:
+    """Return the summary of the table in a file, whose rows have been read."""
     bands = tuple(dict.fromkeys(row.band for row in rows))
     return Contents(file_sha256(path), bands, tuple(dict.fromkeys((row.channel, row.image_type) for row in rows)))
 
@@ -307,6 +358,7 @@ def _row_from_line(
             sky=read(_number, row, "sky", location),
             seeing=read(_number, row, "seeing", location) if channel == "EXT" else None,
             zero_point=read(_number, row, "zero_point", location),
+            clouds=read(_number, row, "clouds", location) if channel == "EXT" else None,
             psf=str(read(user_files.expand_path, row["psf"], path.parent)) if row.get("psf") else None,
             grism_angle=read(_number, row, "grism_angle", location),
             detectors=tuple(row.get("detectors", "").split()),

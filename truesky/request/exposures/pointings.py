@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lake_schema.errors import BadInput, Mistakes
 from truesky.request import instruments, sky_notation
-from truesky.request.exposures.pointing_tables import CHANNELS
+from truesky.request.exposures.pointing_tables import CHANNELS, CLOUDS_LIMITS
 from truesky.request.toml_values import (
     Toml,
     as_table,
@@ -55,6 +55,8 @@ class Pointing:
         Detector whose centre has the position ra, dec.
     exposure_time_s : float, optional
         Exposure time in seconds; None for the value in the mission database.
+    clouds : float
+        Mean extinction in magnitudes by clouds that drift over a ground camera; 0 for a clear sky.
     realisations : int
         Number of exposures that differ only in their noise.
     grism_angle : float, optional
@@ -71,6 +73,7 @@ class Pointing:
     detectors: tuple[str, ...] = ()
     centre_on: str | None = None
     exposure_time_s: float | None = None
+    clouds: float = 0.0
     realisations: int = 1
     grism_angle: float | None = None
 
@@ -123,10 +126,18 @@ def _pointing(value: object, path: str, mission: MissionConfiguration | None, us
             position_angle=read(number, table, f"{path}.position_angle", -360.0, 360.0, 0.0, "deg"),
             mjd=read(sky_notation.optional_mjd, table, f"{path}.mjd"),
             exposure_time_s=read(optional_number, table, f"{path}.exposure_time_s", 0.0, 1e6, "s"),
+            clouds=read(_clouds, table, f"{path}.clouds"),
             realisations=read(integer, table, f"{path}.realisations", 1, MAX_REALISATIONS, 1),
             grism_angle=read(optional_number, table, f"{path}.grism_angle", -360.0, 360.0, "deg"),
         )
     return replace(pointing, **instrument)
+
+
+def _clouds(table: Toml, path: str) -> float:
+    """Read the extinction by clouds of a ground camera, 0 if the key is missing. Raise BadInput for other channels."""
+    if "clouds" in table and table.get("channel") in instruments.EUCLID_CAMERAS:
+        raise BadInput(f"{path} is not for {table['channel']}: used by EXT")
+    return number(table, path, *CLOUDS_LIMITS, 0.0, "mag")
 
 
 def _instrument(

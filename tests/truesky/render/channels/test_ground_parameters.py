@@ -15,6 +15,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.exposure import board_neighbours
 from truesky.render.planning import calibration_frames, ground_surveys, planned_exposures
 from truesky.render.products import raw_pointing
+from truesky.render.sky import diffuse_light, opsim
 from truesky.request.area import Area
 from truesky.request.exposures.observations import Observation
 
@@ -46,6 +47,12 @@ def asked(camera, mission, monkeypatch):
         for profile in (1.0, 2.0):
             own = mission.with_overrides({f"ext.{camera}.psf.profile": (profile, "")})
             ground.CHANNEL.psf(shown, one, passbands.load(band), own, 1)
+        zero_point = planned_exposures.zero_point_of(one.section, band, mission)
+        assert diffuse_light.brightness_of_rate(10.0, one, band, zero_point, mission) > 15.0
+    assert ground_surveys.earliest_date(camera, mission) >= 60126.0
+    assert opsim.position_angle((10.0, None), 0.0, 60.0, one.section, mission) == 10.0
+    if f"{one.section}.rotator.limit" in mission:
+        assert opsim.position_angle((None, 10.0), 120.0, 60.0, one.section, mission) == 20.0
     raw_pointing.commanded_pointing(shown, one, mission, 1)
     surveys = [row["survey"] for row in mission.rows("survey.external") if row["camera"] == camera]
     block = Observation(("EXT",), survey=surveys[0], exposures=1)

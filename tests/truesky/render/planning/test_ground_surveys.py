@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.coordinates import AltAz, EarthLocation, get_sun
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body, get_sun
 from astropy.time import Time
 
 from lake_schema.errors import BadInput
@@ -68,10 +68,10 @@ def test_errors_name_the_line(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
-def survey_of(name, number, seed=3, **changes):
+def survey_of(name, number, seed=3, start=60500.0, **changes):
     block = Observation(("EXT",), survey=name, exposures=number, **changes)
     area = Area(ra=60.0, dec=-35.0, radius=2.0) if name != "cfis" else Area(ra=200.0, dec=40.0, radius=2.0)
-    return [*ground_surveys.exposures(block, area, MISSION, seed, 60500.0)]
+    return [*ground_surveys.exposures(block, area, MISSION, seed, start)]
 
 
 @nightly.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)], (0, 2))
@@ -100,20 +100,64 @@ def test_bands_outside_the_challenge_can_be_planned(name, camera, band):
     assert min(table["sky"].to_pylist()) > 0.0
 
 
-def test_warning_about_dates_in_daylight():
+def test_warnings_about_impossible_dates():
     """Compare the Sun's altitude with astropy."""
-    none = survey_of("lsst", 4, bands=("lsst_r",))
-    assert ground_surveys.daylight_warning(none, MISSION) == ""
+    none = survey_of("lsst", 4, start=60850.0, bands=("lsst_r",))
+    assert list(ground_surveys.date_warnings(none, MISSION)) == []
     # 11:30 local time.
-    dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
+    dated = [replace(one, mjd=60850.68 if i else one.mjd) for i, one in enumerate(none[:2])]
     dated.append(replace(dated[1], image_type="flat"))
-    line = ground_surveys.daylight_warning(dated, MISSION)
+    (line,) = (line for line in ground_surveys.date_warnings(dated, MISSION) if "Sun" in line)
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
-    when = Time(60500.68, format="mjd")
+    when = Time(60850.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
-    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -12 deg")
+    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -8 deg")
     assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
     assert "\n" not in line
+    # At the antipodes of the field's meridian, the field is below the horizon. LSSTCam was not there in 2024.
+    low, early = replace(none[0], mjd=none[0].mjd + 0.5), replace(none[0], mjd=60500.2)
+    lines = list(ground_surveys.date_warnings([low, early], MISSION))
+    assert any("2 exposures of the sky have dates when the field is lower than 19 deg" in line for line in lines)
+    assert "1 of 2 exposures of the sky have dates before first light of the camera" in lines[-1]
+
+
+FIRST_LIGHT = {"lsstcam": "2025-04-15", "jpcam": "2020-06-29", "megacam": "2003-01-10", "decam": "2012-09-12"}
+
+
+@pytest.mark.parametrize(
+    ("survey", "camera", "band"),
+    [
+        ("lsst", "lsstcam", "lsst_u"), ("lsst", "lsstcam", "lsst_r"), ("cfis", "megacam", "cfis_u"),
+        ("cfis", "megacam", "cfis_r"), ("jedis", "jpcam", "jedis_g"), ("des", "decam", "des_z"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("ra", [40.0, 190.0])
+def test_exposures_without_a_date_have_a_dark_sky(survey, camera, band, ra):
+    """Astropy gives Sun and Moon: the Moon is down in blue bands, and down or less than 40 % lit in red bands."""
+    site = ground_surveys.Site.from_mission(f"ext.{camera}", MISSION)
+    place = (ra, float(np.clip(site.latitude + 15.0, -60.0, 50.0)))
+    block = Observation(("EXT",), survey=survey, ra=place[0], dec=place[1], bands=(band,), exposures=3, dither="none")
+    start = ground_surveys.earliest_date(camera, MISSION)
+    dates = [one.mjd for one in ground_surveys.exposures(block, Area(ra=0.0, dec=0.0, radius=1.0), MISSION, 3, start)]
+    dates.append(ground_surveys.first_date(("EXT", camera), band, place, MISSION))
+    where = EarthLocation.from_geodetic(site.longitude, site.latitude, site.height)
+    for mjd in dates:
+        when = Time(mjd, format="mjd")
+        assert mjd >= max(60126.0, Time(FIRST_LIGHT[camera]).mjd)
+        frame = AltAz(obstime=when, location=where)
+        moon, sun = (get_body(name, when, where) for name in ("moon", "sun"))
+        assert sun.transform_to(frame).alt.deg < -17.5
+        phase = np.arctan2(
+            sun.distance * np.sin(sun.separation(moon)),
+            moon.distance - sun.distance * np.cos(sun.separation(moon)),
+        )
+        lit = 0.5 * (1.0 + np.cos(phase.value))
+        field = SkyCoord(*place, unit="deg")
+        if moon.transform_to(frame).alt.deg > -1.0:
+            assert band not in ("lsst_u", "cfis_u", "jedis_g")
+            assert lit < 0.41
+            assert field.separation(SkyCoord(moon.ra, moon.dec)).deg > 29.0
+        assert field.transform_to(frame).secz < 1.3
 
 
 def test_seeing_is_drawn_for_each_exposure():
@@ -121,17 +165,17 @@ def test_seeing_is_drawn_for_each_exposure():
     found = survey_of("lsst", 300)
     found = [one for one in found if one.band == "lsst_r"]
     seeing = np.array(planned_exposures.table(found, [MISSION] * len(found), seed=5)["seeing"])
-    assert np.median(seeing) == pytest.approx(0.73, rel=0.05)
+    assert np.median(seeing) == pytest.approx(0.62, rel=0.05)
     assert np.std(np.log10(seeing)) == pytest.approx(0.09, rel=0.2)
     backwards = planned_exposures.table(found[::-1], [MISSION] * len(found), seed=5)["seeing"].to_pylist()
     assert backwards[::-1] == seeing.tolist()
     assert planned_exposures.table(found[:1], [MISSION], seed=6)["seeing"].to_pylist()[0] != seeing[0]
     still = resolve(overrides={"ext.lsstcam.seeing_scatter": (0.0, "dex")})
-    assert set(planned_exposures.table(found, [still] * len(found))["seeing"].to_pylist()) == {0.73}
+    assert set(planned_exposures.table(found, [still] * len(found))["seeing"].to_pylist()) == {0.62}
     own = [replace(found[0], seeing=1.4, zero_point=28.0, sky=5.0)]
     (row,) = planned_exposures.table(own, [MISSION]).to_pylist()
     assert (row["seeing"], row["zero_point"], row["sky"]) == (1.4, 28.0, 5.0)
-    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam .*0.1 is outside"):
+    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam in lsst_r .*arcsec = 0.1\d+ is outside"):
         planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])
     own = replace(found[0], seeing=0.1, psf="own.psf")
     assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]

@@ -95,7 +95,7 @@ def test_air_refracts_as_published():
 def test_the_whole_of_it_is_galsim_s(camera):
     """Atmosphere, obscured pupil and aberrations of one wavelength agree, except for the place of the centroid."""
     detector, telescope = detector_of(camera), aberrations.Telescope.from_mission(f"ext.{camera}", MISSION)
-    wave, nm = 6200.0, ground._wavefront(detector, 0.5, -0.8, MISSION)
+    wave, nm = 6200.0, ground._wavefront(detector, CASES[camera][1], 0.5, -0.8, MISSION)
     fried = atmosphere.fried_length(0.7, wave, telescope.outer)
     samples, step = 3, detector.pixel_scale / 3
     grid = ground._Grid.from_pixels(128, samples, detector.pixel_scale)
@@ -122,13 +122,14 @@ def test_the_whole_of_it_is_galsim_s(camera):
     assert np.abs(ours - theirs).max() < 3e-4 * theirs.max()
     found, wanted = shape_of(ours, step), shape_of(theirs, step)
     assert found[0] == pytest.approx(wanted[0], rel=5e-4)
-    np.testing.assert_allclose(found[1:3], wanted[1:3], atol=2e-5)
+    # A few thousandths of the ellipticity that the optics cause.
+    np.testing.assert_allclose(found[1:3], wanted[1:3], atol=4e-5)
     # The centroid of the light is at the position of the source, also with coma.
     assert np.hypot(*found[3:]) < 2e-3
     assert np.hypot(*at) > 2e-3
 
 
-@pytest.mark.parametrize(("positions", "size", "ellipticity"), [(1, 0.02, 0.01), (4, 1e-4, 1e-4), (9, 5e-5, 2e-5)])
+@pytest.mark.parametrize(("positions", "size", "ellipticity"), [(1, 0.02, 0.01), (4, 3e-4, 2e-4), (9, 5e-5, 2e-5)])
 def test_it_changes_across_a_detector_as_the_optics_do(positions, size, ellipticity):
     """The reference is the PSF of a detector with its centre at this position."""
     mission, whole = bare("lsstcam"), detector_of("lsstcam")
@@ -181,10 +182,13 @@ def test_the_air_s_ellipticity_is_the_exposure_s():
 
     first = detector_of("lsstcam")
     turned = replace(first, rotation=90.0)
-    airs = [ground.exposure_air(row(60000.0 + 0.01 * i), first, MISSION).shear for i in range(400)]
+    band = passbands.load("lsst_r")
+    airs = [ground.exposure_air(row(60000.0 + 0.01 * i), first, band, MISSION).shear for i in range(400)]
     assert np.std(airs, axis=0) == pytest.approx([0.01, 0.01], rel=0.12)
     assert np.abs(np.mean(airs, axis=0)).max() < 0.002
-    np.testing.assert_allclose(ground.exposure_air(row(60000.0), turned, MISSION).shear, -np.array(airs[0]), atol=1e-12)
+    np.testing.assert_allclose(
+        ground.exposure_air(row(60000.0), turned, band, MISSION).shear, -np.array(airs[0]), atol=1e-12
+    )
     plain = bare("lsstcam", **{"psf.wavefront_scale": (0.0, "")})
     psf = psf_of("lsstcam", 1, plain, replace(AIR, shear=(0.03, -0.02)))
     step, wave = 0.2000587 / psf.planes.samples, float(psf.planes.wavelength[0])
@@ -205,7 +209,8 @@ def test_a_profile_is_chosen_by_a_number():
     round_, moffat, air = (seeing.exposure_psf(row, detector, band, mission, 4) for mission in missions)
     assert [psf.planes is None for psf in (round_, moffat, air)] == [True, True, False]
     for psf in (round_, moffat, air):
-        assert psf.fwhm == pytest.approx(np.hypot(0.9, 0.6 * 0.2), rel=0.03)
+        # 0.9 arcsec at 500 nm, in the red, with telescope and pixel.
+        assert psf.fwhm == pytest.approx(np.hypot(seeing.image_fwhm(row, detector, band, MISSION), 0.6 * 0.2), rel=0.04)
     # Light beyond 3": none, a Moffat profile, and air with an aureole.
     beyond = [float(psf.outside[15]) for psf in (round_, moffat, air)]
     assert beyond[0] < 1e-9
@@ -222,10 +227,12 @@ def test_seeing_that_turbulence_cannot_cause_is_refused_before_rendering():
     """With an outer scale of two metres, no air causes a seeing of half an arcsec."""
     calm = resolve(overrides={"ext.lsstcam.psf.outer_scale": (2.0, "m")})
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
-    for found in (seeing.check, lambda wide, *others: ground.atmospheric_psf(ground.Air(wide), *others, 1)):
-        with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam .*0.5 is outside"):
-            found(0.5, detector, band, calm)
-    seeing.check(1.1, detector, band, calm)
+    with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam in lsst_r .*0.5 is outside"):
+        ground.atmospheric_psf(ground.Air(0.5), detector, band, calm, 1)
+    # The seeing at 500 nm is higher than in the band, and that at the zenith lower than at another airmass.
+    with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam in lsst_r .*0.47\d+ is outside"):
+        seeing.check(0.51, 1.0, detector, band, calm)
+    seeing.check(1.1, 1.0, detector, band, calm)
     assert ground.atmospheric_psf(ground.Air(1.1), detector, band, calm, 1).fwhm == pytest.approx(1.1, rel=0.05)
 
 
@@ -284,7 +291,8 @@ def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
             1, "EXT", camera, "x", "science", 10.0, -20.0, 33.0, 6e4, 30.0, 1.0, 0.7, 28.0, "x",
             airmass=1.4, zenith=zenith,
         )  # fmt: skip
-        air = ground.exposure_air(row, detector, MISSION)
+        band = passbands.load(CASES[camera][1])
+        air = ground.exposure_air(row, detector, band, MISSION)
         assert air.tan_zenith_distance == pytest.approx(np.sqrt(1.4**2 - 1.0))
         system = wcs(detector, 10.0, -20.0, 33.0)
         middle = (detector.nx - 1) / 2, (detector.ny - 1) / 2
@@ -293,8 +301,7 @@ def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
         ra, dec = astrometry.sky_of_pixel(system, *places)
         east = (ra[1] - ra[0]) * np.cos(np.radians(dec[0]))
         assert np.degrees(np.arctan2(east, dec[1] - dec[0])) == pytest.approx(zenith, abs=1.5)
-        band = passbands.load(CASES[camera][1])
         found.append(ground.edges(air, detector, band, MISSION).bars[0, 0] - air.zenith)
     assert (found[0] == pytest.approx(found[1])) == (camera == "lsstcam")
     without = resolve(overrides={f"ext.{camera}.psf.refraction": (0.0, "")})
-    assert ground.exposure_air(row, detector, without).tan_zenith_distance == 0.0
+    assert ground.exposure_air(row, detector, band, without).tan_zenith_distance == 0.0
