@@ -58,9 +58,9 @@ class Amplifier:
         True if the last column of the rectangle is read first.
     read_top : bool
         True if the last row of the rectangle is read first.
-    ratios_to_first : (float, float)
-        Gain and read noise of the amplifier, divided by those of the first amplifier in the camera's table of
-        amplifiers. If the amplifiers of the camera have been measured one by one, they are divided by the medians of
+    ratios_to_first : (float, float, float)
+        Gain, read noise and bias level of the amplifier, divided by those of the first amplifier in the camera's table
+        of amplifiers. If the amplifiers of the camera have been measured one by one, they are divided by the medians of
         the camera instead.
     """
 
@@ -68,7 +68,7 @@ class Amplifier:
     pixels: Section
     read_right: bool
     read_top: bool
-    ratios_to_first: tuple[float, float] = (1.0, 1.0)
+    ratios_to_first: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,7 +345,11 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
             row["read_right"] == "1",
             row["read_top"] == "1",
             measured.get((detector.name, row["amplifier"]))
-            or (float(row["gain"]) / float(reference["gain"]), float(row["read_noise"]) / float(reference["read_noise"])),
+            or (
+                float(row["gain"]) / float(reference["gain"]),
+                float(row["read_noise"]) / float(reference["read_noise"]),
+                1.0,
+            ),
         )
         for row in rows
     )
@@ -363,21 +367,23 @@ def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, st
 
 
 @lru_cache(maxsize=16)
-def _measured_ratios(section: str, mission: MissionConfiguration) -> Mapping[tuple[str, str], tuple[float, float]]:
-    """Return gain and read noise of each measured amplifier of a camera, divided by the medians of all.
+def _measured_ratios(
+    section: str, mission: MissionConfiguration
+) -> Mapping[tuple[str, str], tuple[float, float, float]]:
+    """Return gain, read noise and bias level of each measured amplifier of a camera, divided by the medians of all.
 
-    The keys are the names of detector and amplifier. The result is empty if the mission database has no table of
-    measured amplifiers for the camera.
+    The keys are the names of detector and amplifier. A number that was not measured has the ratio 1. The result is
+    empty if the mission database has no table of measured amplifiers for the camera.
     """
     key = f"{section}.amplifier_values"
     rows = mission.rows(key) if key in mission else ()
     if not rows:
         return {}
-    numbers = np.array([[float(row[name]) for name in _RELATIVE] for row in rows])
+    numbers = np.array([[float(row.get(name, 1.0)) for name in _RELATIVE] for row in rows])
     ratios = numbers / np.median(numbers, axis=0)
     return {
-        (row["detector"], row["amplifier"]): (float(gain), float(noise))
-        for row, (gain, noise) in zip(rows, ratios, strict=True)
+        (row["detector"], row["amplifier"]): (float(gain), float(noise), float(bias))
+        for row, (gain, noise, bias) in zip(rows, ratios, strict=True)
     }
 
 
@@ -391,9 +397,9 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
     return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
-# Parameters that have a value for each amplifier in the camera's table of amplifiers, with their index in the pair
+# Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in the tuple
 # `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
-_RELATIVE = {"gain": 0, "read_noise": 1}
+_RELATIVE = {"gain": 0, "read_noise": 1, "bias": 2}
 
 
 @lru_cache(maxsize=1024)
@@ -425,8 +431,9 @@ def values(
     The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
     the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
     for other amplifiers it is multiplied by their ratio to the first one. If the amplifiers of the camera have been
-    measured one by one, `key` is the median, and is multiplied by the ratio of the amplifier to the median. The random
-    deviations are a property of the hardware and therefore the same in all simulations.
+    measured one by one, `key` is the median, and is multiplied by the ratio of the amplifier to the median; this also
+    holds for the bias level. The random deviations are a property of the hardware and therefore the same in all
+    simulations.
 
     If the request of the user sets the parameter for the whole camera, it is used without ratio and random deviations,
     unless the request also sets the spread. A value that the request sets for a detector or an amplifier is always used

@@ -122,6 +122,19 @@ def test_the_values_of_a_camera_are_the_medians_of_its_measured_amplifiers(camer
         assert MISSION.value(f"ext.{camera}.{key}_spread") == 0.0
 
 
+def test_each_amplifier_of_lsstcam_has_its_measured_bias_level():
+    """Run 13421 of LSSTCam, as imSim has it: 24735, 25064 and 26469 adu, and 18761.5 at the lowest."""
+    for detector, amplifier, bias in (
+        ("R01_S00", "C10", 24735.0), ("R01_S00", "C00", 25064.0), ("R43_S02", "C13", 18761.5), ("R22_S02", "C10", 26469.0)
+    ):  # fmt: skip
+        one = detectors.detector("lsstcam", detector, MISSION)
+        own = layout_of(one)
+        found = amplifiers.values("bias", "adu", one, MISSION, own)
+        assert found[[a.name for a in own.amplifiers].index(amplifier)] == pytest.approx(bias, rel=1e-5)
+    one = first("decam")
+    assert amplifiers.values("bias", "adu", one, MISSION, layout_of(one)) == MISSION.value("ext.decam.bias")
+
+
 def test_measured_crosstalk_is_that_of_the_observatories():
     """obs_subaru's configuration for every CCD of HSC, and DECam_xtalk_20130606: ccd32 is N1."""
     hsc, n1 = detectors.detector("hsc", "1_12", MISSION), detectors.detector("decam", "N1", MISSION)
