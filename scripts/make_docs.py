@@ -38,6 +38,7 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "request.md",
             "tables.md",
             "limits.md",
+            "assumed_numbers.md",
             "mission.md",
             "effects.md",
             "accuracy.md",

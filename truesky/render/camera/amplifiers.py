@@ -79,16 +79,17 @@ class Amplifier:
         True if the last column of the rectangle is read first.
     read_top : bool
         True if the last row of the rectangle is read first.
-    ratios_to_first : (float, float)
-        Gain and read noise of the amplifier, divided by those of the first amplifier in the camera's table of
-        amplifiers.
+    ratios_to_first : (float, float, float)
+        Gain, read noise and bias level of the amplifier, divided by those of the first amplifier in the camera's table
+        of amplifiers. If the amplifiers of the camera have been measured one by one, they are divided by the medians of
+        the camera instead.
     """
 
     name: str
     pixels: Section
     read_right: bool
     read_top: bool
-    ratios_to_first: tuple[float, float] = (1.0, 1.0)
+    ratios_to_first: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,13 +408,19 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
         )
     places = [sorted({int(row[axis]) for row in rows}) for axis in "xy"]
     reference = _table(detector.section, mission)[0]
+    measured = _measured_ratios(detector.section, mission)
     amplifiers = tuple(
         Amplifier(
             row["amplifier"],
             Section(across[places[0].index(int(row["x"]))], up[places[1].index(int(row["y"]))], width, height),
             row["read_right"] == "1",
             row["read_top"] == "1",
-            (float(row["gain"]) / float(reference["gain"]), float(row["read_noise"]) / float(reference["read_noise"])),
+            measured.get((detector.name, row["amplifier"]))
+            or (
+                float(row["gain"]) / float(reference["gain"]),
+                float(row["read_noise"]) / float(reference["read_noise"]),
+                1.0,
+            ),
         )
         for row in rows
     )
@@ -439,6 +446,27 @@ def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, st
     return rows if rows and "prescan" in rows[0] else ()
 
 
+@lru_cache(maxsize=16)
+def _measured_ratios(
+    section: str, mission: MissionConfiguration
+) -> Mapping[tuple[str, str], tuple[float, float, float]]:
+    """Return gain, read noise and bias level of each measured amplifier of a camera, divided by the medians of all.
+
+    The keys are the names of detector and amplifier. A number that was not measured has the ratio 1. The result is
+    empty if the mission database has no table of measured amplifiers for the camera.
+    """
+    key = f"{section}.amplifier_values"
+    rows = mission.rows(key) if key in mission else ()
+    if not rows:
+        return {}
+    numbers = np.array([[float(row.get(name, 1.0)) for name in _RELATIVE] for row in rows])
+    ratios = numbers / np.median(numbers, axis=0)
+    return {
+        (row["detector"], row["amplifier"]): (float(gain), float(noise), float(bias))
+        for row, (gain, noise, bias) in zip(rows, ratios, strict=True)
+    }
+
+
 def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
     """Return the numbers of columns and rows of a detector type of a ground camera, from the mission database.
 
@@ -449,9 +477,9 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
     return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
-# Parameters that have a value for each amplifier in the camera's table of amplifiers, with their index in the pair
+# Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in the tuple
 # `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
-_RELATIVE = {"gain": 0, "read_noise": 1}
+_RELATIVE = {"gain": 0, "read_noise": 1, "bias": 2}
 
 
 @lru_cache(maxsize=1024)
@@ -482,8 +510,10 @@ def values(
     -----
     The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
     the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
-    for other amplifiers it is multiplied by their ratio to the first one. The random deviations are a property of the
-    hardware and therefore the same in all simulations.
+    for other amplifiers it is multiplied by their ratio to the first one. If the amplifiers of the camera have been
+    measured one by one, `key` is the median, and is multiplied by the ratio of the amplifier to the median; this also
+    holds for the bias level. The random deviations are a property of the hardware and therefore the same in all
+    simulations.
 
     If the request of the user sets the parameter for the whole camera, it is used without ratio and random deviations,
     unless the request also sets the spread. A value that the request sets for a detector or an amplifier is always used
@@ -535,6 +565,38 @@ def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) 
                 label = f"amplifier {detector_layout.amplifiers[worst].name} of detector {detector.name}"
                 value = f"{amplifier_values[worst]:.3g} {unit}, at least {minimum:g} is allowed"
                 raise BadInput(f"mission: {name} = {rms:g}: {label} would have {value}")
+
+
+def measured_crosstalk(detector: Detector, detector_layout: Layout, mission: MissionConfiguration) -> Float | None:
+    """Return the measured crosstalk coefficients between the amplifiers of a detector.
+
+    Parameters
+    ----------
+    detector : Detector
+        The detector.
+    detector_layout : Layout
+        Its amplifiers.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float array, shape (n_amplifiers, n_amplifiers), or None
+        Element [i, j] is the fraction of the signal in amplifier j that appears in amplifier i, and can be negative. A
+        pair that was not measured has 0. None if the mission database has no table for the camera, or if the request
+        sets its crosstalk.
+    """
+    key = f"{detector.section}.crosstalk_pairs"
+    is_set = any(f"{detector.section}.{name}" in mission.overridden for name in ("crosstalk", "crosstalk_max"))
+    if is_set or key not in mission:
+        return None
+    pairs = {
+        (row["victim"], row["source"]): float(row["coefficient"])
+        for row in mission.rows(key)
+        if row["detector"] in (detector.name, "all")
+    }
+    names = [amplifier.name for amplifier in detector_layout.amplifiers]
+    return np.array([[pairs.get((victim, source), 0.0) for source in names] for victim in names])
 
 
 def crosstalk_couplings(median: float, largest: float, detector: Detector, detector_layout: Layout) -> Float:

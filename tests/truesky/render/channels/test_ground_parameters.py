@@ -11,6 +11,7 @@ from tests.truesky.render import fields
 from truesky.fluxes import passbands
 from truesky.render.camera import bands, detectors
 from truesky.render.channels import ground
+from truesky.render.effects.readout import crosstalk
 from truesky.render.effects.scene import Scene
 from truesky.render.exposure import board_neighbours
 from truesky.render.planning import calibration_frames, ground_surveys, planned_exposures
@@ -61,6 +62,9 @@ def asked(camera, mission, monkeypatch):
     assert [*calibration_frames.exposures(flat, camera, (60.0, 0.0), mission, 1, 60500.0)]
     board_neighbours.other_detectors(camera, one.name, mission)
     crossed = mission.with_overrides({"survey.satellites.rate": (0.1, "1 / (deg s)")})
+    # A request that sets the crosstalk replaces the coefficients that were measured for each pair of amplifiers.
+    coupled = mission.with_overrides({f"ext.{camera}.crosstalk": (2e-4, "")})
+    crosstalk.coefficients(Scene(coupled, one.section, 90.0, 10.0, 1e6, one))
     every = {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}
     for band in bands.ground_bands(camera, mission):
         scene = Scene(crossed, one.section, 90.0, 10.0, 1e6, one, band=passbands.load(band))

@@ -95,9 +95,13 @@ def coefficients(scene: Scene) -> Frame:
 
     Element [i, j] is the share of the signal of amplifier j that appears in amplifier i. Detectors that are read in
     quadrants have the coefficient of the mission database for neighbours, and half of it for diagonally opposite
-    quadrants. Ground cameras have a coefficient for each pair of amplifiers.
+    quadrants. Ground cameras have a coefficient for each pair of amplifiers: a measured one if there is one, which can
+    be negative.
     """
     if scene.layout is not None and scene.detector is not None:
+        measured = amplifiers.measured_crosstalk(scene.detector, scene.layout, scene.mission)
+        if measured is not None:
+            return measured
         largest = scene.value("crosstalk_max", "")
         return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
     row_neighbour = column_neighbour = scene.value("crosstalk", "")
