@@ -223,7 +223,11 @@ def rows(parameters: Sequence[Parameter]) -> Iterator[tuple[str, ...]]:
     """Yield the row of the table, as texts, for each of some numbers."""
     for parameter in parameters:
         effect = measure(parameter)
-        numbers = [f"{number + 0.0:.3g}" for number in (effect.noise, effect.level, effect.flux)] if effect.image else [""] * 3
+        numbers = (
+            [f"{number + 0.0:.3g}" for number in (effect.noise, effect.level, effect.flux)]
+            if effect.image
+            else [""] * 3
+        )
         yield *identity(parameter), effect.image, *numbers
 
 

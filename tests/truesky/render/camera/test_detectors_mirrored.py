@@ -103,7 +103,7 @@ def test_the_psf_is_mirrored(camera, name):
     """The PSF has the wavefront, its change across the detector, the air's ellipticity, refraction and spikes."""
     band, images = passbands.load(BANDS[camera]), []
     for one in pair(camera, name):
-        air = ground.exposure_air(row_of(camera), one, MISSION)
+        air = ground.exposure_air(row_of(camera), one, band, MISSION)
         images.append((air, ground.atmospheric_psf(air, one, band, MISSION, 9)))
     (air, psf), (expected_air, expected) = images
     assert abs(expected_air.shear[1]) > 1e-4
@@ -125,7 +125,7 @@ def test_the_spider_is_mirrored_as_the_sky():
         band = passbands.load(BANDS[camera])
         angles = []
         for one in pair(camera, name):
-            air = ground.exposure_air(row_of(camera), one, MISSION)
+            air = ground.exposure_air(row_of(camera), one, band, MISSION)
             angles.append(one.handedness * ground.edges(air, one, band, MISSION).bars[:, 0] + np.radians(one.rotation))
         np.testing.assert_allclose(np.exp(2j * angles[0]), np.exp(2j * angles[1]), atol=1e-9)
 
