@@ -397,7 +397,7 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
     return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
-# Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in the tuple
+# Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in
 # `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
 _RELATIVE = {"gain": 0, "read_noise": 1, "bias": 2}
 
