@@ -2,7 +2,7 @@
 
     python -m scripts.assumed_tables > docs/assumed_numbers.md
 
-The numbers are those of the mission database, and their effects those of docs/assumed_numbers.csv, which
+The numbers are read from the mission database, and their effects from docs/assumed_numbers.csv, which
 scripts/rank_assumed_numbers.py has measured.
 """
 
@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 from lake_schema.mission.configuration import MissionConfiguration, resolve
-from scripts.rank_assumed_numbers import assumed_parameters, read_ranking
+from scripts.rank_assumed_numbers import read_ranking
 
 # Settings that choose a model or a plan of calibrations. No measurement could replace them.
 _CHOICES = (
@@ -24,15 +24,15 @@ _HEAD = """# Assumed numbers of ground cameras
 Written by `python -m scripts.assumed_tables > docs/assumed_numbers.md`; do not edit.
 
 The mission database says for each number whether it is published, quoted, derived from published numbers or assumed.
-`truesky mission list "ext.*"` prints all of them with their sources. This page lists the assumed ones of the ground
-cameras, those with the largest effect on an image first.
+`truesky mission list "ext.*"` prints all of them with their sources. This page lists the assumed numbers of the ground
+cameras, sorted by their effect on an image.
 
 The effect is measured. A field of stars is drawn on 256 x 256 pixels in the middle of the camera, once with the numbers
 of the database, and once with one number changed by a plausible error. The random numbers are the same. Cosmic rays,
 defects and dust are measured on 1024 x 1024 pixels.
 
-- **noise**: rms change of a pixel, divided by the noise of a pixel of the sky. A pixel counts with at most ten times its
-  noise. The overscan of each amplifier is subtracted first.
+- **noise**: rms change of a pixel, divided by the noise of a pixel of the sky. A pixel counts with at most ten times
+  its noise. The overscan of each amplifier is subtracted first.
 - **level**: mean change of a pixel, divided by the same noise.
 - **flux**: change of a star of 18 mag in an aperture of 3 arcsec, in mmag.
 
@@ -41,8 +41,8 @@ whole detector. Zero means that the number does not act by default, such as the 
 has another one, that the overscan removes its effect, or that the field has no such feature. Crosstalk between
 detectors, and errors of the pointing, are not measured: these numbers come last.
 """
-_CHOICE_TEXT = """These numbers are settings: they choose a model, or plan calibrations. No measurement could replace them. The
-table shows how much the other setting changes an image.
+_CHOICE_TEXT = """These numbers are settings: they choose a model, or plan calibrations. No measurement could replace
+them. The table shows how much the other setting changes an image.
 """
 
 
@@ -76,12 +76,11 @@ def _counts(mission: MissionConfiguration) -> Iterator[str]:
 
 def _table(ranking: Sequence[Mapping[str, str]]) -> Iterator[str]:
     """Yield the lines of a table with the assumed numbers and their effects."""
-    sources = {p.key: p.source.removeprefix("assumed").removeprefix(": ") for p in assumed_parameters(resolve())}
-    yield "| number | value | changed to | unit | noise | level | flux | remark |"
+    yield "| number | value | changed to | unit | image | noise | level | flux |"
     yield "|---" * 8 + "|"
     for row in ranking:
-        entries = (row[name] for name in ("value", "changed_to", "unit", "noise", "level", "flux"))
-        yield f"| `{row['parameter']}` | {' | '.join(entries)} | {sources[row['parameter']]} |"
+        name, *entries = row.values()
+        yield f"| `{name}` | {' | '.join(entries)} |"
 
 
 if __name__ == "__main__":

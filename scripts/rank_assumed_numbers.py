@@ -112,12 +112,12 @@ def measure(parameter: Parameter) -> Effect:
         return Effect(changed_to)
     band, side = _band_of(camera, name), _LARGE_SIDE if name.startswith(_RARE) else _SIDE
     kind = "flat" if name.startswith(("flat.", "exposure_time_flat")) else "science"
-    before = _draw(camera, band, kind, side, ())
-    after = _draw(camera, band, kind, side, ((parameter.key, changed_to, parameter.unit),))
-    light = max(float(np.median(_electrons(before))), 0.0) if kind == "flat" else 0.0
-    change = (_electrons(after) - _electrons(before)) / np.hypot(before.scene.pixel_noise, np.sqrt(light))
+    reference = _draw(camera, band, kind, side, ())
+    changed = _draw(camera, band, kind, side, ((parameter.key, changed_to, parameter.unit),))
+    light = max(float(np.median(_electrons(reference))), 0.0) if kind == "flat" else 0.0
+    change = (_electrons(changed) - _electrons(reference)) / np.hypot(reference.scene.pixel_noise, np.sqrt(light))
     clipped = np.clip(change, -_LIMIT, _LIMIT)
-    flux = _flux_of_middle(after) / _flux_of_middle(before) if kind == "science" else 1.0
+    flux = _flux_of_middle(changed) / _flux_of_middle(reference) if kind == "science" else 1.0
     return Effect(
         changed_to, f"{band} {kind}", float(np.sqrt((clipped**2).mean())), float(clipped.mean()),
         float(-2500.0 * np.log10(flux)),
@@ -127,9 +127,9 @@ def measure(parameter: Parameter) -> Effect:
 def _band_of(camera: str, name: str) -> str:
     """Return the band in the name of a number, or the camera's reddest one for fringes, else the one of `_BANDS`."""
     bands = band_names(GROUND_CHANNEL, camera, resolve())
-    own = [band for band in bands if name.startswith(f"{band}.")]
+    named = [band for band in bands if name.startswith(f"{band}.")]
     fringed = [band for band in bands if f"ext.{camera}.{band}.fringes" in resolve()]
-    return own[0] if own else fringed[-1] if name == "fringe_period" else _BANDS[camera]
+    return named[0] if named else fringed[-1] if name == "fringe_period" else _BANDS[camera]
 
 
 def _draw(
@@ -205,8 +205,8 @@ def _flux_of_middle(drawn: RenderedDetector) -> float:
     column, row = (float(axis[0]) for axis in astrometry.pixel_of_sky(drawn.wcs, [ra], [dec]))
     y, x = np.mgrid[:side, :side]
     distance = np.hypot(x - column, y - row) * detector.pixel_scale
-    around = frame[(distance > 1.5 * _APERTURE) & (distance < 2.5 * _APERTURE)]
-    return float((frame[distance <= _APERTURE] - np.median(around)).sum())
+    sky_pixels = frame[(distance > 1.5 * _APERTURE) & (distance < 2.5 * _APERTURE)]
+    return float((frame[distance <= _APERTURE] - np.median(sky_pixels)).sum())
 
 
 def _middle_position(drawn: RenderedDetector) -> tuple[float, float]:
@@ -241,14 +241,14 @@ def main() -> None:
     """Write the table of all assumed numbers."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--all", action="store_true", help="measure all numbers again")
-    known: dict[tuple[str, ...], tuple[str, ...]] = {}
+    measured: dict[tuple[str, ...], tuple[str, ...]] = {}
     if not parser.parse_args().all:
-        known = {tuple(row[name] for name in COLUMNS[:4]): tuple(row.values()) for row in read_ranking()}
+        measured = {tuple(row[name] for name in COLUMNS[:4]): tuple(row.values()) for row in read_ranking()}
     with RANKING.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(COLUMNS)
         for parameter in assumed_parameters(resolve()):
-            writer.writerow(known.get(identity(parameter)) or next(rows([parameter])))
+            writer.writerow(measured.get(identity(parameter)) or next(rows([parameter])))
             stream.flush()
 
 

@@ -128,8 +128,11 @@ def test_the_values_of_a_camera_are_the_medians_of_its_measured_amplifiers(camer
 def test_each_amplifier_of_lsstcam_has_its_measured_bias_level():
     """Run 13421 of LSSTCam, as imSim has it: 24735, 25064 and 26469 adu, and 18761.5 at the lowest."""
     for detector, amplifier, bias in (
-        ("R01_S00", "C10", 24735.0), ("R01_S00", "C00", 25064.0), ("R43_S02", "C13", 18761.5), ("R22_S02", "C10", 26469.0)
-    ):  # fmt: skip
+        ("R01_S00", "C10", 24735.0),
+        ("R01_S00", "C00", 25064.0),
+        ("R43_S02", "C13", 18761.5),
+        ("R22_S02", "C10", 26469.0),
+    ):
         one = detectors.detector("lsstcam", detector, MISSION)
         own = layout_of(one)
         found = amplifiers.values("bias", "adu", one, MISSION, own)
