@@ -191,4 +191,4 @@ def _contribution(scene: Scene) -> float:
     return ghost_level(scene) * brightest if brightest else 0.0
 
 
-EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=5e-3, in_place=True)
+EFFECT = Effect("lens_ghosts", apply, parameters, _contribution, cost=5e-3, in_place=True)
