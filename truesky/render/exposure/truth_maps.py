@@ -36,8 +36,8 @@ _CONVERTERS = ("adc", "signal_adc")
 _GRISM = "dispersed_sky"
 # Name of the truth map to which each detector effect contributes, by name of the effect.
 _MAP_OF_EFFECT = {
-    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
-    "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
+    "ghosts": "ghosts", "filter_ghosts": "ghosts", "lens_ghosts": "ghosts",
+    "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky", "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
     "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
     "persistence": "persistence", "macc": "ramp", "trap_pumping": "dipoles",
 }  # fmt: skip
@@ -98,7 +98,7 @@ def map_recorder(
     """
 
     def record(name: str, frame_before: Frame, frame_after: Frame) -> None:
-        if name in ("ghosts", "filter_ghosts") and "ghosts" in truth:
+        if _MAP_OF_EFFECT.get(name) == "ghosts" and "ghosts" in truth:
             maps["ghosts"] = (frame_after - frame_before).astype(np.float32) + maps.get("ghosts", np.float32(0.0))
         if _MAP_OF_EFFECT.get(name) == "sky" and "sky" in truth:
             maps["sky"] = (frame_after - frame_before).astype(np.float32) + maps.get("sky", np.float32(0.0))

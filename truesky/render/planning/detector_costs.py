@@ -29,7 +29,7 @@ _FILLED_S = {
     "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8, "fringes": 2.5e-8},
     "satellites": {"satellite_trails": 2.5e-8},
     "cosmic_rays": {"cosmic_rays": 4.5e-8, "readout_cosmic_rays": 3e-8},
-    "ghosts": {"ghosts": 5e-8},
+    "ghosts": {"ghosts": 5e-8, "lens_ghosts": 5e-8},
     "saturation": {"bleeding": 1e-8},
 }
 # CPU seconds per pixel to make the truth map of stars (image of their true signal), for which stars are drawn again.

@@ -10,6 +10,7 @@ from truesky.render.camera.sections import Section
 from truesky.render.channels import ground, nisp_p, nisp_s, vis
 from truesky.render.effects.charge.ramp import Mode
 from truesky.render.effects.light.ghosts import Pupil
+from truesky.render.effects.light.ground_ghosts import Annuli
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
 from truesky.render.effects.readout.trap_pumping import Pumping
 from truesky.render.effects.readout.traps import Sweeps, Traps
@@ -128,6 +129,12 @@ _CASES = (
         "filter_ghosts",
         (LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),
         (LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),
+        zero=False,
+    ),
+    Case(
+        "lens_ghosts",
+        (Annuli(*np.array([[3.2, 4.0], [2.0, -3.0], [4.0, 6.0], [20.0, 5.0]])), 0.4),
+        (Annuli(*np.zeros((4, 0))), 0.4),
         zero=False,
     ),
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),

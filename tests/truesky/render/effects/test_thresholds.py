@@ -89,6 +89,7 @@ CASES = {
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
+    "lens_ghosts": lambda x: replace(ground(), lights=star(1e7 * x), band=passbands.load("des_r")),
     "straylight": lambda x: scene(lights=star(1e9 * x)),
 }
 # Effects with different values in every frame. Dark current also has a mean.
