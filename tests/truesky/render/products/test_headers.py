@@ -10,7 +10,7 @@ from astropy.time import Time
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION, small
-from truesky.render.camera import detectors
+from truesky.render.camera import detectors, pointing
 from truesky.render.products import fits_files
 from truesky.request.accuracy import SURVEY
 
@@ -116,3 +116,27 @@ def test_rdnoise_under_a_bright_sky(tmp_path):
         of_detector = np.mean(one.scene.amplifier_values("read_noise", "electron"))
         assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
         assert units[0].header["RDNDRAWN"] == 0.0
+
+
+def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
+    """The truth image of the sky has its gradient; the rate in the header is that in the middle of the detector."""
+    detector = small("hsc", detectors.detectors("hsc", MISSION)[50].name, 128)
+    none = fields.galaxies([], []), fields.stars([], [])
+    exposed = {
+        "channel": "EXT", "camera": "hsc", "band": "hsc_z", "exposure_time_s": 200.0, "sky": 34.0, "seeing": 0.7,
+        "clouds": 0.25, "sky_slope_x": 2.0, "sky_slope_y": -1.0,
+    }  # fmt: skip
+    tables = none[0], fields.fluxes(none[0], "hsc_z", []), none[1], fields.fluxes(none[1], "hsc_z", [])
+    one = fields.rendered(exposed, detector, tables, MISSION, SURVEY, truth=("sky",))
+    level = 1.0 + (2.0 * detector.x - 1.0 * detector.y) / 3600.0
+    with science(one, tmp_path) as units:
+        assert units[0].header["CLOUDS"] == 0.25
+        assert units[0].header["SKYRATE"] == pytest.approx(34.0 * level, rel=0.02)
+    sky = np.asarray(one.maps["sky"], float)
+    x, y = (axis[0, 1:] / 3600.0 for axis in pointing.outline((detector,)))
+    lower_left, lower_right, upper_right, upper_left = 6800.0 * (1.0 + 2.0 * x - 1.0 * y)
+    half = 64
+    # Means of the halves, in which fringes average out.
+    across = sky[:, half:].mean() - sky[:, :half].mean(), sky[half:].mean() - sky[:half].mean()
+    edges = lower_right + upper_right - lower_left - upper_left, upper_left + upper_right - lower_left - lower_right
+    assert across == pytest.approx([edge / 4.0 for edge in edges], abs=0.15 * max(map(abs, edges)) / 4.0)
