@@ -182,7 +182,7 @@ def test_seeing_is_drawn_for_each_exposure():
 
 
 def test_clouds_dim_the_zero_point(tmp_path):
-    """By the extinction of the column `clouds`, in a survey and in tables of pointings; sky and seeing do not change."""
+    """By the extinction of the column `clouds`, for surveys and tables of pointings; sky and seeing do not change."""
     clear, cloudy = (survey_of("lsst", 6, start=60850.0, bands=("lsst_r",), clouds=mag) for mag in (0.0, 0.5))
     rows = [planned_exposures.table(one, [MISSION] * 6, seed=5).to_pylist() for one in (clear, cloudy)]
     extinctions = [row["clouds"] for row in rows[1]]
@@ -197,7 +197,7 @@ def test_clouds_dim_the_zero_point(tmp_path):
     assert table[0]["zero_point"] == pytest.approx(28.0 - table[0]["clouds"])
     assert table[0]["clouds"] > 0.0
     assert table[1]["clouds"] == 0.0
-    with pytest.raises(BadInput, match="line 2: clouds = 6.0 is outside 0 to 5"):
+    with pytest.raises(BadInput, match=r"line 2: clouds = 6\.0 is outside 0 to 5"):
         read(tmp_path, f"{HEAD},clouds\n{ROW},6\n")
 
 
