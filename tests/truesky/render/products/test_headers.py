@@ -134,7 +134,8 @@ def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
         assert units[0].header["CLOUDS"] == 0.25
         assert units[0].header["SKYRATE"] == pytest.approx(middle)
     sky = np.asarray(one.maps["sky"], float) / 200.0
-    assert sky.mean() == pytest.approx(middle, rel=2e-3)
+    # At this distance from the boresight, distortion makes pixels smaller by 0.4 %.
+    assert sky.mean() == pytest.approx(middle, rel=6e-3)
     across = sky[:, 64:].mean() - sky[:, :64].mean(), sky[64:].mean() - sky[:64].mean()
     edges = lower_right + upper_right - lower_left - upper_left, upper_left + upper_right - lower_left - lower_right
     assert across == pytest.approx([edge / 4.0 for edge in edges], rel=0.02)
