@@ -138,4 +138,4 @@ def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
     assert sky.mean() == pytest.approx(middle, rel=6e-3)
     across = sky[:, 64:].mean() - sky[:, :64].mean(), sky[64:].mean() - sky[:64].mean()
     edges = lower_right + upper_right - lower_left - upper_left, upper_left + upper_right - lower_left - lower_right
-    assert across == pytest.approx([edge / 4.0 for edge in edges], rel=0.02)
+    assert across == pytest.approx([edge / 4.0 for edge in edges], rel=0.05)
