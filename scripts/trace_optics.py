@@ -58,7 +58,7 @@ _RINGS, _PLACES = 12, 32
 GHOST_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Ghosts with a radius above this (mm) are left out: they are too faint to be seen.
 _WIDEST = 60.0
-# Number of places in each band for which tests have values of their own.
+# Number of places in each band for which tests have traced values.
 _CHECKED = 8
 # Number of ghosts of a camera in a band, the brightest ones.
 _GHOSTS = 10
@@ -108,7 +108,7 @@ CAMERAS = (
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A telescope in a band, with what is needed to trace it.
+    """A telescope in a band, and the wavelength and pupil with which it is traced.
 
     Attributes
     ----------
@@ -175,10 +175,10 @@ class Optics:
         )
         # The mean and the tilts are free in the dark.
         dark[:, :3] = 0.0
-        left = np.concatenate([bright, np.sqrt(_RIDGE) * dark])
-        right = np.concatenate([path[lit], np.zeros(len(dark))])
-        found = np.linalg.lstsq(left, right, rcond=None)[0]
-        return np.concatenate([[0.0], found])
+        design = np.concatenate([bright, np.sqrt(_RIDGE) * dark])
+        target = np.concatenate([path[lit], np.zeros(len(dark))])
+        coefficients = np.linalg.lstsq(design, target, rcond=None)[0]
+        return np.concatenate([[0.0], coefficients])
 
 
 def load_optics(camera: Camera, band: str, mission: MissionConfiguration) -> Optics:
@@ -201,8 +201,8 @@ def plate_scale(camera: Camera, mission: MissionConfiguration) -> float:
 
 def field_reach(camera: Camera, mission: MissionConfiguration) -> float:
     """Return the distance from the axis to the farthest corner of a detector, mm."""
-    every = detectors(camera.name, mission)
-    reach = max(np.hypot(abs(d.x), abs(d.y)) + d.half_diagonal for d in every)
+    all_detectors = detectors(camera.name, mission)
+    reach = max(np.hypot(abs(d.x), abs(d.y)) + d.half_diagonal for d in all_detectors)
     return float(reach / plate_scale(camera, mission))
 
 
@@ -214,8 +214,8 @@ def field_places(camera: Camera, optics: Optics, mission: MissionConfiguration) 
         count = max(6 * round(ring * _PLACES / _RINGS / 6), 1)
         turn = 2.0 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
         # The rings are closer to each other near the edge, as the nodes of a polynomial should be.
-        far = np.sin(0.5 * np.pi * ring / _RINGS)
-        angles += [(far * np.cos(t), far * np.sin(t)) for t in turn]
+        distance = np.sin(0.5 * np.pi * ring / _RINGS)
+        angles += [(distance * np.cos(t), distance * np.sin(t)) for t in turn]
     corner = np.radians(reach * plate / 3600.0)
     for _ in range(3):
         corner *= reach / np.hypot(*optics.chief(corner, 0.0))
@@ -225,36 +225,36 @@ def field_places(camera: Camera, optics: Optics, mission: MissionConfiguration) 
 
 def place_of(angle: Float, optics: Optics, reach: float) -> Float:
     """Return the places in the focal plane of field angles [n, 2], rad, relative to the distance `reach`, mm."""
-    far = np.array([np.hypot(*optics.chief(*one)) for one in angle]) / reach
+    distance = np.array([np.hypot(*optics.chief(*value)) for value in angle]) / reach
     turn = np.arctan2(angle[:, 1], angle[:, 0])
-    return np.stack([far * np.cos(turn), far * np.sin(turn)], axis=1)
+    return np.stack([distance * np.cos(turn), distance * np.sin(turn)], axis=1)
 
 
 def clear_angles(optics: Optics, angle: Float) -> Float:
     """Return field angles [n, 2] of which those in vignetted parts of the field are moved to the border of these."""
-    far = np.hypot(*angle.T)
-    steps = far.max() * np.linspace(1.0, 0.7, 31)
-    limit = next((one for one in steps if optics.lit(one, 0.0) >= _LEAST_LIT), steps[-1])
-    return np.asarray(angle * np.minimum(1.0, limit / np.maximum(far, 1e-12))[:, None])
+    distance = np.hypot(*angle.T)
+    steps = distance.max() * np.linspace(1.0, 0.7, 31)
+    limit = next((value for value in steps if optics.lit(value, 0.0) >= _LEAST_LIT), steps[-1])
+    return np.asarray(angle * np.minimum(1.0, limit / np.maximum(distance, 1e-12))[:, None])
 
 
-def focused(camera: Camera, optics: Optics, angle: Float) -> Optics:
+def move_to_focus(camera: Camera, optics: Optics, angle: Float) -> Optics:
     """Return the telescope with the detector where the mean square of the wavefront over field angles is smallest."""
     import galsim
 
     axis = np.linspace(-1.0, 1.0, 81)
-    x, y = (one.ravel() for one in np.meshgrid(axis, axis))
+    x, y = (value.ravel() for value in np.meshgrid(axis, axis))
     ring = (np.hypot(x, y) <= 1.0) & (np.hypot(x, y) >= optics.inner / optics.radius)
     basis = galsim.zernike.zernikeBasis(NOLL, x[ring], y[ring])
     basis[:4] = 0.0
     # The rings are closer to each other near the edge; the weight makes them equal in area.
-    far = np.hypot(*angle.T) / np.hypot(*angle.T).max()
-    weight = np.sqrt(np.maximum(1.0 - far**2, 0.0))[:, None]
+    distance = np.hypot(*angle.T) / np.hypot(*angle.T).max()
+    weight = np.sqrt(np.maximum(1.0 - distance**2, 0.0))[:, None]
     step = 1e-5
 
     def fronts(shift: float) -> Float:
         moved = Optics(optics.optic.withLocallyShiftedOptic(camera.detector, [0.0, 0.0, shift]), *_rest(optics))
-        front = np.array([moved.zernikes(*one) for one in angle]) @ basis
+        front = np.array([moved.zernikes(*value) for value in angle]) @ basis
         return np.asarray(front - front.mean(axis=1, keepdims=True)) * weight
 
     still, slope = fronts(0.0), (fronts(step) - fronts(-step)) / (2.0 * step)
@@ -274,14 +274,14 @@ def fit_field(place: Float, values: Float, weight: Float, degree: int) -> list[t
     """
     powers = [(k - j, j) for k in range(degree + 1) for j in range(k + 1)]
     basis = np.stack([place[:, 0] ** i * place[:, 1] ** j for i, j in powers], axis=1)
-    found = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * values, rcond=None)[0]
-    error = np.sqrt((((basis @ found) - values)[weight == 1.0, 4:] ** 2).sum(axis=1))
+    coefficients = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * values, rcond=None)[0]
+    error = np.sqrt((((basis @ coefficients) - values)[weight == 1.0, 4:] ** 2).sum(axis=1))
     print(f"  fit: rms {np.sqrt((error**2).mean()):.1f} nm, worst {error.max():.1f} nm", file=sys.stderr)
     return [
-        (noll, i, j, float(found[k, noll]))
+        (noll, i, j, float(coefficients[k, noll]))
         for noll in range(4, NOLL + 1)
         for k, (i, j) in enumerate(powers)
-        if abs(found[k, noll]) >= _SMALLEST
+        if abs(coefficients[k, noll]) >= _SMALLEST
     ]
 
 
@@ -296,8 +296,8 @@ def write_wavefronts(camera: Camera, mission: MissionConfiguration) -> None:
         optics = load_optics(camera, band, mission)
         angle, place = field_places(camera, optics, mission)
         lit = clear_angles(optics, angle)
-        optics = focused(camera, optics, lit[::4])
-        values = np.array([optics.zernikes(*one) for one in lit])
+        optics = move_to_focus(camera, optics, lit[::4])
+        values = np.array([optics.zernikes(*value) for value in lit])
         weight = np.where((lit == angle).all(axis=1), 1.0, _OUTSIDE)
         header = _WAVEFRONT_HEADER.format(
             camera=camera.name, band=band, wavelength=1e9 * optics.wavelength, file=camera.file.format(band[-1])
@@ -311,13 +311,13 @@ def write_wavefronts(camera: Camera, mission: MissionConfiguration) -> None:
 
 def surfaces(optic: Any) -> list[str]:
     """Return the names of the mirrors, of the surfaces of glass, and of the detector, in the order of the light."""
-    found = []
+    surface_names = []
     for item in optic.items:
         if hasattr(item, "items"):
-            found += surfaces(item)
+            surface_names += surfaces(item)
         elif type(item).__name__ in ("Mirror", "RefractiveInterface", "Detector"):
-            found.append(item.name)
-    return found
+            surface_names.append(item.name)
+    return surface_names
 
 
 def trace_ghost(optics: Optics, path: list[str], x: float) -> tuple[float, float, float]:
@@ -353,10 +353,12 @@ def find_ghosts(camera: Camera, band: str, mission: MissionConfiguration) -> lis
     angle, _ = field_places(camera, optics, mission)
     corner = float(np.hypot(*clear_angles(optics, angle).T).max())
     places = [corner * max(place, 0.02) for place in GHOST_PLACES]
-    distances = np.hypot(*place_of(np.array([(one, 0.0) for one in places]), optics, field_reach(camera, mission)).T)
+    distances = np.hypot(
+        *place_of(np.array([(value, 0.0) for value in places]), optics, field_reach(camera, mission)).T
+    )
     names = surfaces(optics.optic)
     glass = [i for i, name in enumerate(names) if name not in ("M1", "M2", "M3", "PM")]
-    found = []
+    candidates = []
     for j in glass:
         for i in glass:
             if i < j:
@@ -365,14 +367,14 @@ def find_ghosts(camera: Camera, band: str, mission: MissionConfiguration) -> lis
                 bright = 0.1 if j == len(names) - 1 else 0.01
                 _, radius, passed = trace_ghost(optics, path, places[2])
                 if radius < _WIDEST:
-                    found.append((bright * passed / radius**2, i, j, path))
-    found.sort(reverse=True)
+                    candidates.append((bright * passed / radius**2, i, j, path))
+    candidates.sort(reverse=True)
     rows = []
-    for _, i, j, path in found[:_GHOSTS]:
+    for _, i, j, path in candidates[:_GHOSTS]:
         first, last = "detector" if j == len(names) - 1 else names[j], (1.0, 1.0)
         for distance, place in zip(distances, places, strict=True):
             centre, radius, passed = trace_ghost(optics, path, place)
-            # Where no light arrives, the geometry is that of the nearest place with light.
+            # If no light arrives, take the geometry of the nearest place with light.
             last = (centre, radius) if passed else last
             numbers = f"{last[0]:.4f}", f"{last[1]:.3f}", f"{passed:.3f}"
             rows.append((band, first, names[i], f"{distance:.4f}", *numbers))
@@ -395,15 +397,14 @@ def fit_distortion(camera: Camera, mission: MissionConfiguration) -> None:
     angle, _ = field_places(camera, optics, mission)
     edge = float(np.hypot(*clear_angles(optics, angle).T).max())
     x = edge * np.sqrt(np.linspace(0.001, 1.0, 60))
-    far = np.array([np.hypot(*optics.chief(one, 0.0)) for one in x])
-    basis = np.stack([far ** (1 + power) for power in (0, 2, 4, 6)], axis=1)
+    distance = np.array([np.hypot(*optics.chief(value, 0.0)) for value in x])
+    basis = np.stack([distance ** (1 + power) for power in (0, 2, 4, 6)], axis=1)
     size = basis.max(axis=0)
-    found = np.linalg.lstsq(basis / size, x, rcond=None)[0] / size
-    error = np.abs(basis @ found - x).max() * 206264.8
-    ratios = ", ".join(f"{one / found[0]:.4e}" for one in found[1:])
-    print(
-        f"{camera.name}: {206264.8 * found[0]:.5f} arcsec/mm, {ratios} per mm^2, mm^4, mm^6; within {error:.4f} arcsec"
-    )
+    coefficients = np.linalg.lstsq(basis / size, x, rcond=None)[0] / size
+    error = np.abs(basis @ coefficients - x).max() * 206264.8
+    ratios = ", ".join(f"{value / coefficients[0]:.4e}" for value in coefficients[1:])
+    print(f"{camera.name}: {206264.8 * coefficients[0]:.5f} arcsec/mm, within {error:.4f} arcsec")
+    print(f"  {ratios} per mm^2, mm^4, mm^6")
 
 
 def check_tables(camera: Camera, mission: MissionConfiguration) -> tuple[list[str], list[str], list[str]]:
@@ -414,22 +415,22 @@ def check_tables(camera: Camera, mission: MissionConfiguration) -> tuple[list[st
         optics = load_optics(camera, band, mission)
         angle, _ = field_places(camera, optics, mission)
         lit = clear_angles(optics, angle)
-        optics = focused(camera, optics, lit[::4])
+        optics = move_to_focus(camera, optics, lit[::4])
         edge = 0.9 * np.hypot(*lit.T).max()
-        far, turn = edge * np.sqrt(rng.random(_CHECKED)), 2.0 * np.pi * rng.random(_CHECKED)
-        chosen = np.stack([far * np.cos(turn), far * np.sin(turn)], axis=1)
-        for one, at in zip(chosen, place_of(chosen, optics, reach), strict=True):
-            numbers = ",".join(f"{nm:.1f}" for nm in optics.zernikes(*one)[4:])
+        distance, turn = edge * np.sqrt(rng.random(_CHECKED)), 2.0 * np.pi * rng.random(_CHECKED)
+        chosen = np.stack([distance * np.cos(turn), distance * np.sin(turn)], axis=1)
+        for value, at in zip(chosen, place_of(chosen, optics, reach), strict=True):
+            numbers = ",".join(f"{nm:.1f}" for nm in optics.zernikes(*value)[4:])
             fronts.append(f"{camera.name},{band},{at[0]:.5f},{at[1]:.5f},{numbers}")
         if band != camera.bands[0]:
             continue
-        for one in chosen:
-            at = optics.chief(*one) @ np.diag([1.0, -1.0])
-            arcsec = 206264.806 * one
+        for value in chosen:
+            at = optics.chief(*value) @ np.diag([1.0, -1.0])
+            arcsec = 206264.806 * value
             places.append(f"{camera.name},{arcsec[0]:.4f},{arcsec[1]:.4f},{at[0]:.6f},{at[1]:.6f}")
-        for one in chosen[np.argsort(far)[[2, 5]]]:
-            at = place_of(one[None], optics, reach)[0]
-            for u, v, x, y in apparent_displacements(optics, *one):
+        for value in chosen[np.argsort(distance)[[2, 5]]]:
+            at = place_of(value[None], optics, reach)[0]
+            for u, v, x, y in apparent_displacements(optics, *value):
                 rays.append(f"{camera.name},{band},{at[0]:.5f},{at[1]:.5f},{u:.4f},{v:.4f},{x:.1f},{y:.1f}")
     return fronts, rays, places
 
@@ -460,8 +461,8 @@ def write_checks(mission: MissionConfiguration) -> None:
     lines: tuple[list[str], ...] = ([], [], [])
     for camera in CAMERAS:
         fit_distortion(camera, mission)
-        for total, some in zip(lines, check_tables(camera, mission), strict=True):
-            total += some
+        for total, camera_lines in zip(lines, check_tables(camera, mission), strict=True):
+            total += camera_lines
     zernikes = ",".join(f"z{noll}" for noll in range(4, NOLL + 1))
     names = "psf/batoid_wavefronts", "psf/batoid_rays", "camera/batoid_distortion"
     columns = (
@@ -469,8 +470,8 @@ def write_checks(mission: MissionConfiguration) -> None:
         "camera,band,x,y,pupil_x,pupil_y,dx_mas,dy_mas",
         "camera,x_arcsec,y_arcsec,x_mm,y_mm",
     )
-    for name, header, some in zip(names, columns, lines, strict=True):
-        text = "\n".join(["# Written by scripts/trace_optics.py with batoid 0.9.", header, *some]) + "\n"
+    for name, header, camera_lines in zip(names, columns, lines, strict=True):
+        text = "\n".join(["# Written by scripts/trace_optics.py with batoid 0.9.", header, *camera_lines]) + "\n"
         (_TESTS / f"{name}.csv").write_text(text, encoding="utf-8")
 
 

@@ -138,12 +138,12 @@ def _ghosts(scene: Scene) -> list[_Ghost]:
         if row["band"] == scene.band.name:
             numbers = [float(row[name]) for name in ("distance", "centre", "radius_mm", "passed")]
             rows.setdefault((row["first"], row["second"]), []).append(numbers)
-    found = []
+    ghosts = []
     for (first, _), lines in rows.items():
         distance, centre, radius, passed = np.array(lines).T
         share = reflectance["glass"] * reflectance["detector" if first == "detector" else "glass"]
-        found.append(_Ghost(distance, centre, np.maximum(radius / pixel, _SMALLEST), share * passed))
-    return found
+        ghosts.append(_Ghost(distance, centre, np.maximum(radius / pixel, _SMALLEST), share * passed))
+    return ghosts
 
 
 def parameters(scene: Scene) -> tuple[Annuli, float]:
@@ -156,17 +156,17 @@ def parameters(scene: Scene) -> tuple[Annuli, float]:
         return Annuli(*np.zeros((4, 0))), _hole(scene)
     first_column, first_row = (scene.window.column, scene.window.row) if scene.window is not None else (0, 0)
     x, y = _focal_plane(detector, lights.column + first_column, lights.row + first_row)
-    every = detectors(scene.section.removeprefix("ext."), scene.mission)
-    reach = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in every)
-    far = np.hypot(x, y) / reach
+    all_detectors = detectors(scene.section.rpartition(".")[2], scene.mission)
+    reach = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in all_detectors)
+    distance_ratio = np.hypot(x, y) / reach
     for ghost in _ghosts(scene):
-        centre, radius, passed = (np.interp(far, ghost.distance, one) for one in ghost[1:])
+        centre, radius, passed = (np.interp(distance_ratio, ghost.distance, values) for values in ghost[1:])
         column, row = _pixels(detector, centre * x, centre * y)
-        level = _level(_Ghost(far, centre, radius, passed), 1.0, scene) * lights.electrons
-        seen = level > scene.noticeable_mean_electrons
+        level = _level(_Ghost(distance_ratio, centre, radius, passed), 1.0, scene) * lights.electrons
+        is_visible = level > scene.noticeable_mean_electrons
         for place, side in ((column, detector.nx), (row, detector.ny)):
-            seen &= (place > -radius - 1.0) & (place < side + radius)
-        parts.append(np.stack([column - first_column, row - first_row, radius, level])[:, seen])
+            is_visible &= (place > -radius - 1.0) & (place < side + radius)
+        parts.append(np.stack([column - first_column, row - first_row, radius, level])[:, is_visible])
     return Annuli(*np.concatenate([np.zeros((4, 0)), *parts], axis=1)), _hole(scene)
 
 
