@@ -181,6 +181,26 @@ def test_seeing_is_drawn_for_each_exposure():
     assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]
 
 
+def test_clouds_dim_the_zero_point(tmp_path):
+    """By the extinction of the column `clouds`, for surveys and tables of pointings; sky and seeing do not change."""
+    clear, cloudy = (survey_of("lsst", 6, start=60850.0, bands=("lsst_r",), clouds=mag) for mag in (0.0, 0.5))
+    rows = [planned_exposures.table(one, [MISSION] * 6, seed=5).to_pylist() for one in (clear, cloudy)]
+    extinctions = [row["clouds"] for row in rows[1]]
+    assert len(set(extinctions)) == 6
+    assert 0.1 < np.mean(extinctions) < 0.9
+    for without, with_clouds in zip(*rows, strict=True):
+        assert without["clouds"] == 0.0
+        assert with_clouds["zero_point"] == pytest.approx(without["zero_point"] - with_clouds["clouds"], abs=1e-12)
+        assert {**with_clouds, "clouds": 0.0, "zero_point": 0.0} == {**without, "zero_point": 0.0}
+    given = read(tmp_path, f"{HEAD},clouds,zero_point\n{ROW},0.3,28.0\n{ROW},,\n")
+    table = planned_exposures.table(given, [MISSION] * 2).to_pylist()
+    assert table[0]["zero_point"] == pytest.approx(28.0 - table[0]["clouds"])
+    assert table[0]["clouds"] > 0.0
+    assert table[1]["clouds"] == 0.0
+    with pytest.raises(BadInput, match=r"line 2: clouds = 6\.0 is outside 0 to 5"):
+        read(tmp_path, f"{HEAD},clouds\n{ROW},6\n")
+
+
 def test_a_row_without_a_date_is_observed_at_night(tmp_path):
     """The field is near the Sun on the first date, where zodiacal light would be 20 times a dark sky."""
     (bare,) = read(tmp_path, "channel,camera,band,ra,dec\nEXT,lsstcam,lsst_r,100.0,20.0\n")

@@ -10,7 +10,7 @@ from astropy.time import Time
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION, small
-from truesky.render.camera import detectors
+from truesky.render.camera import detectors, pointing
 from truesky.render.products import fits_files
 from truesky.request.accuracy import SURVEY
 
@@ -116,3 +116,26 @@ def test_rdnoise_under_a_bright_sky(tmp_path):
         of_detector = np.mean(one.scene.amplifier_values("read_noise", "electron"))
         assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
         assert units[0].header["RDNDRAWN"] == 0.0
+
+
+def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
+    """The truth image of the sky has its gradient; the rate in the header is that in the middle of the detector."""
+    detector = small("lsstcam", "R34_S21", 128)
+    none = fields.galaxies([], []), fields.stars([], [])
+    exposed = {
+        "channel": "EXT", "camera": "lsstcam", "band": "lsst_r", "exposure_time_s": 200.0, "sky": 34.0, "seeing": 0.7,
+        "clouds": 0.25, "sky_slope_x": 0.2, "sky_slope_y": -0.1,
+    }  # fmt: skip
+    tables = none[0], fields.fluxes(none[0], "lsst_r", []), none[1], fields.fluxes(none[1], "lsst_r", [])
+    one = fields.rendered(exposed, detector, tables, MISSION, SURVEY, truth=("sky",))
+    x, y = (axis[0] / 3600.0 for axis in pointing.outline((detector,)))
+    middle, lower_left, lower_right, upper_right, upper_left = 34.0 * (1.0 + 0.2 * x - 0.1 * y)
+    with science(one, tmp_path) as units:
+        assert units[0].header["CLOUDS"] == 0.25
+        assert units[0].header["SKYRATE"] == pytest.approx(middle)
+    sky = np.asarray(one.maps["sky"], float) / 200.0
+    # At this distance from the boresight, distortion makes pixels smaller by 0.4 %.
+    assert sky.mean() == pytest.approx(middle, rel=6e-3)
+    across = sky[:, 64:].mean() - sky[:, :64].mean(), sky[64:].mean() - sky[:64].mean()
+    edges = lower_right + upper_right - lower_left - upper_left, upper_left + upper_right - lower_left - lower_right
+    assert across == pytest.approx([edge / 4.0 for edge in edges], rel=0.05)
