@@ -45,10 +45,10 @@ EFFECTS = (
     "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map",
     "detector_crosstalk", "dispersed_sky", "drift", "edge_displacement", "filter_ghosts", "fringes", "ghosts",
     "group_noise", "hot_pixels", "illumination", "injection_noise", "intra_pixel", "ipc", "lamp_response",
-    "lens_ghosts", "macc", "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence", "pixel_area", "pixel_response",
-    "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity", "read_noise", "readout_cosmic_rays",
-    "readout_trail", "reset_level", "satellite_trails", "serial_cti", "serial_loss", "shutter", "signal_adc",
-    "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
+    "lens_ghosts", "macc", "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence",
+    "pixel_area", "pixel_response", "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity",
+    "read_noise", "readout_cosmic_rays", "readout_trail", "reset_level", "satellite_trails", "serial_cti",
+    "serial_loss", "shutter", "signal_adc", "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
 # Effects that "all" in `effects.off` does not switch off, because no image is valid without them.
 ALWAYS_ON = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")

@@ -36,10 +36,10 @@ _CONVERTERS = ("adc", "signal_adc")
 _GRISM = "dispersed_sky"
 # Name of the truth map to which each detector effect contributes, by name of the effect.
 _MAP_OF_EFFECT = {
-    "ghosts": "ghosts", "filter_ghosts": "ghosts", "lens_ghosts": "ghosts",
-    "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky", "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
-    "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
-    "persistence": "persistence", "macc": "ramp", "trap_pumping": "dipoles",
+    "ghosts": "ghosts", "filter_ghosts": "ghosts", "lens_ghosts": "ghosts", "background": "sky",
+    "dispersed_sky": "sky", "pixel_area": "sky", "straylight": "sky", "fringes": "sky",
+    "satellite_trails": "satellites", "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays",
+    "ramp_cosmic_rays": "cosmic_rays", "persistence": "persistence", "macc": "ramp", "trap_pumping": "dipoles",
 }  # fmt: skip
 
 

@@ -46,7 +46,7 @@ ORDER = (
     ("ghosts", "filter_ghosts", "background"),
     ("background", "pixel_area", "pixel_response"),
     # A fixed part of the sky's light, which vignetting dims as it does satellites'.
-    ("satellite_trails", "background", "pixel_area", "fringes", "illumination", "poisson"),
+    ("lens_ghosts", "satellite_trails", "background", "pixel_area", "fringes", "illumination", "poisson"),
     ("readout_trail", "poisson"),
     ("calibration_lamp", "pixel_response"),
     # All charge fills wells before it is read; what hits the register meanwhile misses the way down the columns.
