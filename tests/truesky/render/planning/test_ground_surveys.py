@@ -175,7 +175,7 @@ def test_seeing_is_drawn_for_each_exposure():
     own = [replace(found[0], seeing=1.4, zero_point=28.0, sky=5.0)]
     (row,) = planned_exposures.table(own, [MISSION]).to_pylist()
     assert (row["seeing"], row["zero_point"], row["sky"]) == (1.4, 28.0, 5.0)
-    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam in lsst_r .*arcsec = 0.1\d+ is outside"):
+    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam in lsst_r .*arcsec = 0\.\d+ is outside"):
         planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])
     own = replace(found[0], seeing=0.1, psf="own.psf")
     assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]

@@ -130,6 +130,7 @@ def test_zodiacal_light_is_brightest_in_the_ecliptic():
             night_sky.sky_rate(night("lsstcam", "lsst_g")[1], ra, dec, t, MISSION)
             for t in 60940.0 + np.arange(0.0, 1.0, 0.01)
             if observatory.moon_altitude(t, site) < 0
+            and observatory.sun_direction(float(t), site)[0] < -20.0
             and abs(observatory.airmass_and_zenith(ra, dec, t, site)[0] - 1.2) < 0.1
         ]
         found.append(np.mean(rates))
