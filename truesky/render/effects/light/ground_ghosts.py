@@ -172,17 +172,14 @@ def parameters(scene: Scene) -> tuple[Annuli, float]:
 
 def _focal_plane(detector: Detector, column: Float, row: Float) -> tuple[Float, Float]:
     """Return the positions of pixels in the focal plane, arcsec."""
-    turn, scale = np.radians(detector.rotation), detector.pixel_scale
-    u, v = scale * (column - (detector.nx - 1) / 2), scale * (row - (detector.ny - 1) / 2)
-    return detector.x + np.cos(turn) * u - np.sin(turn) * v, detector.y + np.sin(turn) * u + np.cos(turn) * v
+    scale = detector.pixel_scale
+    return detector.to_focal_plane(scale * (column - (detector.nx - 1) / 2), scale * (row - (detector.ny - 1) / 2))
 
 
 def _pixels(detector: Detector, x: Float, y: Float) -> tuple[Float, Float]:
     """Return the columns and rows of a detector at positions in the focal plane in arcsec, as `_focal_plane`."""
-    turn, scale = np.radians(detector.rotation), detector.pixel_scale
-    u, v = x - detector.x, y - detector.y
-    column = (np.cos(turn) * u + np.sin(turn) * v) / scale + (detector.nx - 1) / 2
-    return column, (np.cos(turn) * v - np.sin(turn) * u) / scale + (detector.ny - 1) / 2
+    along, up = detector.from_focal_plane(x - detector.x, y - detector.y)
+    return along / detector.pixel_scale + (detector.nx - 1) / 2, up / detector.pixel_scale + (detector.ny - 1) / 2
 
 
 def _contribution(scene: Scene) -> float:
