@@ -457,9 +457,21 @@ class SkyMesh:
 
     @classmethod
     def from_image(cls, image: Float, used: Bool, pattern: SkyPattern | None = None) -> SkyMesh:
-        """Measure the sky of an image [ny, nx], divided by a pattern, in the pixels that are True in `used`.
+        """Measure the sky of an image.
 
-        A square without such pixels gets the level of the nearest square; if all are empty, the sky is 0.
+        Parameters
+        ----------
+        image : float array, shape (ny, nx)
+            Image with the sky.
+        used : bool array, shape (ny, nx)
+            True for pixels in which the sky is measured.
+        pattern : SkyPattern, optional
+            Pattern by which the image is divided before.
+
+        Returns
+        -------
+        SkyMesh
+            The sky. A square without used pixels has the level of the nearest square; if all are empty, the sky is 0.
         """
         edges = [np.linspace(0, n, max(n // _MESH, 1) + 1).round().astype(int) for n in image.shape]
         mesh = np.zeros((len(edges[0]) - 1, len(edges[1]) - 1))

@@ -205,9 +205,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     without this card, flats of ground cameras are assumed to contain it.
     """
     shape = (frame.scene.ny, frame.scene.nx)
-    if not os.path.exists(path):
-        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
-        raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
+    _refuse_missing(path, kind)
     user_plane, user_header = external.read_planes(
         user_files.check_file(path, "master frame"), "", "master frame", _MAX_PIXELS
     )
@@ -232,6 +230,12 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
         raise BadInput(f"{user_files.format_path(path)}: EXPTIME = {seconds} must be a number of seconds from 0")
     vignetted = bool(header.get("VIGNETTE", False))
     return CombinedFrame(mean, uncertainty, count, vignetted), float(seconds)
+
+
+def _refuse_missing(path: Path, kind: str) -> None:
+    if not os.path.exists(path):
+        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
+        raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
 
 
 def _refuse_other_shape(path: Path, shape: tuple[int, ...], expected: tuple[int, int]) -> None:
@@ -280,6 +284,9 @@ def read_masters(
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     bits = np.zeros(shape, np.uint8) if flags is None else flags
     count = calibration.neutral_master(shape, 0.0).count
+    for kind in KINDS:
+        if kind not in without:
+            _refuse_missing(master_path(folder, frame, kind), kind)
     # Begin with the flat, whose flags take the most memory.
     for kind in reversed(KINDS):
         if kind in without:

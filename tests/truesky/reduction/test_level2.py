@@ -74,7 +74,9 @@ def reduced(ground, out, *more, wanted=0):
 
 def of(folder, camera, side, **field):
     ground = ground_frames.made(folder, camera, side, **field)
-    path = reduced(ground, folder / "level2", "--level2")
+    # Fringes need a master of several exposures.
+    without = ("fringes",) if "fringes" in ground.frame.applied else ()
+    path = reduced(ground, folder / "level2", "--level2", "--without", "dark", *without)
     return Made(ground, folder, path, files.read_image(path))
 
 

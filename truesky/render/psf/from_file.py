@@ -159,7 +159,19 @@ def read(path: Path, detector: Detector, band: Passband | None, system: WCS) -> 
 def check(path: Path, detector: Detector, band: Passband | None) -> None:
     """Check that `read` can read the PSF of a detector in a band from a user's file, without resampling a cube.
 
-    BadInput is raised as by `read`.
+    Parameters
+    ----------
+    path : Path
+        FITS file with a cube of PSF images, or file of PSFEx.
+    detector : Detector
+        The detector.
+    band : Passband or None
+        The passband, or None if it is unknown.
+
+    Raises
+    ------
+    BadInput
+        If `read` would raise it.
     """
     data, header = _read_planes(path)
     try:
