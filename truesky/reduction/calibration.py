@@ -13,7 +13,7 @@ the brighter-fatter effect and ghosts are not corrected.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -316,14 +316,15 @@ def calibrate(
         used[rows] &= has_value
         signal = image[rows] - masters.dark.mean[rows] * time
         image[rows] = np.where(has_value, signal, 0.0) / np.where(has_value, response, 1.0)
-    if pattern is not None:
-        _subtract_pattern(image, pattern, used)
+    subtracted = None if pattern is None else _subtract_pattern(image, pattern, used)
     floor = float(np.median(_amplifier_read_variance(scene, applied)))
     sky, weight = SkyMesh.from_image(image, used), np.zeros(image.shape, np.float32)
     for rows in _strips(scene.ny):
         light = _expected_light(image, used, sky, floor, rows)
         response = _response(masters, scene, applied, rows)
-        variance = np.maximum(light * response + masters.dark.mean[rows] * time, 0.0)
+        # What was subtracted has shot noise, too.
+        counted = light if subtracted is None else light + subtracted(rows)
+        variance = np.maximum(counted * response + masters.dark.mean[rows] * time, 0.0)
         variance += reading_variance(scene, applied, rows)
         variance += ((1.0 - time / masters.dark_time) * masters.bias.uncertainty[rows]) ** 2
         variance += (masters.dark.uncertainty[rows] * time) ** 2
@@ -342,8 +343,8 @@ def _response(masters: Masters, scene: Scene, applied: Container[str], rows: sli
     return np.asarray(flat * (1.0 if masters.flat.vignetted else illumination_map(scene, applied, rows)), float)
 
 
-def _subtract_pattern(image: Float, pattern: SkyPattern, used: Bool) -> None:
-    """Subtract the change of the sky by a pattern from `image` in place.
+def _subtract_pattern(image: Float, pattern: SkyPattern, used: Bool) -> Callable[[slice], Float]:
+    """Subtract the change of the sky by a pattern from `image` in place, and return it as a function of the rows.
 
     The sky is measured in the pixels that are True in `used`, after division by the pattern. Fringes are scaled to
     those in the image.
@@ -352,8 +353,13 @@ def _subtract_pattern(image: Float, pattern: SkyPattern, used: Bool) -> None:
     if pattern.fringes is not None:
         pattern = replace(pattern, strength=_fringe_strength(image, pattern, sky, used))
         sky = SkyMesh.from_image(image, used, pattern)
+
+    def change(rows: slice) -> Float:
+        return np.asarray(sky.rows(rows) * (pattern.factor(rows) - 1.0), float)
+
     for rows in _strips(len(image)):
-        image[rows] -= sky.rows(rows) * (pattern.factor(rows) - 1.0)
+        image[rows] -= change(rows)
+    return change
 
 
 def _fringe_strength(image: Float, pattern: SkyPattern, sky: SkyMesh, used: Bool) -> float:
