@@ -30,7 +30,7 @@ from truesky.explore import guard
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import from_files, stars_from_files
 from truesky.render import archive
-from truesky.render.camera import detectors
+from truesky.render.camera import astrometry, detectors
 from truesky.render.planning import ground_surveys
 from truesky.render.psf import from_file
 from truesky.render.sources import ephemerides, galaxy_stamps
@@ -188,7 +188,7 @@ def detector():
 
 
 def of_psf(path):
-    from_file.read(path, detector(), passbands.load("euclid_vis"))
+    from_file.read(path, detector(), passbands.load("euclid_vis"), astrometry.wcs(detector(), 150.0, 2.0, 20.0))
 
 
 def of_pointings(path):
@@ -285,6 +285,7 @@ SCALE = {
     "CRVAL3": 400.0,
     "CDELT3": 350.0,
     "PIXEL": False,
+    "PSFFRAME": "SKY",
 }
 PSFEX = {"POLNAXIS": 2, "POLNGRP": 1, "POLDEG1": 1, "POLNAME1": "X_IMAGE", "POLNAME2": "Y_IMAGE", "PSF_SAMP": 0.5}
 PSFEX |= {"POLZERO1": 1000.0, "POLZERO2": 1000.0, "POLSCAL1": 900.0, "POLSCAL2": 900.0, "POLGRP1": 1, "POLGRP2": 1}

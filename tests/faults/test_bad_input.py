@@ -260,7 +260,10 @@ OWN = {
         '[stars.catalogue]\ncolumns = {{ ra = "ra", dec = "dec", mag_h = "h", teff = "t" }}\nfile = {}\n',
         lambda r: request_checks.star_files(r.stars),
     ),
-    "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: from_file.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
+    "psf": (
+        POINT + "[psf]\neuclid_vis = {}\n",
+        lambda r: from_file.check(Path(dict(r.psfs)["euclid_vis"]), None, None),
+    ),
     "solar_system.bodies": (POINT + "[solar_system]\nbodies = {}\n", lambda r: keys.ephemeris_files(r.bodies, SKY)),
     "structure.stamps": (
         POINT + "[structure]\nstamps = {{ file = {} }}\n",

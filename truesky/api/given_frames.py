@@ -311,7 +311,7 @@ def frame(
         bits = mistakes.read(_read_plane, file, flags, "flags", image.shape)
     pixel_scale = frame_wcs.pixel_scale(system, nx, ny)
     psf = _check_psf(psf) if isinstance(psf, str | Path) else psf
-    model = frame_psf.load_psf(psf, nx, ny, pixel_scale)
+    model = frame_psf.load_psf(psf, nx, ny, pixel_scale, system)
     if weights is not None:
         planes["weight"] = weights[1]
     if bits is not None:

@@ -82,6 +82,33 @@ class PsfImage:
     samples: int
     light: float
 
+    def write(self, path: str | Path) -> Path:
+        """Write the image to a FITS file that `[psf]` of a request and `truesky.frame` read.
+
+        The header states the axes (PSFFRAME = 'PIXELS'), the spacing of the samples, and whether they are averaged over
+        a pixel (PIXEL). An existing file is replaced.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        file, step = Path(path), 1.0 / self.samples
+        cards: tuple[images.Card, ...] = (
+            ("PSFFRAME", "PIXELS", "axes: columns and rows of the detector"),
+            ("CDELT1", step, "[pixel] spacing of the samples"),
+            ("CDELT2", step, "[pixel] spacing of the samples"),
+            ("CUNIT1", "pixel", "unit of CDELT1"),
+            ("PIXEL", self.samples == 1, "averaged over the pixel of the detector"),
+        )
+        images.write_images(file, [images.Image(self.image.astype(np.float32), cards)])
+        return file
+
 
 class SkyImage:
     """Image of a place on the sky, with its truth. `Lake.render` returns it.

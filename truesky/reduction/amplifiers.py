@@ -94,7 +94,7 @@ def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
     Parameters
     ----------
     frame : float array, shape (ny, nx)
-        Measured electrons above the bias.
+        Measured electrons above the bias. The array is overwritten by the result, to save memory.
     scene : Scene
         Exposure of the detector with its mission parameters, which define both effects exactly.
     effects : container of str
@@ -104,7 +104,7 @@ def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
     Returns
     -------
     float array, shape (ny, nx)
-        Corrected electrons, 0 in pixels that no amplifier reads.
+        `frame` with corrected electrons, 0 in pixels that no amplifier reads.
     """
     table = crosstalk.coefficients(scene) if crosstalk.EFFECT.name in effects else None
     curve = nonlinearity.parameters(scene) if nonlinearity.EFFECT.name in effects else None
@@ -117,15 +117,16 @@ def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
 
 
 def _apply_by_rows(frame: Float, scene: Scene, change: Callable[[Float], Float]) -> Float:
-    """Apply `change` to the pixels of a frame, arranged by the q amplifiers, and return the changed frame [ny, nx].
+    """Apply `change` to the pixels of a frame [ny, nx], arranged by the q amplifiers, in place, and return the frame.
 
     `change` gets and returns arrays [q, rows, columns] in which the same position is read at the same time by all
     amplifiers. Pixels that no amplifier reads become 0.
     """
     layout = scene.layout
     if layout is None:
-        return np.asarray(assemble_frame(change(split_frame(frame, scene)), scene))
-    out = np.zeros(frame.shape)
+        frame[:] = assemble_frame(change(split_frame(frame, scene)), scene)
+        return frame
+    frame[layout.unread_pixels] = 0.0
     for first in range(0, layout.height, _ROWS):
         rows = slice(first, min(first + _ROWS, layout.height))
         changed_planes = change(
@@ -134,5 +135,5 @@ def _apply_by_rows(frame: Float, scene: Scene, change: Callable[[Float], Float])
             )
         )
         for q, (amplifier, plane) in enumerate(zip(layout.amplifiers, changed_planes, strict=True)):
-            layout.to_detector_axes(out[amplifier.pixels.slices], q)[rows] = plane
-    return out
+            layout.to_detector_axes(frame[amplifier.pixels.slices], q)[rows] = plane
+    return frame

@@ -1,20 +1,20 @@
 """Calibrate a frame of a CCD: subtract the contributions of the detector, and divide by its response::
 
     counted = corrected(electrons - bias) - dark current x exposure time
-    light = counted / (flat x illumination) - fringes of the sky
+    light = counted / (flat x illumination) - sky x pattern
 
 Here `corrected` removes crosstalk and nonlinearity of the amplifiers. A frame is calibrated in strips of rows to limit
 memory.
 
-Charge transfer inefficiency, the brighter-fatter effect and ghosts are not corrected. The varying area of pixels on the
-sky is not corrected either, because it does not change the total counts of a star. A flat that includes the pixel area
-would make the sky uniform, but the fluxes of stars wrong. A resampling program gets the area from the WCS.
+The pattern contains the fringes of the sky and the varying area of pixels on the sky. It is subtracted and not divided,
+because sources have neither: the counts of a star do not depend on the area of a pixel. Charge transfer inefficiency,
+the brighter-fatter effect and ghosts are not corrected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from lake_schema.arrays import Array, Bool, Float, Float32
 from truesky.reduction import amplifiers
 from truesky.reduction.combining import CombinedFrame
 from truesky.render.effects.charge import pixel_borders
-from truesky.render.effects.light import illumination
+from truesky.render.effects.light import illumination, pixel_area
 from truesky.render.effects.scene import Scene
 
 # Bits of a pixel in the flag map (extension FLG of a calibrated image); the constant FLAGS has their meanings.
@@ -61,6 +61,8 @@ _NEIGHBOURHOOD = 9
 _SOURCE_SIGMA = 4.0
 # Radius in pixels at which the smoothing Gaussian is truncated.
 _SMOOTHING_REACH = 4
+# Pixels farther from the sky than this multiple of the scatter do not contribute to the strength of fringes.
+_FRINGE_SIGMA = 3.0
 # Number of detector rows that are calibrated at a time, to limit memory.
 _ROWS = 512
 
@@ -82,6 +84,8 @@ class Masters:
     dark_time : float
         Mean exposure time of the dark frames in seconds, infinite if unknown. It is needed because the noise of the
         bias, which was subtracted from the darks, is also in the dark current.
+    fringes : float32 array, shape (ny, nx), optional
+        Fringes in the band as a fraction of the sky; None if they are not corrected.
     """
 
     bias: CombinedFrame
@@ -89,6 +93,37 @@ class Masters:
     flat: CombinedFrame
     flags: Array
     dark_time: float = np.inf
+    fringes: Float32 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SkyPattern:
+    """Pattern of the sky on a detector that sources do not have.
+
+    Attributes
+    ----------
+    fringes : float32 array, shape (ny, nx), or None
+        Fringes as a fraction of the sky; None if they are not corrected.
+    strength : float
+        Factor of `fringes`: light of the lines that cause fringes relative to that of the sky changes during a night.
+    area : (float array, float array, float array) or None
+        Columns, rows and coefficients of the change of the pixel area on the sky, the arguments of
+        `pixel_area.area_change`; None if the area is not corrected.
+    """
+
+    fringes: Float32 | None = None
+    strength: float = 1.0
+    area: tuple[Float, Float, Float] | None = None
+
+    def factor(self, rows: slice) -> Float | float:
+        """Return the sky in the pixels of some rows divided by the sky without fringes in a pixel at the boresight."""
+        factor: Float | float = 1.0
+        if self.area is not None:
+            u, v, stretch = self.area
+            factor = 1.0 + pixel_area.area_change(u, v[rows], stretch)
+        if self.fringes is not None:
+            factor = np.asarray(factor * (1.0 + self.strength * self.fringes[rows]), float)
+        return factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +134,7 @@ class ReducedImage:
     ----------
     image : float32 array, shape (ny, nx)
         Light including the sky, in electrons, electrons per second or counts. Pixels without data have no meaningful
-        value: 0, or minus the fringes if fringes were subtracted.
+        value.
     weight : float32 array, shape (ny, nx)
         Inverse variance in the inverse square of the image's unit; 0 for bad pixels.
     flags : uint8 array, shape (ny, nx)
@@ -234,14 +269,14 @@ def calibrate(
     scene: Scene,
     applied: Container[str],
     unit: float = 1.0,
-    fringes: Float32 | None = None,
+    pattern: SkyPattern | None = None,
 ) -> ReducedImage:
     """Calibrate a frame of a CCD.
 
     Parameters
     ----------
     electrons : float array, shape (ny, nx)
-        Electrons of each pixel above the level of the overscan.
+        Electrons of each pixel above the level of the overscan. The array is overwritten, to save memory.
     saturated : bool array, shape (ny, nx)
         True for saturated pixels, which get the flag SATURATED and the weight 0.
     masters : Masters
@@ -253,14 +288,14 @@ def calibrate(
         only if they are among them. Readout noise is included in the weights only if it is among them.
     unit : float, optional
         Number by which electrons are divided: 1 for electrons, the exposure time for e-/s, the gain for ADU.
-    fringes : float32 array, shape (ny, nx), optional
-        Fringe pattern as a fraction of the sky. The pattern times the sky level is subtracted; None to skip this.
+    pattern : SkyPattern, optional
+        Fringes and pixel area. Their change of the sky is subtracted; None to skip this.
 
     Returns
     -------
     ReducedImage
         The calibrated image. Pixels without data, with response 0 or below, or with NaN have the weight 0. Their value
-        is 0, or minus the fringes if fringes are subtracted.
+        is 0, or minus the subtracted pattern of the sky.
 
     Notes
     -----
@@ -268,10 +303,11 @@ def calibrate(
     light, so that weighted means are unbiased.
     """
     time = scene.exposure_time_s
-    image = amplifiers.undo_effects(electrons - masters.bias.mean, scene, applied)
-    del electrons
+    electrons -= masters.bias.mean
+    image = amplifiers.undo_effects(electrons, scene, applied)
     flags = masters.flags | _edge_flags(scene, applied)
     np.bitwise_or(flags, np.uint8(SATURATED), out=flags, where=saturated)
+    del saturated
     flags[amplifiers.unread_pixels(scene)] = NO_DATA
     used = flags & ~np.uint8(GOOD) == 0
     for rows in _strips(scene.ny):
@@ -280,14 +316,15 @@ def calibrate(
         used[rows] &= has_value
         signal = image[rows] - masters.dark.mean[rows] * time
         image[rows] = np.where(has_value, signal, 0.0) / np.where(has_value, response, 1.0)
-    if fringes is not None:
-        _subtract_fringes(image, fringes, used)
+    subtracted = None if pattern is None else _subtract_pattern(image, pattern, used)
     floor = float(np.median(_amplifier_read_variance(scene, applied)))
     sky, weight = SkyMesh.from_image(image, used), np.zeros(image.shape, np.float32)
     for rows in _strips(scene.ny):
         light = _expected_light(image, used, sky, floor, rows)
         response = _response(masters, scene, applied, rows)
-        variance = np.maximum(light * response + masters.dark.mean[rows] * time, 0.0)
+        # What was subtracted has shot noise, too.
+        counted = light if subtracted is None else light + subtracted(rows)
+        variance = np.maximum(counted * response + masters.dark.mean[rows] * time, 0.0)
         variance += reading_variance(scene, applied, rows)
         variance += ((1.0 - time / masters.dark_time) * masters.bias.uncertainty[rows]) ** 2
         variance += (masters.dark.uncertainty[rows] * time) ** 2
@@ -306,14 +343,45 @@ def _response(masters: Masters, scene: Scene, applied: Container[str], rows: sli
     return np.asarray(flat * (1.0 if masters.flat.vignetted else illumination_map(scene, applied, rows)), float)
 
 
-def _subtract_fringes(image: Float, fringes: Float32, used: Bool) -> None:
-    """Subtract `fringes` (a fraction of the sky) times the sky level from `image` in place.
+def _subtract_pattern(image: Float, pattern: SkyPattern, used: Bool) -> Callable[[slice], Float]:
+    """Subtract the change of the sky by a pattern from `image` in place, and return it as a function of the rows.
 
-    The sky is measured in the pixels that are True in `used`, after division by 1 + `fringes`.
+    The sky is measured in the pixels that are True in `used`, after division by the pattern. Fringes are scaled to
+    those in the image.
     """
-    sky = SkyMesh.from_image(image / (1.0 + fringes), used)
+    sky = SkyMesh.from_image(image, used, pattern)
+    if pattern.fringes is not None:
+        pattern = replace(pattern, strength=_fringe_strength(image, pattern, sky, used))
+        sky = SkyMesh.from_image(image, used, pattern)
+
+    def change(rows: slice) -> Float:
+        return np.asarray(sky.rows(rows) * (pattern.factor(rows) - 1.0), float)
+
     for rows in _strips(len(image)):
-        image[rows] -= sky.rows(rows) * fringes[rows]
+        image[rows] -= change(rows)
+    return change
+
+
+def _fringe_strength(image: Float, pattern: SkyPattern, sky: SkyMesh, used: Bool) -> float:
+    """Return the factor by which the fringes of `pattern` fit an image best, by least squares.
+
+    Pixels far from the sky level `sky`, in units of the scatter, are left out. The result is 0 if no pixel is used or
+    the pattern has no fringes.
+    """
+    assert pattern.fringes is not None
+    plain, product, square = SkyPattern(area=pattern.area), 0.0, 0.0
+    for rows in _strips(len(image)):
+        level = sky.rows(rows) * plain.factor(rows)
+        good = used[rows] & (level > 0.0)
+        excess, fringes = image[rows][good] / level[good] - 1.0, pattern.fringes[rows][good].astype(float)
+        if not len(excess):
+            continue
+        middle = float(np.median(excess))
+        near = np.abs(excess - middle) < _FRINGE_SIGMA * 1.4826 * float(np.median(np.abs(excess - middle)))
+        fringes = fringes[near] - fringes[near].mean() if near.any() else fringes[near]
+        product += float((fringes * excess[near]).sum())
+        square += float((fringes**2).sum())
+    return product / square if square > 0.0 else 0.0
 
 
 def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
@@ -394,18 +462,30 @@ class SkyMesh:
     shape: tuple[int, int]
 
     @classmethod
-    def from_image(cls, image: Float, used: Bool) -> SkyMesh:
-        """Measure the sky of an image [ny, nx] in the pixels that are True in `used`.
+    def from_image(cls, image: Float, used: Bool, pattern: SkyPattern | None = None) -> SkyMesh:
+        """Measure the sky of an image.
 
-        A square without such pixels gets the level of the nearest square; if all are empty, the sky is 0.
+        Parameters
+        ----------
+        image : float array, shape (ny, nx)
+            Image with the sky.
+        used : bool array, shape (ny, nx)
+            True for pixels in which the sky is measured.
+        pattern : SkyPattern, optional
+            Pattern by which the image is divided before.
+
+        Returns
+        -------
+        SkyMesh
+            The sky. A square without used pixels has the level of the nearest square; if all are empty, the sky is 0.
         """
         edges = [np.linspace(0, n, max(n // _MESH, 1) + 1).round().astype(int) for n in image.shape]
         mesh = np.zeros((len(edges[0]) - 1, len(edges[1]) - 1))
         for i, (first_row, past_row) in enumerate(zip(edges[0][:-1], edges[0][1:], strict=True)):
+            rows = slice(first_row, past_row)
+            band = image[rows] if pattern is None else image[rows] / pattern.factor(rows)
             for j, (first_column, past_column) in enumerate(zip(edges[1][:-1], edges[1][1:], strict=True)):
-                values = image[first_row:past_row, first_column:past_column][
-                    used[first_row:past_row, first_column:past_column]
-                ]
+                values = band[:, first_column:past_column][used[rows, first_column:past_column]]
                 for _ in range(2):
                     middle = float(np.median(values)) if values.size else 0.0
                     spread = 1.4826 * float(np.median(np.abs(values - middle))) if values.size else 0.0

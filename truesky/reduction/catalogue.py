@@ -7,7 +7,8 @@ source.
 
 References
 ----------
-Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58 (sep).
+Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58 (sep). Windowed positions and their errors: manual of
+SourceExtractor (sextractor.readthedocs.io), section "Windowed positional parameters".
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import sep
 from astropy.wcs import WCS
 from scipy import ndimage
 
-from lake_schema.arrays import Array, Bool, Float
+from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.fits.ldac import ColumnData
 from truesky.reduction.calibration import NO_DATA, SATURATED, ReducedImage
@@ -40,6 +41,10 @@ _MIN_RADIUS = 1.75
 _EXACT = 0
 # Standard deviation of the Gaussian window for XWIN_IMAGE and YWIN_IMAGE, as a multiple of the half-light radius.
 _WINDOW = 2.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
+# Radius of this window in standard deviations, as in SourceExtractor.
+_WINDOW_RADIUS = 4.0
+# Largest number of pixels of all windows whose position errors are computed at the same time, to limit memory.
+_WINDOW_PIXELS = 1 << 20
 # Number of detected pixels for which sep reserves memory, as a fraction of the pixels of a tile.
 _PIXEL_STACK = 0.5
 # Largest number of objects into which sep may divide a source while deblending.
@@ -103,10 +108,11 @@ def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limi
     Returns
     -------
     dict of str to array
-        One value per source in each array, except `errors`, shape (3, n): the covariances xx, yy and xy of the position
-        errors in pixels^2. Positions are in pixels from 0, fluxes in units of the image, and `theta` is in radians.
-        The function `columns` converts these measurements to catalogue columns. Sources are in the order of the tiles,
-        beginning at the first row. The arrays are empty without sources.
+        One value per source in each array, except `errors` and `window_errors`, shape (3, n): the covariances xx, yy
+        and xy of the errors of (x, y) and of (xwin, ywin) in pixels^2. Positions are in pixels from 0, fluxes in units
+        of the image, and `theta` is in radians. The function `columns` converts these measurements to catalogue
+        columns. Sources are in the order of the tiles, beginning at the first row. The arrays are empty without
+        sources.
 
     Notes
     -----
@@ -129,13 +135,15 @@ def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limi
     half_light, _ = sep.flux_radius(
         above, *centres, _ISOPHOTES * shape[0], 0.5, normflux=np.maximum(flux, 1e-20), subpix=5, mask=masked
     )
-    xwin, ywin, _ = sep.winpos(above, *centres, np.maximum(_WINDOW * half_light, 0.5), mask=masked, subpix=_EXACT)
+    window = np.maximum(_WINDOW * half_light, 0.5)
+    xwin, ywin, _ = sep.winpos(above, *centres, window, mask=masked, subpix=_EXACT)
     bits = _flag_bits(segmentation, image.flags, len(sources))
     flags = _flags(sources["flag"], auto_flags | aperture[2], auto_flags, bits)
     pixel = np.rint(centres[1]).astype(int), np.rint(centres[0]).astype(int)
     return {
         "x": centres[0], "y": centres[1], "xwin": xwin, "ywin": ywin, "a": shape[0], "b": shape[1], "theta": shape[2],
         "errors": _errors(sources, flux / np.maximum(error, 1e-20)), "npix": sources["npix"],
+        "window_errors": _window_errors((above, noise, masked), gain, (xwin, ywin), window),
         "fwhm": _fwhm(above, segmentation, sources["peak"]),
         "flux_iso": sources["flux"], "flux_max": sources["peak"], "threshold": sources["thresh"], "kron": kron,
         "flux_auto": flux, "fluxerr_auto": error, "flux_aper": aperture[0], "fluxerr_aper": aperture[1],
@@ -214,6 +222,55 @@ def _errors(sources: Array, signal: Float) -> Float:
     return np.where(np.isfinite(errors).all(axis=0), errors, light_errors)
 
 
+def _window_errors(
+    maps: tuple[Array, Array, Bool], gain: float, positions: tuple[Float, Float], window: Float
+) -> Float:
+    """Return the covariance of the errors of windowed positions in pixels^2: xx, yy and xy, float64[3, n].
+
+    Parameters
+    ----------
+    maps : (float array, float array, bool array), each of shape (ny, nx)
+        Image minus the sky, rms of the sky, and a mask that is True for pixels to ignore.
+    gain : float
+        Electrons per unit of the image.
+    positions : (float array, float array), each of shape (n,)
+        Windowed columns and rows, from 0.
+    window : float array, shape (n,)
+        Standard deviation of the Gaussian window of each source, pixels.
+
+    Returns
+    -------
+    float array, shape (3, n)
+        Covariances 4 sum(w^2 v d d') / sum(w I)^2, where w is the window, I the light, v the variance of a pixel and d
+        its distance from the position. If the light in the window is not positive, the variance is that of the window.
+    """
+    shape, out = maps[0].shape, np.zeros((3, len(window)))
+    half: Int = np.ceil(_WINDOW_RADIUS * window).astype(np.int64)
+    half = np.minimum(half, max(shape))
+    column, row = (np.rint(at).astype(np.int64) for at in positions)
+    for size in np.unique(half):
+        offset = np.arange(-size, size + 1)
+        every = np.flatnonzero(half == size)
+        step = max(_WINDOW_PIXELS // len(offset) ** 2, 1)
+        for first in range(0, len(every), step):
+            at = every[first : first + step]
+            x, y = column[at, None, None] + offset, row[at, None, None] + offset[:, None]
+            dx, dy = x - positions[0][at, None, None], y - positions[1][at, None, None]
+            x, y = np.broadcast_arrays(x, y)
+            inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+            pixel = np.clip(y, 0, shape[0] - 1), np.clip(x, 0, shape[1] - 1)
+            light, rms = (np.asarray(plane[pixel], float) for plane in maps[:2])
+            weight = np.exp(-0.5 * (dx**2 + dy**2) / window[at, None, None] ** 2)
+            weight *= inside & ~maps[2][pixel] & (dx**2 + dy**2 <= (_WINDOW_RADIUS * window[at, None, None]) ** 2)
+            variance = weight**2 * (rms**2 + np.maximum(light, 0.0) / gain)
+            total = (weight * light).sum(axis=(1, 2))
+            terms = np.stack([(variance * term).sum(axis=(1, 2)) for term in (dx**2, dy**2, dx * dy)])
+            is_bright = total > 0.0
+            largest = np.multiply.outer([1.0, 1.0, 0.0], window[at] ** 2)
+            out[:, at] = np.where(is_bright, 4.0 * terms / np.where(is_bright, total, 1.0) ** 2, largest)
+    return out
+
+
 def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
     """Return an estimate of the FWHM of each source in pixels.
 
@@ -267,6 +324,8 @@ def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[C
     ra, dec = astrometry.sky_of_pixel(system, sources["x"], sources["y"])
     ra_window, dec_window = astrometry.sky_of_pixel(system, sources["xwin"], sources["ywin"])
     long, short, angle = _axes(*sources["errors"])
+    window = _axes(*sources["window_errors"])
+    window_sky = _axes(*_sky_moments(system, sources))
     magnitudes = {
         kind: _magnitudes(sources[f"flux_{kind}"], sources[f"fluxerr_{kind}"], zero_point) for kind in ("auto", "aper")
     }
@@ -277,6 +336,10 @@ def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[C
         ("X_IMAGE", "D", "pixel", sources["x"] + 1.0), ("Y_IMAGE", "D", "pixel", sources["y"] + 1.0),
         ("XWIN_IMAGE", "D", "pixel", sources["xwin"] + 1.0), ("YWIN_IMAGE", "D", "pixel", sources["ywin"] + 1.0),
         ("ERRA_IMAGE", "E", "pixel", long), ("ERRB_IMAGE", "E", "pixel", short), ("ERRTHETA_IMAGE", "E", "deg", angle),
+        ("ERRAWIN_IMAGE", "E", "pixel", window[0]), ("ERRBWIN_IMAGE", "E", "pixel", window[1]),
+        ("ERRTHETAWIN_IMAGE", "E", "deg", window[2]),
+        ("ERRAWIN_WORLD", "E", "deg", window_sky[0]), ("ERRBWIN_WORLD", "E", "deg", window_sky[1]),
+        ("ERRTHETAWIN_WORLD", "E", "deg", window_sky[2]),
         ("ALPHA_J2000", "D", "deg", ra), ("DELTA_J2000", "D", "deg", dec),
         ("ALPHAWIN_J2000", "D", "deg", ra_window), ("DELTAWIN_J2000", "D", "deg", dec_window),
         ("FLUX_AUTO", "E", "count", sources["flux_auto"]), ("FLUXERR_AUTO", "E", "count", sources["fluxerr_auto"]),
@@ -293,10 +356,27 @@ def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[C
     ]  # fmt: skip
 
 
+def _sky_moments(system: WCS, sources: dict[str, Array]) -> Float:
+    """Return the covariance of the errors of windowed positions on the sky, deg^2: xx, yy and xy, float64[3, n].
+
+    x points east and y north. SourceExtractor counts ERRTHETAWIN_WORLD from x to y.
+    """
+    xx, yy, xy = sources["window_errors"]
+    derivative = astrometry.jacobian(system, sources["xwin"], sources["ywin"]) / 3600.0
+    (ux, uy), (vx, vy) = np.moveaxis(derivative, 0, -1)
+    # The derivative is that of the position to the west.
+    ux, uy = -ux, -uy
+    return np.stack([
+        ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy,
+        vx * vx * xx + 2.0 * vx * vy * xy + vy * vy * yy,
+        ux * vx * xx + (ux * vy + uy * vx) * xy + uy * vy * yy,
+    ])  # fmt: skip
+
+
 def _axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
     """Return semi-major axis, semi-minor axis and position angle of the error ellipse with these second moments.
 
-    Moments are in pixels^2, axes in pixels. The angle is in degrees from x to y.
+    Moments are in the square of the unit of the axes. The angle is in degrees from x to y.
     """
     middle, off = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))

@@ -11,14 +11,14 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lake_schema import __version__, user_files
-from lake_schema.arrays import Float
+from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from lake_schema.fits.images import Card, Image, read_images, write_images
@@ -29,16 +29,16 @@ from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry
 from truesky.render.channels import registry
-from truesky.render.effects.light import illumination
+from truesky.render.effects.light import illumination, pixel_area
 
 # Kinds of masters of a CCD.
 KINDS = ("bias", "dark", "flat")
 # Kinds of masters of an infrared detector, whose ramps have no bias.
 INFRARED_KINDS = ("dark", "linearity", "flat")
 # Names of corrections that a user can omit: corrections by masters, then corrections by mission parameters.
-CORRECTIONS = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "persistence")
+CORRECTIONS = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "pixel_area", "persistence")
 # Unit of each kind of master in FITS notation; a flat is dimensionless.
-_UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1"}
+_UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1", "fringes": ""}
 # Header cards that must be equal in a master and the frame to calibrate. SEED is the seed of all random numbers of the
 # simulation, on which the pixel pattern of a detector depends.
 SHARED_CARDS = ("INSTRUME", "DETECTOR", "SEED")
@@ -108,7 +108,7 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
     frame : Frame
         Frame to calibrate, or one of the frames that are combined to the master.
     kind : str
-        Kind of master: "bias", "dark", "flat" or "linearity".
+        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
 
     Returns
     -------
@@ -118,9 +118,10 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
     Notes
     -----
     File names begin with the channel, such as VIS or NISP-P. Names of ground cameras begin with the camera, because all
-    ground cameras share one channel; their flats also have the band. For cameras that the user defined, parts of the
-    name are joined by dots: with underscores, camera a_b in band c would have the same file as camera a in band b_c. A
-    dark of NISP is named by its readout mode (groups-reads-drops). Both channels of NISP use the same linearity file.
+    ground cameras share one channel; their flats and fringes also have the band. For cameras that the user defined,
+    parts of the name are joined by dots: with underscores, camera a_b in band c would have the same file as camera a in
+    band b_c. A dark of NISP is named by its readout mode (groups-reads-drops). Both channels of NISP use the same
+    linearity file.
     """
     exposure = frame.exposure
     if frame.scene.ramp:
@@ -129,7 +130,7 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
         return folder / "_".join(filter(None, (channel, detail, frame.detector, f"{kind}.fits")))
     if exposure.camera in SPACE_CAMERAS:
         return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
-    names = (exposure.camera, *((exposure.band,) if kind == "flat" else ()), frame.detector)
+    names = (exposure.camera, *((exposure.band,) if kind in ("flat", "fringes") else ()), frame.detector)
     return folder / f"{('_' if exposure.camera in CAMERAS else '.').join(names)}_{kind}.fits"
 
 
@@ -145,7 +146,7 @@ def write_master(
     combined : CombinedFrame
         Pixels of the master, their uncertainty and number of frames.
     kind : str
-        Kind of master: "bias", "dark", "flat" or "linearity".
+        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
     frames : sequence of Frame
         Frames that were combined, at least one; the header lists their exposures.
     extra_cards : sequence of Card, optional
@@ -156,7 +157,7 @@ def write_master(
         *(card for card in first.cards if card[0] in (*SHARED_CARDS, "CHANNEL", "MISSION", "TRUESKY")),
         ("IMAGETYP", f"master {kind}", "image type"),
         ("BUNIT", _UNITS[kind], "pixel unit"),
-        *((("VIGNETTE", _through_optics(first), "T if the flat includes vignetting"),) if kind == "flat" else ()),
+        *((("VIGNETTE", has_vignetting(first), "T if the flat includes vignetting"),) if kind == "flat" else ()),
         ("NCOMBINE", len(frames), "number of combined frames"),
         (
             "EXPTIME",
@@ -170,7 +171,7 @@ def write_master(
     write_images(path, [*units, Image(combined.count, (), "COUNT")])
 
 
-def _through_optics(flat: Frame) -> bool:
+def has_vignetting(flat: Frame) -> bool:
     """Return True if the light of the flat came through the telescope and is vignetted, as in a dome flat."""
     return illumination.EFFECT.name in flat.applied and registry.CHANNELS[flat.exposure.channel].on_ground
 
@@ -183,7 +184,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     path : Path
         File of `write_master`, or an image that the user made with another program.
     kind : str
-        Kind of master: "bias", "dark", "flat" or "linearity".
+        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
     frame : Frame
         Frame to calibrate.
 
@@ -207,9 +208,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     without this card, flats of ground cameras are assumed to contain it.
     """
     shape = (frame.scene.ny, frame.scene.nx)
-    if not os.path.exists(path):
-        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
-        raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
+    _refuse_missing(path, kind)
     user_plane, user_header = external.read_planes(
         user_files.check_file(path, "master frame"), "", "master frame", _MAX_PIXELS
     )
@@ -217,6 +216,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
         _refuse_other_shape(path, user_plane.shape, shape)
         vignetted = bool(user_header.get("VIGNETTE", registry.CHANNELS[frame.exposure.channel].on_ground))
         return _user_master(user_plane, 1.0 if kind == "flat" else 0.0, vignetted), np.inf
+    del user_plane
     units = read_images(path)
     header = {keyword: value for keyword, value, _ in units[0].cards}
     if header.get("IMAGETYP") != f"master {kind}" or len(units) != 4:
@@ -235,6 +235,12 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     return CombinedFrame(mean, uncertainty, count, vignetted), float(seconds)
 
 
+def _refuse_missing(path: Path, kind: str) -> None:
+    if not os.path.exists(path):
+        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
+        raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
+
+
 def _refuse_other_shape(path: Path, shape: tuple[int, ...], expected: tuple[int, int]) -> None:
     if shape != expected:
         raise BadInput(f"{user_files.format_path(path)}: {shape} pixels, the frame has {expected}")
@@ -248,11 +254,13 @@ def _user_master(values: Float, neutral: float, vignetted: bool) -> CombinedFram
     """
     defined = np.isfinite(values)
     mean = np.where(defined, values, neutral).astype(np.float32)
-    return CombinedFrame(mean, np.zeros(values.shape, np.float32), defined.astype(np.int16), vignetted)
+    return CombinedFrame(mean, np.broadcast_to(np.float32(0.0), values.shape), defined.astype(np.int16), vignetted)
 
 
-def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibration.Masters:
-    """Read the masters (bias, dark and flat) with which a frame of a CCD is calibrated.
+def read_masters(
+    folder: Path, frame: Frame, without: Sequence[str] = (), flags: Array | None = None
+) -> calibration.Masters:
+    """Read the masters (bias, dark, flat and fringes) with which a frame of a CCD is calibrated.
 
     Parameters
     ----------
@@ -261,12 +269,15 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> cal
     frame : Frame
         Frame to calibrate.
     without : sequence of str, optional
-        Kinds of masters that are not read: a flat is replaced by 1, a bias or dark by 0.
+        Kinds of masters that are not read: a flat is replaced by 1, a bias or dark by 0. Fringes are not read either if
+        the frame has none.
+    flags : uint8 array, shape (ny, nx), optional
+        Flag bits of an earlier call for the same detector and band; by default they are computed, which takes time.
 
     Returns
     -------
     calibration.Masters
-        The masters.
+        The masters, without the numbers of combined frames, to save memory.
 
     Raises
     ------
@@ -274,15 +285,26 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> cal
         If a file does not exist, or does not belong to the detector.
     """
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
+    bits = np.zeros(shape, np.uint8) if flags is None else flags
+    count = calibration.neutral_master(shape, 0.0).count
     for kind in KINDS:
+        if kind not in without:
+            _refuse_missing(master_path(folder, frame, kind), kind)
+    # Begin with the flat, whose flags take the most memory.
+    for kind in reversed(KINDS):
         if kind in without:
             combined[kind] = calibration.neutral_master(shape, 1.0 if kind == "flat" else 0.0)
-        else:
-            path = master_path(folder, frame, kind)
-            combined[kind], time = read_master(path, kind, frame)
-            dark_time = time if kind == "dark" else dark_time
-    flags = calibration.master_flags(shape, combined, without)
-    return calibration.Masters(combined["bias"], combined["dark"], combined["flat"], flags, dark_time)
+            continue
+        master, time = read_master(master_path(folder, frame, kind), kind, frame)
+        if flags is None:
+            bits |= calibration.master_flags(shape, {kind: master}, [other for other in KINDS if other != kind])
+        combined[kind] = replace(master, count=count)
+        dark_time = time if kind == "dark" else dark_time
+        del master
+    fringes = None
+    if "fringes" in frame.applied and "fringes" not in without:
+        fringes = read_master(master_path(folder, frame, "fringes"), "fringes", frame)[0].mean
+    return calibration.Masters(combined["bias"], combined["dark"], combined["flat"], bits, dark_time, fringes)
 
 
 def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[str]) -> tuple[Card, ...]:
@@ -328,9 +350,16 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
         ("CALXTALK", "crosstalk" in done, "T if crosstalk was corrected"),
         ("CALLIN", bool(_NONLINEARITY_EFFECTS & done), "T if nonlinearity was corrected"),
         ("CALFRING", "fringes" in done, "T if sky fringes were subtracted"),
+        ("CALAREA", corrects_area(frame, without), "T if the sky has the same pixel area everywhere"),
         ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "T if vignetting and shutter were corrected"),
         *flag_cards(),
     )
+
+
+def corrects_area(frame: Frame, without: Sequence[str]) -> bool:
+    """Return True if the pattern of pixel areas is subtracted from the sky: in frames of ground cameras with it."""
+    on_ground = registry.CHANNELS[frame.exposure.channel].on_ground
+    return on_ground and pixel_area.EFFECT.name in frame.applied - set(without)
 
 
 def flag_cards() -> tuple[Card, ...]:

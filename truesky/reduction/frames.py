@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.arrays import Bool, Float, Float32
+from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
@@ -21,13 +21,10 @@ from lake_schema.mission.published import read_back as mission_of
 from lake_schema.store import read
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.inputs import passband_from_facts
-from truesky.randomness import rng
 from truesky.reduction import amplifiers
 from truesky.render.camera import detectors
-from truesky.render.effects.light import fringes, pixel_area
 from truesky.render.effects.scene import Scene
 from truesky.render.exposure import scene_factory
-from truesky.render.exposure.rendered_detector import random_identity
 from truesky.render.planning import variants
 from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import read_back, sidecar_files
@@ -90,23 +87,6 @@ class Frame:
         levels = self._amplifier_values("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
         return amplifiers.pixels_at_least(adu, levels, self.scene)
-
-    def fringes(self) -> Float32 | None:
-        """Return the simulated fringe pattern as a fraction of the sky, float32[ny, nx].
-
-        The pattern is recomputed from the mission parameters and the seed in the header. The result is None if the
-        frame was simulated without fringes.
-        """
-        effect = fringes.EFFECT
-        if effect.name not in self.applied:
-            return None
-        _, amplitude, period = effect.parameters(self.scene)
-        generator = rng.stream(*random_identity(effect, self.exposure, self.detector, int(self.card("SEED"))))
-        zeros = np.zeros((self.scene.ny, self.scene.nx))
-        pattern = effect.apply(zeros, 1.0, amplitude, period, rng=generator)
-        if pixel_area.EFFECT.name in self.applied:
-            pattern /= pixel_area.apply(np.ones_like(pattern), 1.0, *pixel_area.parameters(self.scene)[1:])
-        return np.asarray(pattern, np.float32)
 
     @property
     def ramp(self) -> tuple[int, int, int]:

@@ -4,7 +4,8 @@
 
 Files of detector 3-4 of VIS are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and
 .._flat.fits (response; 1 if all light is counted). For each pixel, a file also has the uncertainty and the number of
-combined frames. A flat is divided by the light of its lamp, which is known from the mission parameters.
+combined frames. A flat is divided by the light of its lamp, which is known from the mission parameters. If a band has
+fringes, three or more exposures of the sky give .._fringes.fits (fraction of the sky).
 
 Files of detector DET22 of NISP are NISP-P_4-16-4_DET22_dark.fits (one for each readout mode: groups, reads, drops),
 NISP_DET22_linearity.fits and NISP-P_euclid_y_DET22_flat.fits (one for each band, for the mixture of lamps whose colour
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,32 +28,35 @@ from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.command_line import commands
-from truesky.reduction import amplifiers, calibration, files
+from truesky.reduction import amplifiers, calibration, files, fringe_masters
 from truesky.reduction import frames as lake_frames
 from truesky.reduction.combining import CombinedFrame, clipped_mean
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared import nisp
+from truesky.render.channels.image_types import SKY_TYPES
 from truesky.render.effects.light import calibration_lamp, illumination
 
 
 def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, CombinedFrame, list[Frame]]]:
-    """Combine the calibration frames of a CCD to master frames: a bias, a dark, and a flat of each band.
+    """Combine the frames of a CCD to masters: a bias, a dark, and for each band a flat and the fringes of the sky.
 
-    The dark is omitted if there are no dark frames, and the flats if there are no flat frames.
+    The dark is omitted if there are no dark frames, and the flats if there are no flat frames. The fringes of a band
+    are omitted if it has no fringes, no flat, or fewer than three exposures of the sky.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames of the detector, at least one; all image types except bias, dark and flat are ignored.
+        Frames of the detector, at least one.
     scratch : Path
         Folder for temporary files, which take 4 bytes per pixel and frame.
 
     Yields
     ------
     kind : str
-        Kind of master: "bias", "dark" or "flat".
+        Kind of master: "bias", "dark", "flat" or "fringes".
     master : CombinedFrame
-        The master: bias in electrons, dark in electrons per second, or flat as response.
+        The master: bias in electrons, dark in electrons per second, flat as response, or fringes as a
+        fraction of the sky.
     frames : list of Frame
         Frames that were combined.
 
@@ -64,6 +69,7 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
     masters = {kind: calibration.neutral_master(shape, 0.0) for kind in ("bias", "dark")}
     if not lake_frames.select_types(frames, ("bias",)):
         raise BadInput(f"detector {frames[0].detector}: the lake has no frame with image type bias")
+    flats: dict[str, CombinedFrame] = {}
     for kind in files.KINDS:
         for group in _group_frames(lake_frames.select_types(frames, (kind,)), kind):
             lake_frames.common_values(group, (*files.SHARED_CARDS, "MISSION"))
@@ -71,7 +77,22 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
             masters[kind] = _combine_frames(kind, group, masters, stack)
             del stack
             (scratch / kind).unlink()
+            if kind == "flat":
+                flats[group[0].exposure.band] = masters[kind]
             yield kind, masters[kind], group
+    skies = [frame for frame in lake_frames.select_types(frames, SKY_TYPES) if "fringes" in frame.applied]
+    for group in _group_frames(skies, "flat"):
+        flat = flats.get(group[0].exposure.band)
+        if flat is None or len(group) < fringe_masters.LEAST_FRAMES:
+            continue
+        lake_frames.common_values(group, (*files.SHARED_CARDS, "MISSION"))
+        flags = calibration.master_flags(shape, {**masters, "flat": flat}, ())
+        flat = replace(flat, vignetted=files.has_vignetting(lake_frames.select_types(frames, ("flat",))[0]))
+        stack = np.memmap(scratch / "fringes", np.float32, "w+", shape=(len(group), *shape))
+        used = calibration.Masters(masters["bias"], masters["dark"], flat, flags)
+        yield "fringes", fringe_masters.combine(group, used, stack), group
+        del stack
+        (scratch / "fringes").unlink()
 
 
 def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:

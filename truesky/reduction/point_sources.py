@@ -8,6 +8,7 @@ import numpy as np
 import sep
 
 from truesky.reduction.frames import Frame
+from truesky.render.camera import astrometry
 from truesky.render.channels import registry
 from truesky.render.psf import from_file
 
@@ -26,7 +27,8 @@ def profile(frame: Frame) -> Any:
     assert scene.band is not None
     if exposure.psf:
         file = from_file.path_for_detector(exposure.psf, frame.detector)
-        return from_file.read(file, scene.detector, scene.band).profile
+        system = astrometry.wcs(scene.detector, exposure.ra, exposure.dec, exposure.position_angle)
+        return from_file.read(file, scene.detector, scene.band, system).profile
     channel = registry.find_channel(exposure.channel, exposure.image_type, f"exposure {exposure.exposure_id}")
     return channel.psf(exposure, scene.detector, scene.band, scene.mission, _POSITIONS).profile
 

@@ -12,13 +12,15 @@ Level 2 adds a catalogue of sources, the PSF and a .head file (WCS as text) in t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lake_schema import command, user_files
+from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card
 from lake_schema.store import layout
@@ -33,6 +35,7 @@ from truesky.reduction.infrared import nisp
 from truesky.reduction.infrared.persistence_prediction import PersistencePrediction
 from truesky.render.channels import registry
 from truesky.render.channels.image_types import SKY_TYPES
+from truesky.render.effects.light import pixel_area
 
 # Default threshold of the cosmic ray search for level 2, in standard deviations of the noise (van Dokkum 2001).
 _COSMIC_RAY_SIGMA = 4.5
@@ -67,7 +70,7 @@ def reduce_frame(
     frame : Frame
         The raw frame.
     masters : Masters
-        Masters of the detector.
+        Masters of the detector. They are freed after use if the caller has no reference to them.
     reduction : ReductionOptions
         Unit of the result, omitted corrections, and threshold for cosmic rays.
     prediction : PersistencePrediction, optional
@@ -87,10 +90,14 @@ def reduce_frame(
         ramp_effects = () if "nonlinearity" in reduction.without else tuple(corrected_effects)
         image = nisp.calibrate(frame, masters, prediction, ramp_effects, electrons)
     else:
-        fringes = frame.fringes() if "fringes" in corrected_effects else None
+        area = files.corrects_area(frame, reduction.without)
+        pattern = calibration.SkyPattern(masters.fringes, area=pixel_area.parameters(frame.scene)[1:] if area else None)
         image = calibration.calibrate(
-            frame.electrons(), frame.saturated_pixels(), masters, frame.scene, corrected_effects, electrons, fringes
+            frame.electrons(), frame.saturated_pixels(), masters, frame.scene, corrected_effects, electrons, pattern
         )
+        del pattern
+    # The masters of a large detector take gigabytes, which are required for the next steps.
+    del masters
     if reduction.cosmic_rays:
         image = cosmic_rays.flag_hits(image, cosmic_rays.find_hits(image, reduction.cosmic_rays))
     return image, files.reduced_cards(frame, reduction.unit, electrons, reduction.without)
@@ -125,8 +132,8 @@ def run_command(options: argparse.Namespace) -> int:
         exposure, prediction = frames[0].exposure, None
         if frames[0].scene.ramp and "persistence" not in reduction.without:
             prediction = PersistencePrediction(all_frames[exposure.camera, frames[0].detector])
-        for frame, masters in _with_masters(frames, options.masters, reduction.without):
-            image, cards = reduce_frame(frame, masters, reduction, prediction)
+        for frame, load in _with_masters(frames, options.masters, reduction.without):
+            image, cards = reduce_frame(frame, load(), reduction, prediction)
             # Create the folder only now, so that missing masters leave no empty folder.
             out.mkdir(parents=True, exist_ok=True)
             path = out / f"{frame.stem}.fits"
@@ -143,22 +150,40 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _with_masters(
     frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
-) -> Iterator[tuple[Frame, Masters]]:
-    """Yield each frame of a detector with its masters (combined bias, dark and flat frames).
+) -> Iterator[tuple[Frame, Callable[[], Masters]]]:
+    """Yield each frame of a detector with a function that returns its masters (combined bias, dark and flat frames).
 
-    Frames are grouped by band and infrared readout mode, and the masters are read once per group. Raises BadInput if
-    `folder` is None and `without` does not omit every kind of master.
+    Frames are grouped by band and infrared readout mode. The masters of a CCD are read for each frame, since those of a
+    large detector take gigabytes, but their flags are computed once. Those of an infrared detector are read once.
+    BadInput is raised if `folder` is None and `without` does not omit every kind of master.
     """
     groups = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
     for group in dict.fromkeys(groups):
         group_frames = [frame for frame, frame_group in zip(frames, groups, strict=True) if frame_group == group]
-        kinds = files.master_kinds(group_frames[0])
+        first = group_frames[0]
+        kinds = files.master_kinds(first)
+        kinds += tuple({"fringes"} & first.applied)
         if folder is None and not {*without} >= {*kinds}:
             raise BadInput(f"--masters FOLDER is required, or --without {' '.join(kinds)}")
-        masters = (nisp.read_masters if group_frames[0].scene.ramp else files.read_masters)(
-            folder or Path(), group_frames[0], without
-        )
-        yield from ((frame, masters) for frame in group_frames)
+        reader = _infrared_reader if first.scene.ramp else _ccd_reader
+        read = reader(folder or Path(), first, without)
+        yield from ((frame, partial(read, frame)) for frame in group_frames)
+
+
+def _infrared_reader(folder: Path, first: Frame, without: Sequence[str]) -> Callable[[Frame], Masters]:
+    masters = nisp.read_masters(folder, first, without)
+    return lambda _: masters
+
+
+def _ccd_reader(folder: Path, _: Frame, without: Sequence[str]) -> Callable[[Frame], Masters]:
+    flags: list[Array] = []
+
+    def read(frame: Frame) -> Masters:
+        masters = files.read_masters(folder, frame, without, flags[0] if flags else None)
+        flags[:] = [masters.flags]
+        return masters
+
+    return read
 
 
 def _sees_sky(frame: Frame) -> bool:

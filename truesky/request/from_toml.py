@@ -41,8 +41,8 @@ All keys::
     [fluxes.templates]             user's galaxy spectra, earliest type first, counted by sed_1 and sed_2: files, format
     [fluxes.stars]                 user's dwarf spectra: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
     [fluxes.extinction.CODE]       user's law that replaces law 1 .. 4: file, format
-    [psf]          BAND = "file.fits"   user's PSF in a band: a cube of planes or a PSFEx file; from a list of files,
-                   each exposure uses one at random (truesky/render/psf/from_file.py);
+    [psf]          BAND = "file.fits"   user's PSF in a band: a cube of planes (its card PSFFRAME states its axes) or a
+                   PSFEx file; from a list of files, each exposure uses one at random (truesky/render/psf/from_file.py);
                    {detector} in the name is replaced by the detector's name
     [solar_system] bodies = "file"      user's moving bodies that replace ours (truesky/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs

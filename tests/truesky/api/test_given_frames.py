@@ -84,7 +84,11 @@ def test_the_image_of_a_psf_is_drawn_around_a_star(tmp_path):
     side, step, fwhm = 101, 0.1, 0.9
     y, x = (np.mgrid[:side, :side] - side // 2) * step
     light = np.exp(-0.5 * (x**2 + y**2) / (fwhm / 2.3548200450309493) ** 2)
-    cards = fits.Header({"CDELT1": step, "CDELT2": step, "CUNIT1": "arcsec", "PIXEL": True})
+    # A Gaussian given as a number is round in pixels, whose size is the root of their area.
+    pixel = 3600.0 * np.sqrt(abs(LINEAR["CD1_1"] * LINEAR["CD2_2"] - LINEAR["CD1_2"] * LINEAR["CD2_1"]))
+    cards = fits.Header(
+        {"PSFFRAME": "PIXELS", "CDELT1": step / pixel, "CDELT2": step / pixel, "CUNIT1": "pixel", "PIXEL": True}
+    )
     fits.PrimaryHDU(light / light.sum(), cards).writeto(tmp_path / "psf.fits")
     file = frame_file(tmp_path / "a.fits", LINEAR)
     by_width, by_image = (

@@ -38,7 +38,7 @@ class Ground:
     wcs: WCS
 
 
-def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None, overrides=None):
+def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None, overrides=None, number=1):
     """Render stars on a lattice, with fluxes distributed uniformly in the logarithm.
 
     Parameters
@@ -61,20 +61,22 @@ def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None,
         Effects that are forced on or off.
     overrides : dict, optional
         Overrides of mission parameters.
+    number : int
+        Number of the exposure. Each has another pointing, stars at other pixels, and another noise.
     """
     usual = fields.MISSION.value(f"ext.{camera}.cosmic_rays.rate", "1 / s")
     mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s"), **(overrides or {})})
     detector = replace(detectors.detectors(camera, mission)[4], nx=side, ny=side, injection_rows=0)
-    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
+    ra, dec, angle = boresight_for(detector, 53.1 + 0.1 * (number - 1), -27.8, 12.0)
     system = astrometry.wcs(detector, ra, dec, angle)
-    where = astrometry.sky_of_pixel(system, *nominal.lattice(side, pitch))
+    where = astrometry.sky_of_pixel(system, *(at + 17.0 * (number - 1) for at in nominal.lattice(side, pitch)))
     least, most = np.log10(electrons)
     light = 10.0 ** np.random.default_rng(2).uniform(least, most, len(where[0]))
     f_nu = 10 ** (-0.4 * (ZERO_POINT - 2.5 * np.log10(light / SECONDS) - 23.9))
     band, none, points = BANDS[camera], fields.galaxies([], []), fields.stars(*where)
     exposed = {
         "channel": "EXT", "camera": camera, "band": band, "ra": ra, "dec": dec, "position_angle": angle, "seeing": 0.8,
-        "sky": sky, "zero_point": ZERO_POINT, "exposure_time_s": SECONDS,
+        "exposure_id": number, "sky": sky, "zero_point": ZERO_POINT, "exposure_time_s": SECONDS,
     }  # fmt: skip
     tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
     own = passbands.load(band)

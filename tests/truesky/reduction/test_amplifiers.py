@@ -62,8 +62,8 @@ def test_effects_of_amplifiers_are_undone(camera):
     given = nonlinearity.apply(readout.split_frame(came, scene), *curve)
     read = readout.assemble_frame(crosstalk.apply(given, crosstalk.coefficients(scene)), scene)
     assert np.abs(read - came).max() > 10.0
-    found = amplifiers.undo_effects(read, scene, {"crosstalk", "nonlinearity"})
+    found = amplifiers.undo_effects(read.copy(), scene, {"crosstalk", "nonlinearity"})
     np.testing.assert_allclose(found, came, atol=1e-3)
-    left = amplifiers.undo_effects(read, scene, {"crosstalk"})
+    left = amplifiers.undo_effects(read.copy(), scene, {"crosstalk"})
     np.testing.assert_allclose(left, readout.assemble_frame(given, scene), atol=1e-3)
-    np.testing.assert_array_equal(amplifiers.undo_effects(read, scene, ()), read)
+    np.testing.assert_array_equal(amplifiers.undo_effects(read.copy(), scene, ()), read)

@@ -1,10 +1,16 @@
 """Test the detection of sources by tiles."""
 
+import subprocess
+
 import numpy as np
 import pytest
+from astropy.io import fits
+from scipy.spatial import cKDTree
 
+from tests.truesky.render.products.test_tools import tool
 from truesky.reduction import catalogue
 from truesky.reduction.calibration import ReducedImage
+from truesky.render.camera import astrometry
 
 SIDE, WIDTH, NOISE = 512, 2.0, 10.0
 
@@ -43,3 +49,61 @@ def test_every_star_is_found_once(image, monkeypatch):
     off = np.hypot(rows["xwin"][:, None] - image[1][:, 0], rows["ywin"][:, None] - image[1][:, 1])
     assert len(rows["x"]) == len(image[1])
     assert off.min(axis=0).max() < 0.2
+
+
+def test_errors_of_windowed_positions_are_their_scatter():
+    """The sample are 64 stars in 12 images with different noise; the mean squared offset has an error of 4 %."""
+    rng, side, found = np.random.default_rng(6), 512, []
+    at = np.stack(np.meshgrid(np.arange(32, side, 64.0), np.arange(32, side, 64.0)), axis=-1).reshape(-1, 2)
+    at += rng.uniform(-5.0, 5.0, at.shape)
+    pixels = np.arange(side)
+    x, y = (np.exp(-0.5 * ((pixels - place[:, None]) / WIDTH) ** 2) for place in at.T)
+    light = np.einsum("n,ny,nx->yx", np.full(len(at), 2e4) / (2 * np.pi * WIDTH**2), y, x)
+    for _ in range(12):
+        noisy = rng.poisson(light) + 100.0 + NOISE * rng.standard_normal(light.shape)
+        image = ReducedImage(
+            noisy.astype(np.float32), np.full(light.shape, NOISE**-2, np.float32), np.zeros(light.shape, np.uint8)
+        )
+        rows = catalogue.detect_sources(image, 1.0, 6.0, catalogue.Limits(threshold=3.0, pixels=9))
+        distance, which = cKDTree(at).query(np.transpose([rows["xwin"], rows["ywin"]]))
+        near = distance < 1.0
+        off = [rows[name][near] - at[which[near], axis] for axis, name in enumerate(("xwin", "ywin"))]
+        found.append(np.stack([off[0] ** 2, off[1] ** 2]) / rows["window_errors"][:2, near])
+    assert np.concatenate(found, axis=1).mean() == pytest.approx(1.0, abs=0.12)
+
+
+def test_errors_of_windowed_positions_are_those_of_source_extractor(image, tmp_path):
+    """The program measures the same image; the axes of its error ellipses agree within 5 %."""
+    command = tool("source-extractor")
+    header = fits.Header(
+        {
+            "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "CRVAL1": 150.0,
+            "CRVAL2": 2.0, "CRPIX1": 256.0, "CRPIX2": 256.0, "CD1_1": -5e-5, "CD1_2": 1.5e-5, "CD2_1": 1e-5,
+            "CD2_2": 6e-5, "LONPOLE": 180.0, "RADESYS": "ICRS",
+        }
+    )  # fmt: skip
+    fits.writeto(tmp_path / "a.fits", image[0].image, header)
+    names = ["XWIN_IMAGE", "YWIN_IMAGE"]
+    names += [f"ERR{axis}WIN_{place}" for place in ("IMAGE", "WORLD") for axis in ("A", "B", "THETA")]
+    (tmp_path / "names").write_text("\n".join(names))
+    (tmp_path / "filter").write_text("CONV NORM\n1 2 1\n2 4 2\n1 2 1\n")
+    subprocess.run(
+        [command, "a.fits", "-c", "/dev/null", "-PARAMETERS_NAME", "names", "-FILTER_NAME", "filter", "-CATALOG_TYPE",
+         "FITS_1.0", "-CATALOG_NAME", "a.cat", "-GAIN", "1.0", "-DETECT_THRESH", "5", "-VERBOSE_TYPE", "QUIET"],
+        cwd=tmp_path, check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    theirs = fits.getdata(tmp_path / "a.cat", 1)
+    system = astrometry.from_cards(tuple((key, value, "") for key, value in header.items()))
+    rows = catalogue.detect_sources(image[0], 1.0, 6.0, catalogue.Limits(threshold=3.0, pixels=9))
+    ours = {name: values for name, _, _, values in catalogue.columns(rows, system, 25.0)}
+    distance, which = cKDTree(np.transpose([theirs["XWIN_IMAGE"], theirs["YWIN_IMAGE"]])).query(
+        np.transpose([ours["XWIN_IMAGE"], ours["YWIN_IMAGE"]])
+    )
+    near = distance < 0.05
+    assert near.sum() > 40
+    for name in ("ERRAWIN_IMAGE", "ERRBWIN_IMAGE", "ERRAWIN_WORLD", "ERRBWIN_WORLD"):
+        assert np.median(ours[name][near] / theirs[name][which[near]]) == pytest.approx(1.0, abs=0.05)
+    long = near & (ours["ERRAWIN_WORLD"] > 1.1 * ours["ERRBWIN_WORLD"])
+    assert long.sum() > 20
+    turn = ours["ERRTHETAWIN_WORLD"][long] - theirs["ERRTHETAWIN_WORLD"][which[long]]
+    assert np.median(np.abs((turn + 90.0) % 180.0 - 90.0)) < 3.0

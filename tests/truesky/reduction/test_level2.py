@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import tracemalloc
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,13 +24,27 @@ from tests.truesky.reduction import ground_frames
 from tests.truesky.render import fields
 from tests.truesky.render.products import test_tools
 from tests.truesky.render.test_render_exposures_calibration import MODULES
-from truesky.reduction import calibration, files, masters, reduce, stack
+from truesky.reduction import (
+    amplifiers,
+    calibration,
+    catalogue,
+    cosmic_rays,
+    files,
+    fringe_masters,
+    masters,
+    reduce,
+    stack,
+)
 from truesky.reduction import frames as lake_frames
 from truesky.reduction.calibration import COSMIC_RAY, EDGE, NO_DATA, SATURATED
+from truesky.reduction.combining import CombinedFrame
 from truesky.render.camera import astrometry, detectors
+from truesky.render.effects.light import pixel_area
 from truesky.request.from_toml import parse
 
 BLOCK = 64
+# Side of frames with fringes, pixels.
+SIDE = 256
 # Smallest S/N of the stars that are compared, and S/N above which positions are correct within 5 mas.
 SIGNAL, SHARP = 50.0, 200.0
 
@@ -59,7 +74,9 @@ def reduced(ground, out, *more, wanted=0):
 
 def of(folder, camera, side, **field):
     ground = ground_frames.made(folder, camera, side, **field)
-    path = reduced(ground, folder / "level2", "--level2")
+    # Fringes need a master of several exposures.
+    without = ("fringes",) if "fringes" in ground.frame.applied else ()
+    path = reduced(ground, folder / "level2", "--level2", "--without", "dark", *without)
     return Made(ground, folder, path, files.read_image(path))
 
 
@@ -164,7 +181,10 @@ def check_sky(made):
     gain, light, sky = made.image.card("GAIN"), made.ground.one.noise_free, float(np.median(maps["sky"]))
     sources = ndimage.binary_dilation(light > 1e-3 * sky, iterations=2)
     good = (found.weight > 0.0) & ~sources & (maps["cosmic_rays"] == 0)
-    left = np.where(good, found.image * gain - light - maps["sky"], np.nan)
+    # The reduced sky has the pixel area of the boresight.
+    area = 1.0 + pixel_area.area_change(*pixel_area.parameters(made.ground.one.scene)[1:])
+    area = area if made.image.card("CALAREA") else 1.0
+    left = np.where(good, found.image * gain - light - maps["sky"] / area, np.nan)
     dark = made.ground.one.scene.dark_electrons * ("dark_current" in made.ground.frame.applied)
     left = left - dark
     product = np.nanmean((left - np.nanmedian(left)) ** 2 * found.weight / gain**2)
@@ -187,20 +207,19 @@ def test_level_2_files_are_in_one_folder(jpcam):
 
 
 def test_scamp_reads_the_catalogue(jpcam, tmp_path):
-    """With the .head file, SCAMP finds the positions that the catalogue contains."""
+    """With the .head file and its usual columns, SCAMP finds the positions that the catalogue contains."""
     command = test_tools.tool("scamp")
     for end in (".cat", ".head"):
         shutil.copy(jpcam.path.with_suffix(end), tmp_path / f"a{end}")
     rows = jpcam.catalogue
     clean = rows[(rows["FLAGS"] == 0) & (rows["FLUX_AUTO"] > 100.0 * rows["FLUXERR_AUTO"])]
-    stars = SkyCoord(clean["ALPHA_J2000"], clean["DELTA_J2000"], unit="deg")
+    stars = SkyCoord(clean["ALPHAWIN_J2000"], clean["DELTAWIN_J2000"], unit="deg")
     test_tools.reference(tmp_path / "reference.cat", stars)
     done = subprocess.run(
         [command, "a.cat", "-c", "none", "-AHEADER_SUFFIX", ".head", "-HEADER_SUFFIX", ".out",
          "-ASTREF_CATALOG", "FILE", "-ASTREFCAT_NAME", "reference.cat", "-MATCH", "N", "-SOLVE_ASTROM", "N",
-         "-SOLVE_PHOTOM", "N", "-CENTROID_KEYS", "X_IMAGE,Y_IMAGE", "-DISTORT_KEYS", "X_IMAGE,Y_IMAGE",
-         "-CENTROIDERR_KEYS", "ERRA_IMAGE,ERRB_IMAGE,ERRTHETA_IMAGE", "-CHECKPLOT_TYPE", "NONE",
-         "-CROSSID_RADIUS", "1", "-WRITE_XML", "N", "-VERBOSE_TYPE", "NORMAL"],
+         "-SOLVE_PHOTOM", "N", "-CHECKPLOT_TYPE", "NONE", "-CROSSID_RADIUS", "1",
+         "-WRITE_XML", "N", "-VERBOSE_TYPE", "NORMAL"],
         cwd=tmp_path, check=True, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     external = (done.stdout + done.stderr).split("(external)")[1]
@@ -249,30 +268,105 @@ def test_counts_are_electrons_over_the_mean_gain(jpcam, tmp_path):
     assert not any(key.startswith(("DSEC", "CSEC", "BSEC", "DATASEC")) for key, *_ in electrons.cards)
 
 
-def test_fringes_of_the_sky_are_subtracted(tmp_path):
-    """The subtracted fringes are the rendered ones; residuals are below the noise."""
-    found = {}
-    for name, on in (("with", True), ("none", False)):
-        (tmp_path / name).mkdir()
-        field = {"electrons": (2e4, 1e5), "pitch": 128, "forced": {"fringes": on}}
-        found[name] = ground_frames.made(
-            tmp_path / name, "hsc", 256, overrides={"ext.hsc.hsc_z.fringes": (0.05, "")}, **field
+@pytest.mark.nightly
+def test_memory_is_bounded_for_each_pixel(tmp_path, monkeypatch):
+    """A CCD of JPCam with 85 million pixels takes less than 5 GB: 50 bytes per pixel, and 0.5 GB of programs.
+
+    Strips and tiles are as small relative to this frame as they are for a whole CCD.
+    """
+    for module, name, value in (
+        (calibration, "_ROWS", 32), (amplifiers, "_ROWS", 8), (cosmic_rays, "_ROWS", 64), (cosmic_rays, "_MARGIN", 8),
+        (catalogue, "_TILE", 256), (catalogue, "_TILE_MARGIN", 32), (catalogue, "_WINDOW_PIXELS", 1 << 14),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, value)
+    frame, folder = ground_frames.made(tmp_path, "jpcam", 1024, (2e4, 4e5), 64).frame, tmp_path / "all"
+    folder.mkdir()
+    shape = frame.scene.ny, frame.scene.nx
+    for kind in files.KINDS:
+        planes = (
+            np.full(shape, kind == "flat", np.float32),
+            np.full(shape, 1e-3, np.float32),
+            np.full(shape, 5, np.int16),
         )
-    own, none = found["with"], found["none"]
-    pattern = own.frame.fringes()
-    drawn = own.one.maps["sky"] / none.one.maps["sky"] - 1.0
-    np.testing.assert_allclose(pattern, drawn, atol=1e-5)
-    assert none.frame.fringes() is None
+        files.write_master(files.master_path(folder, frame, kind), CombinedFrame(*planes), kind, [frame])
+    monkeypatch.setattr(lake_frames, "from_lake", lambda *_: {("camera", "detector"): [frame]})
+    tracemalloc.start()
+    try:
+        call = ["--lake", str(tmp_path), "--masters", str(folder), "--level2", "--out", str(tmp_path / "out")]
+        assert reduce.main(call) == 0
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    print(f"{peak / np.prod(shape):.1f} bytes per pixel")
+    assert peak / np.prod(shape) < 50.0
+
+
+def test_fringes_are_subtracted_with_a_master_of_the_exposures(tmp_path):
+    """Three exposures of other fields give the master. It has the rendered fringes, of which less than 5 % remain."""
+    overrides = {"ext.hsc.hsc_z.fringes": (0.05, ""), "ext.hsc.fringe_period": (45.0, "pix")}
+    field = {"electrons": (2e4, 1e5), "pitch": 128, "sky": 80.0, "overrides": overrides}
+    exposures = []
+    for number in range(1, 5):
+        (tmp_path / str(number)).mkdir()
+        made = ground_frames.made(tmp_path / str(number), "hsc", SIDE, number=number, forced={"fringes": True}, **field)
+        exposures.append(made)
+    (tmp_path / "none").mkdir()
+    none = ground_frames.made(tmp_path / "none", "hsc", SIDE, forced={"fringes": False}, **field)
+    first, others = exposures[0], [one.frame for one in exposures[1:]]
+    drawn = first.one.maps["sky"] / none.one.maps["sky"] - 1.0
+    found = files.read_masters(first.masters, others[0], ("dark", "fringes"))
+    master = fringe_masters.combine(others, found, np.zeros((len(others), SIDE, SIDE), np.float32))
+    # Broad changes of the sky are not part of the master, and it is smoothed.
+    assert np.polyfit(drawn.ravel(), master.mean.ravel(), 1)[0] == pytest.approx(0.95, abs=0.05)
+    assert np.corrcoef(drawn.ravel(), master.mean.ravel())[0, 1] > 0.95
+    files.write_master(files.master_path(first.masters, first.frame, "fringes"), master, "fringes", others)
     left = []
-    for more in (["--without", "bias", "dark", "fringes"], []):
+    for more in (["--without", "bias", "dark", "fringes", "pixel_area"], []):
         image, other = (
-            files.read_image(reduced(one, tmp_path / f"{len(more)}{name}", *more)) for name, one in found.items()
+            files.read_image(reduced(one, tmp_path / f"{len(more)}{name}", *more))
+            for name, one in (("with", first), ("none", none))
         )
-        good = (image.reduced.weight > 0.0) & (other.reduced.weight > 0.0) & (own.one.noise_free < 1.0)
+        good = (image.reduced.weight > 0.0) & (other.reduced.weight > 0.0) & (first.one.noise_free < 1.0)
         more_light = (image.reduced.image - other.reduced.image)[good] / np.median(other.reduced.image[good])
-        left.append(float(np.polyfit(pattern[good], more_light, 1)[0]))
+        left.append(float(np.polyfit(drawn[good], more_light, 1)[0]))
         assert (image.card("CALFRING"), other.card("CALFRING")) == (not more, False)
     assert left == pytest.approx([1.0, 0.0], abs=0.05)
+
+
+def test_a_frame_with_fringes_requires_their_master(tmp_path, capsys):
+    own = ground_frames.made(tmp_path, "hsc", 256, (2e4, 1e5), 128, forced={"fringes": True})
+    reduced(own, tmp_path / "out", wanted=2)
+    said = capsys.readouterr().err
+    assert "_fringes.fits: there is no such master" in said
+    assert "--without fringes" in said
+
+
+def test_the_sky_has_the_pixel_area_of_the_middle_of_the_camera(tmp_path):
+    """The area of a pixel is that of astropy, in the farthest corner of DECam; stars keep their counts."""
+    ground = ground_frames.made(tmp_path, "decam", 256, (2e4, 1e5), 128, forced={"pixel_area": True, "fringes": False})
+    boresight = replace(ground.one.detector, x=0.0, y=0.0)
+    areas = []
+    for system in (ground.wcs, astrometry.wcs(boresight, 53.1, -27.8, 0.0)):
+        corners = [SkyCoord(*astrometry.sky_of_pixel(system, *at), unit="deg") for at in square(128.0)]
+        sides = [corners[i].separation(corners[i + 1]).arcsec / 20.0 for i in (0, 1)]
+        areas.append(sides[0] * sides[1])
+    expected = areas[0] / areas[1]
+    assert abs(expected - 1.0) > 1e-3
+    with_area, without = (
+        files.read_image(reduced(ground, tmp_path / name, "--without", "dark", *more))
+        for name, more in (("with", ()), ("without", ("pixel_area",)))
+    )
+    assert (with_area.card("CALAREA"), without.card("CALAREA")) == (True, False)
+    good = (with_area.reduced.weight > 0.0) & (ground.one.noise_free < 1.0)
+    levels = [np.median(image.reduced.image[good]) for image in (without, with_area)]
+    assert levels[0] / levels[1] == pytest.approx(expected, abs=2e-4)
+    change = without.reduced.image - with_area.reduced.image
+    # The change is smooth: it is the same in stars and in the sky around them.
+    assert np.ptp(change) < 5e-4 * levels[0]
+
+
+def square(middle):
+    return [(middle - 10.0, middle - 10.0), (middle + 10.0, middle - 10.0), (middle + 10.0, middle + 10.0)]
 
 
 def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):

@@ -258,7 +258,8 @@ def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
         PSF of the detector. BadInput is raised if a user's file is invalid (`psf.from_file.read`).
     """
     if aim.exposure.psf:
-        psf = from_file.read(from_file.path_for_detector(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
+        path = from_file.path_for_detector(aim.exposure.psf, aim.detector.name)
+        psf = from_file.read(path, aim.detector, aim.band, aim.wcs)
     else:
         psf = aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
     return reduce_colours(psf, settings.colours)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from truesky.render.drawing import transfer
 from truesky.render.psf import from_file, model
 from truesky.render.psf.model import Psf
 
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes a second.
+    from astropy.wcs import WCS
+
 # Largest FWHM of a Gaussian PSF, pixels.
 _WIDEST = 100.0
 # Largest distance of the middle of the stars in a PSFEx file from the middle of the frame, relative to its side.
@@ -24,7 +29,7 @@ _MAX_OFF_CENTRE = 0.3
 _RANGES = (0.2, 1.1)
 
 
-def load_psf(psf: Path | float, nx: int, ny: int, pixel_scale: float) -> Psf:
+def load_psf(psf: Path | float, nx: int, ny: int, pixel_scale: float, system: WCS) -> Psf:
     """Return the PSF of a frame.
 
     Parameters
@@ -36,6 +41,8 @@ def load_psf(psf: Path | float, nx: int, ny: int, pixel_scale: float) -> Psf:
         Number of columns and rows of the frame.
     pixel_scale : float
         Arcsec per pixel.
+    system : astropy.wcs.WCS
+        World coordinate system of the frame, through which an image of the PSF on the sky is drawn.
 
     Returns
     -------
@@ -45,12 +52,13 @@ def load_psf(psf: Path | float, nx: int, ny: int, pixel_scale: float) -> Psf:
     Raises
     ------
     BadInput
-        If the file cannot be read, is for a frame of another size, or the PSF is narrower than a pixel.
+        If the file cannot be read, has the axes of a camera, is for a frame of another size, or the PSF is narrower
+        than a pixel.
     """
     if isinstance(psf, Path):
         detector = Detector("frame", "frame", nx, ny, 0.0, 0.0, 0.0, pixel_scale)
-        _check_range(psf, nx, ny)
-        result, place = from_file.read(psf, detector, None), str(psf)
+        _check_header(psf, nx, ny)
+        result, place = from_file.read(psf, detector, None, system), str(psf)
         fwhm = result.fwhm
     else:
         fwhm, place = arguments.check_number("psf", psf, 1e-6, 1e6), "psf"
@@ -90,9 +98,11 @@ def image_side(psf: Psf) -> int:
     return 0 if psf.planes is None else int(np.ceil(psf.planes.images.shape[1] / psf.planes.samples))
 
 
-def _check_range(path: Path, nx: int, ny: int) -> None:
-    """Raise BadInput if the stars of a PSFEx file are on a frame of another size."""
+def _check_header(path: Path, nx: int, ny: int) -> None:
+    """Raise BadInput if the stars of a PSFEx file are on a frame of another size, or an image has axes of a camera."""
     _, header = external.read_planes(path, "PSF_MASK")
+    if "POLNAXIS" not in header and header.get("PSFFRAME") == "CAMERA":
+        raise BadInput(f"{path}: PSFFRAME = 'CAMERA': the focal plane of a given frame is not known, use SKY or PIXELS")
     if header.get("POLNAXIS") != 2 or not header.get("POLDEG1"):
         return
     for axis, side in ((1, nx), (2, ny)):

@@ -58,7 +58,7 @@ def check(
                     checked.add((exposure.camera, exposure.band, path))
                     curve = user_passbands.get(exposure.band) or passbands.load(exposure.band)
                     try:
-                        from_file.read(path, detector, curve)
+                        from_file.check(path, detector, curve)
                     except BadInput as error:
                         # The file of a single exposure is in a table of pointings.
                         key = f"psf.{exposure.band}" if candidates else "pointings: psf"

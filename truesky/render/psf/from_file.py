@@ -3,38 +3,59 @@
 A cube is the first image of a FITS file with two axes, or with three axes and wavelengths along the third. The sum of
 each plane is the fraction of the light that it contains. The header cards are:
 
-- CDELT1 = CDELT2 and CUNIT1 (arcsec, mas or deg): spacing of the samples.
+- PSFFRAME: axes of the planes. It has no default.
+
+  - 'PIXELS': x along the columns of the detector and y along its rows.
+  - 'SKY': x to the west and y to the north, as in GalSim.
+  - 'CAMERA': the x and y axes of the focal plane, on the sky. They are the axes of 'SKY' if the position angle is 0.
+
+- CDELT1 = CDELT2 and CUNIT1: spacing of the samples, in pixels (pixel) for 'PIXELS', otherwise on the sky (arcsec, mas
+  or deg).
 - CRPIX1 and CRPIX2: position of the chief ray (light through the centre of the pupil), 1-based; by default the middle.
 - CRVAL3, CDELT3 and CRPIX3, or WAVE1 to WAVEn: wavelengths in CUNIT3 (Angstrom, nm, um or m).
 - PIXEL: T if the PSF images are already averaged over the detector's pixel; by default F.
 
-The planes of a cube have the axes of the focal plane, with x to the right. They are rotated for detectors that are
-mounted rotated, and mirrored for detectors whose rows run in the mirrored direction. A file of PSFEx has the axes and
-pixels of the detector, includes the average over a pixel, and contains polynomials of the position on the detector. Its
-optional card PSFLIGHT is the fraction of a star's light that its images contain, like the sum of a plane in a cube; by
-default 1. truesky writes this card, PSFEx does not.
+Planes on the sky are drawn through the WCS of the detector: its rotation, and the scale and shear of its distortion at
+each position. A file of PSFEx has the axes and pixels of the detector, includes the average over a pixel, and contains
+polynomials of the position on the detector. Its optional card PSFLIGHT is the fraction of a star's light that
+its images contain, like the sum of a plane in a cube; by default 1. truesky writes this card, PSFEx does not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import comb
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from truesky.fluxes.passbands import Passband
 from truesky.numerics import matrices
+from truesky.render.camera import astrometry
 from truesky.render.camera.detectors import Detector
 from truesky.render.psf.model import SAMPLES, SIDE, Planes, Psf, from_planes
 from truesky.render.psf.sub_bands import sub_bands
 
-# Units that the header card CUNIT1 may have for the spacing of samples, and their size in arcsec.
+if TYPE_CHECKING:
+    # Imported in the functions that use it, because its import takes a second.
+    from astropy.wcs import WCS
+
+# Values of the header card PSFFRAME, and the axes for which they stand.
+_FRAMES = {
+    "PIXELS": "columns and rows of the detector",
+    "SKY": "x west, y north",
+    "CAMERA": "axes of the focal plane, on the sky",
+}
+# Units that the header card CUNIT1 may have for the spacing of samples on the sky, and their size in arcsec.
 _ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
+# Units that the header card CUNIT1 may have for the spacing of samples in the axes of the detector, in pixels.
+_PIXEL = {"pixel": 1.0, "pix": 1.0}
 # Units that the header card CUNIT3 may have for wavelengths, and their size in Angstrom.
 _ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4, "m": 1e10}
 # Smallest sum of a PSF image (fraction of the light that it contains) that is accepted.
@@ -64,6 +85,15 @@ _LEAST_PSFEX_SIDE = 64
 # Number of lobes of the Lanczos kernel with which the PSF images in a user's cube are resampled. With more lobes, the
 # interpolation is more accurate.
 _OF_CUBES = 15
+# Smallest number of samples per detector pixel to which a plane on the sky is resampled before splines interpolate
+# between its samples.
+_FINE_SAMPLES = 6
+# Degree of these splines.
+_SPLINE = 5
+# Positions along each axis of a detector, from -1 to 1 between its edges, at which a plane on the sky is drawn.
+_PLACES = (-0.9, 0.0, 0.9)
+# Degree of the polynomial of the position on the detector that is fitted to the changes of these images.
+_DEGREE = 2
 
 
 def path_for_detector(name: str, detector: str) -> Path:
@@ -74,7 +104,7 @@ def path_for_detector(name: str, detector: str) -> Path:
     return Path(name.replace("{detector}", detector))
 
 
-def read(path: Path, detector: Detector, band: Passband | None) -> Psf:
+def read(path: Path, detector: Detector, band: Passband | None, system: WCS) -> Psf:
     """Read the PSF of a detector in a band from a user's file, and resample it to three or more samples per pixel.
 
     Parameters
@@ -87,6 +117,8 @@ def read(path: Path, detector: Detector, band: Passband | None) -> Psf:
         The passband. It is divided into sub-bands. A cube with several wavelengths must reach from the mean wavelength
         of the first sub-band, or below, to that of the last sub-band, or above. None if the passband is unknown; a cube
         must then have one plane.
+    system : astropy.wcs.WCS
+        World coordinate system of the detector in the exposure, for planes in the axes of the sky.
 
     Returns
     -------
@@ -103,7 +135,8 @@ def read(path: Path, detector: Detector, band: Passband | None) -> Psf:
     Notes
     -----
     For a cube, the interpolation has an error of 5e-5 of the peak if the spacing of its samples is less than half the
-    width of the PSF.
+    width of the PSF. Planes on the sky are drawn through the derivative of the WCS at nine positions on the detector,
+    between which a polynomial of second degree interpolates. The ellipticity of a star has an error below 1e-4.
 
     For PSFEx, a star differs from `galsim.des.DES_PSFEx` by at most 1e-3 of its peak. Between the samples, a PSFEx
     model is defined by a Lanczos kernel with three lobes. The kernel adds light at spatial frequencies near one cycle
@@ -111,37 +144,222 @@ def read(path: Path, detector: Detector, band: Passband | None) -> Psf:
     has. If the file has more than six samples per pixel, or its images are too large, there are fewer; the difference
     is then up to 7e-3.
     """
-    data, header = external.read_planes(path, "PSF_MASK")
+    data, header = _read_planes(path)
     try:
-        if not np.isfinite(data).all():
-            raise BadInput("contains values that are not finite numbers")
         if "POLNAXIS" in header:
             planes = _psfex(data, header, detector)
             side = 2 * int(np.ceil(_psfex_width(data.shape, _card(header, "PSF_SAMP")) / 2.0))
             return from_planes(planes, detector.pixel_scale, has_pixel=True, side=side)
-        return from_planes(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
+        cube = _check_cube(data, header, detector, band)
+        return from_planes(_draw_cube(cube, detector, system), detector.pixel_scale, cube.has_pixel)
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from None
 
 
-def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband | None) -> Planes:
+def check(path: Path, detector: Detector, band: Passband | None) -> None:
+    """Check that `read` can read the PSF of a detector in a band from a user's file, without resampling a cube.
+
+    Parameters
+    ----------
+    path : Path
+        FITS file with a cube of PSF images, or file of PSFEx.
+    detector : Detector
+        The detector.
+    band : Passband or None
+        The passband, or None if it is unknown.
+
+    Raises
+    ------
+    BadInput
+        If `read` would raise it.
+    """
+    data, header = _read_planes(path)
+    try:
+        if "POLNAXIS" in header:
+            _psfex(data, header, detector)
+        else:
+            _check_cube(data, header, detector, band)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from None
+
+
+def _read_planes(path: Path) -> tuple[Float, Mapping[str, Any]]:
+    """Return the PSF images in a file and its header. BadInput is raised if a sample is not finite."""
+    data, header = external.read_planes(path, "PSF_MASK")
+    if not np.isfinite(data).all():
+        raise BadInput(f"{path}: contains values that are not finite numbers")
+    return data, header
+
+
+@dataclass(frozen=True, slots=True)
+class _Cube:
+    """PSF images of sub-bands from a user's cube, with the meaning of their axes.
+
+    Attributes
+    ----------
+    wavelength : float array, shape (w,)
+        Wavelengths, Angstrom.
+    images : float array, shape (w, rows, columns)
+        PSF at these wavelengths.
+    frame : str
+        Axes of the images, a key of _FRAMES.
+    step : float
+        Spacing of the samples: pixels for the frame PIXELS, otherwise arcsec.
+    middle : list of float
+        Row and column of the chief ray in the images, from 0.
+    has_pixel : bool
+        True if the images are already averaged over the detector's pixel.
+    """
+
+    wavelength: Float
+    images: Float
+    frame: str
+    step: float
+    middle: list[float]
+    has_pixel: bool
+
+
+def _check_cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband | None) -> _Cube:
+    """Return the PSF images of the sub-bands of a band, after checking the sums of the planes and all header cards."""
     planes = data if data.ndim == 3 else data[None]
     for number, total in enumerate(planes.sum(axis=(1, 2)), start=1):
         if not _LEAST_SUM <= total <= _MOST_SUM:
             raise BadInput(f"plane {number} sums to {total:.4g}, but {_LEAST_SUM:g} to {_MOST_SUM:g} is allowed")
-    step = _card(header, "CDELT1") * _unit(header, "CUNIT1", _ARCSEC)
+    frame = _frame(header)
+    step = _card(header, "CDELT1") * _unit(header, "CUNIT1", _PIXEL if frame == "PIXELS" else _ARCSEC)
     if step <= 0.0 or _card(header, "CDELT2") != _card(header, "CDELT1"):
         raise BadInput("CDELT1 and CDELT2 must be equal and positive")
+    _check_spacing(step if frame == "PIXELS" else step / detector.pixel_scale)
     middle = [
         _number(header, f"CRPIX{axis}", (n + 1) / 2) - 1 for axis, n in ((2, data.shape[-2]), (1, data.shape[-1]))
     ]
     waves, weights = _colours(header, len(planes), band)
-    spaced = matrices.matmul(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
-    turns = round(detector.rotation / 90.0)
-    images = np.stack([np.rot90(_resample(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
-    if detector.is_mirrored:
-        images = images[:, ::-1]
-    return Planes(waves, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), _half(detector))
+    images = matrices.matmul(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
+    return _Cube(waves, images, frame, step, middle, _has_pixel(header))
+
+
+def _frame(header: Mapping[str, Any]) -> str:
+    """Return the value of the header card PSFFRAME of a cube. BadInput is raised if it is not a key of _FRAMES."""
+    frame = header.get("PSFFRAME")
+    if frame not in _FRAMES:
+        problem = "has no card PSFFRAME" if frame is None else f"PSFFRAME = {frame!r} is not known"
+        allowed = ", ".join(f"{name!r} ({axes})" for name, axes in _FRAMES.items())
+        raise BadInput(f"{problem}: set it to the axes of its planes, one of {allowed}")
+    return str(frame)
+
+
+def _draw_cube(cube: _Cube, detector: Detector, system: WCS) -> Planes:
+    """Resample PSF images to samples of the detector, through its WCS unless they have the axes of the detector."""
+    half = _half(detector)
+    if cube.frame == "PIXELS":
+        images = np.stack([_resample(image, cube.step, cube.middle, _OF_CUBES) for image in cube.images])
+        return Planes(cube.wavelength, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), half)
+    if cube.frame == "CAMERA":
+        system = astrometry.wcs(detector, 0.0, 0.0, 0.0)
+    powers, basis, derivatives = _wcs_derivatives(system, half)
+    middle = derivatives[len(derivatives) // 2] / cube.step
+    images = np.stack([_draw_through(_fine(image, middle, cube.middle), middle) for image in cube.images])
+    # The PSF changes with the position as its mean over all colours does.
+    mean = _fine(cube.images.mean(axis=0), middle, cube.middle)
+    centre = images.mean(axis=0)
+    changes = [_draw_through(mean, matrix / cube.step, len(centre)) - centre for matrix in derivatives]
+    drift = matrices.least_squares(basis, np.stack(changes).reshape(len(basis), -1)).reshape(-1, *centre.shape)
+    kinds = tuple((i, j, 0) for i, j in powers)
+    return Planes(cube.wavelength, images.astype(np.float32), drift.astype(np.float32), half, kinds)
+
+
+def _wcs_derivatives(system: WCS, half: tuple[float, float]) -> tuple[list[tuple[int, int]], Float, Float]:
+    """Return the derivatives of sky positions with respect to pixels at positions on a detector.
+
+    Parameters
+    ----------
+    system : WCS
+        World coordinate system of the detector.
+    half : (float, float)
+        Column and row of the detector's centre.
+
+    Returns
+    -------
+    powers : list of (int, int)
+        Powers of x and y in the terms of a polynomial without constant, where x and y are positions on the detector
+        from -1 to 1 between its edges.
+    basis : float array, shape (n, terms)
+        These terms at the n positions.
+    derivatives : float array, shape (n, 2, 2)
+        Derivatives to the west and north by column and row, arcsec per pixel. The element in the middle, n // 2, is
+        that of the detector's centre.
+    """
+    x, y = (at.ravel() for at in np.meshgrid(_PLACES, _PLACES))
+    powers = [(i, j) for j in range(_DEGREE + 1) for i in range(_DEGREE + 1 - j) if i + j > 0]
+    places = (middle + at * (middle + 0.5) for middle, at in zip(half, (x, y), strict=True))
+    return powers, np.stack([x**i * y**j for i, j in powers], axis=1), astrometry.jacobian(system, *places)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fine:
+    """PSF image on the sky whose samples are so fine that splines interpolate accurately between them.
+
+    Attributes
+    ----------
+    coefficients : float array, shape (s, s)
+        Spline coefficients. The middle sample is the chief ray.
+    factor : int
+        Number of samples per sample of the file along each axis.
+    reach : float
+        Largest distance of samples with light from the chief ray along each axis, samples of the file.
+    """
+
+    coefficients: Float
+    factor: int
+    reach: float
+
+
+def _fine(plane: Float, matrix: Float, middle: list[float]) -> _Fine:
+    """Resample a PSF image to at least _FINE_SAMPLES samples per detector pixel, with a Lanczos kernel.
+
+    `matrix`, shape (2, 2), converts pixels to samples of `plane`. `middle` is the row and column of the chief ray in
+    `plane`, from 0.
+    """
+    factor = max(int(np.ceil(_FINE_SAMPLES / np.sqrt(np.abs(matrices.determinant(matrix))))), 1)
+    reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + _OF_CUBES
+    # Samples outside the largest PSF image are not required. The margin is for the splines and for the changes of
+    # `matrix` within a detector.
+    most = float(np.abs(matrix).sum(axis=1).max()) * (0.55 * SIDE + _OF_CUBES)
+    half = int(np.ceil(min(reach, most) * factor))
+    at = np.arange(-half, half + 1) / factor
+    rows, columns = (_interpolant(at + m, n, _OF_CUBES) for m, n in zip(middle, plane.shape, strict=True))
+    fine = matrices.matmul(rows, matrices.matmul(plane, columns.T))
+    return _Fine(scipy.ndimage.spline_filter(fine, _SPLINE), factor, reach)
+
+
+def _draw_through(fine: _Fine, matrix: Float, side: int | None = None) -> Float:
+    """Draw a PSF image on the sky in the axes of the detector, with SAMPLES samples per pixel.
+
+    Parameters
+    ----------
+    fine : _Fine
+        The PSF image.
+    matrix : float array, shape (2, 2)
+        Matrix that converts pixels (column, row) to samples of the file (column, row).
+    side : int, optional
+        Odd number of rows and columns of the result. By default, all light in a square of SIDE (512) pixels is inside.
+
+    Returns
+    -------
+    float array, shape (side, side)
+        The image, in which the chief ray is the middle sample. Its sum is that of the plane in the file, except for
+        light outside.
+    """
+    if side is None:
+        pixels = fine.reach * float(np.abs(matrices.inverse(matrix)).sum(axis=1).max())
+        side = 2 * max(min(int(pixels * SAMPLES), SIDE * SAMPLES // 2), _LEAST_SIDE * SAMPLES // 2) + 1
+    # The axes of the arrays are (row, column).
+    step = matrix[::-1, ::-1] * (fine.factor / SAMPLES)
+    offset = len(fine.coefficients) // 2 - step.sum(axis=1) * (side // 2)
+    image = scipy.ndimage.affine_transform(
+        fine.coefficients, step, offset, (side, side), order=_SPLINE, mode="constant", prefilter=False
+    )
+    return np.asarray(image * (float(np.abs(matrices.determinant(matrix))) / SAMPLES**2))
 
 
 def _has_pixel(header: Mapping[str, Any]) -> bool:

@@ -14,8 +14,10 @@ from lake_schema.mission.configuration import resolve
 from tests.truesky import nightly
 from tests.truesky.render.exposure.test_render import field, render
 from tests.truesky.render.fields import moments, one_source, small
+from truesky.api.sky_images import PsfImage
 from truesky.fluxes import passbands
 from truesky.render import plan_exposures
+from truesky.render.camera import detectors
 from truesky.render.camera.astrometry import wcs
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.drawing import reference, stamps
@@ -27,7 +29,9 @@ from truesky.request.from_toml import from_table
 BAND, GROUND = passbands.load("euclid_vis"), passbands.load("lsst_r")
 # Sample spacing of the cubes, arcsec.
 STEP = 0.05
-CARDS = {"CDELT1": STEP, "CDELT2": STEP, "CUNIT1": "arcsec"}
+CARDS = {"PSFFRAME": "SKY", "CDELT1": STEP, "CDELT2": STEP, "CUNIT1": "arcsec"}
+# The same spacing in pixels of VIS.
+PIXELS = {"PSFFRAME": "PIXELS", "CDELT1": 0.5, "CDELT2": 0.5, "CUNIT1": "pixel"}
 COLOURS = {"CRVAL3": 500.0, "CDELT3": 100.0, "CUNIT3": "nm"}
 
 
@@ -45,6 +49,10 @@ def gaussian(*sigmas, side=161, x=0.0, y=0.0, stretch=1.0):
     return np.array([plane / plane.sum() for plane in planes])
 
 
+def read(path, detector, band):
+    return from_file.read(path, detector, band, wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)))
+
+
 def star(psf, detector, column=80.3, row=77.6, photons=None, side=128):
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     one = one_source(detector, system, 1e5, column, row)
@@ -53,7 +61,7 @@ def star(psf, detector, column=80.3, row=77.6, photons=None, side=128):
 
 def test_a_cube_of_one_plane(tmp_path):
     detector = small("vis", "2-3")
-    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(0.12, stretch=1.4, x=0.03)[0]), detector, BAND)
+    psf = read(cube(tmp_path / "a.fits", gaussian(0.12, stretch=1.4, x=0.03)[0], **PIXELS), detector, BAND)
     # The fraction of a Gaussian in a pixel is known.
     edges = np.arange(161) - 0.5
     x, y = (np.diff(ndtr((edges - middle) / sigma)) for middle, sigma in ((80.3 + 0.3, 1.2), (77.6, 1.2 * 1.4)))
@@ -67,7 +75,7 @@ def test_a_cube_of_one_plane(tmp_path):
 
 def test_the_pixel_may_be_in_it(tmp_path):
     detector = small("vis", "2-3")
-    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(0.15), PIXEL=True), detector, BAND)
+    psf = read(cube(tmp_path / "a.fits", gaussian(0.15), **PIXELS, PIXEL=True), detector, BAND)
     _, second = moments(star(psf, detector)[60:96, 62:98])
     np.testing.assert_allclose(second * 0.01, 0.15**2 * np.eye(2), atol=2e-4)
 
@@ -79,7 +87,7 @@ def test_colours_are_interpolated_between_planes(tmp_path, how):
     variance = 0.01 + 1e-5 * (waves - 500)
     cards = COLOURS if how == "axis" else {"CUNIT3": "nm", **{f"WAVE{i + 1}": w for i, w in enumerate(waves)}}
     detector = small("vis", "2-3")
-    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(*np.sqrt(variance)), **cards), detector, BAND)
+    psf = read(cube(tmp_path / "a.fits", gaussian(*np.sqrt(variance)), **cards, **PIXELS), detector, BAND)
     n = len(psf.planes.wavelength)
     for k in (0, n - 1):
         _, second = moments(star(psf, detector, photons=np.eye(n)[k : k + 1])[50:106, 52:108])
@@ -88,8 +96,8 @@ def test_colours_are_interpolated_between_planes(tmp_path, how):
 
 
 def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
-    path = cube(tmp_path / "a.fits", gaussian(0.15, x=0.3, y=0.1))
-    upright, turned = (from_file.read(path, small("vis", name), BAND) for name in ("2-3", "2-4"))
+    path = cube(tmp_path / "a.fits", gaussian(0.15, x=0.3, y=0.1), PSFFRAME="CAMERA")
+    upright, turned = (read(path, small("vis", name), BAND) for name in ("2-3", "2-4"))
     centre, _ = moments(star(upright, small("vis", "2-3")))
     other, _ = moments(star(turned, small("vis", "2-4")))
     np.testing.assert_allclose(centre - (80.3, 77.6), (3.0, 1.0), atol=0.01)
@@ -98,9 +106,97 @@ def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
     width = 2.3548 * np.hypot(0.15, 0.1 / 12**0.5)
     assert (upright.fwhm, turned.fwhm) == pytest.approx((width, width), rel=0.02)
     # The file may contain the position of the chief ray.
-    centred = cube(tmp_path / "b.fits", gaussian(0.15, x=0.3, y=0.1), CRPIX1=81.0 + 6, CRPIX2=81.0 + 2)
-    found, _ = moments(star(from_file.read(centred, small("vis", "2-3"), BAND), small("vis", "2-3")))
+    centred = cube(tmp_path / "b.fits", gaussian(0.15, x=0.3, y=0.1), CRPIX1=87.0, CRPIX2=83.0)
+    found, _ = moments(star(read(centred, small("vis", "2-3"), BAND), small("vis", "2-3")))
     np.testing.assert_allclose(found, (80.3, 77.6), atol=0.01)
+
+
+# ------------------------------------------------------------------------------------------------ the sky
+
+# Corner detectors, bands, and sample spacings (arcsec). The changes of ellipticity by the distortion of the camera,
+# which a PSF on nominal pixels lacks, are above these numbers.
+CORNERS = [
+    ("vis", "1-6", "euclid_vis", 0.05, 1e-3),
+    ("decam", "S31", "des_r", 0.13, 1e-3),
+    ("hsc", "1_35", "hsc_r", 0.08, 1e-2),
+]
+
+
+def ellipticity(image):
+    """Return (e1, e2) of an image, weighted by a Gaussian of three pixels about its centroid, and its light."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(float)
+    dx, dy = x - (image * x).sum() / image.sum(), y - (image * y).sum() / image.sum()
+    weighted = image * np.exp(-(dx**2 + dy**2) / 18.0)
+    xx, yy, xy = ((weighted * term).sum() for term in (dx * dx, dy * dy, dx * dy))
+    return np.array([(xx - yy) / (xx + yy), 2.0 * xy / (xx + yy)]), image.sum()
+
+
+def star_near(psf, detector, system, column, row, side=129):
+    """Draw a star of 1e5 electrons on a square of pixels that begins at the column and row that are returned."""
+    first = int(column) - side // 2, int(row) - side // 2
+    near = replace(psf, planes=replace(psf.planes, origin=first))
+    source = one_source(detector, system, 1e5, column, row)
+    source = replace(source, column=source.column - first[0], row=source.row - first[1])
+    return stamps.draw(source, np.array([128]), near, side, side), first
+
+
+@pytest.mark.parametrize(("camera", "name", "band", "step", "wrong"), CORNERS)
+def test_a_psf_on_the_sky_is_what_galsim_draws_through_the_wcs(tmp_path, camera, name, band, step, wrong):
+    """Ellipticities agree within 1e-4 in the middle of a detector and in its corners, light within 1e-4."""
+    detector = detectors.detector(camera, name, resolve())
+    system = wcs(detector, 10.0, -30.0, 33.0)
+    plane = (0.7 * gaussian(0.12, stretch=1.2) + 0.3 * gaussian(0.25, stretch=0.9, x=0.05, y=-0.03))[0]
+    path = cube(tmp_path / "a.fits", plane, CDELT1=step, CDELT2=step)
+    psf = from_file.read(path, detector, passbands.load(band), system)
+    model = galsim.InterpolatedImage(
+        galsim.Image(fits.getdata(path).astype(float), scale=step), x_interpolant="lanczos15", flux=1e5,
+        gsparams=galsim.GSParams(folding_threshold=1e-4, maxk_threshold=1e-5, kvalue_accuracy=1e-7),
+    )  # fmt: skip
+    for x, y in ((0.5, 0.5), (0.02, 0.03), (0.98, 0.97), (0.02, 0.97)):
+        column, row = round(x * detector.nx) + 0.3, round(y * detector.ny) - 0.2
+        ours, first = star_near(psf, detector, system, column, row)
+        local = galsim.AstropyWCS(wcs=system).local(galsim.PositionD(column + 1, row + 1))
+        image = galsim.ImageD(*ours.shape, wcs=local)
+        place = galsim.PositionD(column - first[0] + 1, row - first[1] + 1)
+        theirs = model.drawImage(image, center=place).array
+        (shape, light), (expected, total) = ellipticity(ours), ellipticity(theirs)
+        np.testing.assert_allclose(shape, expected, atol=1e-4)
+        assert light == pytest.approx(total, rel=1e-4)
+        np.testing.assert_allclose(ours, theirs, atol=1e-4 * theirs.max())
+    # A PSF on nominal pixels would fail: the same star through the rotation alone.
+    matrix = local.getMatrix()
+    u, _, v = np.linalg.svd(matrix)
+    nominal = galsim.JacobianWCS(*np.ravel(detector.pixel_scale * u @ v))
+    image = galsim.ImageD(*ours.shape, wcs=nominal)
+    assert np.abs(ellipticity(model.drawImage(image, center=place).array)[0] - expected).max() > wrong
+
+
+def test_axes_of_the_camera_are_those_of_the_sky_without_a_position_angle(tmp_path):
+    detector, plane = small("vis", "3-3"), gaussian(0.15, x=0.3, y=0.1)
+    sky, camera = (cube(tmp_path / f"{frame}.fits", plane, PSFFRAME=frame) for frame in ("SKY", "CAMERA"))
+    upright, turned = (wcs(detector, 0.0, 0.0, angle) for angle in (0.0, 90.0))
+    images = [
+        from_file.read(file, detector, BAND, system).planes.images[0]
+        for file, system in ((sky, upright), (camera, turned), (sky, turned))
+    ]
+    np.testing.assert_array_equal(images[0], images[1])
+    # The y axis of the focal plane points east, so its x axis points north.
+    np.testing.assert_allclose(np.rot90(images[2], -1), images[0], atol=5e-3 * images[0].max())
+
+
+@pytest.mark.parametrize("camera", ["vis", "lsstcam"])
+def test_planes_that_we_write_give_the_same_stars(tmp_path, camera):
+    """The samples of a PSF are written with their axes, and read without interpolation."""
+    detector, band = small(camera, "1-6" if camera == "vis" else "R22_S11"), BAND if camera == "vis" else GROUND
+    first = read(cube(tmp_path / "a.fits", gaussian(0.12, stretch=1.3, x=0.02)[0]), detector, band)
+    image = first.planes.images[0]
+    written = PsfImage(image.astype(float), first.planes.samples, float(image.sum())).write(tmp_path / "b.fits")
+    again = read(written, detector, band)
+    margin = (len(again.planes.images[0]) - len(image)) // 2
+    np.testing.assert_allclose(again.planes.images[0], np.pad(image, margin), rtol=1e-6, atol=1e-9 * image.max())
+    alone = replace(first, planes=replace(first.planes, drift=first.planes.drift[:0], powers=()))
+    expected = star(alone, detector)
+    np.testing.assert_allclose(star(again, detector), expected, atol=1e-6 * expected.max())
 
 
 # ------------------------------------------------------------------------------------------------ PSFEx
@@ -138,7 +234,7 @@ def psfex(path, degree=2, samples=0.65, side=33, **cards):
 def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
     """A small body and a star agree with galsim at each position, without an additional pixel."""
     path, detector = psfex(tmp_path / "a.psf", degree), small("lsstcam", "R22_S11")
-    psf, sigma = from_file.read(path, detector, GROUND), 0.6
+    psf, sigma = read(path, detector, GROUND), 0.6
     source = one_source(
         detector, wcs(detector, 10.0, 20.0, 0.0), 1e5, column, row, bulge_fraction=1.0, bulge_sersic_index=0.5,
         bulge_half_light_radius=sigma * np.sqrt(2 * np.log(2)) * detector.pixel_scale,
@@ -160,7 +256,7 @@ def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
 def test_the_light_of_a_psfex_file(tmp_path):
     """The card PSFLIGHT is the fraction of a star's light in the images; without it they contain all light."""
     detector = small("lsstcam", "R22_S11")
-    whole, most = (from_file.read(psfex(tmp_path / "a.psf", 1, **card), detector, GROUND) for card in ({}, LIGHT))
+    whole, most = (read(psfex(tmp_path / "a.psf", 1, **card), detector, GROUND) for card in ({}, LIGHT))
     assert (whole.profile.flux, most.profile.flux) == pytest.approx((1.0, 0.9), rel=1e-6)
     np.testing.assert_allclose(star(most, detector), 0.9 * star(whole, detector), atol=0.1)
 
@@ -177,7 +273,7 @@ def test_samples_of_a_psfex_file(spacing, shape, samples):
 def test_galaxies_through_a_psfex_file(tmp_path):
     """The reference is a convolution by galsim without an additional pixel."""
     path, detector = psfex(tmp_path / "a.psf", 1), small("lsstcam", "R22_S11")
-    psf = from_file.read(path, detector, GROUND)
+    psf = read(path, detector, GROUND)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     source = one_source(detector, system, 1e5, 80.3, 77.6, inclination=50.0, disk_half_light_radius=1.2)
     ours = stamps.draw(source, np.array([128]), psf, 160, 160)
@@ -191,6 +287,11 @@ def test_galaxies_through_a_psfex_file(tmp_path):
 BAD = {
     "sum": (lambda p: cube(p, 7 * gaussian(0.1, 0.1), **COLOURS), r"plane 1 sums to 7, but 0.5 to 1.001 is allowed"),
     "nan": (lambda p: cube(p, gaussian(0.1) * np.nan), "contains values that are not finite numbers"),
+    "no frame": (
+        lambda p: cube(p, gaussian(0.1), PSFFRAME=""),
+        "PSFFRAME = '' is not known: set it to the axes of its planes",
+    ),
+    "unit of pixels": (lambda p: cube(p, gaussian(0.1), PSFFRAME="PIXELS"), "'arcsec' is not one of pixel, pix"),
     "unit": (lambda p: cube(p, gaussian(0.1), CUNIT1="furlong"), "CUNIT1 = 'furlong' is not one of arcsec, mas, deg"),
     "step": (lambda p: cube(p, gaussian(0.1), CDELT2=0.06), "CDELT1 and CDELT2 must be equal and positive"),
     "coarse": (lambda p: cube(p, gaussian(0.1), CUNIT1="deg"), "samples are 1800 pixels apart"),
@@ -209,12 +310,24 @@ BAD = {
 }
 
 
+def test_a_cube_without_its_frame_is_refused(tmp_path):
+    """The message says what to add."""
+    path = cube(tmp_path / "a.fits", gaussian(0.1))
+    fits.delval(path, "PSFFRAME")
+    with pytest.raises(BadInput) as refused:
+        from_file.check(path, small("vis", "2-3"), BAND)
+    assert str(refused.value) == (
+        f"{path}: has no card PSFFRAME: set it to the axes of its planes, one of 'PIXELS' (columns and rows of the "
+        "detector), 'SKY' (x west, y north), 'CAMERA' (axes of the focal plane, on the sky)"
+    )
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_bad_files_are_refused_by_name(tmp_path, case):
     make, said = BAD[case]
     make(tmp_path / "a.fits")
     with pytest.raises(LakeError, match=said) as refused:
-        from_file.read(tmp_path / "a.fits", small("vis", "2-3"), BAND)
+        read(tmp_path / "a.fits", small("vis", "2-3"), BAND)
     assert str(refused.value).startswith(f"{tmp_path / 'a.fits'}: ")
     assert "\n" not in str(refused.value)
 

@@ -31,6 +31,10 @@ def shape_of(image, column, row):
     return np.array([xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
 
 
+def read(path, detector, band):
+    return from_file.read(path, detector, band, wcs(detector, 10.0, 20.0, 0.0))
+
+
 def cut(camera, name, n=300):
     """Return the middle of a detector."""
     return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n)
@@ -68,7 +72,7 @@ def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, s
         found.append(mine)
     assert np.abs(np.ptp(found, axis=0)).max() > 1e-4
     # The file can also be used as a PSF file of the user.
-    back = from_file.read(path, whole, passbands.load(band))
+    back = read(path, whole, passbands.load(band))
     assert back.fwhm == pytest.approx(psf.fwhm, rel=0.01)
 
 
@@ -133,7 +137,7 @@ def test_a_star_of_the_file_is_that_of_galsim(tmp_path, of):
     """Light in the stamp, pixels and position agree everywhere on the detector."""
     (psf, detector, band), path = model_of(*of), tmp_path / "a.psf"
     to_psfex.write(psf, detector, path)
-    light, back = fits.getheader(path, 1)["PSFLIGHT"], from_file.read(path, detector, band)
+    light, back = fits.getheader(path, 1)["PSFLIGHT"], read(path, detector, band)
     for column, row in positions(detector):
         ours, first = star(back, detector, column, row)
         theirs = light * star_of_galsim(path, column, row, first)
@@ -163,7 +167,7 @@ def test_the_file_has_the_light_of_a_star(tmp_path, of, share):
     y, x = np.mgrid[:SIDE, :SIDE]
     inside = np.maximum(np.abs(x + first[0] - column), np.abs(y + first[1] - row)) < half
     assert drawn[inside].sum() == pytest.approx(light, abs=5e-3)
-    for image in (star(from_file.read(path, detector, band), detector, column, row)[0],
+    for image in (star(read(path, detector, band), detector, column, row)[0],
                   light * star_of_galsim(path, column, row, first)):  # fmt: skip
         assert image.sum() == pytest.approx(light, rel=3e-3)
         assert np.abs(image - drawn)[inside].max() < 8e-3 * drawn.max()
@@ -173,7 +177,7 @@ def test_a_psf_from_a_file_is_written_with_fewer_samples(tmp_path):
     """The PSF of a user's file has many samples per pixel; what is written with the image has the same light."""
     (psf, detector, band), path, again = model_of(*CAMERAS[1]), tmp_path / "a.psf", tmp_path / "b.psf"
     to_psfex.write(psf, detector, path)
-    back = from_file.read(path, detector, band)
+    back = read(path, detector, band)
     to_psfex.write(back, detector, again)
     first, second = (fits.getheader(file, 1) for file in (path, again))
     assert (back.planes.samples, second["PSF_SAMP"]) == (10, pytest.approx(0.3))
