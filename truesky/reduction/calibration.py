@@ -322,7 +322,7 @@ def calibrate(
     for rows in _strips(scene.ny):
         light = _expected_light(image, used, sky, floor, rows)
         response = _response(masters, scene, applied, rows)
-        # What was subtracted has shot noise, too.
+        # The subtracted light has shot noise, too.
         counted = light if subtracted is None else light + subtracted(rows)
         variance = np.maximum(counted * response + masters.dark.mean[rows] * time, 0.0)
         variance += reading_variance(scene, applied, rows)
@@ -346,8 +346,8 @@ def _response(masters: Masters, scene: Scene, applied: Container[str], rows: sli
 def _subtract_pattern(image: Float, pattern: SkyPattern, used: Bool) -> Callable[[slice], Float]:
     """Subtract the change of the sky by a pattern from `image` in place, and return it as a function of the rows.
 
-    The sky is measured in the pixels that are True in `used`, after division by the pattern. Fringes are scaled to
-    those in the image.
+    The sky is measured in the pixels that are True in `used`, after division by the pattern. The fringes are scaled to
+    the image.
     """
     sky = SkyMesh.from_image(image, used, pattern)
     if pattern.fringes is not None:
@@ -377,9 +377,9 @@ def _fringe_strength(image: Float, pattern: SkyPattern, sky: SkyMesh, used: Bool
         if not len(excess):
             continue
         middle = float(np.median(excess))
-        near = np.abs(excess - middle) < _FRINGE_SIGMA * 1.4826 * float(np.median(np.abs(excess - middle)))
-        fringes = fringes[near] - fringes[near].mean() if near.any() else fringes[near]
-        product += float((fringes * excess[near]).sum())
+        is_used = np.abs(excess - middle) < _FRINGE_SIGMA * 1.4826 * float(np.median(np.abs(excess - middle)))
+        fringes = fringes[is_used] - fringes[is_used].mean() if is_used.any() else fringes[is_used]
+        product += float((fringes * excess[is_used]).sum())
         square += float((fringes**2).sum())
     return product / square if square > 0.0 else 0.0
 

@@ -250,10 +250,10 @@ def _window_errors(
     column, row = (np.rint(at).astype(np.int64) for at in positions)
     for size in np.unique(half):
         offset = np.arange(-size, size + 1)
-        every = np.flatnonzero(half == size)
+        sources = np.flatnonzero(half == size)
         step = max(_WINDOW_PIXELS // len(offset) ** 2, 1)
-        for first in range(0, len(every), step):
-            at = every[first : first + step]
+        for first in range(0, len(sources), step):
+            at = sources[first : first + step]
             x, y = column[at, None, None] + offset, row[at, None, None] + offset[:, None]
             dx, dy = x - positions[0][at, None, None], y - positions[1][at, None, None]
             x, y = np.broadcast_arrays(x, y)

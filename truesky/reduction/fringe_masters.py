@@ -55,14 +55,14 @@ def combine(frames: Sequence[Frame], masters: Masters, stack: Array) -> Combined
     variance = [0.0] * len(frames)
     for number, frame in enumerate(frames):
         stack[number], variance[number] = _relative_sky(frame, masters)
-    # The first median contains the wings of sources. What exceeds it in an exposure is a source, and is masked.
+    # The first median contains the wings of sources. Pixels of an exposure that exceed it are sources, and are masked.
     first, _ = _smoothed_median(stack)
     for plane, noise in zip(stack, variance, strict=True):
         plane[_sources(plane - first, noise)] = np.nan
     mean, count = _smoothed_median(stack)
     # The median of n values has pi / 2 times the variance of their mean. The Gaussian averages 4 pi sigma^2 pixels.
-    one = 0.5 * np.pi * float(np.mean(variance)) / (4.0 * np.pi * _SMOOTHING**2)
-    uncertainty = np.sqrt(one / np.maximum(count, 1))
+    single_variance = 0.5 * np.pi * float(np.mean(variance)) / (4.0 * np.pi * _SMOOTHING**2)
+    uncertainty = np.sqrt(single_variance / np.maximum(count, 1))
     return CombinedFrame(mean, uncertainty.astype(np.float32), count)
 
 
@@ -93,8 +93,8 @@ def _sources(above: Float32, variance: float) -> Bool:
     """Return a mask that is True near sources. `above` is an image without sky, and `variance` that of its pixels."""
     smooth = ndimage.gaussian_filter(np.nan_to_num(above), 1.0, mode="nearest")
     # A Gaussian with a standard deviation of one pixel reduces the variance by a factor of 4 pi.
-    found = np.abs(smooth) > _SOURCE_SIGMA * np.sqrt(variance / (4.0 * np.pi))
-    return np.asarray(ndimage.binary_dilation(found, iterations=_SOURCE_MARGIN))
+    is_source = np.abs(smooth) > _SOURCE_SIGMA * np.sqrt(variance / (4.0 * np.pi))
+    return np.asarray(ndimage.binary_dilation(is_source, iterations=_SOURCE_MARGIN))
 
 
 def _relative_sky(frame: Frame, masters: Masters) -> tuple[Float32, float]:

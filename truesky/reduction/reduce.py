@@ -154,7 +154,7 @@ def _with_masters(
     """Yield each frame of a detector with a function that returns its masters (combined bias, dark and flat frames).
 
     Frames are grouped by band and infrared readout mode. The masters of a CCD are read for each frame, since those of a
-    large detector take gigabytes, but their flags are computed once. Those of an infrared detector are read once.
+    large detector take gigabytes, but their flags are computed once. The masters of an infrared detector are read once.
     BadInput is raised if `folder` is None and `without` does not omit every kind of master.
     """
     groups = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]

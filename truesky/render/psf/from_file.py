@@ -324,8 +324,8 @@ def _fine(plane: Float, matrix: Float, middle: list[float]) -> _Fine:
     reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + _OF_CUBES
     # Samples outside the largest PSF image are not required. The margin is for the splines and for the changes of
     # `matrix` within a detector.
-    most = float(np.abs(matrix).sum(axis=1).max()) * (0.55 * SIDE + _OF_CUBES)
-    half = int(np.ceil(min(reach, most) * factor))
+    largest_reach = float(np.abs(matrix).sum(axis=1).max()) * (0.55 * SIDE + _OF_CUBES)
+    half = int(np.ceil(min(reach, largest_reach) * factor))
     at = np.arange(-half, half + 1) / factor
     rows, columns = (_interpolant(at + m, n, _OF_CUBES) for m, n in zip(middle, plane.shape, strict=True))
     fine = matrices.matmul(rows, matrices.matmul(plane, columns.T))
