@@ -232,11 +232,13 @@ def test_bright_stars_are_read_up_to_the_visible_length_of_their_spikes():
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
         assert limits_of({**exposed, **other}, detector).spikes == np.inf
     ground = field_of("EXT")[1]
-    # LSST's aureole shows farther out than its spikes do; a Moffat profile has neither.
-    aureole = limits_of(ground, DETECTOR, "lsst_r").spikes
+    without_ghosts = {"ext.lsstcam.reflectance.glass": (0.0, "")}
+    # LSST's aureole shows farther out than its spikes do; a Moffat profile has neither. Ghosts of fainter stars show.
+    aureole = limits_of(ground, DETECTOR, "lsst_r", resolve(overrides=without_ghosts)).spikes
     assert 23.9 - 2.5 * np.log10(aureole) == pytest.approx(8.0, abs=0.3)
-    moffat = resolve(overrides={"ext.lsstcam.psf.profile": (1.0, "")})
-    assert limits_of(ground, DETECTOR, "lsst_r", moffat).spikes == np.inf
+    moffat = {"ext.lsstcam.psf.profile": (1.0, "")}
+    assert limits_of(ground, DETECTOR, "lsst_r", resolve(overrides=without_ghosts | moffat)).spikes == np.inf
+    assert aureole / 10.0 < limits_of(ground, DETECTOR, "lsst_r", resolve(overrides=moffat)).spikes < aureole
 
 
 @dataclass
