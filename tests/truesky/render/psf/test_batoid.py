@@ -4,6 +4,7 @@ The references are written by `python -m scripts.trace_optics --only checks`.
 """
 
 import csv
+import re
 from pathlib import Path
 
 import galsim
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from lake_schema.mission.configuration import resolve
+from scripts import trace_optics
 from truesky.fluxes import passbands
 from truesky.render.camera import detectors
 from truesky.render.psf import atmosphere, euclid, ground
@@ -42,6 +44,22 @@ def test_the_tables_are_what_batoid_traces(camera):
     assert np.sqrt(np.mean(np.square(errors))) < 0.5 * WITHIN[camera]
     # The tables of the bands differ, and are no small correction.
     assert np.mean(sizes) > 150.0
+
+
+def test_the_tables_are_those_that_the_script_writes():
+    """The lines of comments, which the checksums of the tables include."""
+    for camera in trace_optics.CAMERAS:
+        for band in camera.bands:
+            first, *_ = trace_optics.wavefront_file(camera, band).read_text().splitlines()
+            wavelength = float(re.search(r"\((\d+) nm\)", first)[1])
+            file = camera.file.format(band[-1])
+            header = trace_optics._WAVEFRONT_HEADER.format(
+                camera=camera.name, band=band, wavelength=wavelength, file=file
+            )
+            assert trace_optics.wavefront_file(camera, band).read_text().startswith(header + "noll,")
+        files = ", ".join(sorted({camera.file.format(band[-1]) for band in camera.bands}))
+        header = trace_optics._GHOST_HEADER.format(camera=camera.name, file=files)
+        assert (trace_optics.MODELS / f"ghosts_{camera.name}.csv").read_text().startswith(header + "band,")
 
 
 def third_moments(image, step):
