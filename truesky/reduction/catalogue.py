@@ -267,8 +267,8 @@ def _window_errors(
 def _window_sums(maps: tuple[Array, Array, Bool], gain: float, places: Float, offsets: tuple[Int, Int]) -> Float:
     """Return sum(w I), and sum(w^2 v d d') for xx, yy and xy, of `_window_errors` for n sources, float64[4, n].
 
-    `places`, float64[3, n], has columns, rows and windows. Only pixels at the `offsets` (columns, rows) from the pixel
-    of a source are summed.
+    `places`, float64[3, n], has the columns, rows and windows of the sources. The sums are over pixels at the `offsets`
+    (columns, rows) from the middle pixel of each source.
     """
     shape, (column, row, sigma) = maps[0].shape, places[:, :, None, None]
     x = np.rint(column).astype(np.int64) + offsets[0]
