@@ -63,16 +63,19 @@ _CHECKED = 8
 # Number of ghosts of a camera in a band, the brightest ones.
 _GHOSTS = 10
 _WAVEFRONT_HEADER = """\
-# Wavefront of {camera} in the band {band} ({wavelength:.0f} nm): a polynomial in (x, y), 0 in the middle and at a
-# distance of 1 at the farthest corner of its detectors, for each Zernike mode (Noll index, circle with the radius of
-# the aperture), nm rms before the factor <camera>.psf.wavefront_scale.
+# Wavefront of {camera} in the band {band} ({wavelength:.0f} nm): a polynomial in (x, y), 0 in the middle and \
+at a distance of 1 at
+# the farthest corner of its detectors, for each Zernike mode (Noll index, circle with the radius of the aperture), \
+nm rms.
 # Written by scripts/trace_optics.py with batoid 0.9, prescription {file}. Do not edit.
 """
 _GHOST_HEADER = """\
-# Ghosts of {camera}: light reflected at the surface `first` and then at `second`. distance: of the star from the axis,
-# relative to the farthest corner of a detector. centre: position of the ghost over that of the star. radius_mm: outer
-# radius in the focal plane; the inner one is that of the pupil. passed: fraction of the star's light that no edge
-# stops, before reflectances.
+# Ghosts of {camera}: light reflected at the surface `first` and then at `second`. Rows: distance of the star \
+from the axis,
+# relative to the farthest corner. centre: position of the ghost over that of the star. radius_mm: outer \
+radius in the focal
+# plane; the inner one is that of the pupil. passed: fraction of the star's light that no edge stops, \
+before reflectances.
 # Written by scripts/trace_optics.py with batoid 0.9, prescriptions {file}. Do not edit.
 """
 

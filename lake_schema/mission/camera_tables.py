@@ -322,8 +322,9 @@ def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
 def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
     """Raise BadInput if the amplifiers of one type of detector are not possible.
 
-    They must not overlap or reach beyond the detector of `size` (columns, rows). Their areas, prescans and overscans
-    must have equal sizes, and their gain, read noise and full well must be within bounds.
+    They must not overlap or reach beyond the detector of `size` (columns, rows), and interleaved ones must reach its
+    last column and row. Their areas, prescans and overscans must have equal sizes, and their gain, read noise and full
+    well must be within bounds.
     """
     corners: list[tuple[int, int]] = []
     for row in rows:
@@ -346,6 +347,10 @@ def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
             if row.number(column) != rows[0].number(column):
                 raise BadInput(f"{row.location}: {column} differs from the first amplifier of the type")
         corners.append((x, y))
+    ends = [max(corner[axis] for corner in corners) + rows[0].integer(name) for axis, name in enumerate(("nx", "ny"))]
+    if "interleaved" in rows[0].values and rows[0].integer("interleaved") and tuple(ends) != size:
+        # A raw file has no card with the size of a detector whose pixels do not lie side by side.
+        raise BadInput(f"{rows[0].location}: interleaved amplifiers must reach the last column and row of the detector")
 
 
 def read_wavefront(folder: Path) -> list[Row]:

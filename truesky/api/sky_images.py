@@ -86,7 +86,8 @@ class PsfImage:
         """Write the image to a FITS file that `[psf]` of a request and `truesky.frame` read.
 
         The header states the axes (PSFFRAME = 'PIXELS'), the spacing of the samples, and whether they are averaged over
-        a pixel (PIXEL). An existing file is replaced.
+        a pixel (PIXEL). An existing file is replaced. Raw frames of DECam and HSC are mirrored against an image of a
+        place without a planned exposure: reverse the order of its rows for such frames.
 
         Parameters
         ----------

@@ -244,31 +244,45 @@ def _window_errors(
         Covariances 4 sum(w^2 v d d') / sum(w I)^2, where w is the window, I the light, v the variance of a pixel and d
         its distance from the position. If the light in the window is not positive, the variance is that of the window.
     """
-    shape, out = maps[0].shape, np.zeros((3, len(window)))
-    half: Int = np.ceil(_WINDOW_RADIUS * window).astype(np.int64)
-    half = np.minimum(half, max(shape))
-    column, row = (np.rint(at).astype(np.int64) for at in positions)
+    out = np.zeros((3, len(window)))
+    half: Int = np.minimum(np.ceil(_WINDOW_RADIUS * window).astype(np.int64), max(maps[0].shape))
     for size in np.unique(half):
         offset = np.arange(-size, size + 1)
         sources = np.flatnonzero(half == size)
         step = max(_WINDOW_PIXELS // len(offset) ** 2, 1)
+        # The window of a bleeding star may be larger than the image: it is summed in strips of rows.
+        rows = max(_WINDOW_PIXELS // len(offset), 1)
         for first in range(0, len(sources), step):
             at = sources[first : first + step]
-            x, y = column[at, None, None] + offset, row[at, None, None] + offset[:, None]
-            dx, dy = x - positions[0][at, None, None], y - positions[1][at, None, None]
-            x, y = np.broadcast_arrays(x, y)
-            inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
-            pixel = np.clip(y, 0, shape[0] - 1), np.clip(x, 0, shape[1] - 1)
-            light, rms = (np.asarray(plane[pixel], float) for plane in maps[:2])
-            weight = np.exp(-0.5 * (dx**2 + dy**2) / window[at, None, None] ** 2)
-            weight *= inside & ~maps[2][pixel] & (dx**2 + dy**2 <= (_WINDOW_RADIUS * window[at, None, None]) ** 2)
-            variance = weight**2 * (rms**2 + np.maximum(light, 0.0) / gain)
-            total = (weight * light).sum(axis=(1, 2))
-            terms = np.stack([(variance * term).sum(axis=(1, 2)) for term in (dx**2, dy**2, dx * dy)])
+            places = np.stack([positions[0][at], positions[1][at], window[at]])
+            strips = [offset[start : start + rows] for start in range(0, len(offset), rows)]
+            sums = np.sum([_window_sums(maps, gain, places, (offset, strip)) for strip in strips], axis=0)
+            total, terms = sums[0], sums[1:]
             is_bright = total > 0.0
             largest = np.multiply.outer([1.0, 1.0, 0.0], window[at] ** 2)
             out[:, at] = np.where(is_bright, 4.0 * terms / np.where(is_bright, total, 1.0) ** 2, largest)
     return out
+
+
+def _window_sums(maps: tuple[Array, Array, Bool], gain: float, places: Float, offsets: tuple[Int, Int]) -> Float:
+    """Return sum(w I), and sum(w^2 v d d') for xx, yy and xy, of `_window_errors` for n sources, float64[4, n].
+
+    `places`, float64[3, n], has the columns, rows and windows of the sources. The sums are over pixels at the `offsets`
+    (columns, rows) from the middle pixel of each source.
+    """
+    shape, (column, row, sigma) = maps[0].shape, places[:, :, None, None]
+    x = np.rint(column).astype(np.int64) + offsets[0]
+    y = np.rint(row).astype(np.int64) + offsets[1][:, None]
+    dx, dy = x - column, y - row
+    x, y = np.broadcast_arrays(x, y)
+    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    pixel = np.clip(y, 0, shape[0] - 1), np.clip(x, 0, shape[1] - 1)
+    light, rms = (np.asarray(plane[pixel], float) for plane in maps[:2])
+    weight = np.exp(-0.5 * (dx**2 + dy**2) / sigma**2)
+    weight *= inside & ~maps[2][pixel] & (dx**2 + dy**2 <= (_WINDOW_RADIUS * sigma) ** 2)
+    variance = weight**2 * (rms**2 + np.maximum(light, 0.0) / gain)
+    parts = (weight * light, variance * dx**2, variance * dy**2, variance * (dx * dy))
+    return np.stack([part.sum(axis=(1, 2)) for part in parts])
 
 
 def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:

@@ -57,7 +57,8 @@ _RAW_CARDS: tuple[str, ...] = (
 _RAW_CARDS += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
 # Keywords of single amplifiers, which are not copied to a calibrated image: they end with a number or a letter.
 _AMPLIFIER_CARDS = re.compile(
-    r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT|[ADTBC]SEC)[A-Z]"
+    r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(GAIN|RDNOISE|SATURAT)[A-Z]"
+    r"|(DATA|BIAS|CCD|TRIM|AMP|PRE|POST|DET|[ADTBC])SEC[A-Z]"
     r"|T_(EF|OS)M[NX][0-9]+|T_GAIN[0-9]+"
 )
 # Largest allowed number of pixels in a master that the user made with another program.
@@ -237,7 +238,9 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
 
 def _refuse_missing(path: Path, kind: str) -> None:
     if not os.path.exists(path):
-        remedy = f"make it with truesky masters LAKE --out {path.parent}, or omit its correction with --without {kind}"
+        source = " from exposures of the sky with three or more pointings" if kind == "fringes" else ""
+        remedy = f"make it with truesky masters LAKE --out {path.parent}{source}, or omit its correction"
+        remedy += f" with --without {kind}"
         raise BadInput(f"{user_files.format_path(path)}: there is no such master: {remedy}")
 
 
@@ -287,9 +290,9 @@ def read_masters(
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     bits = np.zeros(shape, np.uint8) if flags is None else flags
     count = calibration.neutral_master(shape, 0.0).count
-    for kind in KINDS:
-        if kind not in without:
-            _refuse_missing(master_path(folder, frame, kind), kind)
+    has_fringes = "fringes" in frame.applied and "fringes" not in without
+    for kind in (*(kind for kind in KINDS if kind not in without), *(("fringes",) if has_fringes else ())):
+        _refuse_missing(master_path(folder, frame, kind), kind)
     # Begin with the flat, whose flags take the most memory.
     for kind in reversed(KINDS):
         if kind in without:
@@ -302,7 +305,7 @@ def read_masters(
         dark_time = time if kind == "dark" else dark_time
         del master
     fringes = None
-    if "fringes" in frame.applied and "fringes" not in without:
+    if has_fringes:
         fringes = read_master(master_path(folder, frame, "fringes"), "fringes", frame)[0].mean
     return calibration.Masters(combined["bias"], combined["dark"], combined["flat"], bits, dark_time, fringes)
 

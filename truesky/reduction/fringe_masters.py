@@ -20,8 +20,8 @@ from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
 from truesky.render.effects.light import pixel_area
 
-# Smallest number of exposures of which a master is made.
-LEAST_FRAMES = 3
+# Exposures whose pointings differ by less than this (arcsec) have the same sources at the same pixels.
+_LEAST_STEP = 5.0
 # Degree of the polynomial of the position that describes the sky of an exposure.
 _SKY_DEGREE = 2
 # Pixels within this distance (pixels) of a detected source are masked.
@@ -32,6 +32,19 @@ _SOURCE_SIGMA = 4.0
 _SMOOTHING = 2.0
 # Number of rows that are combined at a time, to limit memory.
 _ROWS = 64
+
+
+def can_combine(frames: Sequence[Frame]) -> bool:
+    """Return True if the median of exposures of the sky does not contain their sources.
+
+    Fewer than half of them may have the same pointing. They therefore have at least three pointings.
+    """
+    rows = [frame.exposure for frame in frames]
+    ra, dec = (np.radians([getattr(row, axis) for row in rows]) for axis in ("ra", "dec"))
+    place = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    step = np.linalg.norm(place[:, None] - place, axis=-1)
+    same = (step < np.radians(_LEAST_STEP / 3600.0)).sum(axis=1)
+    return bool(2 * same.max(initial=0) < len(frames))
 
 
 def combine(frames: Sequence[Frame], masters: Masters, stack: Array) -> CombinedFrame:

@@ -5,7 +5,7 @@
 Files of detector 3-4 of VIS are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and
 .._flat.fits (response; 1 if all light is counted). For each pixel, a file also has the uncertainty and the number of
 combined frames. A flat is divided by the light of its lamp, which is known from the mission parameters. If a band has
-fringes, three or more exposures of the sky give .._fringes.fits (fraction of the sky).
+fringes, exposures of the sky with three or more pointings give .._fringes.fits (fraction of the sky).
 
 Files of detector DET22 of NISP are NISP-P_4-16-4_DET22_dark.fits (one for each readout mode: groups, reads, drops),
 NISP_DET22_linearity.fits and NISP-P_euclid_y_DET22_flat.fits (one for each band, for the mixture of lamps whose colour
@@ -41,7 +41,8 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
     """Combine the frames of a CCD to masters: a bias, a dark, and for each band a flat and the fringes of the sky.
 
     The dark is omitted if there are no dark frames, and the flats if there are no flat frames. The fringes of a band
-    are omitted if it has no fringes, no flat, or fewer than three exposures of the sky.
+    are omitted if it has no fringes or no flat, or if its exposures of the sky do not suffice
+    (`fringe_masters.can_combine`). Exposures with other mission parameters than the flat are not used for fringes.
 
     Parameters
     ----------
@@ -69,7 +70,6 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
     masters = {kind: calibration.neutral_master(shape, 0.0) for kind in ("bias", "dark")}
     if not lake_frames.select_types(frames, ("bias",)):
         raise BadInput(f"detector {frames[0].detector}: the lake has no frame with image type bias")
-    flats: dict[str, CombinedFrame] = {}
     for kind in files.KINDS:
         for group in _group_frames(lake_frames.select_types(frames, (kind,)), kind):
             lake_frames.common_values(group, (*files.SHARED_CARDS, "MISSION"))
@@ -77,22 +77,38 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
             masters[kind] = _combine_frames(kind, group, masters, stack)
             del stack
             (scratch / kind).unlink()
-            if kind == "flat":
-                flats[group[0].exposure.band] = masters[kind]
             yield kind, masters[kind], group
-    skies = [frame for frame in lake_frames.select_types(frames, SKY_TYPES) if "fringes" in frame.applied]
-    for group in _group_frames(skies, "flat"):
-        flat = flats.get(group[0].exposure.band)
-        if flat is None or len(group) < fringe_masters.LEAST_FRAMES:
-            continue
-        lake_frames.common_values(group, (*files.SHARED_CARDS, "MISSION"))
-        flags = calibration.master_flags(shape, {**masters, "flat": flat}, ())
-        flat = replace(flat, vignetted=files.has_vignetting(lake_frames.select_types(frames, ("flat",))[0]))
-        stack = np.memmap(scratch / "fringes", np.float32, "w+", shape=(len(group), *shape))
-        used = calibration.Masters(masters["bias"], masters["dark"], flat, flags)
-        yield "fringes", fringe_masters.combine(group, used, stack), group
-        del stack
-        (scratch / "fringes").unlink()
+            skies = _fringed_skies(frames, group[0]) if kind == "flat" else []
+            if fringe_masters.can_combine(skies):
+                # Only the flat of this band is in memory.
+                yield "fringes", _combine_skies(skies, masters, group[0], scratch), skies
+
+
+def _fringed_skies(frames: Sequence[Frame], flat: Frame) -> list[Frame]:
+    """Return the exposures of the sky that show fringes, in the band and with the mission parameters of a flat."""
+    shared = *files.SHARED_CARDS, "MISSION"
+    return [
+        frame
+        for frame in lake_frames.select_types(frames, SKY_TYPES)
+        if "fringes" in frame.applied
+        and frame.exposure.band == flat.exposure.band
+        and all(str(frame.card(keyword)) == str(flat.card(keyword)) for keyword in shared)
+    ]
+
+
+def _combine_skies(
+    skies: Sequence[Frame], masters: Mapping[str, CombinedFrame], flat: Frame, scratch: Path
+) -> CombinedFrame:
+    """Combine exposures of the sky to the master of their fringes. `flat` is one of the flats of their band."""
+    shape = skies[0].scene.ny, skies[0].scene.nx
+    response = replace(masters["flat"], vignetted=files.has_vignetting(flat))
+    flags = calibration.master_flags(shape, masters, ())
+    stack = np.memmap(scratch / "fringes", np.float32, "w+", shape=(len(skies), *shape))
+    used = calibration.Masters(masters["bias"], masters["dark"], response, flags)
+    master = fringe_masters.combine(skies, used, stack)
+    del stack
+    (scratch / "fringes").unlink()
+    return master
 
 
 def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:

@@ -258,6 +258,16 @@ def test_a_mistake_is_named_with_its_file_and_line(folder, file, old, new, words
     assert "\n" not in str(refused.value)
 
 
+def test_interleaved_amplifiers_that_leave_the_last_columns_are_refused(tmp_path):
+    """Nothing in a raw file would tell how many columns the detector has."""
+    camera_template.write_like("hsc", tmp_path / "mine")
+    camera_folder.read(tmp_path / "mine")
+    layout = tmp_path / "mine" / "layout.csv"
+    layout.write_text(layout.read_text().replace(",hsc,2048,", ",hsc,2050,"))
+    with pytest.raises(BadInput, match=r"amplifiers\.csv line \d+: interleaved amplifiers must reach the last column"):
+        camera_folder.read(tmp_path / "mine")
+
+
 @pytest.mark.parametrize(("gain", "noise"), [("0", "5"), ("-1", "5"), ("nan", "5"), ("", "5"), ("1.6", "0")])
 def test_an_amplifier_without_gain_or_noise_is_refused(folder, gain, noise):
     file = folder / camera_tables.AMPLIFIERS

@@ -1,6 +1,7 @@
 """Test the detection of sources by tiles."""
 
 import subprocess
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -70,6 +71,32 @@ def test_errors_of_windowed_positions_are_their_scatter():
         off = [rows[name][near] - at[which[near], axis] for axis, name in enumerate(("xwin", "ywin"))]
         found.append(np.stack([off[0] ** 2, off[1] ** 2]) / rows["window_errors"][:2, near])
     assert np.concatenate(found, axis=1).mean() == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_window_of_the_size_of_the_image_takes_little_memory(monkeypatch):
+    """A star that bleeds along all its columns has such a window. Strips of rows have the sums of the whole window."""
+    rng, side = np.random.default_rng(3), 400
+    maps = (
+        rng.uniform(0.0, 9.0, (side, side)).astype(np.float32), np.full((side, side), 2.0, np.float32),
+        rng.random((side, side)) < 0.1,
+    )  # fmt: skip
+    positions, window = (np.array([120.3, 200.0]), np.array([333.3, 17.6])), np.array([90.0, 3.0])
+    found = []
+    for pixels in (1 << 20, 1 << 14):
+        monkeypatch.setattr(catalogue, "_WINDOW_PIXELS", pixels)
+        tracemalloc.start()
+        found.append(catalogue._window_errors(maps, 2.0, positions, window))
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 150 * pixels
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-10)
+    # The formula for the first star, without strips.
+    y, x = np.mgrid[:side, :side]
+    dx, dy = x - positions[0][0], y - positions[1][0]
+    weight = np.exp(-0.5 * (dx**2 + dy**2) / 90.0**2) * ~maps[2] * (dx**2 + dy**2 <= 360.0**2)
+    variance = weight**2 * (4.0 + maps[0].astype(float) / 2.0)
+    expected = [4.0 * (variance * term).sum() / (weight * maps[0]).sum() ** 2 for term in (dx**2, dy**2, dx * dy)]
+    np.testing.assert_allclose(found[0][:, 0], expected, rtol=1e-6)
 
 
 def test_errors_of_windowed_positions_are_those_of_source_extractor(image, tmp_path):

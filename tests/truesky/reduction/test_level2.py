@@ -301,7 +301,7 @@ def test_memory_is_bounded_for_each_pixel(tmp_path, monkeypatch):
     assert peak / np.prod(shape) < 50.0
 
 
-def test_fringes_are_subtracted_with_a_master_of_the_exposures(tmp_path):
+def test_fringes_are_subtracted_with_a_master_of_the_exposures(tmp_path, monkeypatch):
     """Three exposures of other fields give the master. It has the rendered fringes, of which less than 5 % remain."""
     overrides = {"ext.hsc.hsc_z.fringes": (0.05, ""), "ext.hsc.fringe_period": (45.0, "pix")}
     field = {"electrons": (2e4, 1e5), "pitch": 128, "sky": 80.0, "overrides": overrides}
@@ -319,6 +319,15 @@ def test_fringes_are_subtracted_with_a_master_of_the_exposures(tmp_path):
     # Broad changes of the sky are not part of the master, and it is smoothed.
     assert np.polyfit(drawn.ravel(), master.mean.ravel(), 1)[0] == pytest.approx(0.95, abs=0.05)
     assert np.corrcoef(drawn.ravel(), master.mean.ravel())[0, 1] > 0.95
+    # The command makes it after the flat, if the pointings differ.
+    given = {"bias": found.bias, "flat": found.flat}
+    monkeypatch.setattr(masters, "_combine_frames", lambda kind, *_: given[kind])
+    lamps = [replace(others[0], exposure=replace(others[0].exposure, image_type=kind)) for kind in given]
+    for skies, kinds in ((others, ["bias", "flat", "fringes"]), (others[:1] * 4 + others[1:], ["bias", "flat"])):
+        combined = {kind: one for kind, one, _ in masters.from_frames([*lamps, *skies], tmp_path)}
+        assert list(combined) == kinds
+        if "fringes" in combined:
+            np.testing.assert_array_equal(combined["fringes"].mean, master.mean)
     files.write_master(files.master_path(first.masters, first.frame, "fringes"), master, "fringes", others)
     left = []
     for more in (["--without", "bias", "dark", "fringes", "pixel_area"], []):
@@ -338,6 +347,7 @@ def test_a_frame_with_fringes_requires_their_master(tmp_path, capsys):
     reduced(own, tmp_path / "out", wanted=2)
     said = capsys.readouterr().err
     assert "_fringes.fits: there is no such master" in said
+    assert "with three or more pointings" in said
     assert "--without fringes" in said
 
 
@@ -357,6 +367,9 @@ def test_the_sky_has_the_pixel_area_of_the_middle_of_the_camera(tmp_path):
         for name, more in (("with", ()), ("without", ("pixel_area",)))
     )
     assert (with_area.card("CALAREA"), without.card("CALAREA")) == (True, False)
+    # Sections of single amplifiers are those of the raw frame.
+    assert any(re.fullmatch("TRIMSEC[A-Z]", key) for key, *_ in ground.frame.cards)
+    assert not any(re.fullmatch("[A-Z]+SEC[A-Z]", key) for key, *_ in with_area.cards)
     good = (with_area.reduced.weight > 0.0) & (ground.one.noise_free < 1.0)
     levels = [np.median(image.reduced.image[good]) for image in (without, with_area)]
     assert levels[0] / levels[1] == pytest.approx(expected, abs=2e-4)

@@ -445,12 +445,18 @@ def _join_sections(header: Mapping[str, Any], array: Array, convert: Callable[[A
     """Join the pixels of all amplifiers in an array, by its cards DSECn and CSECn, to an image of the detector.
 
     `convert` is a function of the pixels of an amplifier and its number from 1, which returns the pixels to join. The
-    result is 0 in pixels that no amplifier reads.
+    result is 0 in pixels that no amplifier reads. It has the size of DATASEC, if there is this card.
     """
     numbers = range(1, int(header["NAMPS"]) + 1)
     places = [Section.from_text(header[f"CSEC{n}"]) for n in numbers]
     parts = [convert(array[Section.from_text(header[f"DSEC{n}"]).slices], n) for n in numbers]
-    out = np.zeros((max(p.y + p.ny for p in places), max(p.x + p.nx for p in places)), parts[0].dtype)
+    if "DATASEC" in header:
+        # The last rows and columns of the detector may belong to no amplifier.
+        whole = Section.from_text(header["DATASEC"])
+        shape = whole.ny, whole.nx
+    else:
+        shape = max(p.y + p.ny for p in places), max(p.x + p.nx for p in places)
+    out = np.zeros(shape, parts[0].dtype)
     for place, pixels in zip(places, parts, strict=True):
         out[place.slices] = pixels
     return out

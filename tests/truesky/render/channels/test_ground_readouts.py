@@ -1,5 +1,6 @@
 """File formats of a ground detector: one array, one array per amplifier, electrons."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -7,14 +8,16 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from lake_schema.fits.images import Image
 from tests.truesky import nightly
 from tests.truesky.render.channels.test_readout import put
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION
 from tests.truesky.render.products import test_tools as tools
-from truesky.render.camera import astrometry
+from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.sections import Section, steps_of_text
-from truesky.render.channels import ground
+from truesky.render.channels import ground, readout
+from truesky.render.effects.scene import Scene
 from truesky.render.planning import ground_surveys
 from truesky.render.products import read_back
 from truesky.request import schema
@@ -80,6 +83,24 @@ def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
             == together.size
             == len({(p.x, p.y) for p in place}) * place[0].nx * place[0].ny
         )
+
+
+@pytest.mark.parametrize("camera", ["megacam", "decam", "gpc1"])
+def test_columns_and_rows_without_an_amplifier_are_read_back(camera):
+    """A detector of 257 x 193 pixels is divided into equal amplifiers, which leave the last column or row unread."""
+    one = replace(detectors.detectors(camera, MISSION)[0], nx=257, ny=193)
+    scene = Scene(MISSION, one.section, 30.0, 1.0, 1.0, one)
+    assert scene.layout.unread_pixels.any()
+    light = np.arange(257.0 * 193.0).reshape(193, 257) % 4000.0
+    (array,) = readout._amplifiers(
+        scene.layout.split(light), scene, one.name, astrometry.wcs(one, 0.0, 0.0, 0.0)
+    ).extensions
+    cards = (*array.cards, ("DATASEC", array.sections.data.text, ""), ("BIAS", 0.0, ""))
+    for read in (readout._amplifier_pixels, readout._amplifier_electrons):
+        pixels = read([Image(array.data, cards)])
+        assert pixels.shape == (193, 257)
+        assert not pixels[scene.layout.unread_pixels].any()
+        assert pixels.max() > 0.0
 
 
 @pytest.mark.parametrize("way", ["raw", "amplifiers"])

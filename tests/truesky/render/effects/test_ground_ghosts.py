@@ -80,6 +80,22 @@ def test_ghosts_lie_on_the_line_through_the_star_and_the_axis():
     assert all(some <= found[0] | found[1] | found[2] for some in found)
 
 
+@pytest.mark.parametrize(("camera", "name", "band"), [("decam", "S29", "des_r"), ("hsc", "0_05", "hsc_z")])
+def test_a_mirrored_detector_has_its_ghosts_in_mirrored_rows(camera, name, band):
+    """The same detector that is only rotated sees the same ghosts, with its rows in reverse order."""
+    made = scene(camera, name, band, star(700.0, 1200.0, 1e13))
+    last_row = made.detector.ny - 1.0
+    turned = replace(
+        made, detector=replace(made.detector, is_mirrored=False), lights=star(700.0, last_row - 1200.0, 1e13)
+    )
+    (found, _), (expected, _) = ground_ghosts.parameters(made), ground_ghosts.parameters(turned)
+    assert made.detector.is_mirrored
+    assert len(found.row) > 2
+    np.testing.assert_allclose(found.row, last_row - expected.row, atol=1e-6)
+    for values in ("column", "radius", "level"):
+        np.testing.assert_allclose(getattr(found, values), getattr(expected, values), rtol=1e-9)
+
+
 def test_a_window_shows_the_part_of_the_detector_s_ghosts():
     whole = scene("decam", "N4", "des_r", star(900.0, 1800.0))
     part = replace(whole, window=Window(700, 1500, 400, 300), lights=star(200.0, 300.0))
