@@ -67,7 +67,7 @@ def is_table_of_visits(path: Path) -> bool:
     with user_files.open_file(path, "catalogue") as stream:
         start = stream.read(1 << 16)
     lines = (line for line in start.decode("utf-8-sig", errors="replace").splitlines() if not line.startswith("#"))
-    return bool(_KEY_COLUMNS & {name.strip() for name in next(lines, "").split(",")})
+    return bool(_KEY_COLUMNS & {name.strip().strip('"') for name in next(lines, "").split(",")})
 
 
 def read(path: Path, bands: Sequence[str], image_type: str) -> list[Row]:
