@@ -46,7 +46,11 @@ these arguments have the same limits.
 # Columns of numbers in the files of users: kind of file, key of the request or command, and limits by column.
 _FILES: tuple[tuple[str, str, Mapping[str, tuple[float, float]]], ...] = (
     ("Table of pointings", "[[observation]] pointings", pointing_tables.BOUNDS),
-    ("Table of visits", "[[observation]] pointings", {**visit_tables.BOUNDS, **visit_tables.ANGLES}),
+    (
+        "Table of visits",
+        "[[observation]] pointings",
+        {**visit_tables.BOUNDS, **visit_tables.ANGLES, **visit_tables.OPTIONAL},
+    ),
     ("Tables of a camera", "[mission] cameras", {**camera_tables.INTEGER_BOUNDS, **camera_tables.NUMBER_BOUNDS}),
     ("Galaxies", "[ingest.galaxies]", mapping.GALAXY_BOUNDS),
     ("Haloes", "[ingest.halos]", mapping.HALO_BOUNDS),

@@ -82,7 +82,7 @@ def image(x, y, electrons, noise):
 
 def images_work(x, y, identifiers):
     electrons = np.geomspace(3e5, 300.0, len(x))
-    cards = (*astrometry.cards(system()), ("BUNIT", "electron", "unit"))
+    cards = (*astrometry.cards(system()), ("BUNIT", "electron", "unit"), ("PSFFWHM", 0.47, "[arcsec] PSF FWHM"))
     (ra, dec), here = CENTRE, astrometry.sky_of_pixel(system(), [0, NX - 1, NX - 1, 0], [0, 0, NY - 1, NY - 1])
     region = "POLYGON ICRS " + " ".join(f"{a:.7f} {d:.7f}" for a, d in zip(*here, strict=True))
     contents = ("science", "noise_free", "cosmic_rays")

@@ -129,6 +129,8 @@ def test_images_are_found_by_place(service, shown):
         "application/fits",
         "euclid_vis",
     )
+    # The width of stars in the image, not the seeing of the air, which the plan has.
+    assert row["s_resolution"] == 0.47
     assert len(service.search(here.format(place["ra"] + 0.02, place["dec"]))) == 0
     assert len(service.search(here.format(place["ra"] + 180.0, -place["dec"]))) == 0
     cone = "SELECT * FROM ivoa.obscore WHERE INTERSECTS(CIRCLE('ICRS', {}, {}, {}), s_region) = 1"

@@ -55,6 +55,8 @@ def obscore_rows(lake: LakeSession, address: str) -> list[dict[str, Any]]:
             "kbyte": manifest_entry["bytes"] // 1024,
             "version": image.version.key,
             "fov": _diameter(image.row["ra"], image.row["dec"], corners),
+            # The width of stars in the image. The column `seeing` is that of the air at the zenith and at 500 nm.
+            "resolution": header.get("PSFFWHM") or None,
             "wavelengths": bands[image.request_tables.request].get(image.row["band"]),
             "exposure": "/".join(str(part) for part in image.detector_key[:2] if part is not None),
             "nx": header.get("NAXIS1"),

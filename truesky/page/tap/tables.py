@@ -239,8 +239,9 @@ def obscore_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any]
         Row of the exposure in the table `exposures`, or {} if there is no such row.
     file : mapping
         Further properties of the file: `url`, `kbyte` (size, KiB), `nx`, `ny` (shape), `fov` (diameter of the field,
-        deg), `wavelengths` (shortest and longest in angstrom, or None), `version` (key of the version of `products`),
-        and `exposure` (an identifier of the exposure that is unique in the lake).
+        deg), `resolution` (FWHM of stars in arcsec, or None), `wavelengths` (shortest and longest in angstrom, or
+        None), `version` (key of the version of `products`), and `exposure` (an identifier of the exposure that is
+        unique in the lake).
 
     Returns
     -------
@@ -264,7 +265,7 @@ def obscore_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any]
         "s_dec": row["dec"],
         "s_fov": file["fov"],
         "s_region": row["s_region"],
-        "s_resolution": exposure.get("seeing") or None,
+        "s_resolution": file["resolution"],
         "s_xel1": file["nx"],
         "s_xel2": file["ny"],
         "t_min": start,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -423,7 +424,7 @@ def _exposures_of_visit(
     except BadInput as error:
         raise error.with_prefix(row.location) from None
     zero_point = zero_point_of(section, row.band, mission)
-    detector = camera_detectors.detectors(camera, mission)[0]
+    detector = _first_detector(camera, mission)
     exposure = Exposure(
         channel=row.channel,
         camera=camera,
@@ -446,6 +447,12 @@ def _exposures_of_visit(
         replace(exposure, mjd=mjd + i * step, dither=i + 1 if visit.exposures > 1 else None)
         for i in range(visit.exposures)
     ]
+
+
+@lru_cache(maxsize=8)
+def _first_detector(camera: str, mission: MissionConfiguration) -> Detector:
+    # To read the layout of a camera takes milliseconds, and a table may have a million visits.
+    return camera_detectors.detectors(camera, mission)[0]
 
 
 def _check_visit(row: Row, camera: str, site: Site, mission: MissionConfiguration) -> None:

@@ -41,7 +41,7 @@ ANGLES: Mapping[str, tuple[float, float]] = {
     "paraAngle": (-360.0, 360.0),
 }
 # Further columns of numbers that are read if they exist, with their limits.
-_OPTIONAL: Mapping[str, tuple[float, float]] = {"visitTime": (0.1, 1e5)}
+OPTIONAL: Mapping[str, tuple[float, float]] = {"visitTime": (0.1, 1e5)}
 # Columns of texts that name the filter; a table must have one of them. Newer tables have the name of the physical
 # filter, such as r_57, in `filter`, and its letter in `band`.
 _FILTERS = ("band", "filter")
@@ -67,7 +67,7 @@ def is_table_of_visits(path: Path) -> bool:
     with user_files.open_file(path, "catalogue") as stream:
         start = stream.read(1 << 16)
     lines = (line for line in start.decode("utf-8-sig", errors="replace").splitlines() if not line.startswith("#"))
-    return bool(_KEY_COLUMNS & {name.strip() for name in next(lines, "").split(",")})
+    return bool(_KEY_COLUMNS & {name.strip().strip('"') for name in next(lines, "").split(",")})
 
 
 def read(path: Path, bands: Sequence[str], image_type: str) -> list[Row]:
@@ -164,7 +164,7 @@ def _read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
     names = list(connection_rows) if connection_rows is not None else _column_names(path)
     _refuse_missing(path, names)
     filter_column = next(name for name in _FILTERS if name in names)
-    numbers = [*BOUNDS, *(name for name in (*ANGLES, *_OPTIONAL) if name in names)]
+    numbers = [*BOUNDS, *(name for name in (*ANGLES, *OPTIONAL) if name in names)]
     columns: dict[str, Any] = {name: [] for name in numbers}
     filters: list[str] = []
     batches = (
@@ -182,7 +182,7 @@ def _read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise BadInput(f"{user_files.format_path(path)}: contains no visits")
     arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
     find_out_of_bounds(path, {name: arrays[name] for name in BOUNDS}, BOUNDS).refuse()
-    limits = {name: bound for name, bound in {**ANGLES, **_OPTIONAL}.items() if name in arrays}
+    limits = {name: bound for name, bound in {**ANGLES, **OPTIONAL}.items() if name in arrays}
     filled = {name: np.where(np.isnan(arrays[name]), limits[name][1], arrays[name]) for name in limits}
     find_out_of_bounds(path, filled, limits).refuse()
     return arrays, filters

@@ -201,3 +201,12 @@ def test_cameras_without_a_rotator_need_rot_sky_pos(tmp_path):
     assert two.mjd - one.mjd == pytest.approx(17.0 / 86400.0, abs=1e-9)
     with pytest.raises(BadInput, match="rotTelPos: decam has no rotator"):
         ground_surveys.read(write(tmp_path, rotSkyPos=None, rotTelPos=10.0), block, mission)
+
+
+def test_the_layout_of_the_camera_is_read_once_for_all_visits(monkeypatch):
+    """It takes milliseconds, and a table may have a million visits."""
+    calls, original = [], detectors.detectors
+    monkeypatch.setattr(detectors, "detectors", lambda *names: calls.append(names) or original(*names))
+    mission = resolve(overrides={"ext.lsstcam.first_light": (60001.0, "d")})
+    assert len({one.field for one in ground_surveys.read(FILE, BLOCK, mission)}) == 20
+    assert calls == [("lsstcam", mission)]

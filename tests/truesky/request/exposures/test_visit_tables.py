@@ -75,6 +75,11 @@ def test_newer_tables_name_the_physical_filter_too(tmp_path, table):
     assert [row.band for row in read(write_csv(tmp_path / "new.csv", new))] == [row.band for row in read(FILE)]
 
 
+def test_names_of_columns_may_be_in_quotes(tmp_path, table):
+    quoted = {f'"{name}"': values for name, values in table.items()}
+    assert without_place(read(write_csv(tmp_path / "visits.csv", quoted))) == without_place(read(FILE))
+
+
 def test_tables_of_pointings_are_not_visits(tmp_path):
     path = tmp_path / "pointings.csv"
     path.write_text("# fieldRA\nra,dec\n1,2\n")
