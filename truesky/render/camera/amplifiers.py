@@ -582,7 +582,7 @@ def measured_crosstalk(detector: Detector, detector_layout: Layout, mission: Mis
     Returns
     -------
     float array, shape (n_amplifiers, n_amplifiers), or None
-        Element [i, j] is the fraction of the signal in amplifier j that appears in amplifier i, and can be negative. A
+        Element [i, j] is the fraction of the ADU of amplifier j that appears in amplifier i, and can be negative. A
         pair that was not measured has 0. None if the mission database has no table for the camera, or if the request
         sets its crosstalk.
     """

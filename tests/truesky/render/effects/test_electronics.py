@@ -9,6 +9,7 @@ from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 from tests.truesky.render.fields import exposure
 from truesky.randomness.rng import stream
+from truesky.render.camera import amplifiers, detectors
 from truesky.render.effects.charge import charge_injection, dark_current, poisson
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
@@ -137,6 +138,18 @@ def test_crosstalk_is_taken_from_what_was():
         crosstalk.apply(frame, np.zeros((3, 3)))
     with pytest.raises(OutOfRange, match="crosstalk"):
         crosstalk.apply(frame, np.full((4, 4), np.nan))
+
+
+@pytest.mark.parametrize(("camera", "name"), [("hsc", "1_12"), ("decam", "N1")])
+def test_measured_crosstalk_is_a_fraction_of_adu(camera, name):
+    """As the pipelines of the observatories subtract it, before they multiply by gains, which differ."""
+    mission = resolve()
+    scene = Scene(mission, f"ext.{camera}", 90.0, 10.0, 1e6, detectors.detector(camera, name, mission))
+    measured = amplifiers.measured_crosstalk(scene.detector, scene.layout, mission)
+    gain = scene.amplifier_values("gain", "electron / adu")[:, None, None]
+    adu = np.random.default_rng(5).exponential(1e4, (len(measured), 3, 5))
+    found = crosstalk.apply(adu * gain, crosstalk.coefficients(scene)) / gain
+    np.testing.assert_allclose(found, adu + np.einsum("vs,syx->vyx", measured, adu), rtol=1e-12)
 
 
 def test_structure_of_the_bias():

@@ -93,7 +93,7 @@ def _mix(frame: Any, coefficients: Any) -> None:
 def coefficients(scene: Scene) -> Frame:
     """Return the crosstalk coefficients of a scene's detector, shape (q, q) for q amplifiers.
 
-    Element [i, j] is the share of the signal of amplifier j that appears in amplifier i. Detectors that are read in
+    Element [i, j] is the share of the electrons of amplifier j that appears in amplifier i. Detectors that are read in
     quadrants have the coefficient of the mission database for neighbours, and half of it for diagonally opposite
     quadrants. Ground cameras have a coefficient for each pair of amplifiers: a measured one if there is one, which can
     be negative.
@@ -101,7 +101,9 @@ def coefficients(scene: Scene) -> Frame:
     if scene.layout is not None and scene.detector is not None:
         measured = amplifiers.measured_crosstalk(scene.detector, scene.layout, scene.mission)
         if measured is not None:
-            return measured
+            # Observatories measure crosstalk in ADU.
+            gain = np.broadcast_to(scene.amplifier_values("gain", "electron / adu"), len(measured))
+            return np.asarray(measured * (gain[:, None] / gain))
         largest = scene.value("crosstalk_max", "")
         return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
     row_neighbour = column_neighbour = scene.value("crosstalk", "")
