@@ -13,8 +13,10 @@ def electrons(raw, scene, seed, applied):
 
     `applied` contains the names of the effects in the image.
     """
-    gain = np.reshape(scene.amplifier_values("gain", "electron / adu"), (-1, 1, 1))
-    found = (raw.astype(float) - scene.value("bias", "adu")) * gain
+    gain, bias = (
+        np.reshape(scene.amplifier_values(*key), (-1, 1, 1)) for key in (("gain", "electron / adu"), ("bias", "adu"))
+    )
+    found = (raw.astype(float) - bias) * gain
 
     def fixed(effect):
         return stream(seed, camera_of(scene), scene.detector.name, effect.name)
