@@ -341,12 +341,11 @@ def test_without_any_effect_the_image_is_the_truth_in_whole_numbers():
         needed = {"adc", "quadrants", "amplifiers"} & {decision.name for decision in one.decisions}
         assert {decision.name for decision in one.decisions if decision.applied} == needed | set(keep)
         light = one.noise_free.astype(float) + bool(keep) * one.scene.sky_electrons
-        gain, bias = (
-            one.scene.amplifier_values(*key) for key in (("gain", "electron / adu"), ("bias", "adu"))
-        )
+        gain, bias = (one.scene.amplifier_values(*key) for key in (("gain", "electron / adu"), ("bias", "adu")))
         if one.scene.layout is not None:
             gain, bias = (
-                one.scene.layout.assemble(np.broadcast_to(np.reshape(x, (-1, 1, 1)), one.raw.shape)) for x in (gain, bias)
+                one.scene.layout.assemble(np.broadcast_to(np.reshape(value, (-1, 1, 1)), one.raw.shape))
+                for value in (gain, bias)
             )
         assert np.abs(one.science - bias - light / gain).max() == pytest.approx(0.5, abs=1e-2)
 
