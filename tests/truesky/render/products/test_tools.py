@@ -131,19 +131,24 @@ def arrays(path):
 
 
 def with_one_wcs(path):
-    """Return a file in which one WCS is valid for all pixels: the file itself, except for raw frames of HSC.
+    """Return a file in which one WCS and one bias level are valid for all pixels: the file itself, for most cameras.
 
-    These have prescan and overscan between their pixels, and the WCS of the pixels without them. The result then has
-    the pixels of the amplifiers side by side, and their overscan level is subtracted.
+    Raw frames of HSC have prescan and overscan between their pixels, and the WCS of the pixels without them. The result
+    then has the pixels of the amplifiers side by side. Amplifiers of LSSTCam have different bias levels. In both cases
+    the overscan level is subtracted.
     """
     ((header, array), *others) = arrays(path)
-    if others or "NAMPS" not in header or "DATASEC" in header:
+    if others or "NAMPS" not in header:
         return path
     numbers = range(1, header["NAMPS"] + 1)
-    places = [window(header[f"CSEC{n}"]) for n in numbers]
-    out = np.zeros(tuple(max(place[axis].stop for place in places) for axis in (0, 1)), np.float32)
-    for n, place in zip(numbers, places, strict=True):
-        out[place] = array[window(header[f"DSEC{n}"])] - np.median(array[window(header[f"BSEC{n}"])])
+    levels = [np.median(array[window(header[f"BSEC{n}"])]) for n in numbers]
+    if "DATASEC" in header and np.ptp(levels) < 200.0:
+        return path
+    places = [window(header[f"{'DSEC' if 'DATASEC' in header else 'CSEC'}{n}"]) for n in numbers]
+    shape = tuple(max(place[axis].stop for place in places) for axis in (0, 1))
+    out = np.zeros(array.shape if "DATASEC" in header else shape, np.float32)
+    for n, place, level in zip(numbers, places, levels, strict=True):
+        out[place] = array[window(header[f"DSEC{n}"])] - level
     joined = path.with_name(f"joined_{path.name}")
     if not joined.exists():
         fits.writeto(joined, out, header)
