@@ -502,7 +502,8 @@ def test_level_2_of_a_lake_with_its_masters(tmp_path, survey, camera, band, dete
                 publish.make_version(root, step.plan, step.run_task)
         own, out = str(tmp_path / "masters"), tmp_path / "level2"
         assert masters.main(["--lake", str(root), "--out", own]) == 0
-        call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]
+        # The true sky contains the pixel area.
+        call = ["--lake", str(root), "--masters", own, "--without", "dark", "pixel_area", "--out", str(out), "--level2"]
         assert reduce.main(call) == 0
     assert sorted(path.name for path in Path(own).iterdir()) == [
         f"{camera}_{detector}_bias.fits", f"{camera}_{band}_{detector}_flat.fits"
