@@ -6,8 +6,6 @@ import pytest
 from tests.truesky.render.fields import MISSION
 from truesky.render.camera import amplifiers, detectors
 from truesky.render.camera.sections import Section
-from truesky.render.effects.charge import bleeding
-from truesky.render.effects.readout import bias_structure, charge_transfer, crosstalk
 
 # Rubin Observatory, obs_lsst, policy/cameraHeader.yaml: amplifiers in the order of the extensions (hdu 1 to 16), and
 # flipXY of C1x and C0x. The read corner of the array in the file is LL (lower left), so that flipXY tells the corner of
@@ -81,74 +79,3 @@ def test_sections_on_the_sensor_are_in_the_direction_of_the_readout(maker):
         parts = layout.amplifier_sections(number)
         if amplifier.name in PLACES[kind]:
             assert parts.ccd.text_along(parts.steps) == PLACES[kind][amplifier.name]
-
-
-def corner_steps(amplifier):
-    """Return the steps (column, row) away from the corner that the camera description gives for an amplifier."""
-    kind = "e2v" if amplifier.pixels.nx == 512 else "itl"
-    return tuple(-1 if flip else 1 for flip in FLIPS[kind][amplifier.name[1]])
-
-
-def middle(amplifier):
-    """Return the row and column of a pixel in the middle of an amplifier."""
-    return amplifier.pixels.y + amplifier.pixels.ny // 2, amplifier.pixels.x + amplifier.pixels.nx // 2
-
-
-def test_deferred_charge_trails_away_from_the_corner(maker):
-    """A bright pixel of each amplifier leaves charge in the next pixel to be read, in both directions of transfer."""
-    _, layout, _ = maker
-    frame = np.zeros((layout.ny, layout.nx))
-    for amplifier in layout.amplifiers:
-        frame[middle(amplifier)] = 1e5
-    planes = layout.split(frame)
-    for apply, axis in ((charge_transfer.apply_serial_loss, 0), (charge_transfer.apply_parallel_loss, 1)):
-        read = layout.assemble(apply(planes, 1e-5))
-        for amplifier in layout.amplifiers:
-            row, column = middle(amplifier)
-            step = corner_steps(amplifier)[axis]
-            along = (0, step) if axis == 0 else (step, 0)
-            assert read[row + along[0], column + along[1]] > 100.0
-            assert read[row - along[0], column - along[1]] == 0.0
-
-
-def test_the_bias_settles_from_the_corner(maker):
-    """The first column that is read lies in the prescan, so that pixels near the corner have the largest offset."""
-    _, layout, _ = maker
-    pattern = bias_structure.apply(np.zeros(layout.planes_shape), 0.0, -3.0, 40.0, 0.0, np.random.default_rng(1))
-    read = layout.assemble(pattern)
-    for amplifier in layout.amplifiers:
-        row = read[amplifier.pixels.slices][0][:: corner_steps(amplifier)[0]]
-        np.testing.assert_allclose(row, -3.0 * np.exp(-(layout.prescan + np.arange(len(row))) / 40.0), rtol=1e-12)
-
-
-def test_crosstalk_is_at_the_same_distance_from_the_corner(maker):
-    _, layout, _ = maker
-    source = next(a for a in layout.amplifiers if a.name == "C13")
-    frame = np.zeros((layout.ny, layout.nx))
-    across, up = 20, 30
-    column_step, row_step = corner_steps(source)
-    part = frame[source.pixels.slices][::row_step, ::column_step]
-    part[up, across] = 1e5
-    coefficients = np.full((16, 16), 1e-4)
-    read = layout.assemble(crosstalk.apply(layout.split(frame), coefficients))
-    for amplifier in layout.amplifiers:
-        column_step, row_step = corner_steps(amplifier)
-        part = read[amplifier.pixels.slices][::row_step, ::column_step]
-        expected = 1e5 if amplifier is source else 10.0
-        assert part[up, across] == pytest.approx(expected)
-        assert np.count_nonzero(part) == 1
-
-
-def test_bleeding_charge_leaves_at_the_serial_register(maker):
-    """Charge of a full column is lost at the edge of the sensor next to the corner, and turned back in its middle."""
-    _, layout, _ = maker
-    frame = np.zeros((layout.ny, 1))
-    frame[10, 0] = frame[layout.ny - 11, 0] = 1e6
-    bled, lost = bleeding.bleed(frame, 1000.0, layout.column_segments)
-    assert lost > 0.0
-    assert bled[0, 0] == bled[-1, 0] == 1000.0
-    middle_only = np.zeros((layout.ny, 1))
-    middle_only[layout.height - 1, 0] = 1e5
-    bled, lost = bleeding.bleed(middle_only, 1000.0, layout.column_segments)
-    assert lost == 0.0
-    assert bled[layout.height :].sum() == 0.0

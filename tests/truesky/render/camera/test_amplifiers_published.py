@@ -1,7 +1,7 @@
 """Amplifiers of DECam, HSC and MegaPrime: sections and read corners of published headers and camera descriptions.
 
-Charge, bias and crosstalk follow the direction of the readout in the axes of the detector. test_amplifiers_lsstcam.py
-has the same tests for LSSTCam.
+Charge, bias and crosstalk of all cameras follow the direction of the readout in the axes of the detector. The read
+corners of LSSTCam are compared with its camera description in test_amplifiers_lsstcam.py.
 """
 
 from dataclasses import replace
