@@ -327,8 +327,7 @@ def _fine(plane: Float, matrix: Float, middle: list[float]) -> _Fine:
     largest_reach = float(np.abs(matrix).sum(axis=1).max()) * (0.55 * SIDE + _OF_CUBES)
     half = int(np.ceil(min(reach, largest_reach) * factor))
     at = np.arange(-half, half + 1) / factor
-    rows, columns = (_interpolant(at + m, n, _OF_CUBES) for m, n in zip(middle, plane.shape, strict=True))
-    fine = matrices.matmul(rows, matrices.matmul(plane, columns.T))
+    fine = _interpolate(plane, at + middle[0], at + middle[1], _OF_CUBES)
     return _Fine(scipy.ndimage.spline_filter(fine, _SPLINE), factor, reach)
 
 
@@ -501,23 +500,33 @@ def _resample(plane: Float, spacing: float, middle: list[float], lobes: int, sam
     reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + lobes
     half = max(min(int(reach * spacing * samples), SIDE * samples // 2), _LEAST_SIDE * samples // 2)
     at = np.arange(-half, half + 1) / (samples * spacing)
-    rows, columns = (_interpolant(at + m, n, lobes) for m, n in zip(middle, plane.shape, strict=True))
-    return np.asarray(matrices.matmul(rows, matrices.matmul(plane, columns.T)) / (samples * spacing) ** 2)
+    return _interpolate(plane, at + middle[0], at + middle[1], lobes) / (samples * spacing) ** 2
 
 
-def _interpolant(at: Float, count: int, lobes: int) -> Float:
-    """Return the weights [n, count] that interpolate `count` samples at the positions `at` [n], by a Lanczos kernel.
+def _interpolate(plane: Float, rows: Float, columns: Float, lobes: int) -> Float:
+    """Interpolate an image at fractional rows [n] and columns [m] by a Lanczos kernel of `lobes` lobes, float64[n, m].
 
-    Positions are fractional indices of samples. The weights are normalised so that equal samples give the same value
-    between them. Samples with indices below 0 or from `count` on are treated as 0.
+    Pixels outside the image are treated as 0.
     """
-    distance = at[:, None] - np.arange(count)
-    kernel = np.where(np.abs(distance) < lobes, np.sinc(distance) * np.sinc(distance / lobes), 0.0)
-    # `total` is the sum of the kernel over an infinite grid of samples, by which the weights are divided. Near the
-    # border the weights add up to less than 1, because samples outside are 0.
-    steps = (at % 1.0)[:, None] - np.arange(1 - lobes, lobes + 1)
-    total = (np.sinc(steps) * np.sinc(steps / lobes)).sum(axis=1, keepdims=True)
-    return np.asarray(kernel / total)
+    return _interpolate_rows(_interpolate_rows(plane.T, columns, lobes).T, rows, lobes)
+
+
+def _interpolate_rows(plane: Float, at: Float, lobes: int) -> Float:
+    """Interpolate an image [rows, columns] at fractional rows `at` [n] by a Lanczos kernel, float64[n, columns].
+
+    The weights are normalised so that equal rows give the same row between them. Rows outside the image are 0.
+    """
+    count, first = len(plane), np.floor(at).astype(np.int64)
+    steps = np.arange(1 - lobes, lobes + 1)
+    distance = (at - first)[:, None] - steps
+    kernel = np.sinc(distance) * np.sinc(distance / lobes)
+    kernel /= kernel.sum(axis=1, keepdims=True)
+    out = np.zeros((len(at), plane.shape[1]))
+    for step, weight in zip(steps, kernel.T, strict=True):
+        row = first + step
+        inside = np.where((row >= 0) & (row < count), weight, 0.0)
+        out += inside[:, None] * plane[np.clip(row, 0, count - 1)]
+    return out
 
 
 def _half(detector: Detector) -> tuple[float, float]:

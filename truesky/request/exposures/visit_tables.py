@@ -159,17 +159,15 @@ def _read_columns(path: Path) -> tuple[dict[str, Any], list[str]]:
 
     Missing numbers are NaN in columns of angles, and refused in others.
     """
-    is_sqlite = path.suffix.lower() in _SQLITE
-    connection_rows = _sqlite_columns(path) if is_sqlite else None
-    names = list(connection_rows) if connection_rows is not None else _column_names(path)
+    table, names = _sqlite_columns(path) if path.suffix.lower() in _SQLITE else ("", _column_names(path))
     _refuse_missing(path, names)
     filter_column = next(name for name in _FILTERS if name in names)
     numbers = [*BOUNDS, *(name for name in (*ANGLES, *OPTIONAL) if name in names)]
     columns: dict[str, Any] = {name: [] for name in numbers}
     filters: list[str] = []
     batches = (
-        _sqlite_batches(path, numbers, filter_column)
-        if is_sqlite
+        _sqlite_batches(path, table, numbers, filter_column)
+        if table
         else (batch.columns for batch in external_rows.read_batches(path, numbers, (), (filter_column,)))
     )
     for batch in batches:
@@ -223,8 +221,8 @@ def _connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _sqlite_columns(path: Path) -> dict[str, str]:
-    """Return the name of the table of visits in a SQLite file by column: {column: table}."""
+def _sqlite_columns(path: Path) -> tuple[str, list[str]]:
+    """Return the name of the table of visits in a SQLite file, and the names of its columns."""
     try:
         with closing(_connect(path)) as connection:
             tables = [
@@ -236,19 +234,35 @@ def _sqlite_columns(path: Path) -> dict[str, str]:
                     f"{user_files.format_path(path)}: has no table {' or '.join(_TABLE_NAMES)}: it has "
                     f"{', '.join(tables[:5]) or 'no table'}"
                 )
-            return {str(row[1]): table for row in connection.execute(f"PRAGMA table_info({table})")}
+            return table, [str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")]
     except sqlite3.Error as error:
         raise BadInput(f"{user_files.format_path(path)}: {error}") from None
 
 
-def _sqlite_batches(path: Path, numbers: Sequence[str], filter_column: str) -> Iterator[dict[str, Any]]:
-    """Yield the columns of batches of rows of a SQLite file, in the order of the file."""
-    table = _sqlite_columns(path)[filter_column]
+def _sqlite_batches(path: Path, table: str, numbers: Sequence[str], filter_column: str) -> Iterator[dict[str, Any]]:
+    """Yield the columns of batches of rows of a table in a SQLite file, in the order of the file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    table : str
+        Name of the table.
+    numbers : sequence of str
+        Columns of numbers.
+    filter_column : str
+        Column with the name of the filter.
+
+    Yields
+    ------
+    dict
+        Lists of float by column of numbers, with NaN for missing numbers, and a list of str for the filter.
+    """
     selected = ", ".join(f'"{name}"' for name in (*numbers, filter_column))
     try:
         with closing(_connect(path)) as connection:
             # The names are constants of this module, so that the statement cannot contain other text.
-            cursor = connection.execute(f"SELECT {selected} FROM {table} LIMIT {_MAX_ROWS + 1}")  # noqa: S608
+            cursor = connection.execute(f"SELECT {selected} FROM {table} ORDER BY rowid LIMIT {_MAX_ROWS + 1}")  # noqa: S608
             first_row = 1
             while batch := cursor.fetchmany(65_536):
                 values = list(zip(*batch, strict=True))
