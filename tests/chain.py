@@ -62,7 +62,7 @@ def table():
 def quick():
     """Return arrays by name that take a few seconds."""
     from tests.truesky.render import fields
-    from truesky.render.psf import euclid
+    from truesky.render.psf import euclid, ground
     from truesky.render.sources import galaxy_shapes, sersic
 
     yield from table()
@@ -75,6 +75,11 @@ def quick():
     planes = euclid.vis_psf(fields.small("vis", "3-4"), vis, fields.MISSION, 4).planes
     yield "psf", planes.images
     yield "psf_drift", planes.drift
+    ccd = fields.small("lsstcam", "R22_S11")
+    yield (
+        "ground_psf",
+        ground.atmospheric_psf(ground.Air(0.7), ccd, passbands.load("lsst_r"), fields.MISSION, 4).planes.images,
+    )
     yield "sersic", sersic.table()
     shapes = galaxy_shapes.shapes(
         fields.galaxies(np.zeros(50), np.zeros(50), inclination=80 * rng.random(50), gamma1=0.02)

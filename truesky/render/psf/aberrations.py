@@ -16,6 +16,7 @@ import scipy
 from lake_schema.arrays import Complex, Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
+from truesky.render.psf import zernikes
 
 # Largest distance of two points in the pupil (wavelength times spatial frequency) for which the transfer function of
 # the optics is computed, in Fried lengths. At larger distances the air transmits little, and the light is neglected.
@@ -108,14 +109,12 @@ class TransferRatio:
         TransferRatio
             The ratio in the axes of the detector.
         """
-        import galsim
-
         step = 2.0 * telescope.radius / _ACROSS
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
         lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)
         x, y, clear, plain = _pupil(telescope.radius, telescope.inner)
         x, y = axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
-        phase = galsim.zernike.Zernike(nm * (20.0 * np.pi / wave))(x, y)
+        phase = zernikes.sum_of_zernikes(nm * (20.0 * np.pi / wave), x, y)
         field = scipy.fft.fft2(clear * np.exp(1j * phase), (_TRANSFORM, _TRANSFORM))
         overlap = scipy.fft.ifft2(np.abs(field) ** 2)[np.ix_(lags, lags)]
         values = overlap / plain[np.ix_(lags, lags)]

@@ -10,6 +10,7 @@ import scipy
 
 from lake_schema.arrays import Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
+from truesky.render.psf import zernikes
 
 # Radian per arcsec.
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -124,12 +125,11 @@ def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Flo
         sampled pupil has soft edges, which weaken light far from the centre; this is corrected. Because of single
         precision, the relative error per sample is 5e-4, and 5e-6 in the core.
     """
-    import galsim
-
     transmission, transform = optics.transmission, optics.transform
     side = transform if side is None else side
     lit = transmission > 0
-    phase = galsim.zernike.Zernike(nm * (2 * np.pi / (optics.wavelength / 10.0)))(optics.x, optics.y).astype(np.float32)
+    scaled = nm * (2 * np.pi / (optics.wavelength / 10.0))
+    phase = zernikes.sum_of_zernikes(scaled, optics.x, optics.y).astype(np.float32)
     field = np.zeros(transmission.shape, np.complex64)
     field.real[lit] = transmission[lit] * np.cos(phase)
     field.imag[lit] = transmission[lit] * np.sin(phase)
