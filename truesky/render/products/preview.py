@@ -25,14 +25,18 @@ from truesky.render.products.sidecar_files import spectra_file
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-# Width and height of a preview picture in inches.
-_INCHES = (13.2, 9.6)
+# Height of a preview picture, largest width and height of its overview, width and height of a close-up, distance
+# between close-ups, and width of the margins, inches. The picture is as wide as these require: CCDs of some cameras are
+# twice as high as wide.
+_HEIGHT, _OVERVIEW_INCHES, _CLOSE_UP_INCHES, _GAP, _MARGIN = 9.6, (9.44, 8.93), (3.366, 2.928), 0.077, 0.132
+# Width in inches below which the caption of a picture does not fit next to its title and has two lines.
+_ONE_LINE = 12.0
 # Pixels per inch of a preview picture.
 _DPI = 100
 # Largest side in pixels of the overview, which shows the whole image. Close-ups have full resolution.
 _OVERVIEW = 1000
-# Space for the label of a source, as fractions of the width and of the height of the image. Labels whose spaces overlap
-# that of a brighter source are not drawn.
+# Space for the label of a source, as fractions of the height of the image. Labels whose spaces overlap that of a
+# brighter source are not drawn.
 _LABEL_SIZE = (0.14, 0.035)
 # A pixel hit by a cosmic ray is replaced by the median of pixels up to this number of rows and columns away.
 _MEND_RADIUS = 2
@@ -166,34 +170,42 @@ def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Lab
 
     header: dict[str, Any] = {keyword: value for keyword, value, _ in cards}
     system = astrometry.from_cards(cards)
-    figure = Figure(figsize=_INCHES, dpi=_DPI, facecolor=_PAPER)
+    width = min(_OVERVIEW_INCHES[0], _OVERVIEW_INCHES[1] * image.shape[1] / image.shape[0])
+    panels = width + 2 * _MARGIN
+    total = panels + _CLOSE_UP_INCHES[0] + _MARGIN
+    figure = Figure(figsize=(total, _HEIGHT), dpi=_DPI, facecolor=_PAPER)
     FigureCanvasAgg(figure)
     upside_down = astrometry.jacobian(system, [0.0], [0.0])[0, 1, 1] < 0
-    main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
+    main = figure.add_axes((_MARGIN / total, _MARGIN / _HEIGHT, width / total, _OVERVIEW_INCHES[1] / _HEIGHT))
     block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
     _show_image(main, _shrink(image, block), block, image.shape, upside_down)
-    text_x, text_y = _LABEL_SIZE[0] * image.shape[1], _LABEL_SIZE[1] * image.shape[0]
+    text_x, text_y = (size * image.shape[0] for size in _LABEL_SIZE)
     _annotate(main, preview_labels.without_overlaps(names, text_x, text_y, LABELS), image.shape, upside_down)
     _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
     _compass(main, system, image.shape)
     for number, label in enumerate(preview_labels.close_ups(names, image.shape, header["PIXSCALE"])):
-        axes = figure.add_axes((0.735, 0.01 + (0.93 + 0.008) / CLOSE_UPS * (CLOSE_UPS - 1 - number), 0.255, 0.305))
+        bottom = _MARGIN + (_CLOSE_UP_INCHES[1] + _GAP) * (CLOSE_UPS - 1 - number)
+        axes = figure.add_axes(
+            (panels / total, bottom / _HEIGHT, _CLOSE_UP_INCHES[0] / total, _CLOSE_UP_INCHES[1] / _HEIGHT)
+        )
         _close_up(axes, main, image, label, header["PIXSCALE"], upside_down, "abc"[number])
     # Lakes of the first versions have no card BAND; their card FILTER has the same value.
     band = header.get("BAND", header["FILTER"])
     title = f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {band}   {header['EXPTIME']:g} s"
+    caption = ("\n" if total < _ONE_LINE else "   ").join(_caption(header, system, image.shape))
     figure.text(0.012, 0.958, title, color=_INK, fontsize=15, fontweight="bold")
-    figure.text(0.988, 0.958, _caption(header, system, image.shape), color=_INK, fontsize=10.5, ha="right")
+    figure.text(0.988, 0.958, caption, color=_INK, fontsize=10.5, ha="right", linespacing=1.4)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, facecolor=_PAPER, metadata={"Software": None})
 
 
-def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str:
+def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> tuple[str, str]:
+    """Return two texts: position and size of an image of `shape` pixels, and its PSF, sources and version."""
     ra, dec = astrometry.sky_of_pixel(system, [(shape[1] - 1) / 2], [(shape[0] - 1) / 2])
     size = [n * header["PIXSCALE"] / 60.0 for n in shape[::-1]]
     return (
-        f"RA {ra[0]:.4f}  Dec {dec[0]:+.4f}   {size[0]:.1f}' x {size[1]:.1f}'   PSF {header['PSFFWHM']:.2f}\""
-        f"   {header['NSOURCES']:,} sources   truesky {header['TRUESKY']}"
+        f"RA {ra[0]:.4f}  Dec {dec[0]:+.4f}   {size[0]:.1f}' x {size[1]:.1f}'",
+        f'PSF {header["PSFFWHM"]:.2f}"   {header["NSOURCES"]:,} sources   truesky {header["TRUESKY"]}',
     )
 
 
@@ -303,11 +315,12 @@ def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
     x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     inverse = matrices.inverse(astrometry.jacobian(system, [x], [y])[0])
     flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
-    origin = np.array([0.93, 0.05])
+    origin = np.array([1.0 - 0.07 * shape[0] / shape[1], 0.05])
     # Letters of the arrows, and their directions on the sky as (west, north).
     for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
         step = matrices.matmul(inverse, np.array(world)) * flip
-        step = step / np.hypot(*step) * 0.055
+        # In a narrow image, a fraction of the width is shorter than the same fraction of the height.
+        step = step / np.hypot(*step) * 0.055 * np.array([shape[0] / shape[1], 1.0])
         axes.annotate(
             "",
             origin + step,
