@@ -50,7 +50,8 @@ All keys::
                                           analogue-to-digital conversion (ALWAYS_ON in truesky/request/schema.py)
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
-                   band           default: euclid_vis, euclid_h, nisp_red, or the r band of a ground camera
+                   band           default: euclid_vis, euclid_h, nisp_red, or the r band of a ground camera;
+                                  RGS000, RGS180 and BGS000 are nisp_red and nisp_blue at the grism's angle
                    mjd            default: Euclid: first date the Sun allows; ground: first transit at night
                    grism_angle    direction of NISP-S spectra in the focal plane: -4, 0, 180, 184 deg
                    realisations   number of exposures that differ only in their noise
