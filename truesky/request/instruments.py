@@ -207,7 +207,8 @@ def check_band(
         return
     if band == _UNUSED_GRISM:
         usable = ", ".join(grism for grism, (passband, _) in GRISM_NAMES.items() if passband in bands)
-        raise BadInput(f"{path}{': ' if path else ''}Euclid does not observe with grism {band}{': use ' * bool(usable)}{usable}")
+        problem = f"{path}{': ' if path else ''}Euclid does not observe with grism {band}"
+        raise BadInput(f"{problem}: use {usable}" if usable else problem)
     meant = known_name(band, bands)
     remedy = spelling.choices(meant, bands)
     in_observation = path.endswith("bands")
