@@ -103,8 +103,12 @@ def test_wrong_grisms_are_refused(tmp_path):
         spectrum(band="RGS000", grism_angle=184.0)
     with pytest.raises(BadInput, match=r"^pointing\[0\].band: Euclid does not observe with grism RGS270: use RGS000, "):
         spectrum(band="RGS270")
-    with pytest.raises(BadInput, match=r"^pointing\[0\].band: camera vis has no band 'nisp_red': nisp_red is a band of"):
+    with pytest.raises(
+        BadInput, match=r"^pointing\[0\].band: camera vis has no band 'nisp_red': nisp_red is a band of"
+    ):
         spectrum(channel="VIS", band="RGS000")
     (tmp_path / "table.csv").write_text("ra,dec,band,grism_angle\n53,-27,BGS000,180\n")
-    with pytest.raises(BadInput, match=r"table.csv line 2: grism_angle = 180 deg tilts BGS000 by 180 deg, more than 45"):
+    with pytest.raises(
+        BadInput, match=r"table.csv line 2: grism_angle = 180 deg tilts BGS000 by 180 deg, more than 45"
+    ):
         pointing_tables.read(tmp_path / "table.csv", ["NISP-S"], "science")

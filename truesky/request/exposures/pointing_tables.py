@@ -363,8 +363,9 @@ def _row_from_line(
             grism_angle=read(_number, row, "grism_angle", location),
             detectors=tuple(row.get("detectors", "").split()),
         )
-        band, angle = read(replace_grism, parsed.band or "", parsed.grism_angle, f"{location}: grism_angle") or ("", None)
-    return replace(parsed, ra=parsed.ra % 360.0, band=band, grism_angle=angle)
+        spectra = read(replace_grism, parsed.band or "", parsed.grism_angle, f"{location}: grism_angle")
+    band, grism_angle = spectra
+    return replace(parsed, ra=parsed.ra % 360.0, band=band, grism_angle=grism_angle)
 
 
 def _band(row: Mapping[str, str], channel: str, location: str) -> str:

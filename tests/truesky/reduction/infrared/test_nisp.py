@@ -179,7 +179,16 @@ def test_the_bad_pixel_map_flags_hot_pixels_also_without_a_dark(made, tmp_path):
     assert (bits[hot] & calibration.HOT).all()
     assert (bits > 0).mean() < 0.01
     path = sorted((made / "images").iterdir())[0]
-    call = ["--lake", str(made / "lake"), "--exposures", str(int(path.name[:6])), "--without", "dark", "flat", "linearity"]
+    call = [
+        "--lake",
+        str(made / "lake"),
+        "--exposures",
+        str(int(path.name[:6])),
+        "--without",
+        "dark",
+        "flat",
+        "linearity",
+    ]
     (tmp_path / "map").mkdir()
     shutil.copy(made / "masters" / name, tmp_path / "map")
     with small_detectors(192):

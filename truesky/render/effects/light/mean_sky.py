@@ -11,7 +11,7 @@ from collections.abc import Callable, Container, Mapping
 import numpy as np
 
 from lake_schema.arrays import Float
-from truesky.render.effects.light import background, dispersed_sky, pixel_area, straylight
+from truesky.render.effects.light import background, pixel_area, straylight
 from truesky.render.effects.scene import Frame, Scene
 
 

@@ -67,9 +67,7 @@ def apply(
     return out
 
 
-def halo_nodes(
-    shape: tuple[int, int], lights: Lights, fraction: float, scale: float
-) -> tuple[Frame | None, int]:
+def halo_nodes(shape: tuple[int, int], lights: Lights, fraction: float, scale: float) -> tuple[Frame | None, int]:
     """Return the halos of stars at the nodes of a grid, between which `apply` interpolates.
 
     Parameters
