@@ -28,10 +28,10 @@ def no_cards(name: str, header: Mapping[str, Any]) -> Sequence[Card]:
 
 @dataclass(frozen=True, slots=True)
 class _Keywords:
-    """Keywords of the cards that move to the primary header (`common`), and those of them that also stay (`kept`)."""
+    """Keywords of cards that move to the primary header, and among them the keywords that also stay in extensions."""
 
     common: set[str]
-    kept: set[str]
+    repeated: set[str]
 
 
 def join(
@@ -96,7 +96,7 @@ def _joined_hdus(
                 is_image = hdu.header["NAXIS"] and not write.is_compressed(hdu)
                 make_extension = _image_extension if is_image else _compressed_extension
                 if is_image or write.is_compressed(hdu):
-                    extension = make_extension(hdu, name, keywords.common, keywords.kept, first_hdu)
+                    extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
                     for card in array_cards(extension.header["EXTNAME"], extension.header):
                         if card[0] not in extension.header:
                             extension.header.append(card, end=True)

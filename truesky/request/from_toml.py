@@ -77,7 +77,7 @@ All keys::
                    wcs = "sip" | "tpv"   convention for distortion in headers, default: the instrument pipeline's;
                                          source-extractor, SCAMP and SWarp read TPV, or the .head file of the image
                    files = "detector" | "exposure"   also one file with all science images of an exposure
-                   names = "truesky" | "euclid"   names and headers of these files: those of Euclid's raw frames
+                   names = "truesky" | "euclid"   names and headers of these files, as Euclid's raw frames
                    readout = "raw" | "amplifiers" | "electrons"   for ground cameras: one array, one extension per
                                          amplifier, or electrons before the readout
 

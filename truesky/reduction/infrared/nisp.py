@@ -325,8 +325,8 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
     Returns
     -------
     Masters
-        The masters. The linearity is stored as `bias`. The flags are those of the masters that are read, and of the
-        bad-pixel map of the detector if there is one, whatever is omitted.
+        The masters. The linearity is stored as `bias`. Its flags come from the masters that are read, and from the
+        bad-pixel map of the detector if it exists, whatever is omitted.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Mean of the diffuse light that the effects of the sky add to the pixels of a detector, without drawing a frame.
 
-Each function returns the mean over the pixels of the detector, in electrons, of what an effect adds. Fringes are left
-out: their mean is 0 to within a few thousandths of their amplitude.
+Each function returns the mean contribution of an effect to the pixels of the detector, in electrons. Fringes are left
+out, because bright and dark fringes cancel in the mean.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def mean_between_nodes(nodes: Frame, rows: Float, columns: Float) -> float:
     return float(np.einsum("i,j,ij", *weights, nodes))
 
 
-# Function that returns the mean of what an effect adds, by the name of the effect.
+# Function that returns the mean contribution of an effect, by the name of the effect.
 _MEANS: Mapping[str, Callable[[Scene], float]] = {
     "background": _background,
     "dispersed_sky": _dispersed_sky,

@@ -1,6 +1,6 @@
 """Name files of whole exposures as Euclid's level-1 products (raw frames), and make the cards that only those have.
 
-Cards are in addition to those of truesky, which stay. Several keywords of the real products have no counterpart in a
+The cards are added to the usual ones. Several keywords of the real products have no counterpart in a
 simulation, such as telemetry and the numbers of on-board plans; they are missing.
 
 References
@@ -58,7 +58,7 @@ def observation(exposure: ExposureRow) -> int:
 def file_name(exposure: ExposureRow) -> str:
     """Return the name of the file of an exposure: EUC_LE1_VIS-00012-1-D_20240701T001045.000000Z.fits, for example.
 
-    The parts are instrument, observation, dither (1 if there is none), survey, and start of the exposure (UTC). "D" is
+    The parts are instrument, observation, dither (1 without dithers), survey, and start of the exposure (UTC). "D" is
     the survey of all files of Q1, and the same for all exposures. Exposures that differ only in their noise end with
     the number of the realisation from the second one on, for example Z_02.fits.
 
@@ -174,7 +174,7 @@ def array_cards(name: str, header: Mapping[str, Any], exposure: ExposureRow) -> 
     cards: list[Card] = []
     if exposure.channel == "VIS":
         cards += [("CCDID", detector, "CCD, row-column"), ("QUADID", part, "quadrant")]
-        cards += [(keyword, header[own], text) for keyword, own, text in _OVERSCANS if own in header]
+        cards += [(keyword, header[usual], text) for keyword, usual, text in _OVERSCANS if usual in header]
     else:
         cards.append(("DET_ID", detector.removeprefix("DET"), "detector, row and column"))
     if part != "CHI2":
