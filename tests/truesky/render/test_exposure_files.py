@@ -206,7 +206,7 @@ def test_files_have_the_names_and_headers_of_raw_frames_of_euclid(lake, request_
     assert steps[0].plan.key == read.version(lake, "products").key
     make(lake, steps)
     found = opened(lake)
-    start = "20250817T000000.000000Z"
+    start = "20250818T000000.000000Z"
     assert [found[channel][1].name for channel in ("VIS", "NISP-P")] == [
         f"EUC_LE1_VIS-00001-1-D_{start}.fits", f"EUC_LE1_NISP-00002-1-D_{start}.fits",
     ]  # fmt: skip
