@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ _DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 _INHERIT: tuple[Card, ...] = (("INHERIT", True, "primary header also applies"),)
 
 
-# Function that returns further cards of an extension from its name and its header.
+# Function that returns further cards of an extension from its name and from the values of its header.
 ArrayCards = Callable[[str, Mapping[str, Any]], Sequence[Card]]
 
 
@@ -58,8 +59,8 @@ def join(
     kept_keywords : sequence of str, optional
         Those of `shared_keywords` that also stay in the headers of the extensions.
     array_cards : callable, optional
-        Function of the name and the header of an extension that returns further cards of it. Cards with keywords that
-        the header has are left out.
+        Function of the name of an extension and of the values that its header and the primary header have, which returns
+        further cards of the extension. Cards with keywords that its header has are left out.
 
     Raises
     ------
@@ -89,6 +90,7 @@ def _joined_hdus(
 ) -> Iterator[Any]:
 
     yield images.primary_hdu(Image(None, tuple(cards)))
+    common_values = {card[0]: card[1] for card in cards if card[0] in keywords.common}
     for name, file in files:
         with write.open_written(file) as hdus:
             first_hdu = hdus[0]
@@ -97,7 +99,8 @@ def _joined_hdus(
                 make_extension = _image_extension if is_image else _compressed_extension
                 if is_image or write.is_compressed(hdu):
                     extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
-                    for card in array_cards(extension.header["EXTNAME"], extension.header):
+                    known = ChainMap(extension.header, common_values)
+                    for card in array_cards(extension.header["EXTNAME"], known):
                         if card[0] not in extension.header:
                             extension.header.append(card, end=True)
                     yield extension

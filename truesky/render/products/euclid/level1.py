@@ -179,7 +179,7 @@ def array_cards(name: str, header: Mapping[str, Any], exposure: ExposureRow) -> 
         cards.append(("DET_ID", detector.removeprefix("DET"), "detector, row and column"))
     if part != "CHI2":
         cards.append(("DATAUNIT", "ADU", "unit of the pixels"))
-    if {"CD1_2", "CD2_2"} <= {*header}:
+    if "CD1_2" in header and "CD2_2" in header:
         # A y axis with a component CD1_2 to the east and CD2_2 to the north has this position angle.
         angle = math.degrees(math.atan2(header["CD1_2"], header["CD2_2"])) % 360.0
         cards.append(("ORIENTAT", round(angle, _DECIMALS) % 360.0, "[deg] position angle of the y axis"))
