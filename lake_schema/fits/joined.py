@@ -59,7 +59,7 @@ def join(
     kept_keywords : sequence of str, optional
         Those of `shared_keywords` that also stay in the headers of the extensions.
     array_cards : callable, optional
-        Function of the name of an extension and of the values that its header and the primary header have, which returns
+        Function of the name of an extension and of the values in its header and in the primary header, which returns
         further cards of the extension. Cards with keywords that its header has are left out.
 
     Raises
