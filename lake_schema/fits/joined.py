@@ -99,8 +99,8 @@ def _joined_hdus(
                 make_extension = _image_extension if is_image else _compressed_extension
                 if is_image or write.is_compressed(hdu):
                     extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
-                    known = ChainMap(extension.header, common_values)
-                    for card in array_cards(extension.header["EXTNAME"], known):
+                    header_values = ChainMap(extension.header, common_values)
+                    for card in array_cards(extension.header["EXTNAME"], header_values):
                         if card[0] not in extension.header:
                             extension.header.append(card, end=True)
                     yield extension
