@@ -289,12 +289,13 @@ def applied(header):
 
 
 def diffuse_electrons(header):
-    """Return the electrons of sky, by pixel area, and dark current in every pixel."""
-    electrons = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
+    """Return the electrons of sky, by pixel area, and dark current in every pixel. SKYRATE is the mean of the sky."""
+    sky, dark = (header[key] * header["EXPTIME"] for key in ("SKYRATE", "DARKRATE"))
     if "pixel_area" not in applied(header):
-        return electrons
+        return sky + dark
     scene = scene_of(header)
-    return pixel_area.apply(np.full((scene.ny, scene.nx), electrons), *pixel_area.parameters(scene))
+    by_area = pixel_area.apply(np.full((scene.ny, scene.nx), sky), *pixel_area.parameters(scene))
+    return by_area * (sky / by_area.mean()) + dark
 
 
 def sources(field, header):

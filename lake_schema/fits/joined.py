@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,30 @@ _DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 _INHERIT: tuple[Card, ...] = (("INHERIT", True, "primary header also applies"),)
 
 
+# Function that returns further cards of an extension from its name and from the values of its header.
+ArrayCards = Callable[[str, Mapping[str, Any]], Sequence[Card]]
+
+
+def no_cards(name: str, header: Mapping[str, Any]) -> Sequence[Card]:
+    """Return no cards for any extension."""
+    return ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Keywords:
+    """Keywords of cards that move to the primary header, and among them the keywords that also stay in extensions."""
+
+    common: set[str]
+    repeated: set[str]
+
+
 def join(
     path: Path,
     files: Sequence[tuple[str, Path]],
     shared_keywords: Sequence[str],
     extra_cards: Sequence[Card],
     kept_keywords: Sequence[str] = (),
+    array_cards: ArrayCards = no_cards,
 ) -> None:
     """Write the images of several FITS files as extensions to one file, which replaces `path` in one rename.
 
@@ -38,6 +58,9 @@ def join(
         Further cards of the primary header.
     kept_keywords : sequence of str, optional
         Those of `shared_keywords` that also stay in the headers of the extensions.
+    array_cards : callable, optional
+        Function of the name of an extension and of the values in its header and in the primary header, which returns
+        further cards of the extension. Cards with keywords that its header has are left out.
 
     Raises
     ------
@@ -57,24 +80,30 @@ def join(
         for key, card in first_cards[0].items()
         if key in shared_keywords and all(cards.get(key) == card for cards in first_cards)
     ]
-    write.write_one_by_one(
-        path, _joined_hdus(files, [*common, *extra_cards], {card[0] for card in common}, set(kept_keywords))
-    )
+    keywords = _Keywords({card[0] for card in common}, set(kept_keywords))
+    cards = [*common, *(card for card in extra_cards if card[0] not in keywords.common)]
+    write.write_one_by_one(path, _joined_hdus(files, cards, keywords, array_cards))
 
 
 def _joined_hdus(
-    files: Sequence[tuple[str, Path]], cards: Sequence[Card], common_keywords: set[str], kept_keywords: set[str]
+    files: Sequence[tuple[str, Path]], cards: Sequence[Card], keywords: _Keywords, array_cards: ArrayCards
 ) -> Iterator[Any]:
 
     yield images.primary_hdu(Image(None, tuple(cards)))
+    common_values = {card[0]: card[1] for card in cards if card[0] in keywords.common}
     for name, file in files:
         with write.open_written(file) as hdus:
             first_hdu = hdus[0]
             for hdu in hdus:
-                if write.is_compressed(hdu):
-                    yield _compressed_extension(hdu, name, common_keywords, kept_keywords, first_hdu)
-                elif hdu.header["NAXIS"]:
-                    yield _image_extension(hdu, name, common_keywords, kept_keywords, first_hdu)
+                is_image = hdu.header["NAXIS"] and not write.is_compressed(hdu)
+                make_extension = _image_extension if is_image else _compressed_extension
+                if is_image or write.is_compressed(hdu):
+                    extension = make_extension(hdu, name, keywords.common, keywords.repeated, first_hdu)
+                    header_values = ChainMap(extension.header, common_values)
+                    for card in array_cards(extension.header["EXTNAME"], header_values):
+                        if card[0] not in extension.header:
+                            extension.header.append(card, end=True)
+                    yield extension
 
 
 def _image_extension(hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any) -> Any:

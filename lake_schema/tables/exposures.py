@@ -41,6 +41,13 @@ EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
     "NISP-S": ("nisp_red", "nisp_blue"),
 }
+# Grisms of NISP that a request may name in place of their passband: the passband, and the direction of the spectra in
+# the focal plane, deg. RGS270, the fourth grism of the wheel, is not used in flight and has no traces.
+GRISM_NAMES: Mapping[str, tuple[str, float]] = {
+    "RGS000": ("nisp_red", 0.0),
+    "RGS180": ("nisp_red", 180.0),
+    "BGS000": ("nisp_blue", 0.0),
+}
 # Passband by whose fluxes sources are selected for the images of a slitless channel, by channel.
 SELECTION_BANDS: Mapping[str, str] = {"NISP-S": "euclid_h"}
 # Image types of which images can be simulated, by channel. Exposures of the other types can be planned, but not

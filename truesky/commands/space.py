@@ -129,7 +129,7 @@ def _reusable_image_bytes(root: Path, request: Request, exposures: pa.Table, tas
     size = _reusable_output_bytes(root, request, products_plan, requested_outputs)
     if request.files == "exposure":
         exposure_plan, exposure_ids = (
-            exposure_files.plan(products_plan, planned_counts),
+            exposure_files.plan(products_plan, planned_counts, request.file_names),
             {number for number, _ in requested_keys},
         )
         size += _reusable_output_bytes(

@@ -38,7 +38,9 @@ INFRARED_KINDS = ("dark", "linearity", "flat")
 # Names of corrections that a user can omit: corrections by masters, then corrections by mission parameters.
 CORRECTIONS = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "pixel_area", "persistence")
 # Unit of each kind of master in FITS notation; a flat is dimensionless.
-_UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1", "fringes": ""}
+_UNITS = {
+    "bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1", "fringes": "", "bad_pixels": "",
+}  # fmt: skip
 # Header cards that must be equal in a master and the frame to calibrate. SEED is the seed of all random numbers of the
 # simulation, on which the pixel pattern of a detector depends.
 SHARED_CARDS = ("INSTRUME", "DETECTOR", "SEED")
@@ -109,7 +111,7 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
     frame : Frame
         Frame to calibrate, or one of the frames that are combined to the master.
     kind : str
-        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
+        Kind of master: "bias", "dark", "flat", "linearity", "fringes" or "bad_pixels".
 
     Returns
     -------
@@ -122,12 +124,12 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
     ground cameras share one channel; their flats and fringes also have the band. For cameras that the user defined,
     parts of the name are joined by dots: with underscores, camera a_b in band c would have the same file as camera a in
     band b_c. A dark of NISP is named by its readout mode (groups-reads-drops). Both channels of NISP use the same
-    linearity file.
+    linearity file and the same map of bad pixels.
     """
     exposure = frame.exposure
     if frame.scene.ramp:
         detail = {"dark": "-".join(map(str, frame.ramp)) if kind == "dark" else "", "flat": exposure.band}.get(kind)
-        channel = "NISP" if kind == "linearity" else exposure.channel
+        channel = "NISP" if kind in ("linearity", "bad_pixels") else exposure.channel
         return folder / "_".join(filter(None, (channel, detail, frame.detector, f"{kind}.fits")))
     if exposure.camera in SPACE_CAMERAS:
         return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
@@ -147,7 +149,7 @@ def write_master(
     combined : CombinedFrame
         Pixels of the master, their uncertainty and number of frames.
     kind : str
-        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
+        Kind of master: "bias", "dark", "flat", "linearity", "fringes" or "bad_pixels".
     frames : sequence of Frame
         Frames that were combined, at least one; the header lists their exposures.
     extra_cards : sequence of Card, optional
@@ -168,7 +170,9 @@ def write_master(
         *extra_cards,
         *((f"FRAME{i}", frame.exposure.exposure_id, "exposure of a frame") for i, frame in enumerate(frames, start=1)),
     )
-    units = [Image(None, cards), Image(combined.mean, (), "VALUE"), Image(combined.uncertainty, (), "UNCERTAINTY")]
+    # Flag bits are whole numbers, as SourceExtractor requires of FLAG_IMAGE.
+    values = combined.mean.astype(np.uint8) if kind == "bad_pixels" else combined.mean
+    units = [Image(None, cards), Image(values, (), "VALUE"), Image(combined.uncertainty, (), "UNCERTAINTY")]
     write_images(path, [*units, Image(combined.count, (), "COUNT")])
 
 
@@ -185,7 +189,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     path : Path
         File of `write_master`, or an image that the user made with another program.
     kind : str
-        Kind of master: "bias", "dark", "flat", "linearity" or "fringes".
+        Kind of master: "bias", "dark", "flat", "linearity", "fringes" or "bad_pixels".
     frame : Frame
         Frame to calibrate.
 

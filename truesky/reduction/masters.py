@@ -10,7 +10,8 @@ fringes, exposures of the sky with three or more pointings give .._fringes.fits 
 Files of detector DET22 of NISP are NISP-P_4-16-4_DET22_dark.fits (one for each readout mode: groups, reads, drops),
 NISP_DET22_linearity.fits and NISP-P_euclid_y_DET22_flat.fits (one for each band, for the mixture of lamps whose colour
 is most similar to the sky). The linearity is the coefficient b in 1/electron: of N electrons, N (1 - b N) are measured.
-It is fitted to flats of one lamp at three or more intensities.
+It is fitted to flats of one lamp at three or more intensities. NISP_DET22_bad_pixels.fits has the flags of hot pixels
+and of pixels with a response far from 1, from all darks and flats.
 """
 
 from __future__ import annotations

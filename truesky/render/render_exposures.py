@@ -62,7 +62,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     if request.files == "exposure":
         steps.append(
             Step(
-                exposure_files.plan(plan, inputs.selection.detector_counts),
+                exposure_files.plan(plan, inputs.selection.detector_counts, request.file_names),
                 exposure_files.make_exposure_file,
                 unit="exposure",
             )

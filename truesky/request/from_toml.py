@@ -50,7 +50,8 @@ All keys::
                                           analogue-to-digital conversion (ALWAYS_ON in truesky/request/schema.py)
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
-                   band           default: euclid_vis, euclid_h, nisp_red, or the r band of a ground camera
+                   band           default: euclid_vis, euclid_h, nisp_red, or the r band of a ground camera;
+                                  RGS000, RGS180 and BGS000 are nisp_red and nisp_blue at the grism's angle
                    mjd            default: Euclid: first date the Sun allows; ground: first transit at night
                    grism_angle    direction of NISP-S spectra in the focal plane: -4, 0, 180, 184 deg
                    realisations   number of exposures that differ only in their noise
@@ -76,6 +77,7 @@ All keys::
                    wcs = "sip" | "tpv"   convention for distortion in headers, default: the instrument pipeline's;
                                          source-extractor, SCAMP and SWarp read TPV, or the .head file of the image
                    files = "detector" | "exposure"   also one file with all science images of an exposure
+                   names = "truesky" | "euclid"   names and headers of these files, as Euclid's raw frames
                    readout = "raw" | "amplifiers" | "electrons"   for ground cameras: one array, one extension per
                                          amplifier, or electrons before the readout
 
@@ -113,6 +115,7 @@ from truesky.request.schema import (
     DENSITY_MODELS,
     EFFECTS,
     FILE_LAYOUTS,
+    FILE_NAMES,
     LADDER,
     LENSING_NSIDES,
     MAX_SHEAR,
@@ -347,9 +350,18 @@ def _products(table: Toml) -> dict[str, Any]:
             "compression": read(_string, table, "products.compression", COMPRESSIONS, "none"),
             "wcs": read(_string, table, "products.wcs", WCS_CONVENTIONS) if "wcs" in table else None,
             "files": read(_string, table, "products.files", FILE_LAYOUTS, "detector"),
+            "file_names": read(_file_names, table),
             "readout": read(_string, table, "products.readout", READOUTS, "raw"),
         }
     return values
+
+
+def _file_names(table: Toml) -> str:
+    """Read the convention for the names of files of whole exposures. Raise BadInput if there are no such files."""
+    names = _string(table, "products.names", FILE_NAMES, FILE_NAMES[0])
+    if names != FILE_NAMES[0] and table.get("files") != "exposure":
+        raise BadInput(f'products.names = "{names}" names files of whole exposures: write files = "exposure", too')
+    return names
 
 
 def _bodies(table: Toml, folder: Path) -> Path:

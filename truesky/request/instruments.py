@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from lake_schema.errors import BadInput, bad_input
-from lake_schema.tables.exposures import EUCLID_BANDS
+from lake_schema.tables.exposures import EUCLID_BANDS, GRISM_NAMES
 from lake_schema.texts import spelling
 from truesky.request.toml_values import known_name, quote_value
 
@@ -23,6 +23,10 @@ GROUND_CHANNEL = "EXT"
 _DEFAULT_BANDS = {"VIS": "euclid_vis", "NISP-P": "euclid_h", "NISP-S": "nisp_red"}
 # End of the name of the passband of a ground camera that is the default for pointings, if the camera has it.
 _DEFAULT_GROUND_BAND = "_r"
+# Grism of NISP's wheel with which the mission does not observe.
+_UNUSED_GRISM = "RGS270"
+# Largest angle in degrees between the spectra of a grism that a request names and the direction of the untilted grism.
+_MAX_GRISM_TILT = 45.0
 # Largest number of detectors that an error message suggests.
 _SUGGESTED_DETECTORS = 3
 # The same of mission parameters.
@@ -119,6 +123,41 @@ def default_band(channel: str, camera: str, mission: MissionConfiguration) -> st
     return next((band for band in bands if band.endswith(_DEFAULT_GROUND_BAND)), bands[0])
 
 
+def replace_grism(band: str, grism_angle: float | None, path: str) -> tuple[str, float | None]:
+    """Return the passband and the direction of the spectra if the name of a passband is the name of a grism.
+
+    Parameters
+    ----------
+    band : str
+        Name of a passband, or of a grism: RGS000, RGS180 or BGS000.
+    grism_angle : float or None
+        Direction of the spectra in the focal plane in degrees; None if the request does not state it.
+    path : str
+        Path of the angle, for the error message.
+
+    Returns
+    -------
+    band : str
+        Passband of the grism; the given name if it is not the name of a grism.
+    grism_angle : float or None
+        The given angle. If it is None, that of the untilted grism, or None without a grism.
+
+    Raises
+    ------
+    BadInput
+        If spectra of this grism cannot have this direction.
+    """
+    if band not in GRISM_NAMES:
+        return band, grism_angle
+    passband, nominal = GRISM_NAMES[band]
+    if grism_angle is None:
+        return passband, nominal
+    tilt = abs((grism_angle - nominal + 180.0) % 360.0 - 180.0)
+    if tilt > _MAX_GRISM_TILT:
+        raise BadInput(f"{path} = {grism_angle:g} deg tilts {band} by {tilt:g} deg, more than {_MAX_GRISM_TILT:g}")
+    return passband, grism_angle
+
+
 def check_camera(channel: str, camera: str, mission: MissionConfiguration, path: str) -> None:
     """Check that a channel has a camera.
 
@@ -166,6 +205,10 @@ def check_band(
     """
     if band in bands:
         return
+    if band == _UNUSED_GRISM:
+        usable = ", ".join(grism for grism, (passband, _) in GRISM_NAMES.items() if passband in bands)
+        problem = f"{path}{': ' if path else ''}Euclid does not observe with grism {band}"
+        raise BadInput(f"{problem}: use {usable}" if usable else problem)
     meant = known_name(band, bands)
     remedy = spelling.choices(meant, bands)
     in_observation = path.endswith("bands")

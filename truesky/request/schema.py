@@ -29,6 +29,8 @@ COMPRESSIONS = ("none", "rice")
 # Conventions for distortion in FITS headers. This copies truesky/render/camera/tpv.py; a test compares the two.
 WCS_CONVENTIONS = ("sip", "tpv")
 FILE_LAYOUTS = ("detector", "exposure")
+# Conventions for the names and headers of files of whole exposures.
+FILE_NAMES = ("truesky", "euclid")
 # Forms of the images of ground cameras. This copies truesky/render/channels/ground.py; test_readout.py compares them.
 READOUTS = ("raw", "amplifiers", "electrons")
 # Names of the fields of `Request` that set the format of image files.
@@ -230,6 +232,8 @@ class Request:
         Convention for distortion in FITS headers, one of `WCS_CONVENTIONS`; None for that of the instrument's pipeline.
     files : str
         "exposure" if science images are also stored in one file per exposure, "detector" if not.
+    file_names : str
+        Convention for names and headers of files of whole exposures, one of `FILE_NAMES`.
     readout : str
         Form of the images of ground cameras, one of `READOUTS`.
     psfs : tuple of (str, str)
@@ -268,6 +272,7 @@ class Request:
     compression: str = "none"
     wcs: str | None = None
     files: str = "detector"
+    file_names: str = "truesky"
     readout: str = "raw"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None

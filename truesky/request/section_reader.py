@@ -32,7 +32,7 @@ _SECTIONS: dict[str, tuple[str, ...]] = {
     "solar_system": ("bodies",),
     "effects": ("on", "off"),
     "explore": (),
-    "products": ("truth", "compression", "wcs", "files", "readout"),
+    "products": ("truth", "compression", "wcs", "files", "names", "readout"),
 }
 # Sections and lists of exposures where a key belongs, for error messages about a key in a wrong place.
 _PLACES: dict[str, str] = {

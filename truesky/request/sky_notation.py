@@ -16,6 +16,7 @@ from typing import Any
 
 from lake_schema import arguments
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.tables.exposures import GRISM_NAMES
 from truesky.request.toml_values import Toml, checked_number, has_key, quote_value, required_value
 
 # First and last date (MJD) that a request may contain: 1968 to 2132.
@@ -196,7 +197,8 @@ def optional_mjd(table: Toml, path: str) -> float | None:
 def understood_values(table: Toml) -> Iterator[str]:
     """Yield one line for each value of a valid request that a user may have meant differently: how it is understood.
 
-    These are positions and dates that are not numbers, and radii of areas that may have been meant in arcmin.
+    These are positions and dates that are not numbers, radii of areas that may have been meant in arcmin, and grisms
+    that are named in place of passbands.
     `table` is the parsed request. Lines are, for example, "pointing[0].mjd = '2027-01-01' is MJD 61406 (UTC)".
     """
     for key in ("area", "pointing", "observation"):
@@ -218,5 +220,10 @@ def _understood(value: Any, path: str, axis: str) -> Iterator[str]:
     elif axis in _SEXAGESIMAL_UNITS and isinstance(value, str):
         degrees = angle(value, path, axis, (-math.inf, math.inf))
         yield f"{path} = {value} is {degrees:.10g} deg"
+    elif axis == "band" and value in GRISM_NAMES:
+        band, direction = GRISM_NAMES[value]
+        yield f"{path} = {value} is {band} with grism_angle = {direction:g}, unless grism_angle is given"
+    elif axis == "bands" and value in GRISM_NAMES:
+        yield f"{path} = {value} is {GRISM_NAMES[value][0]}; the survey sets the angles of the spectra"
     elif axis == "radius" and value >= _LARGE_RADIUS:
         yield f"{path} = {value} is in degrees; for {value} arcmin write {value / 60.0:.4g}"

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -195,6 +196,45 @@ def test_exposure_files_do_not_change_product_keys(lake, request_file):
     make(lake, render_exposures.steps(lake, replace(request, noise_seed=9)))
     with pytest.raises(BadInput, match="exposure_files has outdated images"):
         archive.exposures(lake)
+
+
+def test_files_have_the_names_and_headers_of_raw_frames_of_euclid(lake, request_file):
+    """Only names and cards change, and fitsverify finds no error."""
+    request = replace(parse(request_file), file_names="euclid")
+    before = {channel: images.read_images(path) for channel, (_, path) in opened(lake).items()}
+    steps = render_exposures.steps(lake, request)
+    assert steps[0].plan.key == read.version(lake, "products").key
+    make(lake, steps)
+    found = opened(lake)
+    start = "20250818T000000.000000Z"
+    assert [found[channel][1].name for channel in ("VIS", "NISP-P")] == [
+        f"EUC_LE1_VIS-00001-1-D_{start}.fits", f"EUC_LE1_NISP-00002-1-D_{start}.fits",
+    ]  # fmt: skip
+    assert set(archive.exposures(lake)["path"].to_pylist()) == {row["path"] for row, _ in found.values()}
+    for channel, (row, path) in found.items():
+        files = read.version(lake, "exposure_files")
+        assert files.sidecar_path(head_files.head_path(row["path"])).is_file()
+        for old, new in zip(before[channel], images.read_images(path), strict=True):
+            assert old.name == new.name
+            assert (old.data is None and new.data is None) or np.array_equal(old.data, new.data)
+            assert {card[0]: card for card in old.cards}.items() <= {card[0]: card for card in new.cards}.items()
+        with fits.open(path) as units:
+            first = units[0].header
+            assert {"OBSTYPE", "SEQID", "ORIENTAT", "DATAUNIT", "MJDATE", "RA", "DEC", "PA", "MJD-OBS"} <= set(first)
+            assert first["N_CCD" if channel == "VIS" else "N_DET"] == 2
+            for name in DETECTORS[channel]:
+                for part in "EFGH" if channel == "VIS" else ("SCI", "CHI2"):
+                    header = units[f"{name}.{part}"].header
+                    assert header["RA"] == pytest.approx(first["RA"], abs=1e-6)
+                    if channel == "VIS":
+                        assert (header["CCDID"], header["QUADID"]) == (name, part)
+                        sizes = [header[key] for key in ("PRESCANX", "OVRSCANX", "OVRSCANY")]
+                        assert (header["NAXIS1"], header["NAXIS2"]) == (
+                            SIDE // 2 + sizes[0] + sizes[1], SIDE // 2 + sizes[2],
+                        )  # fmt: skip
+        if shutil.which("fitsverify"):
+            done = subprocess.run(["fitsverify", "-q", str(path)], capture_output=True, text=True, timeout=120)
+            assert "0 warnings and 0 errors" in done.stdout or "OK" in done.stdout, done.stdout
 
 
 def test_the_archive_lists_exposure_files(whole, capsys):

@@ -154,6 +154,8 @@ BAD = [
     ("products", {"compression": "zip"}, "products.compression"),
     ("products", {"wcs": "zpn"}, "products.wcs"),
     ("products", {"files": "quadrant"}, "products.files = 'quadrant'"),
+    ("products", {"files": "exposure", "names": "esa"}, "products.names = 'esa' is not one of truesky, euclid"),
+    ("products", {"names": "euclid"}, 'products.names = "euclid" names files of whole exposures: write files = "expo'),
     ("products", {"readout": "photons"}, "products.readout = 'photons'"),
     ("pointing", {}, "pointing must be a list"),
     ("pointing", [3], r"pointing\[0\]"),

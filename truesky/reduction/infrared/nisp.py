@@ -1,4 +1,4 @@
-"""Make NISP masters (combined calibration frames) of dark current, linearity and flats, and calibrate NISP images::
+"""Make NISP masters (dark current, linearity, flats and the bad-pixel map), and calibrate NISP images::
 
     image = (linearised(measured - bias) - persistence - dark current x exposure time) / flat
 
@@ -43,7 +43,7 @@ class Master:
     Attributes
     ----------
     kind : str
-        Kind of master: "bias", "dark", "linearity" or "flat".
+        Kind of master: "bias", "dark", "linearity", "flat" or "bad_pixels".
     combined : CombinedFrame
         Pixels of the master, their uncertainty and number of frames.
     frames : sequence of Frame
@@ -92,9 +92,9 @@ def declared_nonlinearity(frame: Frame) -> float:
 
 
 def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
-    """Make the masters of a NISP detector: a dark for each readout mode, the linearity, and a flat of each band.
+    """Make the masters of a NISP detector: darks by readout mode, linearity, flats by band, and the bad-pixel map.
 
-    A master is omitted if the frames do not allow it.
+    A master is omitted if the frames do not allow it. The map combines the flags of all darks and flats.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
     Yields
     ------
     Master
-        First the darks, then the linearity, then the flats.
+        First the darks, then the linearity, then the flats, and the bad-pixel map at the end.
 
     Raises
     ------
@@ -116,6 +116,7 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
         in instrument, detector or seed.
     """
     prediction, darks = PersistencePrediction(frames), dict[tuple[int, int, int], CombinedFrame]()
+    bad_pixels, judged = np.zeros((frames[0].scene.ny, frames[0].scene.nx), np.uint8), 0
     for group in _group_frames(
         lake_frames.select_types(frames, ("dark",)), lambda frame: (frame.exposure.channel, *frame.ramp)
     ):
@@ -123,6 +124,7 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
             group, [frame.exposure.exposure_time_s for frame in group], (prediction, 0.0, None), scratch
         )
         darks[group[0].ramp] = combined
+        bad_pixels, judged = bad_pixels | calibration.dark_flags(combined), judged + 1
         yield Master("dark", combined, group)
     flats = [
         frame
@@ -139,7 +141,12 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
         b = combined.mean.astype(float)
         yield Master("linearity", combined, series)
     for group in _group_frames(flats, lambda frame: (frame.exposure.channel, frame.exposure.band)):
-        yield _make_flat(group, (prediction, declared_nonlinearity(group[0]) if b is None else b, darks), scratch)
+        flat = _make_flat(group, (prediction, declared_nonlinearity(group[0]) if b is None else b, darks), scratch)
+        bad_pixels, judged = bad_pixels | calibration.response_flags(flat.combined), judged + 1
+        yield flat
+    counts = np.full(bad_pixels.shape, judged, np.int16)
+    combined = CombinedFrame(bad_pixels.astype(np.float32), np.zeros(bad_pixels.shape, np.float32), counts)
+    yield Master("bad_pixels", combined, lake_frames.select_types(frames, ("dark", "flat")), files.flag_cards())
 
 
 def _group_frames(frames: Sequence[Frame], key: object) -> list[list[Frame]]:
@@ -318,7 +325,8 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
     Returns
     -------
     Masters
-        The masters. The linearity is stored as `bias`.
+        The masters. The linearity is stored as `bias`. Its flags come from the masters that are read, and from the
+        bad-pixel map of the detector if it exists, whatever is omitted.
 
     Raises
     ------
@@ -334,5 +342,8 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
             combined[kind], time = files.read_master(files.master_path(folder, frame, kind), kind, frame)
             dark_time = time if kind == "dark" else dark_time
     flags = calibration.master_flags(shape, combined, without)
+    if (bad_pixels := files.master_path(folder, frame, "bad_pixels")).exists():
+        bits = files.read_master(bad_pixels, "bad_pixels", frame)[0].mean
+        flags |= np.clip(bits, 0, 255).astype(np.uint8)
     flat = replace(combined["flat"], vignetted=True)
     return Masters(combined["linearity"], combined["dark"], flat, flags, dark_time)

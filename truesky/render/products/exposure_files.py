@@ -16,14 +16,17 @@ import pyarrow.compute as pc
 from lake_schema.errors import Damaged
 from lake_schema.fits import joined
 from lake_schema.fits.images import Card
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
 from lake_schema.store import read, reuse
 from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import digest
+from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import EXPOSURE_FILES
 from truesky.render.camera import detectors
 from truesky.render.planning.exposure_chunks import rows as planned_rows
 from truesky.render.products import head_files, headers
+from truesky.render.products.euclid import level1
 from truesky.render.products.keys import part_name
 
 # Keywords in the headers of detector files whose cards go to the primary header of the file with all detectors, if they
@@ -48,7 +51,7 @@ _EXPOSURE_KEYWORDS = (
 _CAMERAS_WITHOUT_PRIMARY = ("megacam",)
 
 
-def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
+def plan(products: Plan, detector_counts: Mapping[int, int], names: str = "truesky") -> Plan:
     """Plan the table `exposure_files`: one partition per exposure that has images in the table `products`.
 
     Parameters
@@ -57,6 +60,9 @@ def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
         Plan of the table `products`, with one partition per detector image.
     detector_counts : mapping of int to int
         Number of planned detectors of each exposure, by exposure number.
+    names : str, optional
+        Convention for names and headers, one of `FILE_NAMES` of truesky.request.schema. "euclid" is that of Euclid's
+        raw frames, for exposures of VIS and NISP.
 
     Returns
     -------
@@ -67,11 +73,15 @@ def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
     keys_by_exposure: dict[int, dict[str, str]] = defaultdict(dict)
     for part in products.tasks:
         keys_by_exposure[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
+    # The default is not among the facts, so that the keys of existing files do not change.
+    convention = {} if names == "truesky" else {"names": names}
     parts = []
     for number, keys in sorted(keys_by_exposure.items()):
-        names = sorted(keys)
-        exposure_facts = {"exposure_id": number, "detectors": names, "planned": detector_counts[number]}
-        key = digest({**exposure_facts, "products": [keys[name] for name in names]})
+        detector_names = sorted(keys)
+        exposure_facts = {
+            "exposure_id": number, "detectors": detector_names, "planned": detector_counts[number], **convention,
+        }  # fmt: skip
+        key = digest({**exposure_facts, "products": [keys[name] for name in detector_names]})
         parts.append(Task(f"{number:06d}.parquet", {**exposure_facts, reuse.PRODUCT: key}))
     return Plan(EXPOSURE_FILES, {"products": products.key}, tuple(parts))
 
@@ -95,7 +105,11 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
     exposures = read.version(lake, "exposures", products.manifest["facts"]["inputs"]["exposures"])
     (exposure,) = planned_rows(exposures, [facts["exposure_id"]], where=in_exposure).to_pylist()
     first = rows[facts["detectors"][0]]
-    path = f"images/{exposure['exposure_id']:06d}/{exposure['channel']}_{exposure['band']}_science.fits"
+    name = f"{exposure['channel']}_{exposure['band']}_science.fits"
+    is_euclid = facts.get("names") == "euclid" and exposure["channel"] in level1.INSTRUMENTS
+    if is_euclid:
+        name = level1.file_name(ExposureRow.from_row(exposure))
+    path = f"images/{exposure['exposure_id']:06d}/{name}"
     table = EXPOSURE_FILES.build(
         {
             "path": [path],
@@ -106,28 +120,36 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
             "sources": [sum(row["sources"] for row in rows.values())],
         }
     )
-    order = _sort_detectors(lake, products, exposure["camera"], facts["detectors"])
+    mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
+    order = _sort_detectors(mission, exposure["camera"], facts["detectors"])
     files = [(name, products.sidecar_path(rows[name]["path"])) for name in order]
     heads = [products.sidecar_path(head_files.head_path(rows[name]["path"])) for name in order]
     writers = {
-        path: partial(_write, files, _cards(exposure, facts), _kept_keywords(exposure["camera"])),
+        path: partial(_write, files, *_cards(exposure, facts, mission, is_euclid), _kept_keywords(exposure["camera"])),
         head_files.head_path(path): partial(_write_heads, heads),
     }
     return Output(table, writers)
 
 
-def _sort_detectors(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
+def _sort_detectors(mission: MissionConfiguration, camera: str, names: Sequence[str]) -> list[str]:
     """Return the given names of detectors in the order in which the mission database lists them for the camera."""
-    mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
     return [detector.name for detector in detectors.detectors(camera, mission) if detector.name in names]
 
 
-def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
-    return (
+def _cards(
+    exposure: dict[str, Any], facts: Json, mission: MissionConfiguration, is_euclid: bool
+) -> tuple[tuple[Card, ...], joined.ArrayCards]:
+    """Return further cards of the primary header, and a function that returns further cards of an array."""
+    cards: tuple[Card, ...] = (
         ("POSANGLE", exposure["position_angle"], "[deg] position angle, north through east"),
         ("NDETECT", len(facts["detectors"]), "number of detectors in this file"),
         ("NPLANNED", facts["planned"], "number of planned detectors of the exposure"),
     )
+    if not is_euclid:
+        return cards, joined.no_cards
+    row = ExposureRow.from_row(exposure)
+    cards += level1.exposure_cards(row, len(facts["detectors"]), mission)
+    return cards, partial(level1.array_cards, exposure=row)
 
 
 def _write_heads(files: Sequence[Path], path: Path) -> None:
@@ -139,5 +161,11 @@ def _kept_keywords(camera: str) -> tuple[str, ...]:
     return _EXPOSURE_KEYWORDS if camera in _CAMERAS_WITHOUT_PRIMARY else headers.PER_ARRAY_KEYWORDS
 
 
-def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], kept_keywords: Sequence[str], path: Path) -> None:
-    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, kept_keywords)
+def _write(
+    files: Sequence[tuple[str, Path]],
+    cards: Sequence[Card],
+    array_cards: joined.ArrayCards,
+    kept_keywords: Sequence[str],
+    path: Path,
+) -> None:
+    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, kept_keywords, array_cards)

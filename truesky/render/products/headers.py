@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime, timedelta
 
@@ -19,7 +19,9 @@ from truesky.render.channels.readout import Extension
 from truesky.render.channels.registry import find_effects
 from truesky.render.dispersing import draw
 from truesky.render.effects.charge import ramp, ramp_nonlinearity
+from truesky.render.effects.light import mean_sky
 from truesky.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
+from truesky.render.effects.scene import Scene
 from truesky.render.exposure import truth_maps
 from truesky.render.exposure.rendered_detector import RenderedDetector, random_identity
 from truesky.render.products import calibration_cards
@@ -82,7 +84,7 @@ def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         ("DETSIZE", _mosaic_size(rendered), "section of the mosaic of all detectors"),
         *unit_cards(rendered.readout.unit),
         *_shared_amplifier_cards(rendered),
-        ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky background"),
+        ("SKYRATE", _mean_sky_rate(scene, applied), "[electron/s/pix] mean sky background"),
         (
             "DARKRATE",
             bool(_DARK_EFFECTS & applied) * scene.dark_rate,
@@ -90,6 +92,15 @@ def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         ),
         *_effect_cards(rendered),
     )
+
+
+def _mean_sky_rate(scene: Scene, applied: Container[str]) -> float:
+    """Return the mean of the diffuse light that is drawn in the pixels of the detector, in electrons per second.
+
+    `applied` has the names of the applied effects. Without a duration there is no light; the result is then 0.
+    """
+    seconds = scene.exposure_time_s
+    return mean_sky.mean_electrons(scene, applied) / seconds if seconds > 0.0 else 0.0
 
 
 def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:

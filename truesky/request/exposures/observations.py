@@ -361,7 +361,7 @@ def _values_of_kind(
             "image_type": image_type,
             "survey": read(string, table, f"{path}.survey", surveys, None if ground else "wide"),
             "dither": read(_dither, table, f"{path}.dither", ground),
-            "bands": read(strings, table, f"{path}.bands"),
+            "bands": read(_bands, table, f"{path}.bands"),
             "detectors": read(strings, table, f"{path}.detectors"),
             "lamps": read(_lamps, table, f"{path}.lamps", channels),
         }
@@ -373,6 +373,12 @@ def _values_of_kind(
             names = {**values, "bands": [band for band in values["bands"] if band not in of_user]}
             read(_check_names, names, table.get("blue") is True, mission, path)
     return values
+
+
+def _bands(table: Toml, path: str) -> tuple[str, ...]:
+    """Read the passbands of an observation. A grism stands for its passband: the survey sets the angles of spectra."""
+    named = strings(table, path)
+    return tuple(dict.fromkeys(instruments.replace_grism(band, None, path)[0] for band in named))
 
 
 def _check_names(values: Mapping[str, Any], has_blue_grism: bool, mission: MissionConfiguration, path: str) -> None:

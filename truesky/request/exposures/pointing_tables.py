@@ -19,7 +19,7 @@ from lake_schema.tables import exposures as declared
 from lake_schema.tables.exposures import EUCLID_BANDS
 from lake_schema.texts import spelling
 from truesky.request import sky_notation
-from truesky.request.instruments import EUCLID_CAMERAS
+from truesky.request.instruments import EUCLID_CAMERAS, replace_grism
 
 CHANNELS = tuple(code for code, _ in declared.CHANNELS)
 IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
@@ -43,7 +43,7 @@ COLUMNS = (
     ),
     ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the channel of the observation, if it has only one"),
     ("camera", "", "camera in the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
-    ("band", "", "passband", "VIS: euclid_vis"),
+    ("band", "", "passband, or a grism", "VIS: euclid_vis"),
     ("exposure_time_s", "s", "effective exposure time", "the observation's, else the mission's"),
     ("image_type", "", "image type, as in a request", "the observation's"),
     ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
@@ -57,7 +57,7 @@ COLUMNS = (
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
     ("clouds", "mag", "mean extinction by clouds of the night, for ground cameras", "the observation's, else 0"),
     ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
-    ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0"),
+    ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0, or the grism's"),
 )
 # Smallest and largest mean extinction by clouds, mag. A sky with thicker clouds is not observed.
 CLOUDS_LIMITS = (0.0, 5.0)
@@ -363,7 +363,9 @@ def _row_from_line(
             grism_angle=read(_number, row, "grism_angle", location),
             detectors=tuple(row.get("detectors", "").split()),
         )
-    return replace(parsed, ra=parsed.ra % 360.0)
+        spectra = read(replace_grism, parsed.band or "", parsed.grism_angle, f"{location}: grism_angle")
+    band, grism_angle = spectra
+    return replace(parsed, ra=parsed.ra % 360.0, band=band, grism_angle=grism_angle)
 
 
 def _band(row: Mapping[str, str], channel: str, location: str) -> str:

@@ -130,6 +130,9 @@ def _pointing(value: object, path: str, mission: MissionConfiguration | None, us
             realisations=read(integer, table, f"{path}.realisations", 1, MAX_REALISATIONS, 1),
             grism_angle=read(optional_number, table, f"{path}.grism_angle", -360.0, 360.0, "deg"),
         )
+        if instrument is not None and instrument["band"] not in user_bands:
+            spectra = read(instruments.replace_grism, instrument["band"], pointing.grism_angle, f"{path}.grism_angle")
+            instrument |= dict(zip(("band", "grism_angle"), spectra or (), strict=False))
     return replace(pointing, **instrument)
 
 
@@ -156,7 +159,8 @@ def _instrument(
                 band = instruments.default_band(channel, camera, mission)
             elif band is not None and band not in user_bands:
                 bands = instruments.band_names(channel, camera, mission)
-                read(instruments.check_band, band, bands, f"camera {camera}", f"{path}.band", mission)
+                passband, _ = instruments.replace_grism(band, None, "")
+                read(instruments.check_band, passband, bands, f"camera {camera}", f"{path}.band", mission)
             read(instruments.check_detectors, (camera,), detectors or (), mission, f"{path}.detectors")
             centred = (centre_on,) if centre_on else ()
             read(instruments.check_detectors, (camera,), centred, mission, f"{path}.centre_on")

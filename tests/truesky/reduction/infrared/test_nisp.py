@@ -1,5 +1,7 @@
 """Compare NISP masters and calibrated images of rendered frames of a lake with the truth."""
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -12,7 +14,7 @@ from tests.truesky.render.test_render_exposures_infrared import MODULES
 from truesky.randomness.rng import stream
 from truesky.reduction import calibration, files, masters, reduce
 from truesky.reduction import frames as lake_frames
-from truesky.render.effects.charge import ramp_nonlinearity
+from truesky.render.effects.charge import dark_map, ramp_nonlinearity
 from truesky.render.effects.effect import Effect
 from truesky.request.from_toml import parse
 
@@ -153,6 +155,48 @@ def own_numbers(effect: Effect):
 
 def frames_of_master(mean, error):
     return calibration.CombinedFrame(mean, error, np.ones(mean.shape, np.int16))
+
+
+def test_the_bad_pixel_map_flags_hot_pixels_also_without_a_dark(made, tmp_path):
+    """Hot pixels above 10 times the noise of an image are in the map, and no calibrated image shows them unflagged.
+
+    The dark current of each pixel is drawn as the renderer draws it. A mean of 1e-3 of the pixels are hot (Kubik et al.
+    2025 allow 2e-3 bad ones), with an exponential distribution of mean 5 e-/s in 87.2 s: exp(-70 / 436) of them have
+    more than 10 x 7 e-, 31 +- 6 of 192 x 192 pixels.
+    """
+    name = "NISP_DET22_bad_pixels.fits"
+    units = images.read_images(made / "masters" / name)
+    header = {key: value for key, value, _ in units[0].cards}
+    bits = np.asarray(units[1].data)
+    assert (header["IMAGETYP"], header["FLAG4"], bits.dtype) == ("master bad_pixels", "hot pixel", np.uint8)
+    with small_detectors(192):
+        (own,) = lake_frames.from_lake(layout.resolve_lake(made / "lake")).values()
+    drawn = dark_map.EFFECT.apply(
+        np.zeros(bits.shape), *dark_map.EFFECT.parameters(own[0].scene), rng=own_numbers(dark_map.EFFECT)
+    )
+    hot = drawn > 10.0 * 7.0
+    assert 13 <= hot.sum() <= 55
+    assert (bits[hot] & calibration.HOT).all()
+    assert (bits > 0).mean() < 0.01
+    path = sorted((made / "images").iterdir())[0]
+    call = [
+        "--lake",
+        str(made / "lake"),
+        "--exposures",
+        str(int(path.name[:6])),
+        "--without",
+        "dark",
+        "flat",
+        "linearity",
+    ]
+    (tmp_path / "map").mkdir()
+    shutil.copy(made / "masters" / name, tmp_path / "map")
+    with small_detectors(192):
+        assert reduce.main([*call, "--masters", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 0
+    for file in (path, tmp_path / "out" / path.name):
+        reduced = files.read_image(file).reduced
+        assert (reduced.flags[hot] & calibration.HOT).all()
+        assert not reduced.weight[hot].any()
 
 
 def test_header_of_a_calibrated_image(made):

@@ -119,7 +119,7 @@ def test_rdnoise_under_a_bright_sky(tmp_path):
 
 
 def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
-    """The truth image of the sky has its gradient; the rate in the header is that in the middle of the detector."""
+    """The truth image of the sky has its gradient; the rate in the header is its mean."""
     detector = small("lsstcam", "R34_S21", 128)
     none = fields.galaxies([], []), fields.stars([], [])
     exposed = {
@@ -130,10 +130,10 @@ def test_clouds_and_the_sky_of_twilight_are_in_the_file(tmp_path):
     one = fields.rendered(exposed, detector, tables, MISSION, SURVEY, truth=("sky",))
     x, y = (axis[0] / 3600.0 for axis in pointing.outline((detector,)))
     middle, lower_left, lower_right, upper_right, upper_left = 34.0 * (1.0 + 0.2 * x - 0.1 * y)
+    sky = np.asarray(one.maps["sky"], float) / 200.0
     with science(one, tmp_path) as units:
         assert units[0].header["CLOUDS"] == 0.25
-        assert units[0].header["SKYRATE"] == pytest.approx(middle)
-    sky = np.asarray(one.maps["sky"], float) / 200.0
+        assert units[0].header["SKYRATE"] == pytest.approx(sky.mean(), rel=3e-3)
     # At this distance from the boresight, distortion makes pixels smaller by 0.4 %.
     assert sky.mean() == pytest.approx(middle, rel=6e-3)
     across = sky[:, 64:].mean() - sky[:, :64].mean(), sky[64:].mean() - sky[:64].mean()

@@ -60,20 +60,46 @@ def apply(
     OutOfRange
         If `fraction` or `scale` is outside its limits or NaN.
     """
+    out = copy_frame(frame, out)
+    nodes, step = halo_nodes((out.shape[0], out.shape[1]), lights, fraction, scale)
+    if nodes is not None:
+        _interpolate(out, nodes, step)
+    return out
+
+
+def halo_nodes(shape: tuple[int, int], lights: Lights, fraction: float, scale: float) -> tuple[Frame | None, int]:
+    """Return the halos of stars at the nodes of a grid, between which `apply` interpolates.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Numbers of rows and columns of the frame.
+    lights, fraction, scale : Lights, float, float
+        Stars, fraction of their flux in the halo, and scale length of the halo in pixels, as for `apply`.
+
+    Returns
+    -------
+    nodes : float array, shape (gy, gx), or None
+        Electrons per pixel at the nodes; None without halos.
+    step : int
+        Distance between nodes in pixels. The first node lies on the first pixel.
+
+    Raises
+    ------
+    OutOfRange
+        If `fraction` or `scale` is outside its limits or NaN.
+    """
     if not 0.0 <= fraction <= 1.0:
         raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)
     if not 1.0 <= scale <= 1e6:
         raise OutOfRange("straylight scale", scale, 1.0, 1e6)
-    out = copy_frame(frame, out)
-    if fraction == 0.0 or out.size == 0 or not len(lights.electrons):
-        return out
     step = int(np.clip(scale * _NODE_SPACING, 1, _MAX_STEP))
-    ny, nx = out.shape
-    nodes = np.zeros(((ny - 1) // step + 2, (nx - 1) // step + 2))
+    if fraction == 0.0 or min(shape) == 0 or not len(lights.electrons):
+        return None, step
+    nodes = np.zeros(((shape[0] - 1) // step + 2, (shape[1] - 1) // step + 2))
     height = lights.electrons * fraction / (2.0 * np.pi * scale**2)
     _add_halos(nodes, step, lights.column, lights.row, height, 1.0 / scale**2)
-    _interpolate(out, nodes, step)
-    return out
+    return nodes, step
 
 
 @jit
@@ -107,7 +133,8 @@ def _halo_parameters(scene: Scene) -> tuple[float, float]:
     return scene.value("halo.fraction", ""), scene.value("halo.radius", "arcsec") / pixel_scale
 
 
-def _parameters(scene: Scene) -> tuple[Any, ...]:
+def parameters(scene: Scene) -> tuple[Lights, float, float]:
+    """Return the parameters of `apply` for a scene: stars with a noticeable halo, its fraction and scale in pixels."""
     fraction, scale = _halo_parameters(scene)
     lights = scene.lights
     # Omit halos whose peak is at most a thousandth of the noticeable change. Even a thousand of them at the same place
@@ -122,4 +149,4 @@ def _contribution(scene: Scene) -> float:
     return fraction * float(scene.lights.electrons.sum()) / (2.0 * np.pi * scale**2)
 
 
-EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=5e-3, in_place=True)
+EFFECT = Effect("straylight", apply, parameters, _contribution, cost=5e-3, in_place=True)

@@ -1,0 +1,1 @@
+"""Names and headers of Euclid's level-1 files, for files of whole exposures."""
