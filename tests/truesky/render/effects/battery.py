@@ -9,7 +9,7 @@ from truesky.render.camera.amplifiers import Amplifier, Layout
 from truesky.render.camera.sections import Section
 from truesky.render.channels import ground, nisp_p, nisp_s, vis
 from truesky.render.effects.charge.ramp import Mode
-from truesky.render.effects.light.ghosts import Pupil
+from truesky.render.effects.light.ghosts import Order, Pupil
 from truesky.render.effects.light.ground_ghosts import Annuli
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
 from truesky.render.effects.readout.trap_pumping import Pumping
@@ -121,14 +121,14 @@ _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
     Case(
         "ghosts",
-        (LIGHTS, 1e-4, (0.0, 5.0), Pupil(6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2)),
-        (LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),
+        ((Order(LIGHTS, 1e-4, (0.0, 5.0), Pupil(6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2)),),),
+        ((Order(LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),),),
         zero=False,
     ),
     Case(
         "filter_ghosts",
-        (LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),
-        (LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),
+        ((Order(LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),),),
+        ((Order(LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),),),
         zero=False,
     ),
     Case(
