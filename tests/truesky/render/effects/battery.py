@@ -9,6 +9,7 @@ from truesky.render.camera.amplifiers import Amplifier, Layout
 from truesky.render.camera.sections import Section
 from truesky.render.channels import ground, nisp_p, nisp_s, vis
 from truesky.render.effects.charge.ramp import Mode
+from truesky.render.effects.charge.track_charge import THIN, Spread
 from truesky.render.effects.light.ghosts import Order, Pupil
 from truesky.render.effects.light.ground_ghosts import Annuli
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
@@ -175,18 +176,25 @@ _CASES = (
     ),
     Case("dark_current", (0.3,), (0.0,), zero=False, whole=True),
     Case("hot_pixels", (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
-    Case("cosmic_rays", (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),
+    Case("cosmic_rays", (5.0, TRACKS, THIN), (0.0, TRACKS, THIN), zero=False, whole=True),
+    Case(
+        "cosmic_rays: wide, with an uneven energy loss",
+        (5.0, TRACKS, Spread(0.3, 0.2, 3.3)),
+        (0.0, TRACKS, Spread(0.3, 0.2, 3.3)),
+        zero=False,
+        whole=True,
+    ),
     Case(
         "readout_cosmic_rays",
-        (5.0, TRACKS, (4, 1, 3), END_OF_LIFE),
-        (0.0, TRACKS, (4, 1, 3), END_OF_LIFE),
+        (5.0, TRACKS, (4, 1, 3), END_OF_LIFE, THIN),
+        (0.0, TRACKS, (4, 1, 3), END_OF_LIFE, THIN),
         planes=True,
         zero=False,
     ),
     Case(
         "readout_cosmic_rays: silicon without traps",
-        (5.0, TRACKS, (4, 1, 3), None),
-        (0.0, TRACKS, (4, 1, 3), None),
+        (5.0, TRACKS, (4, 1, 3), None, THIN),
+        (0.0, TRACKS, (4, 1, 3), None, THIN),
         planes=True,
         zero=False,
         whole=True,
