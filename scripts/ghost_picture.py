@@ -36,14 +36,12 @@ def _draw_ghosts(axes: Axes, mission: MissionConfiguration) -> None:
     lights = Lights(np.array([_COLUMN]), np.array([_ROW]), np.array([rate * _TIME]))
     scene = Scene(mission, "vis", _TIME, 0.22, 0.0, detector, lights)
     frame = ghosts.apply(np.zeros((detector.ny, detector.nx)), *ghosts.parameters(scene))
-    (left, right), (low, high) = (
-        tuple(int(start + n) for n in sides) for start, sides in ((_COLUMN, _COLUMNS), (_ROW, _ROWS))
-    )
-    part = frame[low:high, left:right]
+    columns, rows = (slice(*(int(at + n) for n in sides)) for at, sides in ((_COLUMN, _COLUMNS), (_ROW, _ROWS)))
+    part = frame[rows, columns]
     part = part.reshape(len(part) // _BINNED, _BINNED, -1, _BINNED).mean(axis=(1, 3))
     extent = (_COLUMNS[0], _COLUMNS[1], _ROWS[0], _ROWS[1])
-    shown = axes.imshow(np.log10(part + 0.02), origin="lower", cmap="gray", extent=extent)
-    bar = axes.figure.colorbar(shown, ax=axes, ticks=np.log10(np.array([0.0, 0.1, 1.0, 10.0]) + 0.02), shrink=0.6)
+    image = axes.imshow(np.log10(part + 0.02), origin="lower", cmap="gray", extent=extent)
+    bar = axes.figure.colorbar(image, ax=axes, ticks=np.log10(np.array([0.0, 0.1, 1.0, 10.0]) + 0.02), shrink=0.6)
     bar.ax.set_yticklabels(["0", "0.1", "1", "10"])
     bar.set_label("electrons per pixel")
     axes.plot(0, 0, "*", color="tab:orange")
@@ -58,9 +56,9 @@ def _draw_ghosts(axes: Axes, mission: MissionConfiguration) -> None:
 
 def _draw_offsets(axes: Axes, mission: MissionConfiguration) -> None:
     """Draw the offsets of both orders over the focal plane as arrows, twice as long as in the focal plane."""
-    for one in detectors.detectors("vis", mission):
-        width, height = (n * one.pixel_scale / 3600.0 for n in (one.nx, one.ny))
-        corner = (one.x / 3600.0 - width / 2, one.y / 3600.0 - height / 2)
+    for detector in detectors.detectors("vis", mission):
+        width, height = (n * detector.pixel_scale / 3600.0 for n in (detector.nx, detector.ny))
+        corner = (detector.x / 3600.0 - width / 2, detector.y / 3600.0 - height / 2)
         axes.add_patch(Rectangle(corner, width, height, fill=False, edgecolor="0.8"))
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.35, 0.35, 6)] * 2))
     to_degrees = mission.value("vis.fpa.pixel_scale", "deg / pix")
@@ -78,9 +76,9 @@ def _draw_offsets(axes: Axes, mission: MissionConfiguration) -> None:
 def write(path: Path) -> None:
     """Write the picture to a JPEG file."""
     mission = resolve()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 6.0), layout="constrained", width_ratios=(1.0, 1.6))
-    _draw_ghosts(left, mission)
-    _draw_offsets(right, mission)
+    figure, panels = plt.subplots(1, 2, figsize=(10.0, 6.0), layout="constrained", width_ratios=(1.0, 1.6))
+    _draw_ghosts(panels[0], mission)
+    _draw_offsets(panels[1], mission)
     figure.savefig(path, dpi=100, pil_kwargs={"quality": 85})
     plt.close(figure)
 

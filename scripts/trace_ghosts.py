@@ -28,11 +28,11 @@ ORDERS = (1, 2)
 _HALF_FIELD, _STARS, _DEGREE = 0.42, 43, 3
 _HEADER = """\
 # Ghosts of VIS: offset of a ghost from its star, over the offset of order 1 in the middle of the field
-# (vis.ghost.offset_y). x, y: position of the star, degrees from the centre of the focal plane; to_x, to_y: coefficients of
-# x^x_power y^y_power. Order: number of reflections by the back of the dichroic (Euclid Data Product Description Document).
-# Assumed: a plane-parallel plate {thickness:.1f} mm thick, of index {index:.2f}, at the exit pupil {distance:.0f} mm from the
-# focal plane, tilted by {tilt:.2f} deg, which gives the offset of the mission database. Error of the fit: {error:.2f} pixels.
-# Written by scripts/trace_ghosts.py. Do not edit.
+# (vis.ghost.offset_y). x, y: position of the star, degrees from the centre of the focal plane; to_x, to_y: coefficients
+# of x^x_power y^y_power. Order: number of reflections by the back of the dichroic (Euclid Data Product Description
+# Document). Assumed: a plane-parallel plate {thickness:.1f} mm thick, of index {index:.2f}, at the exit pupil
+# {distance:.0f} mm from the focal plane, tilted by {tilt:.2f} deg, which gives the offset of the mission database.
+# Error of the fit: {error:.2f} pixels. Written by scripts/trace_ghosts.py. Do not edit.
 """
 
 
@@ -91,9 +91,9 @@ def text(mission: MissionConfiguration) -> str:
     lines, error = ["order,x_power,y_power,to_x,to_y"], 0.0
     for order in ORDERS:
         relative = np.stack(offsets_mm(to_mm * x, to_mm * y, tilt, thickness, order), axis=1) / middle
-        found = np.round(np.linalg.lstsq(terms, relative, rcond=None)[0], 5)
-        error = max(error, np.abs(terms @ found - relative).max() * middle / pixel)
-        lines += [f"{order},{i},{j},{a:g},{b:g}" for (i, j), (a, b) in zip(powers, found + 0.0, strict=True) if a or b]
+        fitted = np.round(np.linalg.lstsq(terms, relative, rcond=None)[0], 5)
+        error = max(error, np.abs(terms @ fitted - relative).max() * middle / pixel)
+        lines += [f"{order},{i},{j},{a:g},{b:g}" for (i, j), (a, b) in zip(powers, fitted + 0.0, strict=True) if a or b]
     header = _HEADER.format(
         thickness=thickness, index=INDEX, distance=PUPIL_DISTANCE_MM, tilt=np.degrees(tilt), error=error
     )

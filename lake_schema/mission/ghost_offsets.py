@@ -86,15 +86,16 @@ def faults(mission: MissionConfiguration) -> Iterator[str]:
         places = [axis.ravel() for axis in np.meshgrid(x, y)]
         for plate in plates:
             for order in orders(mission, camera, plate):
-                offsets = np.abs(offset(mission, (camera, plate), order, *places))
+                offsets = np.abs(np.stack(offset(mission, (camera, plate), order, *places)))
                 # A coefficient that is not a number leaves the plane, too.
                 leaves = ~(offsets <= half[:, None]).all(axis=0)
                 if leaves.any():
                     worst = int(np.argmax(np.where(leaves, np.nan_to_num(offsets, nan=np.inf).max(axis=0), -1.0)))
+                    place = f"x = {places[0][worst]:.2f}, y = {places[1][worst]:.2f} deg"
+                    displaced = f"{offsets[0, worst]:.0f} and {offsets[1, worst]:.0f} pixels"
                     yield (
-                        f"mission parameter {camera}.{plate}.offset_y: the ghost of order {order} of a star at x = "
-                        f"{places[0][worst]:.2f}, y = {places[1][worst]:.2f} deg is displaced by {offsets[0, worst]:.0f} "
-                        f"and {offsets[1, worst]:.0f} pixels and leaves the focal plane ({half[0]:.0f} and "
-                        f"{half[1]:.0f} pixels from its middle to its edges)"
+                        f"mission parameter {camera}.{plate}.offset_y: the ghost of order {order} of a star at {place} "
+                        f"is displaced by {displaced} and leaves the focal plane ({half[0]:.0f} and {half[1]:.0f} "
+                        "pixels from its middle to its edges)"
                     )
                     break

@@ -142,8 +142,8 @@ def _diffuse(
     first = np.flatnonzero(np.diff(event, prepend=-1))
     start = end - part
     start -= np.repeat(start[first], np.diff(first, append=len(event)))
-    near = max(1, int(np.ceil(_REACH * sigma - 0.5)))
-    edges, weights = np.arange(-near, near + 2), np.zeros((len(event), 2 * near + 1, 2 * near + 1))
+    reach = max(1, int(np.ceil(_REACH * sigma - 0.5)))
+    edges, weights = np.arange(-reach, reach + 2), np.zeros((len(event), 2 * reach + 1, 2 * reach + 1))
     points = min(int(np.ceil(np.sqrt(2.0) / (_STEP * sigma))), _MOST_POINTS)
     for point in range(points):
         along = length * (start + part * (point + 0.5) / points)
@@ -153,7 +153,7 @@ def _diffuse(
         ]
         weights += shares[1][:, :, None] * shares[0][:, None, :]
     weights *= (total / weights.sum(axis=(1, 2)))[:, None, None]
-    moved = np.arange(-near, near + 1)
+    moved = np.arange(-reach, reach + 1)
     columns, rows = (
         np.broadcast_to(at, weights.shape).ravel()
         for at in (column[:, None, None] + moved[None, None, :], row[:, None, None] + moved[None, :, None])

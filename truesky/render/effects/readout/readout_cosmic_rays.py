@@ -20,8 +20,8 @@ _NEGLIGIBLE = 1e-3
 
 
 def apply_readout(
-    frame: Frame, expected: float, quantiles: Frame, pixels: tuple[int, int, int], silicon: Traps | None, spread: Spread,
-    rng: np.random.Generator, out: Frame | None = None,
+    frame: Frame, expected: float, quantiles: Frame, pixels: tuple[int, int, int], silicon: Traps | None,
+    spread: Spread, rng: np.random.Generator, out: Frame | None = None,
 ) -> Frame:  # fmt: skip
     """Draw the cosmic rays that arrive while the quadrants of a detector are read, and add their charge.
 

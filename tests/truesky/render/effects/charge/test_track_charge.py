@@ -68,7 +68,9 @@ def test_every_track_keeps_its_charge(spread):
     np.testing.assert_array_equal(np.bincount(event, charge, len(events[0])), events[5])
 
 
-@pytest.mark.parametrize(("sigma", "angle", "length"), [(0.3, 0.4, 9.3), (0.3, 2.0, 1e-6), (0.1, 5.0, 3.3), (0.8, 1.6, 6.0)])
+@pytest.mark.parametrize(
+    ("sigma", "angle", "length"), [(0.3, 0.4, 9.3), (0.3, 2.0, 1e-6), (0.1, 5.0, 3.3), (0.8, 1.6, 6.0)]
+)
 def test_charge_diffuses_as_single_electrons_would(sigma, angle, length):
     """Against four million electrons that start evenly along the path and move by Gaussian random numbers."""
     x, y, count, draws = 15.2, 18.7, 4_000_000, rng(2)
@@ -102,7 +104,7 @@ def test_energy_losses_have_a_moyal_distribution():
 
 
 def test_the_variance_is_proportional_to_the_path():
-    """A track through 40 um of silicon, 1 pixel long on the detector, has a path of 3.5 pixels for each of its pixels."""
+    """Silicon three times as thick as the track is long makes the path in each pixel longer by sqrt(10)."""
     pixels, each, scale = 20_000, 1e6, 0.1
     found = []
     for thickness in (0.0, 3.0 * pixels):
@@ -121,7 +123,7 @@ def test_wide_tracks_cover_more_pixels():
 
 @pytest.mark.parametrize("spread", [Spread(-0.1), Spread(1.1), Spread(np.nan), Spread(0.0, 2.0), Spread(0.0, np.nan)])
 def test_impossible_spreads_are_refused(spread):
-    with pytest.raises(OutOfRange, match="cosmic rays|straggling"):
+    with pytest.raises(OutOfRange, match=r"cosmic rays|straggling"):
         cosmic_rays.draw_tracks((30, 30), 4.0, TRACKS, rng(), spread)
 
 
