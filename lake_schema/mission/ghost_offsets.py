@@ -29,9 +29,21 @@ _CHECKED = 9
 
 
 def orders(mission: MissionConfiguration, camera: str, plate: str) -> tuple[int, ...]:
-    """Return the orders of the ghosts of a plate, from 1.
+    """Return the orders of the ghosts of a plate.
 
-    `camera` is "vis" or "nisp", and `plate` the part of parameter names that follows it, one of `PLATES`.
+    Parameters
+    ----------
+    mission : MissionConfiguration
+        Mission database.
+    camera : str
+        "vis" or "nisp".
+    plate : str
+        Part of parameter names that follows the camera, one of `PLATES`.
+
+    Returns
+    -------
+    tuple of int
+        Numbers of reflections by the back of the plate, from 1, ascending.
     """
     return tuple(sorted({int(row[0]) for row in _rows(mission, camera, plate)}))
 

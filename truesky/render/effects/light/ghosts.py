@@ -204,7 +204,22 @@ def _ghosts_of_order(scene: Scene, plate: str, order: int) -> Order:
 
 
 def flux_ratio(scene: Scene, plate: str, order: int) -> float:
-    """Return the flux of a ghost of a plate relative to its star, for an order from 1."""
+    """Return the flux of a ghost relative to its star.
+
+    Parameters
+    ----------
+    scene : Scene
+        Settings of the exposure.
+    plate : str
+        Prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the filter.
+    order : int
+        Order of the ghost, from 1.
+
+    Returns
+    -------
+    float
+        Flux of the ghost divided by the flux of the star.
+    """
     ratio = scene.value(f"{plate}.flux_ratio", "")
     return ratio if order == 1 else ratio * scene.value(f"{plate}.order_ratio", "") ** (order - 1)
 

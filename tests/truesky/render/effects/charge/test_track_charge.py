@@ -72,7 +72,10 @@ def test_every_track_keeps_its_charge(spread):
     ("sigma", "angle", "length"), [(0.3, 0.4, 9.3), (0.3, 2.0, 1e-6), (0.1, 5.0, 3.3), (0.8, 1.6, 6.0)]
 )
 def test_charge_diffuses_as_single_electrons_would(sigma, angle, length):
-    """Against four million electrons that start evenly along the path and move by Gaussian random numbers."""
+    """Against four million electrons that start evenly along the path and move by Gaussian random numbers.
+
+    The sample is 1600 pixels within five standard errors: significance 1e-3.
+    """
     x, y, count, draws = 15.2, 18.7, 4_000_000, rng(2)
     event, column, row, charge = distributed(tracks((x, y, angle, length, count)), Spread(sigma))
     assert (event == 0).all()
@@ -89,7 +92,10 @@ def test_charge_diffuses_as_single_electrons_would(sigma, angle, length):
 
 
 def test_energy_losses_have_a_moyal_distribution():
-    """A horizontal track along the middle of a row, of which each pixel holds the same path, against scipy."""
+    """A horizontal track along the middle of a row, of which each pixel holds the same path, against scipy.
+
+    The sample is 20,000 pixels; significance 0.01.
+    """
     pixels, each, scale = 20_000, 1e6, 0.1
     one = tracks((0.0, 0.5, 0.0, pixels, pixels * each))
     _, column, _, charge = distributed(one, Spread(0.0, scale, 0.0))
