@@ -83,10 +83,9 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
     frame = draw_light(detector.ny, detector.nx)
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector)
     # Place the bright star so that its ghost falls into the middle of the detector.
-    _, _, across, *_ = ghosts.parameters(scene)
-    place = (0.5 * n - shift for n, shift in zip((detector.nx, detector.ny), across, strict=True))
-    lights = Lights(*(np.array([at]) for at in (*place, _LIGHT)))
-    scene = replace(scene, lights=lights)
+    middle = Lights(*(np.array([at]) for at in (0.5 * detector.nx, 0.5 * detector.ny, _LIGHT)))
+    columns, rows = ghosts.offset(scene, "ghost", 1, middle)
+    scene = replace(scene, lights=replace(middle, column=middle.column - columns, row=middle.row - rows))
     out: dict[str, float] = {}
     for effect in vis.SKY:
         frame = _measure_effect(effect, frame, scene, repeats, out)

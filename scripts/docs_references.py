@@ -29,6 +29,7 @@ from truesky.render.channels import ground, nisp_p, nisp_s, registry, vis
 from truesky.render.channels.aim import Aim
 from truesky.render.effects.charge import bleeding
 from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import ghosts
 from truesky.render.effects.readout import quadrants
 from truesky.render.effects.scene import Frame, Lights, NeighbourCharge, Scene
 from truesky.render.exposure import sky_through_grism
@@ -149,8 +150,15 @@ def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
     small = type(detector)("3-4", "vis", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
     frame[200, 100] += 3e6
-    lights = Lights(np.array([150.0]), np.array([150.0 - mission.value("vis.ghost.offset_y", "pix")]), np.array([1e9]))
-    return frame, Scene(mission, "vis", 560.53, 0.25, float(frame.max()), small, lights)
+    scene = Scene(mission, "vis", 560.53, 0.25, float(frame.max()), small)
+    return frame, _with_ghost(scene, "ghost", 1e9)
+
+
+def _with_ghost(scene: Scene, plate: str, electrons: float) -> Scene:
+    """Add a bright star whose ghost of the first order is at column and row 150."""
+    middle = Lights(np.array([150.0]), np.array([150.0]), np.array([electrons]))
+    columns, rows = ghosts.offset(scene, plate, 1, middle)
+    return replace(scene, lights=replace(middle, column=150.0 - columns, row=150.0 - rows))
 
 
 def _effect_parameters(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
@@ -249,8 +257,6 @@ def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
     detector = detectors.detector("nisp", "DET22", mission)
     small = type(detector)("DET22", "nisp", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
-    place = 150.0 - mission.value("nisp.filter_ghost.offset_y", "pix")
-    lights = Lights(np.array([150.0]), np.array([place]), np.array([1e9]))
     persistence_charge = 10.0 * (np.hypot(*(np.indices(frame.shape) - _SIDE / 2)) < _SIDE / 10)
     scene = Scene(
         mission,
@@ -259,11 +265,10 @@ def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
         1.0,
         float(frame.max()),
         small,
-        lights,
         ramp="photometric",
         persistence_charge=persistence_charge,
     )
-    return frame, scene
+    return frame, _with_ghost(scene, "filter_ghost", 1e9)
 
 
 def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:

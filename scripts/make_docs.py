@@ -23,7 +23,7 @@ from nbconvert import MarkdownExporter
 from sphinx.application import Sphinx
 
 from lake_schema.mission.configuration import resolve
-from scripts import docs_references, page_pictures, place_pictures, structure_picture
+from scripts import docs_references, ghost_picture, page_pictures, place_pictures, structure_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 # Chapters of the site: title and pages. "walks" means the pages of docs/walks, "notebooks" those of all notebooks, and
@@ -126,6 +126,7 @@ def pages(into: Path, run: bool) -> None:
 def _with_pictures(into: Path) -> None:
     """Draw pictures of galaxies and places and, if a browser is available, screenshots of the web page of a lake."""
     structure_picture.write(into / "structure.jpg")
+    ghost_picture.write(into / "ghosts.jpg")
     place_pictures.write_places(_DEMO_LAKE, into / "places.jpg")
     place_pictures.write_injection(into / "injection.jpg")
     if why := page_pictures.missing_requirement():

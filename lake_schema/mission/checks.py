@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from lake_schema.errors import BadInput
+from lake_schema.mission import ghost_offsets
 from lake_schema.mission.camera_tables import find_overlaps
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.detector_overrides import split_name
@@ -41,7 +42,7 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
     yield from _amplifier_faults("vis.amplifiers", configuration)
     yield from _gap_faults("vis", configuration)
     yield from _gap_faults("nisp", configuration)
-    yield from ramp_faults(configuration)
+    yield from value_faults(configuration)
     for m in configuration.models:
         if m.key.endswith(".throughput"):
             yield from _throughput_faults(m.key, configuration)
@@ -92,6 +93,15 @@ def _gap_faults(section: str, configuration: MissionConfiguration) -> Iterator[s
     for axis in ("x", "y"):
         if configuration.value(f"{section}.fpa.gap_{axis}", "arcsec") < 0:
             yield f"mission parameter {section}.fpa.gap_{axis}: detectors overlap"
+
+
+def value_faults(configuration: MissionConfiguration) -> Iterator[str]:
+    """Yield one sentence per fault of numbers of a request that are within their bounds, but do not fit together.
+
+    Faults are impossible ramps (exposures of NISP), and ghosts that are displaced out of the focal plane.
+    """
+    yield from ramp_faults(configuration)
+    yield from ghost_offsets.faults(configuration)
 
 
 def ramp_faults(configuration: MissionConfiguration) -> Iterator[str]:

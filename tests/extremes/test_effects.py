@@ -89,7 +89,7 @@ def test_no_traps_and_far_beyond_the_end_of_life(age):
 def test_exposure_times_from_zero_to_one_day(seconds):
     scene = Scene(resolve(), "vis", seconds, 0.25, 1e4)
     assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT)]).all()
-    expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
+    expected, quantiles, _ = cosmic_rays.EFFECT.parameters(scene)
     started = time.process_time()
     image = cosmic_rays.draw_tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, quantiles, np.random.default_rng(1))
     assert time.process_time() - started < HANGS

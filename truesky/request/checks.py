@@ -139,11 +139,11 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
     Raises
     ------
     BadInput
-        If a user's value has an unknown name or a wrong unit, or is out of range. Also if a user's camera, or the ramp
-        of an infrared detector (numbers of groups, reads and drops), is not valid. There is one line for each mistake,
-        which names the key.
+        If a user's value has an unknown name or a wrong unit, or is out of range. Also if a user's camera, the ramp of
+        an infrared detector (numbers of groups, reads and drops), or the offset of ghosts, is not valid. There is one
+        line for each mistake, which names the key.
     """
-    from lake_schema.mission.checks import camera_faults, ramp_faults
+    from lake_schema.mission.checks import camera_faults, value_faults
     from lake_schema.mission.configuration import resolve
 
     overrides = {key: (override.value, override.unit) for key, override in choice.overrides}
@@ -155,7 +155,7 @@ def check_mission(choice: MissionChoice) -> MissionConfiguration:
         for i, camera in enumerate(choice.cameras):
             for fault in camera_faults(camera.name, mission):
                 mistakes.add(BadInput(f"mission.cameras[{i}]: {fault}"))
-        for fault in ramp_faults(mission):
+        for fault in value_faults(mission):
             mistakes.add(BadInput(f"mission: {fault}"))
     return mission
 
@@ -182,7 +182,7 @@ def check_explored(explore: Sequence[tuple[str, Sequence[str]]], mission: Missio
 
 
 def _check_values(key: str, values: Sequence[str], mission: MissionConfiguration) -> None:
-    from lake_schema.mission.checks import ramp_faults
+    from lake_schema.mission.checks import value_faults
 
     with Mistakes() as mistakes:
         for value in values:
@@ -192,7 +192,7 @@ def _check_values(key: str, values: Sequence[str], mission: MissionConfiguration
                 texts = (text.removeprefix(f"{_OVERRIDE}{key}: ") for text in error.messages)
                 mistakes.add(bad_input(texts).with_prefix(f"explore.{key}"))
                 continue
-            for fault in ramp_faults(changed_mission):
+            for fault in value_faults(changed_mission):
                 mistakes.add(BadInput(f"explore.{key}: {fault}"))
 
 

@@ -66,7 +66,7 @@ All keys::
         pointings = "file.csv"     table of pointings instead of both (truesky/request/exposures/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
-        lamps = [..], intensities = [..] of flat and persistence
+        lamps = [..], intensities = [..] of flat and persistence; exposures flats of each lamp, band and intensity
         macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
         delays_s = [..], bright = "flat" | "sky" of persistence
         phase_times_s = [..] of trap_pumping     defocus_nm = [..] of defocus

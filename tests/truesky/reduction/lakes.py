@@ -12,9 +12,12 @@ RAYS_OFF = ["cosmic_rays", "readout_cosmic_rays"]
 
 
 def request(
-    bias=8, dark=4, flat=12, off=(), truth=("noise_free", "sky"), overrides=None, depth=(19.0, 19.0), dither="S"
+    bias=8, dark=4, flat=2, off=(), truth=("noise_free", "sky"), overrides=None, depth=(19.0, 19.0), dither="S"
 ):
-    """Return a request with a visit of a field in four dithers, or other dithers, and calibration frames."""
+    """Return a request with a visit of a field in four dithers, or other dithers, and calibration frames.
+
+    `flat` flats are taken of each of the six lamps.
+    """
     blocks = [{**BLOCK, "fields": 1, "dither": dither, "short": False, "flat": False}]
     for kind, count in (("bias", bias), ("dark", dark), ("flat", flat)):
         blocks += [{**BLOCK, "image_type": kind, "exposures": count}] if count else []

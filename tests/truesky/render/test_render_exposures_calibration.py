@@ -42,6 +42,8 @@ def wanted():
         blocks.append({**BLOCK, "image_type": kind, "exposures": 1})
         if kind == "dark":
             blocks[-1]["exposure_time_s"] = 600.0
+        elif kind == "flat":
+            blocks[-1]["lamps"] = [1]
     universe = requests.shallow(17.0, 12.0, 'lensing = "none"\n')
     keys = f'accuracy = "draft"\n{universe}[fluxes]\nbands = ["euclid_vis"]\n'
     table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=7))

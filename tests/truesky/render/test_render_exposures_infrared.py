@@ -58,7 +58,7 @@ macc = [2, 1, 0]
 mjd = {MJD + 20 * HOUR}
 {BLOCK}
 image_type = "flat"
-exposures = 2
+exposures = 1
 lamps = [5, 3]
 mjd = {MJD + 30 * HOUR}
 {BLOCK}

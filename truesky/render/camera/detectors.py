@@ -149,6 +149,16 @@ class Detector:
         axes, x, y = self.axes, np.asarray(x, float), np.asarray(y, float)
         return axes[0, 0] * x + axes[1, 0] * y, axes[0, 1] * x + axes[1, 1] * y
 
+    def focal_plane_place(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
+        """Return the positions (x, y) of pixels in the focal plane, arcsec; columns and rows count from 0."""
+        places = ((column, self.nx), (row, self.ny))
+        return self.to_focal_plane(*(self.pixel_scale * (np.asarray(at, float) - (n - 1) / 2) for at, n in places))
+
+    def pixel_place(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[Float, Float]:
+        """Return the columns and rows of positions in the focal plane (arcsec), the inverse of `focal_plane_place`."""
+        along, up = self.from_focal_plane(np.asarray(x, float) - self.x, np.asarray(y, float) - self.y)
+        return along / self.pixel_scale + (self.nx - 1) / 2, up / self.pixel_scale + (self.ny - 1) / 2
+
     @property
     def half_diagonal(self) -> float:
         """Distance from the centre of the detector to its corners, arcsec."""

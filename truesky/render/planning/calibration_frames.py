@@ -15,7 +15,6 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.randomness import rng
 from truesky.render.camera import pointing
-from truesky.render.camera.lamps import LAMPS
 from truesky.render.channels import image_types, registry
 from truesky.render.effects.readout import trap_pumping
 from truesky.render.planning import lit_flats, persistence_darks
@@ -122,16 +121,11 @@ def _frames(template: Exposure, block: Observation, mission: MissionConfiguratio
         yield from _pumping_frames(band_exposures[0], block, mission)
     elif not block.exposures:
         raise BadInput(f"image_type {template.image_type} requires exposures, the number of frames")
-    elif template.image_type == "flat" and template.camera in LAMPS:
-        frames_by_lamp = lit_flats.by_lamp(band_exposures, block, mission)
-        for i in range(block.exposures):
-            cycle, lamp_frames = i // len(frames_by_lamp), frames_by_lamp[i % len(frames_by_lamp)]
-            yield from lit_flats.at_levels(lamp_frames[cycle % len(lamp_frames)], block, mission)
+    elif template.image_type == "flat":
+        yield from lit_flats.series(band_exposures, block, mission)
     else:
-        lamp = 1 if template.image_type == "flat" else None
         for i in range(block.exposures):
-            frame = replace(band_exposures[i % len(band_exposures)], lamp=lamp)
-            yield from lit_flats.at_levels(frame, block, mission) if lamp else [frame]
+            yield band_exposures[i % len(band_exposures)]
 
 
 def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:

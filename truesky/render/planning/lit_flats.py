@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain, repeat
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -19,6 +20,34 @@ from truesky.request.exposures.observations import Observation
 _MIN_RELATIVE_SIGNAL = 0.05
 
 
+def series(band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
+    """Yield the flats of an observation: `block.exposures` of each lamp, in each band that sees it, at each intensity.
+
+    Flats that differ only in their noise follow one another, so that the difference of two of them measures the gain.
+
+    Parameters
+    ----------
+    band_exposures : sequence of Exposure
+        One flat per band, all of the same camera; at least one.
+    block : Observation
+        Observation block of the request, with its lamps, intensities and number of exposures.
+    mission : MissionConfiguration
+        Mission database, with the spectra of the lamps and the signal of a flat.
+
+    Yields
+    ------
+    Exposure
+        One flat.
+
+    Notes
+    -----
+    BadInput is raised as by `by_lamp`.
+    """
+    for flat in chain.from_iterable(by_lamp(band_exposures, block, mission)):
+        for level in at_levels(flat, block, mission):
+            yield from repeat(level, block.exposures)
+
+
 def by_lamp(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration
 ) -> list[list[Exposure]]:
@@ -29,7 +58,8 @@ def by_lamp(
     band_exposures : sequence of Exposure
         One flat per band, all of the same camera; at least one.
     block : Observation
-        Observation block of the request. Its `lamps` are used, or all lamps of the camera if it names none.
+        Observation block of the request. Its `lamps` are used, or all lamps of the camera if it names none. Ground
+        cameras have one lamp, which all bands see.
     mission : MissionConfiguration
         Mission database, with the spectra of the lamps.
 
@@ -44,6 +74,8 @@ def by_lamp(
         If a lamp that the block names is too faint in all bands, or if all lamps are.
     """
     camera, flats = band_exposures[0].camera, []
+    if camera not in LAMPS:
+        return [[replace(frame, lamp=1) for frame in band_exposures]]
     curves = {frame.band: passbands.load(frame.band) for frame in band_exposures}
     for lamp in block.lamps or range(1, LAMPS[camera][0] + 1):
         signals = {
@@ -53,7 +85,8 @@ def by_lamp(
         # Flats of NISP-S are taken with the grism in the beam. Flats in other channels do not change here.
         lamp_flats = [through_grism(frame, None, mission) for frame in frames]
         if block.lamps and not lamp_flats:
-            raise BadInput(f"lamps: {lamp} is not visible in {', '.join(curves)}")
+            nm = mission.value(f"{camera}.flat.led_{lamp}", "nm")
+            raise BadInput(f"lamps: {lamp} ({nm:g} nm) is not visible in {', '.join(curves)}")
         if lamp_flats:
             flats.append(lamp_flats)
     if not flats:

@@ -44,7 +44,7 @@ from truesky.request.instruments import check_band, check_detectors
 from truesky.request.schema import Request
 
 # Keys of an observation with which a message about it may begin.
-_KEY_STARTS = ("mjd:", "detectors:", "pointings:", "pointings[")
+_KEY_STARTS = ("mjd:", "detectors:", "pointings:", "pointings[", "lamps:", "bands:")
 # Names of the Euclid Deep Fields.
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
 # Image types of calibrations, whose exposures the module `calibration_frames` plans.

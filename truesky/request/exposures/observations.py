@@ -140,7 +140,8 @@ class Observation:
         Visits of each field; 0 for the number in the survey.
     exposures : int
         Number of exposures. A ground survey that shares positions among bands counts those of all bands together.
-        For calibrations, the number of frames or of dithers, at each level, phase time or defocus. 0 for the default;
+        For calibrations, the number of frames or of dithers, at each level, phase time or defocus, and for flats also
+        of each lamp in each band that sees it. 0 for the default;
         bias, dark, flat and charge_injection frames have none, so that 0 is refused.
     dither : str or tuple of (float, float)
         Name of the dither pattern within a field, one of `DITHERS`, or offsets (x, y) in arcsec along the axes of the

@@ -75,7 +75,7 @@ def build(folder, side, darks, flats, sources=STARS):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("infrared"), 192, DARKS, 6)
+    return build(tmp_path_factory.mktemp("infrared"), 192, DARKS, 3)
 
 
 def master(made, name):
@@ -122,7 +122,7 @@ def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
 
 @pytest.mark.nightly
 def test_a_quarter_of_a_detector(tmp_path):
-    check(build(tmp_path, 1024, 12, 6, requests.shallow(19.0, 19.0) + '[fluxes]\nbands = ["euclid_j"]\n'))
+    check(build(tmp_path, 1024, 12, 3, requests.shallow(19.0, 19.0) + '[fluxes]\nbands = ["euclid_j"]\n'))
 
 
 def test_masters_agree_with_the_detector(made):

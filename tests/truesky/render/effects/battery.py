@@ -9,7 +9,8 @@ from truesky.render.camera.amplifiers import Amplifier, Layout
 from truesky.render.camera.sections import Section
 from truesky.render.channels import ground, nisp_p, nisp_s, vis
 from truesky.render.effects.charge.ramp import Mode
-from truesky.render.effects.light.ghosts import Pupil
+from truesky.render.effects.charge.track_charge import THIN, Spread
+from truesky.render.effects.light.ghosts import Order, Pupil
 from truesky.render.effects.light.ground_ghosts import Annuli
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
 from truesky.render.effects.readout.trap_pumping import Pumping
@@ -121,14 +122,14 @@ _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
     Case(
         "ghosts",
-        (LIGHTS, 1e-4, (0.0, 5.0), Pupil(6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2)),
-        (LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),
+        ((Order(LIGHTS, 1e-4, (0.0, 5.0), Pupil(6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2)),),),
+        ((Order(LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),),),
         zero=False,
     ),
     Case(
         "filter_ghosts",
-        (LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),
-        (LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),
+        ((Order(LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),),),
+        ((Order(LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),),),
         zero=False,
     ),
     Case(
@@ -175,18 +176,25 @@ _CASES = (
     ),
     Case("dark_current", (0.3,), (0.0,), zero=False, whole=True),
     Case("hot_pixels", (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
-    Case("cosmic_rays", (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),
+    Case("cosmic_rays", (5.0, TRACKS, THIN), (0.0, TRACKS, THIN), zero=False, whole=True),
+    Case(
+        "cosmic_rays: wide, with an uneven energy loss",
+        (5.0, TRACKS, Spread(0.3, 0.2, 3.3)),
+        (0.0, TRACKS, Spread(0.3, 0.2, 3.3)),
+        zero=False,
+        whole=True,
+    ),
     Case(
         "readout_cosmic_rays",
-        (5.0, TRACKS, (4, 1, 3), END_OF_LIFE),
-        (0.0, TRACKS, (4, 1, 3), END_OF_LIFE),
+        (5.0, TRACKS, (4, 1, 3), END_OF_LIFE, THIN),
+        (0.0, TRACKS, (4, 1, 3), END_OF_LIFE, THIN),
         planes=True,
         zero=False,
     ),
     Case(
         "readout_cosmic_rays: silicon without traps",
-        (5.0, TRACKS, (4, 1, 3), None),
-        (0.0, TRACKS, (4, 1, 3), None),
+        (5.0, TRACKS, (4, 1, 3), None, THIN),
+        (0.0, TRACKS, (4, 1, 3), None, THIN),
         planes=True,
         zero=False,
         whole=True,

@@ -70,10 +70,10 @@ def test_ghosts_lie_on_the_line_through_the_star_and_the_axis():
     for name in ("R22_S11", "R12_S01", "R43_S21"):
         detector = detectors.detector("lsstcam", name, MISSION)
         # A star at (1500, 900) arcsec in the focal plane.
-        column, row = ground_ghosts._pixels(detector, np.array([1500.0]), np.array([900.0]))
+        column, row = detector.pixel_place([1500.0], [900.0])
         made = scene("lsstcam", name, "lsst_r", Lights(column, row, np.array([1e13])))
         annuli, _ = ground_ghosts.parameters(made)
-        x, y = ground_ghosts._focal_plane(detector, annuli.column, annuli.row)
+        x, y = detector.focal_plane_place(annuli.column, annuli.row)
         np.testing.assert_allclose(1500.0 * y, 900.0 * x, atol=1e-6 * 1500**2)
         found.append({(round(a, 6), round(r, 6)) for a, r in zip(x.tolist(), annuli.radius.tolist(), strict=True)})
     assert len(found[0]) > 0

@@ -20,7 +20,8 @@ from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.channels import vis
 from truesky.render.drawing import cost, stamps
-from truesky.render.effects.light import calibration_lamp
+from truesky.render.effects.light import calibration_lamp, ghosts
+from truesky.render.effects.scene import Lights, Scene
 from truesky.render.exposure import truth_maps
 from truesky.render.planning import planned_exposures, variants
 from truesky.request import schema
@@ -238,8 +239,11 @@ def ghost_of(mag):
 @nightly.parametrize("name", SHOWS, (0, 2, 4))
 def test_each_effect_can_be_forced_on_and_off(name):
     detector = small("vis", "3-4", SIDE)
-    beside = SIDE / 2 - 750.0 * (-1 if detector.upside_down else 1)
-    mags, x, y = [GHOSTS_STAR, 12.0, 18.0], [SIDE / 2, 60.3, 190.2], [beside, 100.4, 60.7]
+    # The ghost of the star beside the detector is in its middle.
+    middle = Lights(np.array([SIDE / 2]), np.array([SIDE / 2]), np.ones(1))
+    moved = ghosts.offset(Scene(MISSION, "vis", nominal.TIME, 0.2, 0.0, detector), "ghost", 1, middle)
+    beside = [SIDE / 2 - float(shift[0]) for shift in moved]
+    mags, x, y = [GHOSTS_STAR, 12.0, 18.0], [beside[0], 60.3, 190.2], [beside[1], 100.4, 60.7]
     off, on = (nominal.rendered(detector, mags, x, y, forced={name: wish}) for wish in (False, True))
     for one, wish in ((off, False), (on, True)):
         (decision,) = (d for d in one.decisions if d.name == name)

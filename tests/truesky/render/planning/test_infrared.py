@@ -25,9 +25,9 @@ FLAT = {"channels": ["NISP-P"], "image_type": "flat"}
 POINTING = {"channel": "NISP-P", "band": "euclid_h", "ra": 53.117, "dec": -27.808, "mjd": 60905.0}
 
 
-def exposures(*blocks, **sections):
+def exposures(*blocks, mission=MISSION, **sections):
     wanted = from_table(copy.deepcopy({**BASE, "observation": list(blocks), **sections}))
-    return survey.exposures(wanted, MISSION)
+    return survey.exposures(wanted, mission)
 
 
 def flats(**more):
@@ -35,19 +35,19 @@ def flats(**more):
 
 
 def test_flats_are_in_bands_in_which_a_lamp_is_visible():
-    """All lamps are used equally often; the 1190 nm lamp is in both Y and J, which overlap there."""
-    assert flats(exposures=10) == {
-        (1, "euclid_y"): 2, (2, "euclid_j"): 1, (2, "euclid_y"): 1, (3, "euclid_j"): 2, (4, "euclid_h"): 2,
+    """Each lamp has the same number of flats in each of its bands; 1190 nm is in both Y and J, which overlap there."""
+    assert flats(exposures=2) == {
+        (1, "euclid_y"): 2, (2, "euclid_j"): 2, (2, "euclid_y"): 2, (3, "euclid_j"): 2, (4, "euclid_h"): 2,
         (5, "euclid_h"): 2,
     }  # fmt: skip
-    assert flats(exposures=4, bands=["euclid_h"]) == {(4, "euclid_h"): 2, (5, "euclid_h"): 2}
-    assert flats(exposures=4, lamps=[5, 3]) == {(5, "euclid_h"): 2, (3, "euclid_j"): 2}
-    for lamp, band in flats(exposures=30):
+    assert flats(exposures=3, bands=["euclid_h"]) == {(4, "euclid_h"): 3, (5, "euclid_h"): 3}
+    assert flats(exposures=1, lamps=[5, 3]) == {(5, "euclid_h"): 1, (3, "euclid_j"): 1}
+    for lamp, band in flats(exposures=1):
         assert calibration_lamp.led_efficiency(passbands.load(band), lamp, "nisp", MISSION) > 0.05
 
 
 def test_invalid_lamps_are_refused():
-    with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 is not visible in euclid_y"):
+    with pytest.raises(BadInput, match=r"^observation\[0\]\.lamps: 5 \(1880 nm\) is not visible in euclid_y$"):
         flats(exposures=1, bands=["euclid_y"], lamps=[5])
     for lamps, message in (
         ([6], r"\[0\] = 6 is outside \[1, 5\]"),
@@ -56,6 +56,12 @@ def test_invalid_lamps_are_refused():
     ):
         with pytest.raises(BadInput, match=rf"observation\[0\]\.lamps.*{message}"):
             flats(exposures=1, lamps=lamps)
+    # A wavelength of the user that VIS does not detect is refused only if the lamp is named.
+    infrared_lamp = resolve(overrides={"vis.flat.led_2": (2000.0, "nm")})
+    of_vis = {"channels": ["VIS"], "image_type": "flat", "exposures": 1}
+    assert [e.lamp for e, _ in exposures(of_vis, mission=infrared_lamp)] == [1, 3, 4, 5, 6]
+    with pytest.raises(BadInput, match=r"^observation\[0\]\.lamps: 2 \(2000 nm\) is not visible in euclid_vis$"):
+        exposures({**of_vis, "lamps": [1, 2]}, mission=infrared_lamp)
     with pytest.raises(BadInput, match="lamps is not for dark: used by flat"):
         exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "lamps": [1]})
 
@@ -67,7 +73,7 @@ def test_number_of_lamps_agrees_with_requests():
 def test_calibrations_without_a_date_follow_one_another():
     """A dark taken during a flat would contain the persistence of the flat."""
     found = exposures(
-        {**FLAT, "exposures": 3}, {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
+        {**FLAT, "exposures": 3, "lamps": [1]}, {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
         {"channels": ["VIS"], "image_type": "dark", "exposures": 1},
         {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "mjd": 60200.0},
         {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 1},
@@ -224,13 +230,19 @@ def test_a_ramp_of_a_block_of_spectra(block):
 
 
 def test_flats_at_intensities():
-    """Each intensity has the same number of frames and sets the level of the lamp for its exposures."""
+    """Each intensity has the same number of frames, one after the other, and sets the level of its lamp."""
     found = exposures({**FLAT, "exposures": 2, "lamps": [3, 5], "intensities": [0.1, 1.0, 2.5]})
     level = MISSION.value("nisp.flat.signal")
     assert [(e.lamp, mission.value("nisp.flat.signal") / level) for e, mission in found] == [
-        (lamp, pytest.approx(share)) for lamp in (3, 5) for share in (0.1, 1.0, 2.5)
+        (lamp, pytest.approx(share)) for lamp in (3, 5) for share in (0.1, 1.0, 2.5) for _ in range(2)
     ]
-    assert [e.settings is None for e, _ in found] == [False, True, False] * 2
+    assert [e.settings is None for e, _ in found] == ([False] * 2 + [True] * 2 + [False] * 2) * 2
+    # Both frames of a pair have their own date, on which their random numbers depend.
+    assert all(earlier.mjd < later.mjd for (earlier, _), (later, _) in pairwise(found))
+    of_dome = exposures({**FLAT, "channels": ["EXT"], "survey": "des", "exposures": 2, "intensities": [0.5, 1.0]})
+    assert Counter((e.lamp, e.band, e.settings is None) for e, _ in of_dome) == {
+        (1, f"des_{band}", at_full_level): 2 for band in "griz" for at_full_level in (False, True)
+    }
     of_vis = exposures({"channels": ["VIS"], "image_type": "flat", "exposures": 1, "intensities": [0.5]})
     assert of_vis[0][1].value("vis.flat.signal") == 0.5 * MISSION.value("vis.flat.signal")
     # Each variant has its explored value, which the intensity of a lamp multiplies.

@@ -1,4 +1,4 @@
-"""Cosmic rays: straight tracks one pixel wide that deposit charge along their length.
+"""Cosmic rays: straight tracks that deposit charge along their length, by default one pixel wide.
 
 Cosmic rays during the exposure hit the pixels that collect light. Functions of this module also draw the tracks for
 the module `readout_cosmic_rays`: cosmic rays during the readout, which hit a detector whose rows are being shifted
@@ -17,6 +17,8 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.camera import amplifiers
+from truesky.render.effects.charge import track_charge
+from truesky.render.effects.charge.track_charge import THIN, Spread
 from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
@@ -34,9 +36,13 @@ _NEGLIGIBLE = 1e-3
 # Number of tracks that are drawn together. A track of average length takes 1.1 kB, so that those of an exposure of
 # 1e6 s would take 27 GB.
 _TOGETHER = 1 << 18
+# The same for tracks whose charge spreads to other pixels, which take more memory.
+_TOGETHER_WIDE = 1 << 13
 
 
-def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator, out: Frame | None = None) -> Frame:
+def apply(
+    frame: Frame, expected: float, quantiles: Frame, spread: Spread, rng: np.random.Generator, out: Frame | None = None
+) -> Frame:
     """Draw the cosmic rays of an exposure, and add their charge to a frame.
 
     Parameters
@@ -48,6 +54,8 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
     quantiles : float array, shape (q, 3)
         Distribution of tracks: cumulative probability (ascending), length in pixels and charge in electrons. Between
         rows, the logarithms of length and charge are interpolated linearly.
+    spread : Spread
+        Fluctuations of the charge along the tracks, and diffusion.
     rng : numpy.random.Generator
         Random generator of the tracks.
     out : float64 array, shape of `frame`, optional
@@ -64,11 +72,13 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
         If `expected` is outside its limits or NaN.
     """
     out = copy_frame(frame, out)
-    _add_tracks(out, expected, quantiles, rng)
+    _add_tracks(out, expected, quantiles, spread, rng)
     return out
 
 
-def draw_tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
+def draw_tracks(
+    shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator, spread: Spread = THIN
+) -> Frame:
     """Draw an image that contains only the charge of random cosmic rays.
 
     Parameters
@@ -82,6 +92,8 @@ def draw_tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: 
         rows, the logarithms of length and charge are interpolated linearly.
     rng : numpy.random.Generator
         Random generator of the tracks.
+    spread : Spread, optional
+        Fluctuations of the charge along the tracks, and diffusion. By default, tracks are thin lines.
 
     Returns
     -------
@@ -99,17 +111,17 @@ def draw_tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: 
     outside the image and enter it, so that the density of tracks is uniform.
     """
     out = np.zeros(shape)
-    _add_tracks(out, expected, quantiles, rng)
+    _add_tracks(out, expected, quantiles, spread, rng)
     return out
 
 
-def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> None:
+def _add_tracks(out: Frame, expected: float, quantiles: Frame, spread: Spread, rng: np.random.Generator) -> None:
     count = draw_event_count(expected, rng)
     if out.size:
         ny, nx = out.shape
-        for batch in batches(count):
+        for batch in batches(count, spread):
             events = draw_events(batch, ny, nx, quantiles, rng)
-            _, column, row, charge = pixels_of_events(events)
+            _, column, row, charge = track_charge.distribute(events, pixels_of_events(events), spread, rng)
             add_charge(out, row, column, charge)
 
 
@@ -141,10 +153,11 @@ def draw_event_count(expected: float, rng: np.random.Generator) -> int:
     return int(rng.poisson(expected))
 
 
-def batches(count: int) -> Iterator[int]:
+def batches(count: int, spread: Spread = THIN) -> Iterator[int]:
     """Yield the sizes of the groups in which `count` tracks are drawn, to limit the memory that they take."""
-    for drawn in range(0, count, _TOGETHER):
-        yield min(_TOGETHER, count - drawn)
+    together = _TOGETHER if spread.is_thin else _TOGETHER_WIDE
+    for drawn in range(0, count, together):
+        yield min(together, count - drawn)
 
 
 def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Generator) -> tuple[Any, ...]:
@@ -308,10 +321,11 @@ def brightest_pixel(scene: Scene) -> float:
     """Return the highest charge in electrons that a cosmic ray leaves in one pixel.
 
     It is the maximum over the rows of `track_quantiles`. A track shorter than a pixel leaves its whole charge in one
-    pixel, a longer one the charge per pixel of its length.
+    pixel, a longer one the charge per pixel of its length, times the largest fluctuation.
     """
     _, length, charge = track_quantiles(scene).T
-    return float((charge / np.maximum(length, 1.0)).max())
+    highest = track_charge.of_scene(scene).largest_fluctuation
+    return float(np.minimum(highest * charge / np.maximum(length, 1.0), charge).max())
 
 
 def median_pixel(scene: Scene, expected: float) -> float:
@@ -327,7 +341,7 @@ def median_pixel(scene: Scene, expected: float) -> float:
 EFFECT = Effect(
     "cosmic_rays",
     apply,
-    lambda scene: (_expected_events(scene), track_quantiles(scene)),
+    lambda scene: (_expected_events(scene), track_quantiles(scene), track_charge.of_scene(scene)),
     lambda scene: median_pixel(scene, _expected_events(scene)),
     cost=4e-3,
     systematic=zero_contribution,

@@ -2,16 +2,23 @@
 
 A ghost is an annulus of uniform surface brightness, with gaps for the three arms that hold the secondary mirror of the
 telescope. The plate is the dichroic in the effect `EFFECT`, and the filter in the effect `FILTER`.
+
+Light of order n was reflected n times by the back of the plate. It travels n times as far through the plate: its ghost
+is n times as wide, and about n times as far from the star. The offset is a polynomial of the star's position in the
+focal plane (`lake_schema.mission.ghost_offsets`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
+from lake_schema.mission import ghost_offsets
 from truesky.numerics.compiling import jit
 from truesky.render.camera.detectors import Detector
 from truesky.render.effects.effect import Effect, copy_frame
@@ -45,24 +52,38 @@ class Pupil(NamedTuple):
     width: float
 
 
+class Order(NamedTuple):
+    """Ghosts of one order.
+
+    Attributes
+    ----------
+    lights : Lights
+        Positions (columns and rows) and electrons of the stars.
+    ratio : float
+        Flux of a ghost relative to its star, 0 to 1.
+    offset : (float array, float array), shape (n,)
+        Positions of the centres of the ghosts minus the positions of their stars, in columns and rows.
+    pupil : Pupil
+        Shape of a ghost.
+    """
+
+    lights: Lights
+    ratio: float
+    offset: tuple[Float, Float]
+    pupil: Pupil
+
+
 def apply(
-    frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
-    rng: np.random.Generator | None = None, out: Frame | None = None,
-) -> Frame:  # fmt: skip
-    """Add the ghost of every star in `lights` to a frame, also of stars outside the frame.
+    frame: Frame, orders: Sequence[Order], rng: np.random.Generator | None = None, out: Frame | None = None
+) -> Frame:
+    """Add the ghosts of stars to a frame, also of stars outside the frame.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Expected electrons.
-    lights : Lights
-        Positions (columns and rows) and electrons of the stars.
-    ratio : float
-        Flux of a ghost relative to its star, 0 to 1.
-    offset : (float, float)
-        Position of the centre of a ghost minus the position of its star, in columns and rows.
-    pupil : Pupil
-        Shape of a ghost.
+    orders : sequence of Order
+        The ghosts of each order.
     rng : numpy.random.Generator, optional
         Not used.
     out : float64 array, shape of `frame`, optional
@@ -76,22 +97,27 @@ def apply(
     Raises
     ------
     OutOfRange
-        If `ratio` or a value of `pupil` is outside its limits. The values of the arms are not checked.
+        If the ratio or a value of the pupil of an order is outside its limits. The values of the arms are not checked.
     """
-    radius, hole, arms, width = pupil
+    out = copy_frame(frame, out)
+    for order in orders:
+        _add_order(out, order)
+    return out
+
+
+def _add_order(frame: Frame, order: Order) -> None:
+    lights, ratio, offset, (radius, hole, arms, width) = order
     for name, value, lowest, highest in (
         ("ghost ratio", ratio, 0.0, 1.0), ("ghost radius", radius, 0.5, 1e4), ("ghost hole", hole, 0.0, 0.99),
         ("ghost arms", width, 0.0, radius),
     ):  # fmt: skip
         if not lowest <= value <= highest:
             raise OutOfRange(name, value, lowest, highest)
-    out = copy_frame(frame, out)
-    if ratio == 0.0 or out.size == 0 or not len(lights.electrons):
-        return out
+    if ratio == 0.0 or frame.size == 0 or not len(lights.electrons):
+        return
     stamp = _pupil_image(radius, hole, np.array(arms, float).reshape(-1, 4), width)
     stamp /= stamp.sum()
-    _add_stamps(out, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
-    return out
+    _add_stamps(frame, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
 
 
 @jit
@@ -146,23 +172,26 @@ def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -
                 frame[r, c] += electrons[i] * light
 
 
-def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
-    """Return the parameters of `apply` for the ghosts of a plate: stars, flux ratio, offset and shape of their ghosts.
+def parameters(scene: Scene, plate: str = "ghost") -> tuple[tuple[Order, ...]]:
+    """Return the parameters of `apply` for the ghosts of a plate: stars, flux ratio, offset and shape by order.
 
     `plate` is the prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the
-    filter. Stars (`Lights`) whose ghosts are not noticeable are left out. The ratio is the flux of a ghost divided by
-    the flux of its star. The offset (columns, rows) from a star to its ghost is along the y axis of the focal plane.
-    The shape (`Pupil`) has gaps where the arms in the telescope's pupil block the light.
+    filter. Stars (`Lights`) whose ghosts are not noticeable are left out. The shape (`Pupil`) has gaps where the arms
+    in the telescope's pupil block the light.
     """
+    orders = ghost_offsets.orders(scene.mission, scene.section, plate)
+    return (tuple(_ghosts_of_order(scene, plate, order) for order in orders),)
+
+
+def _ghosts_of_order(scene: Scene, plate: str, order: int) -> Order:
     detector = scene.detector or _WITHOUT_DETECTOR
-    length = scene.value(f"{plate}.offset_y", "pix")
-    radius = scene.value(f"{plate}.radius_out", "pix")
-    aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
+    ratio, radius = flux_ratio(scene, plate, order), order * scene.value(f"{plate}.radius_out", "pix")
+    lights = noticeable_lights(scene, ratio, radius)
+    scale = radius / (0.5 * scene.mission.value("plm.aperture_diameter", "mm"))
 
     def pupil_value(key: str, unit: str) -> float:
         return scene.mission.value(f"plm.pupil.{key}", unit)
 
-    scale = radius / aperture
     reach = scale * pupil_value("spider_half_length", "mm")
     places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
     # Convert the arms from the axes of the focal plane to the axes of the detector.
@@ -170,18 +199,61 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
         (float(x), float(y), detector.own_degrees(pupil_value(f"spider{number}.angle", "deg")), reach)
         for number, (x, y) in enumerate((detector.from_focal_plane(*place) for place in places), start=1)
     )
-    along, up = detector.from_focal_plane(0.0, length)
-    width = scale * pupil_value("spider_width", "mm")
-    ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
-    return (
-        noticeable_lights(scene, ratio, plate),
-        ratio,
-        (float(along), float(up)),
-        Pupil(radius, hole, arms, width),
-    )
+    hole, width = scene.value(f"{plate}.radius_in_ratio", ""), scale * pupil_value("spider_width", "mm")
+    return Order(lights, ratio, offset(scene, plate, order, lights), Pupil(radius, hole, arms, width))
 
 
-def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
+def flux_ratio(scene: Scene, plate: str, order: int) -> float:
+    """Return the flux of a ghost relative to its star.
+
+    Parameters
+    ----------
+    scene : Scene
+        Settings of the exposure.
+    plate : str
+        Prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the filter.
+    order : int
+        Order of the ghost, from 1.
+
+    Returns
+    -------
+    float
+        Flux of the ghost divided by the flux of the star.
+    """
+    ratio = scene.value(f"{plate}.flux_ratio", "")
+    return ratio if order == 1 else ratio * scene.value(f"{plate}.order_ratio", "") ** (order - 1)
+
+
+def offset(scene: Scene, plate: str, order: int, lights: Lights) -> tuple[Float, Float]:
+    """Return the offsets from stars to their ghosts in columns and rows.
+
+    Parameters
+    ----------
+    scene : Scene
+        Settings of the exposure. Without a detector, columns and rows are the axes of the focal plane, and the stars
+        are taken to be in its middle.
+    plate : str
+        Prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the filter.
+    order : int
+        Order of the ghosts.
+    lights : Lights
+        Positions of the stars.
+
+    Returns
+    -------
+    columns, rows : float array, shape (n,)
+        Offsets in pixels.
+    """
+    detector = scene.detector or _WITHOUT_DETECTOR
+    first_column, first_row = (scene.window.column, scene.window.row) if scene.window is not None else (0, 0)
+    x, y = detector.focal_plane_place(lights.column + first_column, lights.row + first_row)
+    if scene.detector is None:
+        x, y = np.zeros((2, len(lights.electrons)))
+    moved = ghost_offsets.offset(scene.mission, (scene.section, plate), order, x / 3600.0, y / 3600.0)
+    return detector.from_focal_plane(*moved)
+
+
+def noticeable_lights(scene: Scene, ratio: float, radius: float) -> Lights:
     """Return the stars whose ghost, summed over its area, is noticeable compared with the noise of the same area.
 
     Parameters
@@ -190,15 +262,15 @@ def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Light
         Settings of the exposure, with the bright stars and the noise of a pixel.
     ratio : float
         Flux of a ghost relative to its star.
-    plate : str, optional
-        Prefix of the parameters in the mission database: "ghost" for the dichroic, "filter_ghost" for the filter.
+    radius : float
+        Radius of a ghost, pixels.
 
     Returns
     -------
     Lights
         Selected stars, in their original order.
     """
-    area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
+    area = np.pi * radius**2
     lights = scene.lights
     bright = ratio * lights.electrons > scene.noticeable_electrons * np.sqrt(area)
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright])

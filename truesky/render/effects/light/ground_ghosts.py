@@ -15,7 +15,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.camera.detectors import Detector, detectors
+from truesky.render.camera.detectors import detectors
 from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.psf.aberrations import Telescope
@@ -155,31 +155,19 @@ def parameters(scene: Scene) -> tuple[Annuli, float]:
     if detector is None:
         return Annuli(*np.zeros((4, 0))), _hole(scene)
     first_column, first_row = (scene.window.column, scene.window.row) if scene.window is not None else (0, 0)
-    x, y = _focal_plane(detector, lights.column + first_column, lights.row + first_row)
+    x, y = detector.focal_plane_place(lights.column + first_column, lights.row + first_row)
     all_detectors = detectors(scene.section.rpartition(".")[2], scene.mission)
     reach = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in all_detectors)
     distance_ratio = np.hypot(x, y) / reach
     for ghost in _ghosts(scene):
         centre, radius, passed = (np.interp(distance_ratio, ghost.distance, values) for values in ghost[1:])
-        column, row = _pixels(detector, centre * x, centre * y)
+        column, row = detector.pixel_place(centre * x, centre * y)
         level = _level(_Ghost(distance_ratio, centre, radius, passed), 1.0, scene) * lights.electrons
         is_visible = level > scene.noticeable_mean_electrons
         for place, side in ((column, detector.nx), (row, detector.ny)):
             is_visible &= (place > -radius - 1.0) & (place < side + radius)
         parts.append(np.stack([column - first_column, row - first_row, radius, level])[:, is_visible])
     return Annuli(*np.concatenate([np.zeros((4, 0)), *parts], axis=1)), _hole(scene)
-
-
-def _focal_plane(detector: Detector, column: Float, row: Float) -> tuple[Float, Float]:
-    """Return the positions of pixels in the focal plane, arcsec."""
-    scale = detector.pixel_scale
-    return detector.to_focal_plane(scale * (column - (detector.nx - 1) / 2), scale * (row - (detector.ny - 1) / 2))
-
-
-def _pixels(detector: Detector, x: Float, y: Float) -> tuple[Float, Float]:
-    """Return the columns and rows of a detector at positions in the focal plane in arcsec, as `_focal_plane`."""
-    along, up = detector.from_focal_plane(x - detector.x, y - detector.y)
-    return along / detector.pixel_scale + (detector.nx - 1) / 2, up / detector.pixel_scale + (detector.ny - 1) / 2
 
 
 def _contribution(scene: Scene) -> float:

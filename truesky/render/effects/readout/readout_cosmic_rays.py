@@ -8,7 +8,8 @@ import numpy as np
 
 from lake_schema.arrays import Int
 from truesky.numerics.compiling import jit
-from truesky.render.effects.charge import cosmic_rays
+from truesky.render.effects.charge import cosmic_rays, track_charge
+from truesky.render.effects.charge.track_charge import Spread
 from truesky.render.effects.effect import Effect, copy_frame, zero_contribution
 from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
@@ -20,7 +21,7 @@ _NEGLIGIBLE = 1e-3
 
 def apply_readout(
     frame: Frame, expected: float, quantiles: Frame, pixels: tuple[int, int, int], silicon: Traps | None,
-    rng: np.random.Generator, out: Frame | None = None,
+    spread: Spread, rng: np.random.Generator, out: Frame | None = None,
 ) -> Frame:  # fmt: skip
     """Draw the cosmic rays that arrive while the quadrants of a detector are read, and add their charge.
 
@@ -37,6 +38,8 @@ def apply_readout(
         before the pixels, and number of columns that are pixels.
     silicon : Traps or None
         Traps along the columns, which capture and release charge. None to ignore them.
+    spread : Spread
+        Fluctuations of the charge along the tracks, and diffusion.
     rng : numpy.random.Generator
         Random generator of the tracks.
     out : float64 array, shape of `frame`, optional
@@ -58,10 +61,10 @@ def apply_readout(
         part = quadrant[:, prescan : prescan + columns]
         if not rows or not part.size:
             continue
-        for batch in cosmic_rays.batches(count):
-            event, column, row, charge = cosmic_rays.pixels_of_events(
-                cosmic_rays.draw_events(batch, rows, columns, quantiles, rng)
-            )
+        for batch in cosmic_rays.batches(count, spread):
+            events = cosmic_rays.draw_events(batch, rows, columns, quantiles, rng)
+            crossings = cosmic_rays.pixels_of_events(events)
+            event, column, row, charge = track_charge.distribute(events, crossings, spread, rng)
             # Number of rows that were read before the cosmic ray arrived. Its charge is read that many rows later than
             # its pixel.
             rows_read = rng.integers(0, quadrant.shape[0], batch)
@@ -128,10 +131,11 @@ def _expected_readout(scene: Scene) -> float:
     return cosmic_rays.event_rate(scene, float((scene.nx // 2) * scene.half_rows)) * scene.value("readout_time", "s")
 
 
-def _readout_parameters(scene: Scene) -> tuple[float, Frame, tuple[int, int, int], Traps | None]:
+def _readout_parameters(scene: Scene) -> tuple[float, Frame, tuple[int, int, int], Traps | None, Spread]:
     prescan, half = int(scene.value("fpa.prescan", "pix")), scene.nx // 2
     silicon = charge_transfer.silicon_traps(scene, "parallel") if charge_transfer.PARALLEL.is_applied(scene) else None
-    return _expected_readout(scene), cosmic_rays.track_quantiles(scene), (scene.half_rows, prescan, half), silicon
+    pixels, spread = (scene.half_rows, prescan, half), track_charge.of_scene(scene)
+    return _expected_readout(scene), cosmic_rays.track_quantiles(scene), pixels, silicon, spread
 
 
 READOUT = Effect(

@@ -12,6 +12,7 @@ from tests.truesky import nightly
 from tests.truesky.render.effects.readout.test_charge_transfer import every_transfer
 from truesky.render.camera import detectors
 from truesky.render.effects.charge import cosmic_rays, ramp_cosmic_rays
+from truesky.render.effects.charge.track_charge import THIN
 from truesky.render.effects.readout import charge_transfer, readout_cosmic_rays
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Scene
@@ -22,7 +23,7 @@ SCENE = Scene(MISSION, "vis", 560.53, 0.25, 1e4, detectors.detector("vis", "3-4"
 
 
 def test_a_nominal_exposure_is_covered_to_two_or_three_per_cent():
-    expected, quantiles = cosmic_rays.EFFECT.parameters(SCENE)
+    expected, quantiles, _ = cosmic_rays.EFFECT.parameters(SCENE)
     assert expected == pytest.approx(1.0 * 4096 * 4136 * (12e-4) ** 2 * 560.53)
     # A sixteenth of a detector, and of its tracks.
     image = cosmic_rays.draw_tracks((1033, 1024), expected / 16, quantiles, np.random.default_rng(5))
@@ -91,13 +92,14 @@ def test_even_over_the_frame():
 
 def test_readout_hits_lie_in_readout_coordinates():
     """Rows that are read later have been on the detector for longer; prescan and overscan columns have no silicon."""
-    expected, _, (rows, prescan, columns), silicon = readout_cosmic_rays.READOUT.parameters(SCENE)
+    expected, _, (rows, prescan, columns), silicon, spread = readout_cosmic_rays.READOUT.parameters(SCENE)
+    assert spread == THIN._replace(thickness=spread.thickness)
     assert silicon == charge_transfer.silicon_traps(SCENE, "parallel")
-    assert readout_cosmic_rays.READOUT.parameters(replace(SCENE, forced={"parallel_cti": False}))[-1] is None
+    assert readout_cosmic_rays.READOUT.parameters(replace(SCENE, forced={"parallel_cti": False}))[-2] is None
     assert (rows, prescan, columns) == (2066, 51, 2048)
     assert expected == pytest.approx(72 * 2066 * 2048 * (12e-4) ** 2)
     empty = np.zeros((40, 126, 90))
-    out = readout_cosmic_rays.apply_readout(empty, 60.0, TRACKS, (120, 10, 64), None, np.random.default_rng(1))
+    out = readout_cosmic_rays.apply_readout(empty, 60.0, TRACKS, (120, 10, 64), None, THIN, np.random.default_rng(1))
     assert (out[:, :, :10] == 0).all()
     assert (out[:, :, 74:] == 0).all()
     hits = (out[:, :, 10:74] > 0).mean(axis=(0, 2))
@@ -143,7 +145,7 @@ def apply_to_ramp(expected, rng):
 
 def apply_to_readout(expected, rng):
     # With one row of pixels and 63 rows of overscan, all charge is read.
-    return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, (1, 0, 64), None, rng)
+    return readout_cosmic_rays.apply_readout(np.zeros((1, 64, 64)), expected, QUANTILES, (1, 0, 64), None, THIN, rng)
 
 
 QUANTILES = np.array([[0.0, 0.01, 7.0], [1.0, 0.01, 7.0]])
@@ -172,7 +174,7 @@ def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
     """LSSTCam has 0.2 per second and detector. For an intensity cos^2, 1 - cos^4 of the zenith angle is uniform."""
     lsst = detectors.detector("lsstcam", "R22_S11", MISSION)
     scene = Scene(MISSION, "ext.lsstcam", 30.0, 30.0, 1e4, lsst)
-    expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
+    expected, quantiles, _ = cosmic_rays.EFFECT.parameters(scene)
     assert expected == pytest.approx(0.2 * 30.0)
     quarter = replace(scene, detector=replace(lsst, nx=lsst.nx // 2, ny=lsst.ny // 2))
     assert cosmic_rays.EFFECT.parameters(quarter)[0] == pytest.approx(0.25 * expected)
