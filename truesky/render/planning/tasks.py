@@ -28,11 +28,15 @@ from lake_schema.texts import spelling
 from truesky.render.camera import amplifiers, pointing
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels import registry
+from truesky.render.effects.charge import ramp
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import calibration_lamp
 from truesky.render.effects.readout import adc
+from truesky.render.effects.scene import Scene
 from truesky.render.exposure import persistence, scene_factory
 from truesky.render.exposure.records import Variant
 from truesky.render.planning import variants
-from truesky.render.planning.detector_costs import CostModel, OutputFiles, cost_model
+from truesky.render.planning.detector_costs import CostModel, OutputFiles, RampLoad, cost_model
 from truesky.render.planning.planned_exposures import Exposure
 from truesky.render.planning.source_counts import Densities
 from truesky.request.accuracy import SURVEY, Accuracy
@@ -98,7 +102,7 @@ def table(
     costs: dict[tuple[Any, ...], CostModel] = {}
     planned: list[_ExposureTasks] = []
     for row, detector_names in zip(rows, detectors, strict=True):
-        kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
+        kind = (row.camera, row.channel, row.band, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in costs:
             variant = variants.variant(row.settings, mission, accuracy, forced or {})
             costs[kind] = _cost_of_exposure(row, variant, truth, files)
@@ -463,6 +467,7 @@ def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], 
     channel, kind = row.channel, row.image_type
     sees_sky = kind in registry.CHANNELS[channel].sky_types
     effects = registry.CHANNELS[channel].with_readout(files.readout).effects.get(kind)
+    ramp_load = RampLoad()
     if effects is not None:
         all_detectors = camera_detectors.detectors(row.camera, variant.mission)
         amplifiers.refuse_spread(all_detectors, variant.mission)
@@ -472,4 +477,15 @@ def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], 
         scene = scene_factory.with_non_source_light(scene, registry.CHANNELS[channel], effects)
         files = replace(files, has_32_bits=adc.pixel_type(scene) is np.int32)
         effects = tuple(e for e in effects if variant.forced.get(e.name, sees_sky or e.is_needed(scene)))
-    return cost_model(channel, sees_sky, effects, variant.accuracy, truth, files)
+        ramp_load = _ramp_load(scene, effects)
+    return cost_model(channel, sees_sky, effects, variant.accuracy, truth, files, ramp_load)
+
+
+def _ramp_load(scene: Scene, effects: Sequence[Effect]) -> RampLoad:
+    """Return the groups of reads of an exposure, and the frames that are drawn separately because of a bright lamp."""
+    if ramp.EFFECT not in effects:
+        return RampLoad()
+    mode = ramp.mode_of_scene(scene)
+    lamp_electrons = calibration_lamp.EFFECT.contribution(scene) if calibration_lamp.EFFECT in effects else 0.0
+    is_bright = lamp_electrons * mode.frames / mode.integration_frames > ramp.LINEAR_BELOW
+    return RampLoad(mode.groups, mode.frames if is_bright else 0)
