@@ -197,9 +197,7 @@ def cost_model(
     map_seconds += _STARS_S * ("stars" in maps)
     return CostModel(
         start_s=channel_cost.frame_s + sees_sky * channel_cost.sky_s,
-        pixel_s=1e-6 * (sum(effect.cost for effect in applied) + ramp_s)
-        + _MAP_S * map_bytes
-        + map_seconds,
+        pixel_s=1e-6 * (sum(effect.cost for effect in applied) + ramp_s) + _MAP_S * map_bytes + map_seconds,
         galaxy_s=sees_sky * channel_cost.galaxy_s * accuracy_factor,
         star_s=sees_sky * channel_cost.star_s * accuracy_factor * (1 + ("stars" in maps)),
         start_gb=channel_cost.base_gb + _KEPT_GB + _CHARGE_MAPS_GB * has_persistence,
