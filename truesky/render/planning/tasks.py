@@ -25,6 +25,7 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
 from lake_schema.texts import spelling
+from truesky.fluxes import passbands
 from truesky.render.camera import amplifiers, pointing
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels import registry
@@ -474,6 +475,9 @@ def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], 
         scene = replace(
             scene_factory.from_exposure(row, all_detectors[0], variant.mission, variant.accuracy), forced=variant.forced
         )
+        if row.lamp is not None and row.band in passbands.names():
+            # The passband determines how bright the lamp is.
+            scene = replace(scene, band=passbands.load(row.band))
         scene = scene_factory.with_non_source_light(scene, registry.CHANNELS[channel], effects)
         files = replace(files, has_32_bits=adc.pixel_type(scene) is np.int32)
         effects = tuple(e for e in effects if variant.forced.get(e.name, sees_sky or e.is_needed(scene)))
