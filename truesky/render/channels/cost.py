@@ -32,9 +32,12 @@ class Cost:
         map is drawn once for all later images of a detector.
     release_s : float
         Seconds to compute the charge that is released in an image because of one earlier image; 0 without persistence.
-    lamp_s : float
-        Additional seconds per million pixels if a calibration lamp illuminates the detector. The charge of each frame
-        of a ramp is then drawn separately.
+    group_s : float
+        Additional seconds per million pixels for each group of reads of a ramp, in images without the sky. Images of
+        the sky have this time in `sky_s`. 0 for detectors that are read once.
+    lamp_frame_s : float
+        Additional seconds per million pixels for each frame of a ramp, if a calibration lamp is so bright that the
+        charge of each frame is drawn separately.
     most_sources : float
         Largest number of sources on a detector to which `galaxy_s` and `star_s` apply. In deeper catalogues, further
         sources are too faint to be drawn.
@@ -50,5 +53,6 @@ class Cost:
     file_bytes_per_pixel: float
     redraw_s: float = 0.0
     release_s: float = 0.0
-    lamp_s: float = 0.0
+    group_s: float = 0.0
+    lamp_frame_s: float = 0.0
     most_sources: float = math.inf

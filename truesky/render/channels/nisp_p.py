@@ -98,6 +98,10 @@ def _psf(
 # sources and 1.2 GB. redraw_s is the cost to draw the charge map of an image, once for all later images, and release_s
 # the cost of the charge that one earlier image releases. An AMD EPYC with other load took 0.92 to 1.07 s and 0.038 s
 # (2.2 to 2.6 s for the map of a NISP-S image), when it took 17.0 to 20.2 s for an image with a forecast of 12.9 s.
+# group_s and lamp_frame_s follow from 11 frames without light and 12 flats of DET14, DET22 and DET33, rendered in one
+# process of an AMD EPYC with other load, for which `forecasting.speed` measured a factor of 0.83. Darks took 1.4 to
+# 2.2 s with 4 groups, 2.6 s with 8, and 4.2 and 4.9 s with 15. Flats of 76 frames took 6.2 to 8.2 s, or 2.0 to 2.3 s if
+# the lamp is faint.
 COST = Cost(
     frame_s=0.05,
     sky_s=2.6,
@@ -109,7 +113,8 @@ COST = Cost(
     file_bytes_per_pixel=3.0,
     redraw_s=0.7,
     release_s=0.03,
-    lamp_s=1.2,
+    group_s=0.07,
+    lamp_frame_s=0.02,
 )
 
 CHANNEL = Channel(

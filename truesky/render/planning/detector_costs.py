@@ -15,7 +15,6 @@ from lake_schema.arrays import Float, Int
 from truesky.render.channels import registry
 from truesky.render.drawing import settings
 from truesky.render.effects.effect import Effect
-from truesky.render.effects.light import calibration_lamp
 from truesky.render.exposure import truth_maps
 from truesky.request.accuracy import SURVEY, Accuracy
 
@@ -65,6 +64,25 @@ class OutputFiles:
 
 
 _DETECTOR_FILES = OutputFiles()
+
+
+@dataclass(frozen=True, slots=True)
+class RampLoad:
+    """Work to draw the ramp (reads without reset) of a detector, on which the time of calibration frames depends.
+
+    Attributes
+    ----------
+    groups : int
+        Number of groups of averaged reads; 0 for a detector that is read once.
+    counted_frames : int
+        Number of frames whose charge is drawn separately in every pixel, because a calibration lamp is bright; else 0.
+    """
+
+    groups: int = 0
+    counted_frames: int = 0
+
+
+_NO_RAMP = RampLoad()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +144,7 @@ def cost_model(
     accuracy: Accuracy = SURVEY,
     truth: Sequence[str] = (),
     files: OutputFiles = _DETECTOR_FILES,
+    ramp_load: RampLoad = _NO_RAMP,
 ) -> CostModel:
     """Return the model of CPU time, memory and file size for detectors with one channel, image type and effects.
 
@@ -143,6 +162,8 @@ def cost_model(
         Names of the truth maps (images of the true signals of effects) that the request asks for.
     files : OutputFiles
         Format of the image files.
+    ramp_load : RampLoad
+        Groups and separately drawn frames of the exposure.
 
     Returns
     -------
@@ -166,7 +187,9 @@ def cost_model(
     images = 2 if files.has_exposure_file else 1
     written_bytes = registry.CHANNELS[channel].with_readout(files.readout).readout.file_bytes_per_pixel
     effect_names = [effect.name for effect in applied]
-    has_lamp = calibration_lamp.EFFECT.name in effect_names
+    # Images of the sky have the time of their groups in `sky_s`.
+    ramp_s = channel_cost.group_s * ramp_load.groups * (not sees_sky)
+    ramp_s += channel_cost.lamp_frame_s * ramp_load.counted_frames
     has_persistence = registry.CHANNELS[channel].persistence_effect is not None
     map_seconds = sum(
         cost for name in maps for effect_name, cost in _FILLED_S.get(name, {}).items() if effect_name in effect_names
@@ -174,9 +197,7 @@ def cost_model(
     map_seconds += _STARS_S * ("stars" in maps)
     return CostModel(
         start_s=channel_cost.frame_s + sees_sky * channel_cost.sky_s,
-        pixel_s=1e-6 * (sum(effect.cost for effect in applied) + channel_cost.lamp_s * has_lamp)
-        + _MAP_S * map_bytes
-        + map_seconds,
+        pixel_s=1e-6 * (sum(effect.cost for effect in applied) + ramp_s) + _MAP_S * map_bytes + map_seconds,
         galaxy_s=sees_sky * channel_cost.galaxy_s * accuracy_factor,
         star_s=sees_sky * channel_cost.star_s * accuracy_factor * (1 + ("stars" in maps)),
         start_gb=channel_cost.base_gb + _KEPT_GB + _CHARGE_MAPS_GB * has_persistence,

@@ -25,14 +25,19 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
 from lake_schema.texts import spelling
+from truesky.fluxes import passbands
 from truesky.render.camera import amplifiers, pointing
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels import registry
+from truesky.render.effects.charge import ramp
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import calibration_lamp
 from truesky.render.effects.readout import adc
+from truesky.render.effects.scene import Scene
 from truesky.render.exposure import persistence, scene_factory
 from truesky.render.exposure.records import Variant
 from truesky.render.planning import variants
-from truesky.render.planning.detector_costs import CostModel, OutputFiles, cost_model
+from truesky.render.planning.detector_costs import CostModel, OutputFiles, RampLoad, cost_model
 from truesky.render.planning.planned_exposures import Exposure
 from truesky.render.planning.source_counts import Densities
 from truesky.request.accuracy import SURVEY, Accuracy
@@ -98,7 +103,7 @@ def table(
     costs: dict[tuple[Any, ...], CostModel] = {}
     planned: list[_ExposureTasks] = []
     for row, detector_names in zip(rows, detectors, strict=True):
-        kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
+        kind = (row.camera, row.channel, row.band, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in costs:
             variant = variants.variant(row.settings, mission, accuracy, forced or {})
             costs[kind] = _cost_of_exposure(row, variant, truth, files)
@@ -463,13 +468,28 @@ def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], 
     channel, kind = row.channel, row.image_type
     sees_sky = kind in registry.CHANNELS[channel].sky_types
     effects = registry.CHANNELS[channel].with_readout(files.readout).effects.get(kind)
+    ramp_load = RampLoad()
     if effects is not None:
         all_detectors = camera_detectors.detectors(row.camera, variant.mission)
         amplifiers.refuse_spread(all_detectors, variant.mission)
         scene = replace(
             scene_factory.from_exposure(row, all_detectors[0], variant.mission, variant.accuracy), forced=variant.forced
         )
+        if row.lamp is not None and row.band in passbands.names():
+            # The passband determines how bright the lamp is.
+            scene = replace(scene, band=passbands.load(row.band))
         scene = scene_factory.with_non_source_light(scene, registry.CHANNELS[channel], effects)
         files = replace(files, has_32_bits=adc.pixel_type(scene) is np.int32)
         effects = tuple(e for e in effects if variant.forced.get(e.name, sees_sky or e.is_needed(scene)))
-    return cost_model(channel, sees_sky, effects, variant.accuracy, truth, files)
+        ramp_load = _ramp_load(scene, effects)
+    return cost_model(channel, sees_sky, effects, variant.accuracy, truth, files, ramp_load)
+
+
+def _ramp_load(scene: Scene, effects: Sequence[Effect]) -> RampLoad:
+    """Return the groups of reads of an exposure, and the frames that are drawn separately because of a bright lamp."""
+    if ramp.EFFECT not in effects:
+        return RampLoad()
+    mode = ramp.mode_of_scene(scene)
+    lamp_electrons = calibration_lamp.EFFECT.contribution(scene) if calibration_lamp.EFFECT in effects else 0.0
+    is_bright = lamp_electrons * mode.frames / mode.integration_frames > ramp.LINEAR_BELOW
+    return RampLoad(mode.groups, mode.frames if is_bright else 0)

@@ -32,11 +32,15 @@ OUTPUTS, FOLLOWED = 32, 64
 
 @dataclass(frozen=True)
 class Lines:
-    """H alpha lines of n galaxies: wavelength (A), flux (erg s-1 cm-2) and half-light radius (arcsec), all [n]."""
+    """H alpha lines of n galaxies: wavelength (A), flux (erg s-1 cm-2) and half-light radius (arcsec), all [n].
+
+    `nii` is the flux of [N II] 6585 relative to H alpha, [n] or a number.
+    """
 
     wavelength: np.ndarray
     flux: np.ndarray
     radius: np.ndarray
+    nii: np.ndarray | float = 0.0
 
 
 def trace(detector, grism, angle, number=1):
@@ -61,13 +65,17 @@ def undispersed(path, wavelength, at):
     return found
 
 
-def exposure(lines, places, detector, shining=True, **columns):
-    """Render the spectra of galaxies on a detector, with or without their lines; their continua have about 24 mag."""
+def exposure(lines, places, detector, shining=True, forced=CLEAN, **columns):
+    """Render the spectra of galaxies on a detector, with or without their lines; their continua have about 24 mag.
+
+    `forced` switches effects on and off.
+    """
     n = len(lines.flux)
     body = {name: np.zeros(n) for name in colours.GALAXY_COLUMNS}
     body |= {
         "z_obs": lines.wavelength / HALPHA - 1.0, "mag_r01": np.full(n, 26.5), "abs_mag_r01": np.full(n, -20.0),
         "frac_1": np.ones(n), "sed_1": np.full(n, 8.0), "flux_halpha": lines.flux if shining else np.zeros(n),
+        "flux_nii": lines.flux * lines.nii * shining,
         "disk_half_light_radius": lines.radius, "kind": np.zeros(n),
     }  # fmt: skip
     library = templates.galaxy_library()
@@ -77,7 +85,7 @@ def exposure(lines, places, detector, shining=True, **columns):
     )
     flux = np.array([passbands.ab_flux(BAND, BAND.wavelength, one) for one in spectra])
     mags = units.AB_UJY - 2.5 * np.log10(units.ujy_of_cgs(flux))
-    return spectroscopic.rendered(mags, *places, detector=detector, body=body, forced=CLEAN, **columns)
+    return spectroscopic.rendered(mags, *places, detector=detector, body=body, forced=forced, **columns)
 
 
 # ---------------------------------------------------------------------------------------------- noise

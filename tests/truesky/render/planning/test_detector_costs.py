@@ -179,11 +179,9 @@ def test_the_forecast_of_a_dry_run_as_json(tmp_path, capsys):
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
     own = registry.CHANNELS[channel]
-    assert (
-        min(getattr(own.cost, name) for name in own.cost.__slots__ if name not in ("redraw_s", "release_s", "lamp_s"))
-        > 0.0
-    )
-    assert (own.cost.lamp_s > 0.0) == bool(own.ramp_name)
+    of_nisp = ("redraw_s", "release_s", "group_s", "lamp_frame_s")
+    assert min(getattr(own.cost, name) for name in own.cost.__slots__ if name not in of_nisp) > 0.0
+    assert (own.cost.lamp_frame_s > 0.0) == (own.cost.group_s > 0.0) == bool(own.ramp_name)
     assert (own.cost.redraw_s > own.cost.release_s > 0.0) == (own.persistence_effect is not None)
 
 
@@ -194,8 +192,29 @@ def test_every_channel_can_be_planned():
     assert [name for name in dict(CHANNELS) if "flat" in registry.CHANNELS[name].sky_types] == ["VIS"]
 
 
-def test_a_lamp_costs_time_in_ramps():
+def test_a_bright_lamp_costs_time_in_ramps():
     effects = registry.CHANNELS["NISP-S"].effects
-    flat, dark = (detector_costs.cost_model("NISP-S", False, effects[kind]) for kind in ("flat", "dark"))
-    lamp_s = registry.CHANNELS["NISP-S"].cost.lamp_s
-    assert flat.pixel_s - dark.pixel_s > 1e-6 * lamp_s
+    flat, faint = (
+        detector_costs.cost_model("NISP-S", False, effects["flat"], ramp_load=detector_costs.RampLoad(15, frames))
+        for frames in (394, 0)
+    )
+    assert flat.pixel_s - faint.pixel_s == pytest.approx(394e-6 * registry.CHANNELS["NISP-S"].cost.lamp_frame_s)
+
+
+# Image type of NISP-P, keys of the observation, and CPU seconds in one process of a machine with a calibration of 0.83.
+NISP_FRAMES = [
+    ("dark", {}, 1.9),
+    ("dark", {"macc": [8, 16, 11]}, 2.57),
+    ("dark", {"macc": [15, 16, 11]}, 4.6),
+    ("flat", {"bands": ["euclid_h"], "lamps": [4], "intensities": [0.04]}, 1.98),
+    ("flat", {"bands": ["euclid_h"], "lamps": [4], "intensities": [0.3]}, 7.4),
+    ("flat", {"bands": ["euclid_h"], "lamps": [4], "intensities": [1.0]}, 7.8),
+]
+
+
+@pytest.mark.parametrize(("kind", "keys", "seconds"), NISP_FRAMES)
+def test_the_time_of_nisp_calibration_frames_is_forecast(tmp_path, kind, keys, seconds):
+    """The times were measured on frames of a whole detector; the forecast is within the accuracy of 25 %."""
+    block = [{"channels": ["NISP-P"], "image_type": kind, "exposures": 1, "detectors": ["DET14"], **keys}]
+    (task,) = planned(tmp_path, observation=block)[1].to_pylist()
+    assert 0.8 < 0.83 * task["seconds"] / seconds < 1.25
