@@ -224,11 +224,11 @@ class Scene:
             Values of the q amplifiers, in the order of the planes of a frame that is split into amplifiers. One number
             if all amplifiers have the same value, or if a window is drawn.
         """
-        layout = None if self.detector is None else amplifiers.layout(self.detector, self.mission)
-        if self.detector is not None and layout is not None:
+        if self.detector is not None:
+            layout = amplifiers.layout(self.detector, self.mission)
             values = np.atleast_1d(amplifiers.values(key, unit, self.detector, self.mission, layout))
         else:
-            values = np.array(self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name))
+            values = np.array(self.mission.amplifier_values(f"{self.section}.{key}", unit, ""))
         if self.window is not None and len(values) > 1:
             return float(values[self.amplifier])
         return values if len(values) > 1 else float(values[0])
@@ -345,6 +345,11 @@ class Scene:
         # Behind a grism the sky background varies over the detector: add its mean difference from a uniform background.
         dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
         return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
+
+    @property
+    def full_well(self) -> float:
+        """Full well in electrons of the amplifier in whose pixels it is highest."""
+        return float(np.max(self.amplifier_values("full_well", "electron")))
 
     @property
     def noticeable_fraction(self) -> float:

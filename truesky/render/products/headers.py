@@ -367,16 +367,16 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
     It is the value of a full pixel after the losses by charge transfer and nonlinearity, minus five times the noise of
     readout (read noise and bias structure, added linearly), rounded down and within the range of the converter.
     """
-    full = rendered.scene.value("full_well", "electron")
-    scene = replace(rendered.scene, peak_electrons=full)
+    full_wells = rendered.scene.amplifier_values("full_well", "electron")
+    scene = replace(rendered.scene, peak_electrons=rendered.scene.full_well)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     # Sum the largest charge losses that a pixel may have by charge transfer. The first pixel of a column or row has
     # them, because it finds all traps empty.
     losses = (
         charge_transfer.PARALLEL, charge_transfer.SERIAL, charge_transfer.PARALLEL_LOSS, charge_transfer.SERIAL_LOSS
     )  # fmt: skip
-    remaining = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
-    signal: float | Float = remaining
+    remaining = full_wells - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    signal = remaining
     if scene.ramp:
         b = scene.value("nonlinearity", "1 / electron")
         of_charge, of_signal = (
@@ -385,8 +385,8 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
         signal = ramp.signal_at_full_well(scene, of_charge, of_signal)
     if nonlinearity.EFFECT.name in applied:
         curve = nonlinearity.parameters(scene)
-        n_amplifiers = max(np.size(number) for number in curve)
-        signal = nonlinearity.apply(np.full(n_amplifiers, max(remaining, 0.0)), *curve)
+        n_amplifiers = max(np.size(number) for number in (*curve, remaining))
+        signal = nonlinearity.apply(np.array(np.broadcast_to(np.maximum(remaining, 0.0), n_amplifiers)), *curve)
         signal = signal if n_amplifiers > 1 else float(signal[0])
     noises = (bias_structure.EFFECT, read_noise.EFFECT, ramp_noise.EFFECT, ramp_noise.DRIFT)
     signal = signal - _NOISE_SIGMAS * sum(effect.contribution(scene) for effect in noises if effect.name in applied)

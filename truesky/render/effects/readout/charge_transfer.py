@@ -315,7 +315,7 @@ def _max_deferred(scene: Scene, direction: str) -> float:
         return 0.0
     layout = scene.layout
     transfers = layout.prescan_rows + layout.height if direction == "parallel" else layout.prescan + layout.width
-    packet = min(scene.brightest_electrons, scene.value("full_well", "electron"))
+    packet = min(scene.brightest_electrons, scene.full_well)
     return transfers * _transfer_loss(scene, direction) * packet
 
 
