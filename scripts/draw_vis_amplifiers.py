@@ -22,8 +22,9 @@ from truesky.randomness import rng
 SPREADS = {"gain": (0.02, 4), "read_noise": (0.05, 3), "full_well": (0.03, 0), "bias": (0.1, 1)}
 # Largest deviation in standard deviations.
 _LIMIT = 2.5
-_HEAD = """# VIS: gain, read noise, full well and bias level of each quadrant, as simulated. scripts/draw_vis_amplifiers.py drew them at random.
-# gain: electron / adu; read_noise, full_well: electron; bias: adu. All are used relative to the medians of this table.
+_HEAD = """# VIS: gain, read noise, full well and bias level of each quadrant, as simulated: drawn at random about the
+# numbers of the camera by scripts/draw_vis_amplifiers.py. All are used relative to the medians of this table.
+# gain: electron / adu; read_noise, full_well: electron; bias: adu.
 detector,amplifier,gain,read_noise,full_well,bias"""
 
 

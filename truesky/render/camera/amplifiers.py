@@ -481,7 +481,7 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
 
 # Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in
 # `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
-_RELATIVE = {"gain": 0, "read_noise": 1, "bias": 2, "full_well": 3}
+_RELATIVE = {key: index for index, key in enumerate(detector_overrides.AMPLIFIER_COLUMNS)}
 
 
 @lru_cache(maxsize=1024)

@@ -174,6 +174,8 @@ class Scene:
         Number of the amplifier, from 0, that reads the window. All pixels of a window are read by one amplifier.
     sky_slopes : (float, float)
         Relative change of the sky background per pixel along rows (with the column) and along columns (with the row).
+    mjd : float
+        Date of the exposure (MJD), on which ageing and the drift of the bias depend; 0 if it does not matter.
     """
 
     mission: MissionConfiguration
@@ -199,6 +201,7 @@ class Scene:
     window: Window | None = None
     amplifier: int = 0
     sky_slopes: tuple[float, float] = (0.0, 0.0)
+    mjd: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """Return a parameter of the detector in the given unit.

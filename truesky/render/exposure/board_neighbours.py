@@ -217,7 +217,8 @@ def _bled_electrons(frame: Frame, first: int, scene: Scene) -> Frame:
     """Return the electrons per pixel after charge above the full well has bled along the columns.
 
     `frame` contains the expected electrons per pixel, from column `first` of the detector on. They are first rounded
-    down to whole electrons, and negative numbers are set to 0. `scene` contains the properties of the detector, such as its full well.
+    down to whole electrons, and negative numbers are set to 0. `scene` contains the properties of the detector, such as
+    its full well.
     """
     whole = np.floor(frame)
     np.maximum(whole, 0.0, out=whole)

@@ -59,9 +59,7 @@ def apply(
     return bleed(frame, capacity, segments, out)[0]
 
 
-def bleed(
-    frame: Frame, capacity: float | Float, segments: Segments, out: Frame | None = None
-) -> tuple[Frame, float]:
+def bleed(frame: Frame, capacity: float | Float, segments: Segments, out: Frame | None = None) -> tuple[Frame, float]:
     """Move charge above the full well along its column, and count the charge that leaves the detector.
 
     Parameters
@@ -164,8 +162,8 @@ def saturated_pixels(frame: Frame, capacity: float | Float, segments: Segments) 
         True for pixels with at least their full well, rounded down to a whole number. Rows outside all segments are
         False.
     """
-    out = np.zeros(frame.shape, bool)
-    for (first, past, _), full in zip(segments, np.floor(_of_segments(capacity, segments, frame.shape[1])), strict=True):
+    out, full_wells = np.zeros(frame.shape, bool), np.floor(_of_segments(capacity, segments, frame.shape[1]))
+    for (first, past, _), full in zip(segments, full_wells, strict=True):
         out[first:past] = frame[first:past] >= full
     return out
 
