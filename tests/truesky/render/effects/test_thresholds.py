@@ -87,6 +87,8 @@ CASES = {
         scene(crosstalk_detectors=1e-4), neighbour_charge=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
     ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
+    "bias_drift": lambda x: replace(scene(bias_drift=0.1 * x), mjd=60905.0),
+    "row_noise": lambda x: scene(bias_row_noise=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
     "lens_ghosts": lambda x: replace(ground(), lights=star(1e7 * x), band=passbands.load("des_r")),
@@ -102,6 +104,8 @@ QUADRANTS = (
     "crosstalk",
     "detector_crosstalk",
     "bias_structure",
+    "bias_drift",
+    "row_noise",
     "readout_cosmic_rays",
 )
 
