@@ -31,7 +31,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.camera.sections import Section, Sections
 
 Number = TypeVar("Number", bound=np.generic)
-# Gain, read noise, bias level and full well of an amplifier, relative to those of the camera.
+# Gain, read noise, bias level and full well of an amplifier, divided by the values of the camera.
 Ratios = tuple[float, float, float, float]
 
 # Random deviations of an amplifier's parameters, such as the gain, from the mean of its detector are limited to this
@@ -514,8 +514,8 @@ def values(
     -----
     The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
     the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
-    for other amplifiers it is multiplied by their ratio to the first one. If the database has a table with the values
-    of each amplifier of the camera, `key` is the median, and is multiplied by the ratio of the amplifier to the median;
+    for other amplifiers it is multiplied by their ratio to the first one. If the database has a table with values
+    for each amplifier of the camera, `key` is the median, and is multiplied by the ratio of the amplifier to the median;
     this also holds for bias level and full well. The random deviations are a property of the hardware and therefore the
     same in all simulations.
 
@@ -544,7 +544,7 @@ def values(
 def _ratios(
     detector: Detector, mission: MissionConfiguration, detector_layout: Layout | None
 ) -> tuple[tuple[str, Ratios], ...]:
-    """Return the name of each amplifier of a detector, and its values relative to those of the camera.
+    """Return the name of each amplifier of a detector, and its values divided by the values of the camera.
 
     `detector_layout` is None for a detector that is read in quadrants or as one frame. A camera without amplifiers in
     the mission database has a single one, without a name.

@@ -37,7 +37,7 @@ def apply(
     frame : float array, shape (ny, nx)
         Electrons, whole numbers of 0 or more.
     capacity : float or float array, shape (n_segments, nx)
-        Full well in electrons, 1 or more: of all pixels, or of each segment and column.
+        Full well in electrons, 1 or more: one for all pixels, or one for each segment and column.
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
         register is above).
@@ -67,7 +67,7 @@ def bleed(frame: Frame, capacity: float | Float, segments: Segments, out: Frame 
     frame : float array, shape (ny, nx)
         Electrons, 0 or more.
     capacity : float or float array, shape (n_segments, nx)
-        Full well in electrons, 1 or more: of all pixels, or of each segment and column.
+        Full well in electrons, 1 or more: one for all pixels, or one for each segment and column.
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
         register is above). Rows outside all segments are unchanged.
@@ -152,7 +152,7 @@ def saturated_pixels(frame: Frame, capacity: float | Float, segments: Segments) 
     frame : float array, shape (ny, nx)
         Electrons.
     capacity : float or float array, shape (n_segments, nx)
-        Full well in electrons: of all pixels, or of each segment and column.
+        Full well in electrons: one for all pixels, or one for each segment and column.
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, as for `apply`.
 
