@@ -515,9 +515,9 @@ def values(
     The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
     the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
     for other amplifiers it is multiplied by their ratio to the first one. If the database has a table with values
-    for each amplifier of the camera, `key` is the median, and is multiplied by the ratio of the amplifier to the median;
-    this also holds for bias level and full well. The random deviations are a property of the hardware and therefore the
-    same in all simulations.
+    for each amplifier of the camera, `key` is the median, and is multiplied by the ratio of the amplifier to the
+    median; this also holds for bias level and full well. The random deviations are a property of the hardware and
+    therefore the same in all simulations.
 
     If the request of the user sets the parameter for the whole camera, it is used without ratio and random deviations,
     unless the request also sets the spread. A value that the request sets for a detector or an amplifier is always used
