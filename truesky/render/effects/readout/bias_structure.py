@@ -204,7 +204,7 @@ EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True,
 DRIFT = Effect(
     "bias_drift",
     apply_drift,
-    lambda scene: (_in_electrons(scene, "bias_drift"), scene.mjd, scene.value("bias_drift_time", "h") / 24.0),
+    lambda scene: (_in_electrons(scene, "bias_drift"), scene.mjd, scene.value("bias_drift_scale", "h") / 24.0),
     lambda scene: float(np.max(_in_electrons(scene, "bias_drift"))),
     fixed=True,
     cost=3e-3,
