@@ -176,7 +176,7 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
         "VIS": {
             "intra_pixel", "background", "pixel_area", "illumination", "shutter", "pixel_response", "poisson",
             "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "quadrants", "readout_cosmic_rays",
-            "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc",
+            "nonlinearity", "crosstalk", "bias_structure", "bias_drift", "row_noise", "read_noise", "adc",
         },
         "EXT": {
             "background", "illumination", "pixel_response", "tree_rings", "edge_displacement", "poisson",
@@ -184,9 +184,9 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
             "serial_loss", "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc",
         },
     }[channel]  # fmt: skip
-    read_noise = scene.value("read_noise", "electron") * ("read_noise" in applied)
+    read_noise = calibrated.of_pixels(scene, "read_noise", "electron") * ("read_noise" in applied)
     expected = one.noise_free + scene.sky_electrons + scene.dark_electrons * ("dark_current" in applied)
-    variance = expected + read_noise**2 + scene.value("gain", "electron / adu") ** 2 / 12
+    variance = expected + read_noise**2 + calibrated.of_pixels(scene, "gain", "electron / adu") ** 2 / 12
     found = calibrated.electrons(one.raw, scene, 1, applied)
     found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
     pull = (found - expected) / np.sqrt(variance)
@@ -226,7 +226,7 @@ SHOWS = {
 
 def change(on, off):
     """e- of pixels that are not full."""
-    difference = on.scene.value("gain", "electron / adu") * (on.science.astype(float) - off.science)
+    difference = calibrated.of_pixels(on.scene, "gain", "electron / adu") * (on.science.astype(float) - off.science)
     return np.where(np.maximum(on.science, off.science) < 40_000, difference, 0.0)
 
 
@@ -341,12 +341,7 @@ def test_without_any_effect_the_image_is_the_truth_in_whole_numbers():
         needed = {"adc", "quadrants", "amplifiers"} & {decision.name for decision in one.decisions}
         assert {decision.name for decision in one.decisions if decision.applied} == needed | set(keep)
         light = one.noise_free.astype(float) + bool(keep) * one.scene.sky_electrons
-        gain, bias = (one.scene.amplifier_values(*key) for key in (("gain", "electron / adu"), ("bias", "adu")))
-        if one.scene.layout is not None:
-            gain, bias = (
-                one.scene.layout.assemble(np.broadcast_to(np.reshape(value, (-1, 1, 1)), one.raw.shape))
-                for value in (gain, bias)
-            )
+        gain, bias = (calibrated.of_pixels(one.scene, *key) for key in (("gain", "electron / adu"), ("bias", "adu")))
         assert np.abs(one.science - bias - light / gain).max() == pytest.approx(0.5, abs=1e-2)
 
 
