@@ -179,8 +179,9 @@ def parameters(scene: Scene) -> tuple[float | Float, Segments]:
     # Only detectors that are read in quadrants have several. The order is upper left (E), upper right (F), lower right
     # (G), lower left (H).
     upper_left, upper_right, lower_right, lower_left = full_wells
-    halves = np.array([[lower_left, lower_right], [upper_left, upper_right]])
-    return np.repeat(halves, scene.nx // 2, axis=1), scene.column_segments
+    is_right = np.arange(scene.nx) >= scene.nx // 2
+    lower, upper = np.where(is_right, lower_right, lower_left), np.where(is_right, upper_right, upper_left)
+    return np.stack([lower, upper]), scene.column_segments
 
 
 def _contribution(scene: Scene) -> float:
