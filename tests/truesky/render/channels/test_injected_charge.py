@@ -38,7 +38,7 @@ def test_trails_behind_injected_rows_tell_the_traps():
     """The charge released behind the first block gives the density and the release time of the slow species."""
     # An observer removes cosmic rays by clipping several frames.
     clean = {"readout_cosmic_rays": False}
-    _, found = electrons("charge_injection", (1200, 512), 0.0, forced=clean, **{"cti.age": (1.0, "")})
+    _, found = electrons("charge_injection", (1200, 512), 0.0, forced=clean, mjd=60905.0, **{"cti.age": (1.0, "")})
     mission = resolve()
     on, off = (int(mission.value(f"vis.injection.{key}")) for key in ("on", "off"))
     first = on + off
@@ -145,7 +145,7 @@ def test_a_request_that_sets_the_damage_stops_its_growth():
         ("3-4", mission, 0.5), ("1-1", mission, DAMAGE["2029-07-01"]),
         ("1-1", other, 0.1 + 0.2 * (DATES["2029-07-01"] - 60126.0) / 365.25),
     ):  # fmt: skip
-        scene = Scene(setting, "vis", 0.0, 0.0, 0.0, detectors.detector("vis", name), mjd=DATES["2029-07-01"])
+        scene = Scene(setting, "vis", 0.0, 0.0, 0.0, detectors.detector("vis", name, setting), mjd=DATES["2029-07-01"])
         assert charge_transfer.age(scene) == pytest.approx(wanted, rel=1e-6)
     # Before the launch, the detectors have the damage of the launch.
     assert charge_transfer.age(replace(scene, mission=resolve(), mjd=0.0)) == 0.03

@@ -8,21 +8,29 @@ from scipy.ndimage import binary_dilation
 from lake_schema.mission.configuration import resolve
 from tests.truesky.render import nominal
 from tests.truesky.render.fields import MISSION, small
+from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.readout import quadrants
 from truesky.render.products import fits_files, headers
+from truesky.render.psf import euclid
+from truesky.request.accuracy import SURVEY
 
 PRESCAN, OVERSCAN, ROWS = 51, 29, 20
 # Largest distance in pixels at which the covariance of pixels is measured.
 LAG = 8
 # Effects that an observer has corrected.
+CLEAN = nominal.off("bias_structure", *nominal.COSMIC_RAYS)
 CORRECTED = nominal.off("nonlinearity", "crosstalk", "detector_crosstalk", "parallel_cti", "serial_cti", "hot_pixels")
 
 
 def frame(kind, number, seconds, side=1024, forced=None, mission=MISSION):
-    return nominal.rendered(
-        small("vis", "3-4", side), [], [], [], kind=kind, number=number, seconds=seconds, forced=forced,
-        truth=("cosmic_rays",), mission=mission, sky=0.0 if kind == "bias" else nominal.SKY,
-    )  # fmt: skip
+    detector, colours = small("vis", "3-4", side), settings_for(SURVEY).colours
+    with pytest.MonkeyPatch.context() as patch:
+        # No source is drawn. The PSF is that of all frames, because it takes longer than a frame.
+        patch.setattr(euclid, "vis_psf", lambda *_: nominal.psf_with_transforms(small("vis", "3-4", 1024), colours))
+        return nominal.rendered(
+            detector, [], [], [], kind=kind, number=number, seconds=seconds, forced=forced, truth=("cosmic_rays",),
+            mission=mission, sky=0.0 if kind == "bias" else nominal.SKY,
+        )  # fmt: skip
 
 
 def of_header(one, keyword):
@@ -137,7 +145,7 @@ def test_headers_have_the_values_of_their_quadrant(tmp_path):
 def overscan_levels(number, **overrides):
     """Return the overscan level of each quadrant, and of each of its rows, in ADU, without the fixed pattern."""
     mission = MISSION.with_overrides({f"vis.{key}": (value, "adu") for key, value in overrides.items()})
-    one = frame("bias", number, 0.0, 512, {**CORRECTED, "bias_structure": False}, mission)
+    one = frame("bias", number, 0.0, 512, {**CORRECTED, **CLEAN}, mission)
     columns = one.raw.astype(float)[:, :, -OVERSCAN:] - one.scene.amplifier_values("bias", "adu")[:, None, None]
     return columns.mean(axis=(1, 2)), one
 
@@ -162,5 +170,5 @@ def test_rows_share_an_offset_with_their_overscan():
     _, without = overscan_levels(1, bias_row_noise=0.0)
     assert without.raw[:, :, PRESCAN:-OVERSCAN].mean(axis=2).std(axis=1).max() < 0.12
     # A number of 0 and an effect that is switched off give the same frame.
-    off = frame("bias", 1, 0.0, 512, {**CORRECTED, **nominal.off("bias_structure", "row_noise")})
+    off = frame("bias", 1, 0.0, 512, {**CORRECTED, **CLEAN, "row_noise": False})
     np.testing.assert_array_equal(off.raw, without.raw)
