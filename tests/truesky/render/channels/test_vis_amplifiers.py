@@ -23,10 +23,11 @@ CORRECTED = nominal.off("nonlinearity", "crosstalk", "detector_crosstalk", "para
 
 
 def frame(kind, number, seconds, side=1024, forced=None, mission=MISSION):
-    detector, colours = small("vis", "3-4", side), settings_for(SURVEY).colours
+    detector = small("vis", "3-4", side)
+    psf = nominal.psf_with_transforms(small("vis", "3-4", 256), settings_for(SURVEY).colours)
     with pytest.MonkeyPatch.context() as patch:
-        # No source is drawn. The PSF is that of all frames, because it takes longer than a frame.
-        patch.setattr(euclid, "vis_psf", lambda *_: nominal.psf_with_transforms(small("vis", "3-4", 1024), colours))
+        # No source is drawn. All frames share a PSF, because its computation takes longer than a frame.
+        patch.setattr(euclid, "vis_psf", lambda *_: psf)
         return nominal.rendered(
             detector, [], [], [], kind=kind, number=number, seconds=seconds, forced=forced, truth=("cosmic_rays",),
             mission=mission, sky=0.0 if kind == "bias" else nominal.SKY,
