@@ -33,7 +33,7 @@ def test_changed_numbers_are_allowed():
 
 
 def test_the_quadrants_of_vis_are_those_that_the_script_draws():
-    """If this fails, run: python -m scripts.draw_vis_amplifiers > lake_schema/mission/models/amplifier_values_vis.csv"""
+    """If this fails, write the output of `python -m scripts.draw_vis_amplifiers` to amplifier_values_vis.csv."""
     table = MISSION.content(MISSION.model("vis.amplifier_values")).decode()
     assert table.splitlines() == list(draw_vis_amplifiers.lines(MISSION))
 

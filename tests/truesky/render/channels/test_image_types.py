@@ -153,7 +153,8 @@ def test_lamps_shine_from_their_own_side(planned, tmp_path):
         # All lamps give the same signal, whatever the response of the band is.
         seen = calibration_lamp.efficiency_of_scene(Scene(mission, "vis", 10.0, 0.0, 0.0), lamp)
         level = mission.value("vis.flat.signal", "electron") / seen
-        as_bright = resolve(overrides={"vis.flat.signal": (level, "electron")})
+        equal = {key: (mission.value(key), mission.parameter(key).unit) for key in ("vis.gain", "vis.bias")}
+        as_bright = resolve(overrides={"vis.flat.signal": (level, "electron"), **equal})
         one, header = written((planned[0], as_bright, rows), rows["flat", 10, lamp], tmp_path, quiet, magnitude=25.0)
         assert header["LAMP"] == lamp
         frame, half = one.science.astype(float), SIDE // 2
