@@ -31,8 +31,6 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.camera.sections import Section, Sections
 
 Number = TypeVar("Number", bound=np.generic)
-# Gain, read noise, bias level and full well of an amplifier, divided by the values of the camera.
-Ratios = tuple[float, float, float, float]
 
 # Random deviations of an amplifier's parameters, such as the gain, from the mean of its detector are limited to this
 # number of standard deviations. Random crosstalk coefficients have a log-normal distribution, in which the largest
@@ -82,7 +80,7 @@ class Amplifier:
         True if the last column of the rectangle is read first.
     read_top : bool
         True if the last row of the rectangle is read first.
-    ratios_to_first : (float, float, float, float)
+    ratios_to_first : tuple of 4 float
         Gain, read noise, bias level and full well of the amplifier, divided by those of the first amplifier in the
         camera's table of amplifiers. If the mission database has a table with the values of each amplifier of the
         camera, they are divided by the medians of the camera instead.
@@ -92,7 +90,7 @@ class Amplifier:
     pixels: Section
     read_right: bool
     read_top: bool
-    ratios_to_first: Ratios = (1.0, 1.0, 1.0, 1.0)
+    ratios_to_first: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,12 +417,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
             row["read_right"] == "1",
             row["read_top"] == "1",
             measured.get((detector.name, row["amplifier"]))
-            or (
-                float(row["gain"]) / float(reference["gain"]),
-                float(row["read_noise"]) / float(reference["read_noise"]),
-                1.0,
-                1.0,
-            ),
+            or (*(float(row[key]) / float(reference[key]) for key in ("gain", "read_noise")), 1.0, 1.0),
         )
         for row in rows
     )
@@ -451,7 +444,7 @@ def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, st
 
 
 @lru_cache(maxsize=16)
-def _measured_ratios(section: str, mission: MissionConfiguration) -> Mapping[tuple[str, str], Ratios]:
+def _measured_ratios(section: str, mission: MissionConfiguration) -> Mapping[tuple[str, str], tuple[float, ...]]:
     """Return gain, read noise, bias level and full well of each amplifier of a camera, divided by the medians of all.
 
     The keys are the names of detector and amplifier. A number that the table lacks has the ratio 1. The result is empty
@@ -463,10 +456,8 @@ def _measured_ratios(section: str, mission: MissionConfiguration) -> Mapping[tup
         return {}
     numbers = np.array([[float(row.get(name, 1.0)) for name in _RELATIVE] for row in rows])
     ratios = numbers / np.median(numbers, axis=0)
-    return {
-        (row["detector"], row["amplifier"]): (float(gain), float(noise), float(bias), float(full_well))
-        for row, (gain, noise, bias, full_well) in zip(rows, ratios, strict=True)
-    }
+    places = ((row["detector"], row["amplifier"]) for row in rows)
+    return {place: tuple(values_of_place) for place, values_of_place in zip(places, ratios.tolist(), strict=True)}
 
 
 def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
@@ -526,34 +517,25 @@ def values(
     name, spread = f"{detector.section}.{key}", f"{detector.section}.{key}_spread"
     rms = mission.value(spread, unit) if detector_layout is not None and spread in mission else 0.0
     exact = name in mission.overridden and spread not in mission.overridden
-    amplifier_ratios = _ratios(detector, mission, detector_layout)
-    results = np.empty(len(amplifier_ratios))
-    for number, (amplifier, ratios) in enumerate(amplifier_ratios):
+    if detector_layout is not None:
+        ratios = {amplifier.name: amplifier.ratios_to_first for amplifier in detector_layout.amplifiers}
+    else:
+        measured = _measured_ratios(detector.section, mission)
+        # A camera without amplifiers in the mission database has a single one, without a name.
+        names = detector_overrides.amplifiers(detector.section, mission) or ("",)
+        ratios = {name: measured.get((detector.name, name), (1.0,) * len(_RELATIVE)) for name in names}
+    results = np.empty(len(ratios))
+    for number, amplifier in enumerate(ratios):
         place = DetectorPlace(detector.name, amplifier)
         results[number] = mission.value(name, unit, place)
         if not exact and not mission.is_overridden_at(name, place):
             deviation = float(rng.stream(0, name, detector.name, amplifier).standard_normal())
-            relative = ratios[_RELATIVE[key]] if key in _RELATIVE else 1.0
+            relative = ratios[amplifier][_RELATIVE[key]] if key in _RELATIVE else 1.0
             results[number] = relative * results[number] + rms * float(
                 np.clip(deviation, -_MAX_DEVIATION, _MAX_DEVIATION)
             )
     results.setflags(write=False)
     return results if np.ptp(results) > 0.0 else float(results[0])
-
-
-def _ratios(
-    detector: Detector, mission: MissionConfiguration, detector_layout: Layout | None
-) -> tuple[tuple[str, Ratios], ...]:
-    """Return the name of each amplifier of a detector, and its values divided by the values of the camera.
-
-    `detector_layout` is None for a detector that is read in quadrants or as one frame. A camera without amplifiers in
-    the mission database has a single one, without a name.
-    """
-    if detector_layout is not None:
-        return tuple((amplifier.name, amplifier.ratios_to_first) for amplifier in detector_layout.amplifiers)
-    names = detector_overrides.amplifiers(detector.section, mission) or ("",)
-    measured = _measured_ratios(detector.section, mission)
-    return tuple((name, measured.get((detector.name, name), (1.0, 1.0, 1.0, 1.0))) for name in names)
 
 
 # Unit and smallest allowed value of the gain and of the read noise of any amplifier, checked by `refuse_spread`. The
