@@ -5,8 +5,11 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
+from tests.truesky.render import nominal
+from tests.truesky.render.fields import small
 from truesky.render.planning import planned_exposures
 from truesky.render.planning.planned_exposures import Exposure
+from truesky.render.products import headers
 from truesky.render.sky import ice
 
 ICY = resolve(overrides={"plm.ice": (1.0, "")})
@@ -51,6 +54,17 @@ def test_stars_and_sky_are_dimmed_alike():
     # Numbers that the user gives are those of the detector, whatever the ice.
     given = row(ICY, BEFORE, sky=0.3, zero_point=25.0)
     assert (given["sky"], given["zero_point"]) == (0.3, 25.0)
+
+
+def test_the_header_has_the_lost_fraction():
+    """The frame is from the day before the mirror was heated."""
+    number = int(BEFORE - nominal.DAY)
+    for mission, expected in ((ICY, 0.13 * 170 / 171), (resolve(), None)):
+        one = nominal.rendered(
+            small("vis", "3-4", 64), [], [], [], kind="bias", seconds=0.0, sky=0.0, mission=mission, number=number
+        )
+        cards = {keyword: value for keyword, value, _ in headers.science_cards(one)}
+        assert cards.get("ICELOSS") == (expected if expected is None else pytest.approx(expected, rel=1e-9))
 
 
 def test_ice_that_absorbs_everything_is_refused():
