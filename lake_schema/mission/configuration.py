@@ -82,6 +82,7 @@ class MissionConfiguration:
         object.__setattr__(self, "_places_by_key", places_by_key)
         lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
         lines += [f"{m.key}={m.sha256}\n" for m in self.models]
+        lines += [f"{key} is set\n" for key in self.overridden if self._may_differ(key)]
         object.__setattr__(self, "_fingerprint", hashlib.sha256("".join(lines).encode()).hexdigest())
         everything = repr((self.parameters, self.ladder, self.overridden, self.models, self.folder))
         object.__setattr__(self, "_digest", hashlib.sha256(everything.encode()).hexdigest())
@@ -109,6 +110,19 @@ class MissionConfiguration:
 
     def __contains__(self, key: object) -> bool:
         return key in self._parameters_by_key or key in self._models_by_key
+
+    def _may_differ(self, key: str) -> bool:
+        """Return True if a parameter has values for places or dates, which an override of the camera's value replaces.
+
+        Such an override changes images even if it equals the value of the database.
+        """
+        section, name = detector_overrides.camera_prefix(key), key.rpartition(".")[2]
+        in_table = f"{section}.amplifier_values" in self and name in detector_overrides.AMPLIFIER_COLUMNS
+        return in_table or any(f"{key}{ending}" in self for ending in ("_spread", "_growth"))
+
+    def is_overridden(self, key: str, place: DetectorPlace) -> bool:
+        """Return True if the request sets a parameter: for the whole camera, or for a detector or amplifier."""
+        return key in self.overridden or self.is_overridden_at(key, place)
 
     def is_overridden_at(self, key: str, place: DetectorPlace) -> bool:
         """Return True if a parameter has a value for a detector or amplifier that replaces the value of the camera.
@@ -229,7 +243,8 @@ class MissionConfiguration:
     def fingerprint(self) -> str:
         """sha256 (hexadecimal) of all names, values and units of parameters, and of the sha256 of all models.
 
-        It does not depend on statuses and sources.
+        It does not depend on statuses and sources. An override with the value of the database changes it only if it
+        replaces differences between amplifiers, or a growth with time.
         """
         return self._fingerprint
 

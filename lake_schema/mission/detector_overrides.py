@@ -28,6 +28,8 @@ from lake_schema.errors import BadInput
 GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
 # Levels at which the value of a parameter may differ, as in places.csv: one value per camera, detector or amplifier.
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
+# Parameters that the table `amplifier_values` of a camera may have for each amplifier, in columns of the same name.
+AMPLIFIER_COLUMNS = ("gain", "read_noise", "bias", "full_well")
 
 
 class MissionValues(Protocol):

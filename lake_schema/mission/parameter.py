@@ -37,7 +37,8 @@ _MAX_LENGTH = 1000
 # Units of the parameters in the package. Their texts are not parsed again, because importing astropy.units takes half a
 # second.
 _SHIPPED_UNITS = frozenset((
-    "", "1 / (cm2 s)", "1 / (deg s)", "1 / electron", "1 / mm2", "1 / mm4", "1 / mm6", "1 / pix", "1 / s", "K",
+    "", "1 / (cm2 s)", "1 / (deg s)", "1 / electron", "1 / mm2", "1 / mm4", "1 / mm6", "1 / pix", "1 / s",
+    "1 / yr", "K",
     "adu", "arcmin", "arcsec", "arcsec / h", "arcsec / mm", "arcsec / pix", "arcsec / um", "cm2", "d", "deg",
     "deg / s", "deg-2", "deg2", "dex", "dex / mag", "eV", "electron", "electron / (s pix)", "electron / adu",
     "electron / um", "erg / (s cm2)", "h", "km", "m", "m2", "mag", "mag / arcsec2", "mas", "mm", "mm / pix", "ms",

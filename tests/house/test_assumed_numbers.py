@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema.mission.configuration import resolve
-from scripts import assumed_tables, rank_assumed_numbers
+from scripts import assumed_tables, draw_vis_amplifiers, rank_assumed_numbers
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "assumed_numbers.md"
 MISSION = resolve()
@@ -30,6 +30,12 @@ def test_changed_numbers_are_allowed():
     }
     found = resolve(overrides=changed)
     assert all(found.value(key) == value != MISSION.value(key) for key, (value, _) in changed.items())
+
+
+def test_the_quadrants_of_vis_are_those_that_the_script_draws():
+    """If this fails, write the output of `python -m scripts.draw_vis_amplifiers` to amplifier_values_vis.csv."""
+    table = MISSION.content(MISSION.model("vis.amplifier_values")).decode()
+    assert table.splitlines() == list(draw_vis_amplifiers.lines(MISSION))
 
 
 def check_ranking(key, effect):

@@ -43,13 +43,14 @@ MAX_SHEAR = 0.9
 # Names of all instrument effects that a request may switch. This copies the registry of channels, because requests must
 # not import the renderer; test_effect.py compares the two.
 EFFECTS = (
-    "adc", "amplifiers", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp",
-    "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map",
+    "adc", "amplifiers", "background", "bias_drift", "bias_structure", "bleeding", "brighter_fatter",
+    "calibration_lamp", "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current",
+    "dark_map",
     "detector_crosstalk", "dispersed_sky", "drift", "edge_displacement", "filter_ghosts", "fringes", "ghosts",
     "group_noise", "hot_pixels", "illumination", "injection_noise", "intra_pixel", "ipc", "lamp_response",
     "lens_ghosts", "macc", "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence",
     "pixel_area", "pixel_response", "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity",
-    "read_noise", "readout_cosmic_rays", "readout_trail", "reset_level", "satellite_trails", "serial_cti",
+    "read_noise", "readout_cosmic_rays", "readout_trail", "reset_level", "row_noise", "satellite_trails", "serial_cti",
     "serial_loss", "shutter", "signal_adc", "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
 # Effects that "all" in `effects.off` does not switch off, because no image is valid without them.

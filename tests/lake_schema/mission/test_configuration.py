@@ -70,7 +70,10 @@ def test_later_and_newer_records_win_when_they_hold():
 def test_the_fingerprint_follows_the_values():
     base = resolve()
     assert len(base.fingerprint) == 64
-    assert resolve(overrides={"vis.gain": (3.48, "electron / adu")}).fingerprint == base.fingerprint
+    assert resolve(overrides={"vis.exposure_time": (560.53, "s")}).fingerprint == base.fingerprint
+    # An override of the camera's gain makes all quadrants alike, and one of the age stops the ageing.
+    for name, unit in (("vis.gain", "electron / adu"), ("vis.cti.age", ""), ("ext.jpcam.gain", "electron / adu")):
+        assert resolve(overrides={name: (base.value(name), unit)}).fingerprint != base.fingerprint
     assert resolve(overrides={"vis.gain": (3.5, "electron / adu")}).fingerprint != base.fingerprint
     assert resolve(ladder=("SIM", "CBE", "BLT", "DES", "REQ")).fingerprint != base.fingerprint
     assert pickle.loads(pickle.dumps(base)) == base

@@ -3,6 +3,7 @@
 import numpy as np
 
 from truesky.randomness.rng import stream
+from truesky.reduction import amplifiers
 from truesky.render.effects.charge import pixel_borders, pixel_response
 from truesky.render.effects.light import illumination
 from truesky.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
@@ -24,6 +25,9 @@ def electrons(raw, scene, seed, applied):
     if "bias_structure" in applied:
         parameters = bias_structure.EFFECT.parameters(scene)
         found -= bias_structure.structure(len(raw), raw.shape[2], *parameters, fixed(bias_structure.EFFECT))[:, None]
+    if "bias_drift" in applied:
+        drift = bias_structure.DRIFT
+        found -= drift.apply(np.zeros((len(raw), 1, 1)), *drift.parameters(scene), fixed(drift))
     if "crosstalk" in applied:
         # First order in the coefficients; the error is 1e-8.
         found = 2.0 * found - crosstalk.apply(found, *crosstalk.EFFECT.parameters(scene))
@@ -32,6 +36,16 @@ def electrons(raw, scene, seed, applied):
     if scene.layout is not None:
         return scene.layout.assemble(found) / flat(scene, seed, applied)
     return quadrants.assemble(found, *quadrants.overscan_sizes(scene)) / flat(scene, seed, applied)
+
+
+def of_pixels(scene, key, unit):
+    """Return a parameter of the amplifier of each pixel, such as its gain: shape (ny, nx), or a number."""
+    return amplifiers.to_pixels(scene.amplifier_values(key, unit), scene)
+
+
+def adu_to_electrons(science, scene):
+    """Return pixels [ny, nx] in electrons above the bias level of their amplifier."""
+    return (science - of_pixels(scene, "bias", "adu")) * of_pixels(scene, "gain", "electron / adu")
 
 
 def camera_of(scene):

@@ -125,10 +125,14 @@ def rendered(
 
 
 def exposure(**known):
-    """Return a row of the table `exposures`; only some columns matter."""
+    """Return a row of the table `exposures`; only some columns matter.
+
+    VIS has the radiation damage of its launch.
+    """
+    mjd = 60126.0 if known.get("camera", "vis") == "vis" else 60905.0
     nominal = {
         "exposure_id": 1, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": "science",
-        "ra": 0.0, "dec": 0.0, "position_angle": 0.0, "mjd": 60905.0, "exposure_time_s": 100.0,
+        "ra": 0.0, "dec": 0.0, "position_angle": 0.0, "mjd": mjd, "exposure_time_s": 100.0,
         "sky": 0.0, "seeing": 0.0, "zero_point": 25.93, "survey": "test",
     }  # fmt: skip
     return ExposureRow(**{**nominal, **known})

@@ -18,6 +18,8 @@ from truesky.request.accuracy import SURVEY
 
 TIME = MISSION.value("vis.exposure_time", "s")
 SKY, SEED = 0.25, 1
+# Exposures are taken on the days after this MJD, the launch, with the radiation damage of the beginning of the mission.
+DAY = MISSION.value("svm.launch", "d")
 COSMIC_RAYS = ("cosmic_rays", "readout_cosmic_rays")
 # Effects that move or compress charge, which calibration does not correct.
 CHARGE = ("parallel_cti", "serial_cti", "brighter_fatter")
@@ -60,7 +62,7 @@ def rendered(
     ra, dec, angle = pointing(detector)
     exposed = {
         "exposure_id": number, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": kind,
-        "ra": ra, "dec": dec, "position_angle": angle, "mjd": 60905.0 + number, "exposure_time_s": seconds,
+        "ra": ra, "dec": dec, "position_angle": angle, "mjd": DAY + number, "exposure_time_s": seconds,
         "seeing": 0.0, "sky": sky, "zero_point": planned_exposures.zero_point_of("vis", "euclid_vis", mission),
     }  # fmt: skip
     system = astrometry.wcs(detector, ra, dec, angle)

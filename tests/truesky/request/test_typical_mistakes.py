@@ -353,6 +353,21 @@ MISTAKES = {
         "mission.overrides.vis.read_noise [electron] = -3",
         "[0.0, ",
     ),
+    "a quadrant without gain": (
+        section("mission.overrides", '"vis.gain@3-4.E" = { value = 0.0, unit = "electron / adu" }'),
+        "mission.overrides.vis.gain@3-4.E [electron / adu] = 0.0",
+        "is outside [0.001, 1000.0]",
+    ),
+    "a quadrant with an unknown gain": (
+        section("mission.overrides", '"vis.gain@3-4.E" = { value = nan, unit = "electron / adu" }'),
+        "mission.overrides.vis.gain@3-4.E.value = nan",
+        "is outside",
+    ),
+    "ageing that is negative": (
+        section("mission.overrides", '"vis.cti.age_growth" = { value = -0.1, unit = "1 / yr" }'),
+        "mission.overrides.vis.cti.age_growth [1 / yr] = -0.1",
+        "is outside [0.0, 10.0]",
+    ),
     "a wrong unit": (
         section("mission.overrides", '"vis.gain" = { value = 3.0, unit = "mm" }'),
         "mission.overrides.vis.gain: the unit must be electron / adu",

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
+from lake_schema.mission import detector_overrides
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.detector_overrides import DetectorPlace
 from truesky.randomness import rng
@@ -79,17 +80,17 @@ class Amplifier:
         True if the last column of the rectangle is read first.
     read_top : bool
         True if the last row of the rectangle is read first.
-    ratios_to_first : (float, float, float)
-        Gain, read noise and bias level of the amplifier, divided by those of the first amplifier in the camera's table
-        of amplifiers. If the amplifiers of the camera have been measured one by one, they are divided by the medians of
-        the camera instead.
+    ratios_to_first : tuple of 4 float
+        Gain, read noise, bias level and full well of the amplifier, divided by those of the first amplifier in the
+        camera's table of amplifiers. If the mission database has a table with the values of each amplifier of the
+        camera, they are divided by the medians of the camera instead.
     """
 
     name: str
     pixels: Section
     read_right: bool
     read_top: bool
-    ratios_to_first: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ratios_to_first: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,11 +417,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
             row["read_right"] == "1",
             row["read_top"] == "1",
             measured.get((detector.name, row["amplifier"]))
-            or (
-                float(row["gain"]) / float(reference["gain"]),
-                float(row["read_noise"]) / float(reference["read_noise"]),
-                1.0,
-            ),
+            or (*(float(row[key]) / float(reference[key]) for key in ("gain", "read_noise")), 1.0, 1.0),
         )
         for row in rows
     )
@@ -447,13 +444,11 @@ def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, st
 
 
 @lru_cache(maxsize=16)
-def _measured_ratios(
-    section: str, mission: MissionConfiguration
-) -> Mapping[tuple[str, str], tuple[float, float, float]]:
-    """Return gain, read noise and bias level of each measured amplifier of a camera, divided by the medians of all.
+def _measured_ratios(section: str, mission: MissionConfiguration) -> Mapping[tuple[str, str], tuple[float, ...]]:
+    """Return gain, read noise, bias level and full well of each amplifier of a camera, divided by the medians of all.
 
-    The keys are the names of detector and amplifier. A number that was not measured has the ratio 1. The result is
-    empty if the mission database has no table of measured amplifiers for the camera.
+    The keys are the names of detector and amplifier. A number that the table lacks has the ratio 1. The result is empty
+    if the mission database has no table with the values of each amplifier of the camera.
     """
     key = f"{section}.amplifier_values"
     rows = mission.rows(key) if key in mission else ()
@@ -461,10 +456,8 @@ def _measured_ratios(
         return {}
     numbers = np.array([[float(row.get(name, 1.0)) for name in _RELATIVE] for row in rows])
     ratios = numbers / np.median(numbers, axis=0)
-    return {
-        (row["detector"], row["amplifier"]): (float(gain), float(noise), float(bias))
-        for row, (gain, noise, bias) in zip(rows, ratios, strict=True)
-    }
+    places = ((row["detector"], row["amplifier"]) for row in rows)
+    return {place: tuple(values_of_place) for place, values_of_place in zip(places, ratios.tolist(), strict=True)}
 
 
 def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
@@ -479,14 +472,14 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
 
 # Parameters that may have a value for each amplifier in the camera's tables of amplifiers, with their index in
 # `Amplifier.ratios_to_first` (values of an amplifier divided by those of the first amplifier).
-_RELATIVE = {"gain": 0, "read_noise": 1, "bias": 2}
+_RELATIVE = {key: index for index, key in enumerate(detector_overrides.AMPLIFIER_COLUMNS)}
 
 
 @lru_cache(maxsize=1024)
 def values(
-    key: str, unit: str, detector: Detector, mission: MissionConfiguration, detector_layout: Layout
+    key: str, unit: str, detector: Detector, mission: MissionConfiguration, detector_layout: Layout | None = None
 ) -> float | Float:
-    """Return the values of a parameter for all amplifiers of a detector, with random deviations.
+    """Return the values of a parameter for all amplifiers of a detector, with their differences.
 
     Parameters
     ----------
@@ -498,37 +491,46 @@ def values(
         The detector.
     mission : MissionConfiguration
         Mission database.
-    detector_layout : Layout
-        Amplifiers of the detector.
+    detector_layout : Layout, optional
+        Amplifiers of the detector. None for a detector that is read in quadrants or as one frame; its amplifiers have
+        no random deviations.
 
     Returns
     -------
     float or float array, shape (n_amplifiers,)
-        Values in the order of `detector_layout.amplifiers`. One number if all are equal.
+        Values in the order of `detector_layout.amplifiers`, or of the camera's table of amplifiers. One number if all
+        are equal.
 
     Notes
     -----
     The parameter `key` is the value without random deviations, and `key` + "_spread" the rms of the deviations (0 if
     the database has none). For gain and read noise, `key` is the value of the first amplifier in the camera's table;
-    for other amplifiers it is multiplied by their ratio to the first one. If the amplifiers of the camera have been
-    measured one by one, `key` is the median, and is multiplied by the ratio of the amplifier to the median; this also
-    holds for the bias level. The random deviations are a property of the hardware and therefore the same in all
-    simulations.
+    for other amplifiers it is multiplied by their ratio to the first one. If the database has a table with values
+    for each amplifier of the camera, `key` is the median, and is multiplied by the ratio of the amplifier to the
+    median; this also holds for bias level and full well. The random deviations are a property of the hardware and
+    therefore the same in all simulations.
 
     If the request of the user sets the parameter for the whole camera, it is used without ratio and random deviations,
     unless the request also sets the spread. A value that the request sets for a detector or an amplifier is always used
     as it is.
     """
     name, spread = f"{detector.section}.{key}", f"{detector.section}.{key}_spread"
-    rms = mission.value(spread, unit) if spread in mission else 0.0
+    rms = mission.value(spread, unit) if detector_layout is not None and spread in mission else 0.0
     exact = name in mission.overridden and spread not in mission.overridden
-    results = np.empty(len(detector_layout.amplifiers))
-    for number, amplifier in enumerate(detector_layout.amplifiers):
-        place = DetectorPlace(detector.name, amplifier.name)
+    if detector_layout is not None:
+        ratios = {amplifier.name: amplifier.ratios_to_first for amplifier in detector_layout.amplifiers}
+    else:
+        measured = _measured_ratios(detector.section, mission)
+        # A camera without amplifiers in the mission database has a single one, without a name.
+        names = detector_overrides.amplifiers(detector.section, mission) or ("",)
+        ratios = {name: measured.get((detector.name, name), (1.0,) * len(_RELATIVE)) for name in names}
+    results = np.empty(len(ratios))
+    for number, amplifier in enumerate(ratios):
+        place = DetectorPlace(detector.name, amplifier)
         results[number] = mission.value(name, unit, place)
         if not exact and not mission.is_overridden_at(name, place):
-            deviation = float(rng.stream(0, name, detector.name, amplifier.name).standard_normal())
-            relative = amplifier.ratios_to_first[_RELATIVE[key]] if key in _RELATIVE else 1.0
+            deviation = float(rng.stream(0, name, detector.name, amplifier).standard_normal())
+            relative = ratios[amplifier][_RELATIVE[key]] if key in _RELATIVE else 1.0
             results[number] = relative * results[number] + rms * float(
                 np.clip(deviation, -_MAX_DEVIATION, _MAX_DEVIATION)
             )

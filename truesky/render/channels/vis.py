@@ -84,6 +84,8 @@ _READOUT = (
     crosstalk.EFFECT,
     detector_crosstalk.EFFECT,
     bias_structure.EFFECT,
+    bias_structure.DRIFT,
+    bias_structure.ROW_NOISE,
     read_noise.EFFECT,
     adc.EFFECT,
 )

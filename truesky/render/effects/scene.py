@@ -174,6 +174,8 @@ class Scene:
         Number of the amplifier, from 0, that reads the window. All pixels of a window are read by one amplifier.
     sky_slopes : (float, float)
         Relative change of the sky background per pixel along rows (with the column) and along columns (with the row).
+    mjd : float
+        Date of the exposure (MJD), on which ageing and the drift of the bias depend; 0 if it does not matter.
     """
 
     mission: MissionConfiguration
@@ -199,6 +201,7 @@ class Scene:
     window: Window | None = None
     amplifier: int = 0
     sky_slopes: tuple[float, float] = (0.0, 0.0)
+    mjd: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """Return a parameter of the detector in the given unit.
@@ -224,11 +227,11 @@ class Scene:
             Values of the q amplifiers, in the order of the planes of a frame that is split into amplifiers. One number
             if all amplifiers have the same value, or if a window is drawn.
         """
-        layout = None if self.detector is None else amplifiers.layout(self.detector, self.mission)
-        if self.detector is not None and layout is not None:
+        if self.detector is not None:
+            layout = amplifiers.layout(self.detector, self.mission)
             values = np.atleast_1d(amplifiers.values(key, unit, self.detector, self.mission, layout))
         else:
-            values = np.array(self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name))
+            values = np.array(self.mission.amplifier_values(f"{self.section}.{key}", unit, ""))
         if self.window is not None and len(values) > 1:
             return float(values[self.amplifier])
         return values if len(values) > 1 else float(values[0])
@@ -345,6 +348,11 @@ class Scene:
         # Behind a grism the sky background varies over the detector: add its mean difference from a uniform background.
         dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
         return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
+
+    @property
+    def full_well(self) -> float:
+        """Full well in electrons of the amplifier in whose pixels it is highest."""
+        return float(np.max(self.amplifier_values("full_well", "electron")))
 
     @property
     def noticeable_fraction(self) -> float:

@@ -79,7 +79,7 @@ def is_noticeable(aim: Aim, variant: Variant) -> bool:
     if _EFFECT not in aim.effects or not aim.sees_sky:
         return False
     scene = scene_factory.from_aim(aim, variant)
-    max_electrons = abs(detector_crosstalk.coefficient(scene)) * bleeding.full_well(scene)
+    max_electrons = abs(detector_crosstalk.coefficient(scene)) * scene.full_well
     return bool(max_electrons > 0.0 and variant.forced.get(_EFFECT.name, max_electrons > scene.noticeable_electrons))
 
 
@@ -193,7 +193,7 @@ def _charged_pixels(drawn: DrawnUnits, scene: Scene, threshold: float) -> tuple[
     """
     rows, columns, electrons = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
     for first, past in _bright_columns(drawn, threshold):
-        charge = _bled_electrons(drawn.electrons_of_columns(first, past), scene)
+        charge = _bled_electrons(drawn.electrons_of_columns(first, past), first, scene)
         row, column = np.nonzero(charge > threshold)
         rows.append(row)
         columns.append(column + first)
@@ -213,15 +213,19 @@ def _bright_columns(drawn: DrawnUnits, threshold: float) -> list[tuple[int, int]
     return [(int(group[0]) * wings.BLOCK, min((int(group[-1]) + 1) * wings.BLOCK, nx)) for group in groups]
 
 
-def _bled_electrons(frame: Frame, scene: Scene) -> Frame:
+def _bled_electrons(frame: Frame, first: int, scene: Scene) -> Frame:
     """Return the electrons per pixel after charge above the full well has bled along the columns.
 
-    `frame` contains the expected electrons per pixel. They are first rounded down to whole electrons, and negative
-    numbers are set to 0. `scene` contains the properties of the detector, such as its full well.
+    `frame` contains the expected electrons per pixel, from column `first` of the detector on. They are first rounded
+    down to whole electrons, and negative numbers are set to 0. `scene` contains the properties of the detector, such as
+    its full well.
     """
     whole = np.floor(frame)
     np.maximum(whole, 0.0, out=whole)
-    return bleeding.apply(whole, bleeding.full_well(scene), scene.column_segments)
+    full_wells, segments = bleeding.parameters(scene)
+    if isinstance(full_wells, np.ndarray):
+        full_wells = full_wells[:, first : first + whole.shape[1]]
+    return bleeding.apply(whole, full_wells, segments)
 
 
 def _select_stars(

@@ -88,7 +88,7 @@ def from_exposure(
     scene = Scene(
         mission, detector.section, exposure.exposure_time_s, exposure.sky * level, 0.0, detector,
         lamp=exposure.lamp or 1, accuracy=accuracy, ramp=channel.ramp_name if channel else "",
-        zero_point=exposure.zero_point, sky_slopes=(slopes[0], slopes[1]),
+        zero_point=exposure.zero_point, sky_slopes=(slopes[0], slopes[1]), mjd=exposure.mjd,
     )  # fmt: skip
     if scene.ramp:
         ramp.mode_of_scene(scene)

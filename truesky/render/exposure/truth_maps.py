@@ -107,9 +107,7 @@ def map_recorder(
         if name == "trap_pumping" and "dipoles" in truth:
             maps["dipoles"] = np.rint(frame_after - frame_before).astype(np.int32)
         if name == "bleeding" and "saturation" in truth:
-            maps["saturation"] = bleeding.saturated_pixels(frame_after, scene.value("full_well", "electron")).astype(
-                np.uint8
-            )
+            maps["saturation"] = bleeding.saturated_pixels(frame_after, *bleeding.parameters(scene)).astype(np.uint8)
         if name == "ramp" and "saturation" in truth:
             full = ramp.full_pixels(frame_before, ramp.mode_of_scene(scene), scene.value("full_well", "electron"))
             maps["saturation"] = full.astype(np.uint8)

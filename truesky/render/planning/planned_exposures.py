@@ -5,6 +5,7 @@ The rows also have the sky background, the photometric zero point and the seeing
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.effects.charge import ramp
 from truesky.render.psf import seeing as ground_psf
-from truesky.render.sky import clouds, night_sky, observatory
+from truesky.render.sky import clouds, ice, night_sky, observatory
 from truesky.render.sky.diffuse_light import SkyBand, sky_rate
 from truesky.render.sky.night_sky import Night
 from truesky.request.exposures.observations import Observation
@@ -394,12 +395,14 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
             cloud_mag = clouds.extinction(e.clouds, e.mjd, e.exposure_time_s, night.site.longitude, seed)
             slopes = night_sky.twilight_slopes(night, (e.ra, e.dec), e.position_angle, e.mjd, mission)
     channel = registry.CHANNELS[e.channel]
+    passed = ice.transmission(e.band, e.mjd, mission) if e.camera in SPACE_CAMERAS else 1.0
+    extinction_mag -= 2.5 * math.log10(passed)
     if e.image_type in _DARK_TYPES or (channel.on_ground and not channel.sees_sky(e.image_type)):
         sky = 0.0
     elif sky is None and night is not None:
         sky = night_sky.sky_rate(night, e.ra, e.dec, e.mjd, mission)
     elif sky is None:
-        sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission)
+        sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission) * passed
     return {
         **{name: getattr(e, name) for name in EXPOSURES.names if name not in _COMPUTED_COLUMNS},
         "exposure_id": number,

@@ -12,6 +12,7 @@ import numpy as np
 from lake_schema import __version__
 from lake_schema.arrays import Float
 from lake_schema.fits.images import Card
+from lake_schema.mission.parameter import SPACE_CAMERAS
 from lake_schema.tables.exposures import ExposureRow
 from truesky.randomness import rng
 from truesky.render.camera import astrometry, detectors, observatories, sections
@@ -25,6 +26,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.exposure import truth_maps
 from truesky.render.exposure.rendered_detector import RenderedDetector, random_identity
 from truesky.render.products import calibration_cards
+from truesky.render.sky import ice
 from truesky.request import accuracy
 
 # The saturation level in the header is the mean value of a full pixel minus this number of standard deviations of the
@@ -316,6 +318,7 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *astrometry.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] pixel scale at the boresight"),
         *((("CLOUDS", exposure.clouds, "[mag] extinction by clouds, in ZEROPNT"),) if exposure.clouds else ()),
+        *_ageing_cards(rendered),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] PSF FWHM including the pixel"),
         ("SEEING", exposure.seeing, "[arcsec] FWHM of the air at zenith and 500 nm"),
@@ -330,6 +333,18 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         ("TRUESKY", __version__, "version of the simulator"),
         *_accuracy_cards(rendered),
     )
+
+
+def _ageing_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
+    """Return the cards of ice on the optics of Euclid and of radiation damage of VIS at the date of the exposure."""
+    exposure, scene = rendered.exposure, rendered.scene
+    cards: list[Card] = []
+    if exposure.camera in SPACE_CAMERAS and scene.mission.value("plm.ice") > 0.0:
+        lost = 1.0 - ice.transmission(exposure.band, exposure.mjd, scene.mission)
+        cards.append(("ICELOSS", lost, "fraction of light lost by ice, in ZEROPNT"))
+    if f"{scene.section}.cti.age" in scene.mission:
+        cards.append(("CTIAGE", charge_transfer.age(scene), "traps relative to the end of the mission"))
+    return tuple(cards)
 
 
 def _lamp_cards(lamp: int, rendered: RenderedDetector) -> tuple[Card, ...]:
@@ -378,16 +393,16 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
     It is the value of a full pixel after the losses by charge transfer and nonlinearity, minus five times the noise of
     readout (read noise and bias structure, added linearly), rounded down and within the range of the converter.
     """
-    full = rendered.scene.value("full_well", "electron")
-    scene = replace(rendered.scene, peak_electrons=full)
+    full_wells = rendered.scene.amplifier_values("full_well", "electron")
+    scene = replace(rendered.scene, peak_electrons=rendered.scene.full_well)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     # Sum the largest charge losses that a pixel may have by charge transfer. The first pixel of a column or row has
     # them, because it finds all traps empty.
     losses = (
         charge_transfer.PARALLEL, charge_transfer.SERIAL, charge_transfer.PARALLEL_LOSS, charge_transfer.SERIAL_LOSS
     )  # fmt: skip
-    remaining = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
-    signal: float | Float = remaining
+    remaining = full_wells - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    signal = remaining
     if scene.ramp:
         b = scene.value("nonlinearity", "1 / electron")
         of_charge, of_signal = (
@@ -396,10 +411,13 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
         signal = ramp.signal_at_full_well(scene, of_charge, of_signal)
     if nonlinearity.EFFECT.name in applied:
         curve = nonlinearity.parameters(scene)
-        n_amplifiers = max(np.size(number) for number in curve)
-        signal = nonlinearity.apply(np.full(n_amplifiers, max(remaining, 0.0)), *curve)
+        n_amplifiers = max(np.size(number) for number in (*curve, remaining))
+        signal = nonlinearity.apply(np.array(np.broadcast_to(np.maximum(remaining, 0.0), n_amplifiers)), *curve)
         signal = signal if n_amplifiers > 1 else float(signal[0])
-    noises = (bias_structure.EFFECT, read_noise.EFFECT, ramp_noise.EFFECT, ramp_noise.DRIFT)
+    noises = (
+        bias_structure.EFFECT, bias_structure.DRIFT, bias_structure.ROW_NOISE, read_noise.EFFECT, ramp_noise.EFFECT,
+        ramp_noise.DRIFT,
+    )  # fmt: skip
     signal = signal - _NOISE_SIGMAS * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
     level = signal / scene.amplifier_values("gain", "electron / adu") + scene.amplifier_values("bias", "adu")
     rounded = np.floor(np.clip(level, 0.0, scene.amplifier_values("adc_max", "adu")))

@@ -13,6 +13,7 @@ from lake_schema.mission.parameter import CAMERAS
 from tests.truesky.render.fields import MISSION
 from truesky.render.camera import amplifiers, detectors
 from truesky.render.camera.sections import Section
+from truesky.render.effects.scene import Scene
 
 GAIN = "electron / adu"
 # Published numbers of rows and columns of raw files.
@@ -139,6 +140,52 @@ def test_each_amplifier_of_lsstcam_has_its_measured_bias_level():
         assert found[[a.name for a in own.amplifiers].index(amplifier)] == pytest.approx(bias, rel=1e-5)
     one = first("decam")
     assert amplifiers.values("bias", "adu", one, MISSION, layout_of(one)) == MISSION.value("ext.decam.bias")
+
+
+def values_of_quadrants(key, unit, mission=MISSION):
+    """Return the values of the 144 quadrants of VIS, shape (36, 4), as images are made with."""
+    return np.array([
+        np.broadcast_to(Scene(mission, "vis", 0.0, 0.0, 0.0, detector).amplifier_values(key, unit), 4)
+        for detector in detectors.detectors("vis", mission)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "unit", "mean", "spread"),
+    [
+        ("gain", GAIN, 3.48, 0.02),
+        ("read_noise", "electron", 4.4, 0.05),
+        ("full_well", "electron", 2e5, 0.03),
+        ("bias", "adu", 1000.0, 0.1),
+    ],
+)
+def test_the_quadrants_of_vis_differ(key, unit, mean, spread):
+    """The median is the number of the camera; each detector has its own values."""
+    found = values_of_quadrants(key, unit)
+    assert found.shape == (36, 4)
+    assert np.median(found) == pytest.approx(mean, rel=1e-3)
+    assert found.std() / found.mean() == pytest.approx(spread, rel=0.05)
+    # Neighbouring quadrants are not alike, and detectors are not alike.
+    assert np.abs(np.diff(found, axis=1)).mean() > 0.8 * spread * mean
+    assert found.mean(axis=1).std() > 0.3 * spread * mean
+    # As in the file of the detector: 1-1.E is the first line, 6-6.H the last.
+    rows = MISSION.rows("vis.amplifier_values")
+    assert [(row["detector"], row["amplifier"]) for row in rows[::143]] == [("1-1", "E"), ("6-6", "H")]
+    np.testing.assert_allclose(found.ravel(), [float(row[key]) for row in rows], rtol=1e-5)
+
+
+def test_a_request_replaces_values_of_quadrants():
+    """A value for the camera makes all alike; one for a detector or a quadrant leaves the others as they are."""
+    usual = values_of_quadrants("gain", GAIN)
+    for name, replaced in (
+        ("vis.gain", np.s_[:, :]), ("vis.gain@3-4", np.s_[15, :]), ("vis.gain.F", np.s_[:, 1]),
+        ("vis.gain@3-4.E", np.s_[15, 0]),
+    ):  # fmt: skip
+        wanted = usual.copy()
+        wanted[replaced] = 3.3
+        mission = resolve(overrides={name: (3.3, GAIN)})
+        np.testing.assert_array_equal(values_of_quadrants("gain", GAIN, mission), wanted)
+        np.testing.assert_array_equal(values_of_quadrants("bias", "adu", mission), values_of_quadrants("bias", "adu"))
 
 
 def test_measured_crosstalk_is_that_of_the_observatories():

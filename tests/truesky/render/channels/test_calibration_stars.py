@@ -8,7 +8,7 @@ from scipy import optimize
 
 from lake_schema.mission.configuration import resolve
 from tests.truesky import nightly
-from tests.truesky.render import fields
+from tests.truesky.render import calibrated, fields
 from truesky.render.camera import astrometry, detectors
 from truesky.render.channels.aim import Aim
 from truesky.render.exposure import standard_stars
@@ -24,7 +24,7 @@ QUIET = dict.fromkeys(
     (
         "cosmic_rays", "readout_cosmic_rays", "poisson", "read_noise", "hot_pixels", "dark_current", "brighter_fatter",
         "parallel_cti", "serial_cti", "nonlinearity", "crosstalk", "detector_crosstalk", "bias_structure",
-        "pixel_response", "illumination", "ghosts", "shutter", "pixel_area",
+        "bias_drift", "row_noise", "pixel_response", "illumination", "ghosts", "shutter", "pixel_area",
     ),
     False,
 )  # fmt: skip
@@ -71,7 +71,8 @@ def test_none_lies_on_rows_that_are_not_read():
 def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
     """In each column, the full pixels hold the charge that fell on them, and no electron is lost."""
     one, _ = rendered("bleeding", 14.0)
-    well, full = one.scene.value("full_well", "electron"), one.maps["saturation"] > 0
+    full = one.maps["saturation"] > 0
+    wells = calibrated.of_pixels(one.scene, "full_well", "electron")
     fallen = one.noise_free + 0.25 * 561.0
     columns = np.flatnonzero(full.sum(axis=0) > 20)
     assert len(columns) >= 10
@@ -83,8 +84,8 @@ def test_length_of_a_bleed_trail_follows_from_the_excess_charge():
             assert len(rows) == rows[-1] - rows[0] + 1
             # The pixels at the two ends take the rest of the charge.
             reach = slice(max(rows[0] - 1, 0), rows[-1] + 2)
-            assert len(rows) == pytest.approx(fallen[half, column][reach].sum() / well, abs=2.0)
-    image = (one.science - one.scene.value("bias", "adu")) * one.scene.value("gain", "electron / adu")
+            assert len(rows) == pytest.approx(fallen[half, column][reach].sum() / wells[half, column][0], abs=2.0)
+    image = calibrated.adu_to_electrons(one.science, one.scene)
     assert image.sum() == pytest.approx(fallen.sum(), rel=2e-3)
 
 
@@ -112,5 +113,6 @@ def test_a_star_beside_the_field_measures_the_halo():
     assert fraction == pytest.approx(MISSION.value("vis.halo.fraction"), rel=0.01)
     assert scale == pytest.approx(MISSION.value("vis.halo.radius", "arcsec"), rel=0.01)
     # The image contains the halo, and also the diffraction spikes.
-    excess = (one.science.astype(float) - without.science).mean() * one.scene.value("gain", "electron / adu")
+    gain = calibrated.of_pixels(one.scene, "gain", "electron / adu")
+    excess = ((one.science.astype(float) - without.science) * gain).mean()
     assert excess > halo.mean() > 5.0

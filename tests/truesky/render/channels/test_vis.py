@@ -67,8 +67,14 @@ def test_signal_to_noise_of_a_weak_lensing_galaxy_is_as_required(ladder, least, 
 
 def flats(level, side, forced, seconds=10.0):
     """Return two flats of the same detector, in electrons above the column means of the biases."""
-    mission = resolve(overrides={"vis.flat.signal": (level, "electron"), "vis.flat.illumination": (0.0, ""),
-                                 "vis.flat.gradient": (0.0, "")})  # fmt: skip
+    # All quadrants are equal, and the bias does not drift.
+    equal = {
+        key: (MISSION.value(key), MISSION.parameter(key).unit) for key in ("vis.gain", "vis.read_noise", "vis.bias")
+    }
+    mission = resolve(overrides={
+        "vis.flat.signal": (level, "electron"), "vis.flat.illumination": (0.0, ""), "vis.flat.gradient": (0.0, ""),
+        "vis.bias_drift": (0.0, "adu"), "vis.bias_row_noise": (0.0, "adu"), **equal,
+    })  # fmt: skip
     scene = Scene(mission, "vis", seconds, 0.25, 0.0, small("vis", "3-4", side))
     dark = replace(scene, exposure_time_s=0.0, sky_rate=0.0)
 

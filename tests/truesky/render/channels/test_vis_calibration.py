@@ -15,12 +15,15 @@ FRAMES, BLOCK = 20, 64
 
 
 def raw(detector, kind, number, seconds, sky=nominal.SKY, forced=None):
-    """Return the quadrants with overscan, in electrons above the zero of the converter, and the exposure."""
+    """Return the quadrants with overscan, in electrons above the mean of the overscan, and the exposure."""
     sky = 0.0 if kind == "bias" else sky
     one = nominal.rendered(
         detector, [], [], [], kind=kind, number=number, seconds=seconds, sky=sky, forced=forced, truth=("cosmic_rays",)
     )
-    return one.raw.astype(np.float32) * np.float32(one.scene.value("gain", "electron / adu")), one
+    gain = np.reshape(one.scene.amplifier_values("gain", "electron / adu"), (-1, 1, 1))
+    # The second half of the overscan is free of deferred charge.
+    level = one.raw[:, :-20, -14:].mean(axis=(1, 2), keepdims=True)
+    return ((one.raw - level) * gain).astype(np.float32), one
 
 
 def combined(frames):

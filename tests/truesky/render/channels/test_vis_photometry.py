@@ -114,7 +114,9 @@ def test_signal_to_noise_of_weak_lensing_galaxies_is_as_stated():
     # The aperture is 1.3" across.
     flux, blind = (sep.sum_circle(part, x, y, 6.5)[0] for part in (np.where(bad, 0.0, image), bad.astype(float)))
     true = sep.sum_circle(one.noise_free.astype(float), x, y, 6.5)[0].mean()
-    pixel = one.scene.pixel_noise**2 + one.scene.value("gain", "electron / adu") ** 2 / 12
+    scene = one.scene
+    gain, read_noise = (scene.amplifier_values(*of) for of in (("gain", "electron / adu"), ("read_noise", "electron")))
+    pixel = scene.sky_electrons + scene.dark_electrons + np.mean(read_noise**2 + gain**2 / 12)
     noise = np.sqrt((true + np.pi * 6.5**2 * pixel) / 4)
     seen = flux[blind == 0]
     assert len(seen) > 240

@@ -219,6 +219,8 @@ _CASES = (
     Case("crosstalk", (PAIRS,), (np.zeros((4, 4)),), planes=True, linear=True),
     Case("detector_crosstalk", beside(1e5), (None, 1e-4), planes=True, zero=False),
     Case("bias_structure", (30.0, -9.0, 40.0, 1.0), (0.0, 0.0, 40.0, 0.0), planes=True, zero=False, positive=False),
+    Case("bias_drift", (3.0, 60900.0, 0.25), (0.0, 60900.0, 0.25), planes=True, zero=False, positive=False),
+    Case("row_noise", (3.0,), (0.0,), planes=True, zero=False, positive=False),
     Case("read_noise", (4.4,), (0.0,), zero=False, positive=False),
     Case("adc", (3.48, 0.0, 65535.0), None, whole=True),
     # Up the ramp.

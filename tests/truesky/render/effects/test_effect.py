@@ -56,6 +56,7 @@ ORDER = (
     ("dark_current", "bleeding", "amplifiers", "parallel_loss", "serial_loss", "nonlinearity"),
     # Charge is read before it is amplified and converted.
     ("serial_cti", "nonlinearity", "crosstalk", "detector_crosstalk", "bias_structure", "read_noise", "adc"),
+    ("bias_structure", "bias_drift", "row_noise", "read_noise"),
     # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.
     (
         "background",

@@ -169,6 +169,44 @@ def test_structure_of_the_bias():
             bias_structure.apply(frame, *wrong, np.random.default_rng(2))
 
 
+def drift_of(mjd, amplifiers=4000, rms=2.0, time=0.25):
+    """Return the offsets of many amplifiers on a date."""
+    frame = np.zeros((amplifiers, 1, 1))
+    return bias_structure.apply_drift(frame, rms, mjd, time, np.random.default_rng(5))[:, 0, 0]
+
+
+def test_the_bias_drifts_slowly():
+    """The offsets are normal; after the correlation time they have the correlation exp(-1/2), after weeks none."""
+    start = drift_of(60905.0)
+    assert start.std() == pytest.approx(2.0, rel=0.04)
+    assert abs(start.mean()) < 0.12
+    assert np.mean(np.abs(start) < 2.0) == pytest.approx(0.683, abs=0.025)
+    for days in (1e-4, 0.125, 0.25, 0.5, 20.0):
+        found = np.corrcoef(start, drift_of(60905.0 + days))[0, 1]
+        assert found == pytest.approx(np.exp(-0.5 * (days / 0.25) ** 2), abs=0.06)
+    assert np.abs(drift_of(60905.0 + 1e-4) - start).max() < 0.02
+    frame = np.arange(24.0).reshape(2, 3, 4)
+    moved = bias_structure.apply_drift(frame, np.array([1.0, 0.0]), 60905.0, 0.25, np.random.default_rng(1)) - frame
+    assert np.ptp(moved[0]) == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_array_equal(moved[1], 0.0)
+    assert moved[0, 0, 0] != 0.0
+    for wrong in ((-1.0, 60905.0, 0.25), (np.nan, 60905.0, 0.25), (1.0, 60905.0, 0.0)):
+        with pytest.raises(OutOfRange, match="bias drift"):
+            bias_structure.apply_drift(frame, *wrong, np.random.default_rng(1))
+
+
+def test_the_pixels_of_a_row_share_an_offset():
+    found = bias_structure.apply_row_noise(np.zeros((2, 5000, 3)), np.array([0.5, 2.0]), np.random.default_rng(3))
+    np.testing.assert_array_equal(found, np.repeat(found[..., :1], 3, axis=2))
+    assert found[..., 0].std(axis=1) == pytest.approx([0.5, 2.0], rel=0.04)
+    # Neither neighbouring rows nor the same row of the other amplifier have the same offset.
+    assert abs(np.corrcoef(found[0, 1:, 0], found[0, :-1, 0])[0, 1]) < 0.06
+    assert abs(np.corrcoef(found[0, :, 0], found[1, :, 0])[0, 1]) < 0.06
+    np.testing.assert_array_equal(bias_structure.apply_row_noise(found, 0.0, np.random.default_rng(3)), found)
+    with pytest.raises(OutOfRange, match="noise of rows"):
+        bias_structure.apply_row_noise(found, -1.0, np.random.default_rng(3))
+
+
 def test_injected_charge_comes_in_blocks():
     level = charge_injection.apply(np.zeros((1200, 50)), 15_000.0, 100, 200, 0.03, np.random.default_rng(1))
     out = charge_injection.apply_noise(level, 100, 200, 60.0, np.random.default_rng(2))

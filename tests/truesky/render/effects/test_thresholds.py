@@ -25,7 +25,9 @@ NX, NY = 8, DETECTOR.ny
 
 
 def database(**values):
-    """The mission with some of the camera's parameters replaced."""
+    """Return overrides of some of the camera's parameters. All quadrants are equal."""
+    equal = {key: MISSION.value(f"vis.{key}") for key in ("gain", "read_noise", "bias", "full_well")}
+    values = equal | values
     units = {key: MISSION.parameter(f"vis.{key.replace('__', '.')}").unit for key in values}
     return {f"vis.{key.replace('__', '.')}": (value, units[key]) for key, value in values.items()}
 
@@ -87,6 +89,8 @@ CASES = {
         scene(crosstalk_detectors=1e-4), neighbour_charge=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
     ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
+    "bias_drift": lambda x: replace(scene(bias_drift=0.1 * x), mjd=60905.0),
+    "row_noise": lambda x: scene(bias_row_noise=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
     "lens_ghosts": lambda x: replace(ground(), lights=star(1e7 * x), band=passbands.load("des_r")),
@@ -102,6 +106,8 @@ QUADRANTS = (
     "crosstalk",
     "detector_crosstalk",
     "bias_structure",
+    "bias_drift",
+    "row_noise",
     "readout_cosmic_rays",
 )
 
@@ -228,7 +234,7 @@ def test_a_quicklook_leaves_out_no_more_than_the_error_that_it_allows():
         return frame, {decision.name for decision in decisions if decision.applied}
 
     (quick, few), (_, drafted), (fine, needed) = (read(each) for each in (QUICKLOOK, DRAFT, SURVEY))
-    assert needed - few == {"pixel_area", "dark_current"}
+    assert needed - few == {"pixel_area", "dark_current", "row_noise"}
     assert needed == drafted
     noise, change = one.scene.pixel_noise, fine - quick
     assert 0.0 < np.sqrt(np.mean(change**2)) < QUICKLOOK.background * noise

@@ -90,7 +90,7 @@ def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
     ra, dec, angle = nominal.pointing(detector)
     centre = astrometry.centre(detector, astrometry.wcs(detector, ra, dec, angle))
     lon, lat = (float(x) for x in ecliptic(*centre))
-    start = 60905.0 + 1
+    start = nominal.DAY + 1
     values = {"mjd": [start], "lon": [lon], "lat": [lat], "east": [60.0], "north": [0.0], "mag": [18.0]}
     file = written(tmp_path / "one.parquet", values)
     one = nominal.rendered(detector, [], [], [], asteroids=ephemerides.read(file, "exposure").on_day)
@@ -108,7 +108,7 @@ def test_bright_bodies_shine_around_corners(tmp_path):
     detector = small("vis", "3-4", 256)
     ra, dec, angle = nominal.pointing(detector)
     system = astrometry.wcs(detector, ra, dec, angle)
-    start = 60905.0 + 1
+    start = nominal.DAY + 1
     lon, lat = ecliptic(*astrometry.sky_of_pixel(system, [127.5, 127.5, 127.5], [127.5, 500.0, 20.0]))
     values = {"mjd": [start] * 3, "lon": lon, "lat": lat, "east": [60.0, 0.0, 0.0], "north": [0.0] * 3}
     file = written(tmp_path / "bright.parquet", {**values, "mag": [12.0, 8.0, 21.0]})
@@ -136,7 +136,7 @@ def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
     detector = small("vis", "3-4", 256)
     system = astrometry.wcs(detector, *nominal.pointing(detector))
     lon, lat = ecliptic(*astrometry.sky_of_pixel(system, np.array([127.5]), np.array([-away])))
-    start, east = 60905.0 + 1, rate * 0.5 * nominal.TIME / 3600.0 / 3600.0 / np.cos(np.radians(lat))
+    start, east = nominal.DAY + 1, rate * 0.5 * nominal.TIME / 3600.0 / 3600.0 / np.cos(np.radians(lat))
     values = {"mjd": [start], "lon": lon - east, "lat": lat, "east": [rate], "north": [0.0], "mag": [5.0]}
     file = written(tmp_path / "beside.parquet", values)
     quiet = nominal.off(*nominal.COSMIC_RAYS)
@@ -354,7 +354,7 @@ def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
     system = astrometry.wcs(detector, *nominal.pointing(detector))
     lon, lat = (float(x) for x in ecliptic(*astrometry.centre(detector, system)))
     # The body is in the middle after a tenth of the exposure, so the middle of its trail is elsewhere.
-    when = 60906.0 + 0.1 * nominal.TIME / 86400.0
+    when = nominal.DAY + 1 + 0.1 * nominal.TIME / 86400.0
     values = {"mjd": [when], "lon": [lon], "lat": [lat], "east": [rate * np.cos(turn)], "north": [rate * np.sin(turn)]}
     file = written(tmp_path / "fast.parquet", {**values, "mag": [12.0]})
     quiet = nominal.off(*nominal.COSMIC_RAYS)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lake_schema.arrays import Bool
+from lake_schema.arrays import Bool, Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect, copy_frame
@@ -24,7 +24,11 @@ Segments = Sequence[tuple[int, int, bool]]
 
 
 def apply(
-    frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None, out: Frame | None = None
+    frame: Frame,
+    capacity: float | Float,
+    segments: Segments,
+    rng: np.random.Generator | None = None,
+    out: Frame | None = None,
 ) -> Frame:
     """Limit every pixel to its full well and move the excess charge along its column.
 
@@ -32,8 +36,8 @@ def apply(
     ----------
     frame : float array, shape (ny, nx)
         Electrons, whole numbers of 0 or more.
-    capacity : float
-        Full well in electrons, 1 or more.
+    capacity : float or float array, shape (n_segments, nx)
+        Full well in electrons, 1 or more: one for all pixels, or one for each segment and column.
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
         register is above).
@@ -55,15 +59,15 @@ def apply(
     return bleed(frame, capacity, segments, out)[0]
 
 
-def bleed(frame: Frame, capacity: float, segments: Segments, out: Frame | None = None) -> tuple[Frame, float]:
+def bleed(frame: Frame, capacity: float | Float, segments: Segments, out: Frame | None = None) -> tuple[Frame, float]:
     """Move charge above the full well along its column, and count the charge that leaves the detector.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons, 0 or more.
-    capacity : float
-        Full well in electrons, 1 or more.
+    capacity : float or float array, shape (n_segments, nx)
+        Full well in electrons, 1 or more: one for all pixels, or one for each segment and column.
     segments : sequence of (int, int, bool)
         Parts of every column that are read through one serial register, each (first row, last row + 1, True if the
         register is above). Rows outside all segments are unchanged.
@@ -83,36 +87,42 @@ def bleed(frame: Frame, capacity: float, segments: Segments, out: Frame | None =
     OutOfRange
         If `capacity` is less than 1, infinite or NaN, or if a segment is outside the frame.
     """
-    if not 1.0 <= capacity < np.inf:
-        raise OutOfRange("full well", capacity, 1.0, np.inf)
+    lowest = float(np.min(capacity))
+    if not (lowest >= 1.0 and np.max(capacity) < np.inf):
+        raise OutOfRange("full well", lowest, 1.0, np.inf)
     for first, past, _ in segments:
         if not 0 <= first <= past <= len(frame):
             raise OutOfRange("rows of a column", first if first < 0 else past, 0, len(frame))
     out = copy_frame(frame, out)
     highest = out.max(axis=0, initial=0.0)
-    if highest.max(initial=0.0) <= capacity:
+    if highest.max(initial=0.0) <= lowest:
         return out, 0.0
-    full, lost = float(np.floor(capacity)), 0.0
-    columns = np.flatnonzero(highest > full)
-    for first, past, register_above in segments:
+    full_wells, lost = np.floor(_of_segments(capacity, segments, out.shape[1])), 0.0
+    for (first, past, register_above), full in zip(segments, full_wells, strict=True):
         if past > first:
-            segment = out[first:past]
+            segment, columns = out[first:past], np.flatnonzero(highest > full)
             lost += _bleed_segment(segment[::-1] if register_above else segment, columns, full)
     return out, lost
 
 
+def _of_segments(capacity: float | Float, segments: Segments, nx: int) -> Float:
+    """Return the full well of each segment and column in electrons, shape (n_segments, nx)."""
+    return np.array(np.broadcast_to(capacity, (len(segments), nx)), float)
+
+
 @jit
-def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
+def _bleed_segment(segment: Any, columns: Any, full_wells: Any) -> float:
     """Let charge above the full well flow along the columns of one segment, in place, and return the electrons lost.
 
     A segment is the part of the columns that is read through one serial register, here below row 0. Charge that reaches
-    the register is lost. Only the columns with the indices `columns` are treated. `full` is the full well in electrons.
+    the register is lost. Only the columns with the indices `columns` are treated. `full_wells` is the full well of each
+    column in electrons.
     """
     n = segment.shape[0]
     down = np.empty(n)
     lost = 0.0
     for x in columns:
-        carried = 0.0
+        carried, full = 0.0, full_wells[x]
         for y in range(n):
             charge = segment[y, x]
             # Half of a pixel's charge above full well flows up (away from the serial register), the other half down.
@@ -134,34 +144,49 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
     return lost
 
 
-def saturated_pixels(frame: Frame, capacity: float) -> Bool:
+def saturated_pixels(frame: Frame, capacity: float | Float, segments: Segments) -> Bool:
     """Return a mask of the pixels at or above the full well.
 
     Parameters
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
-    capacity : float
-        Full well in electrons.
+    capacity : float or float array, shape (n_segments, nx)
+        Full well in electrons: one for all pixels, or one for each segment and column.
+    segments : sequence of (int, int, bool)
+        Parts of every column that are read through one serial register, as for `apply`.
 
     Returns
     -------
     bool array, shape (ny, nx)
-        True for pixels with at least `capacity` electrons, rounded down to a whole number.
+        True for pixels with at least their full well, rounded down to a whole number. Rows outside all segments are
+        False.
     """
-    return np.asarray(frame >= np.floor(capacity))
+    out, full_wells = np.zeros(frame.shape, bool), np.floor(_of_segments(capacity, segments, frame.shape[1]))
+    for (first, past, _), full in zip(segments, full_wells, strict=True):
+        out[first:past] = frame[first:past] >= full
+    return out
 
 
-def full_well(scene: Scene) -> float:
-    """Return the full well (largest charge of a pixel) of the scene's detector in electrons."""
-    return scene.value("full_well", "electron")
+def parameters(scene: Scene) -> tuple[float | Float, Segments]:
+    """Return the full well of a scene's detector in electrons, and the parts of its columns, as `apply` takes them.
+
+    The full well is one number if it is equal for all amplifiers, and else has the shape (n_segments, nx).
+    """
+    full_wells = scene.amplifier_values("full_well", "electron")
+    if not isinstance(full_wells, np.ndarray):
+        return full_wells, scene.column_segments
+    # Only detectors that are read in quadrants have several. The order is upper left (E), upper right (F), lower right
+    # (G), lower left (H).
+    upper_left, upper_right, lower_right, lower_left = full_wells
+    is_right = np.arange(scene.nx) >= scene.nx // 2
+    lower, upper = np.where(is_right, lower_right, lower_left), np.where(is_right, upper_right, upper_left)
+    return np.stack([lower, upper]), scene.column_segments
 
 
 def _contribution(scene: Scene) -> float:
     """Return the electrons above the full well in the brightest pixel; 0 if it is not full."""
-    return max(scene.brightest_electrons - full_well(scene), 0.0)
+    return max(scene.brightest_electrons - float(np.min(scene.amplifier_values("full_well", "electron"))), 0.0)
 
 
-EFFECT = Effect(
-    "bleeding", apply, lambda scene: (full_well(scene), scene.column_segments), _contribution, cost=5e-3, in_place=True
-)
+EFFECT = Effect("bleeding", apply, parameters, _contribution, cost=5e-3, in_place=True)

@@ -310,7 +310,7 @@ def _parameters(scene: Scene) -> tuple[tuple[float, float], float, float, float,
         np.sqrt(2.0 * max_noise / max(float(kernel(shift, softening).sum()), 1e-30)),
         scene.accuracy.shape / (_R2_GROWTH * max(shift, 1e-30)),
     )
-    return shifts, softening, scene.value("full_well", "electron"), float(threshold), scene.injection_rows
+    return shifts, softening, scene.full_well, float(threshold), scene.injection_rows
 
 
 def _contribution(scene: Scene) -> float:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import OutOfRange
+from lake_schema.mission.detector_overrides import DetectorPlace
 from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.readout import traps
@@ -36,6 +37,8 @@ _FLUX = 0.05
 _SHIFT = 0.036
 # Change of the ellipticity of a source by traps, in the pixel farthest from the amplifier, at the end of the mission.
 _SHAPE = 0.01
+# Julian year in days.
+_DAYS_PER_YEAR = 365.25
 # Numerical methods to follow charge over traps, from the fastest to the slowest: nine groups of traps by the charge
 # that reaches them, one sweep over all pixels, Heun's method, and four steps of Heun's method. Each row is (error e,
 # exponent p, method). Let d be the number of traps divided by that at the end of the mission. The error of a method is
@@ -159,11 +162,10 @@ def _best_sweeps(accuracy: Accuracy, traps_passed: float) -> tuple[float, Sweeps
 def silicon_traps(scene: Scene, direction: str) -> Traps:
     """Return the traps for one direction of transfer, "parallel" or "serial", from the mission database.
 
-    The density is that at the end of the mission times the parameter `cti.age`. This is the radiation damage since
-    launch, divided by the damage at the end of the mission. For the serial direction, the density is also multiplied by
-    the parameter `cti.serial_ratio`.
+    The density is that at the end of the mission times the age of the damage, `age`. For the serial direction, the
+    density is also multiplied by the parameter `cti.serial_ratio`.
     """
-    damage = scene.value("cti.age", "")
+    damage = age(scene)
     if direction == "serial":
         damage *= scene.value("cti.serial_ratio", "")
     species = range(1, _SPECIES + 1)
@@ -174,6 +176,21 @@ def silicon_traps(scene: Scene, direction: str) -> Traps:
         scene.value("cti.notch", "electron"),
         scene.value("cti.well_fill_power", ""),
     )
+
+
+def age(scene: Scene) -> float:
+    """Return the radiation damage at the date of an exposure, divided by the damage at the end of the mission.
+
+    It is the parameter `cti.age` at launch and grows by `cti.age_growth` with time: the number of traps is proportional
+    to the dose of protons. If the request sets `cti.age` but not `cti.age_growth`, it does not grow. Before the launch,
+    the damage is that at launch.
+    """
+    place = DetectorPlace(scene.detector.name if scene.detector is not None else "")
+    at_launch, growth = scene.value("cti.age", ""), scene.value("cti.age_growth", "1 / yr")
+    is_set, grows = (scene.mission.is_overridden(f"{scene.section}.cti.{key}", place) for key in ("age", "age_growth"))
+    if is_set and not grows:
+        return at_launch
+    return at_launch + growth * max(scene.mjd - scene.mission.value("svm.launch", "d"), 0.0) / _DAYS_PER_YEAR
 
 
 def apply_parallel_loss(
@@ -315,7 +332,7 @@ def _max_deferred(scene: Scene, direction: str) -> float:
         return 0.0
     layout = scene.layout
     transfers = layout.prescan_rows + layout.height if direction == "parallel" else layout.prescan + layout.width
-    packet = min(scene.brightest_electrons, scene.value("full_well", "electron"))
+    packet = min(scene.brightest_electrons, scene.full_well)
     return transfers * _transfer_loss(scene, direction) * packet
 
 

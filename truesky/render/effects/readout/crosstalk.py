@@ -120,7 +120,7 @@ def coefficients(scene: Scene) -> Frame:
 
 
 def _contribution(scene: Scene) -> float:
-    full = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    full = min(scene.brightest_electrons, scene.full_well + scene.sky_electrons)
     return float(np.abs(coefficients(scene)).max()) * full
 
 

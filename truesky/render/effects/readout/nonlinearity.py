@@ -179,7 +179,7 @@ def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
 
 
 def _contribution(scene: Scene) -> float:
-    brightest = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    brightest = min(scene.brightest_electrons, scene.full_well + scene.sky_electrons)
     curve = parameters(scene)
     light = np.full(max(np.size(number) for number in curve), brightest)
     return float(np.max(light - apply(light, *curve)))

@@ -86,7 +86,26 @@ def test_full_columns_and_frames():
     out, lost = bleed(calm, FULL, 2)
     assert lost == 0
     np.testing.assert_array_equal(out, calm)
-    assert bleeding.saturated_pixels(out, FULL).all()
+    assert bleeding.saturated_pixels(out, FULL, runs(len(out), 2, 0)).all()
+
+
+def test_each_segment_and_column_has_its_own_full_well():
+    """A frame whose parts have different full wells bleeds as if each part were alone."""
+    frame = np.rint(10 ** np.random.default_rng(4).uniform(1, 3.5, (40, 6)))
+    parts, wells = runs(40, 2), np.array([[900.0, 900.0, 1e3, 1e3, 1e3, 1100.0], [800.0] * 3 + [1200.0] * 3])
+    found, lost = bleeding.bleed(frame, wells, parts)
+    expected, total = np.zeros_like(frame), 0.0
+    for (first, past, above), row in zip(parts, wells, strict=True):
+        for column_number, well in enumerate(row):
+            alone = bleeding.bleed(frame[first:past, [column_number]], float(well), [(0, past - first, above)])
+            expected[first:past, [column_number]], total = alone[0], total + alone[1]
+    np.testing.assert_array_equal(found, expected)
+    assert lost == total > 0
+    full = bleeding.saturated_pixels(found, wells, parts)
+    np.testing.assert_array_equal(full, found >= np.repeat(wells, 20, axis=0))
+    assert 0 < full.sum() < full.size
+    with pytest.raises(OutOfRange, match="full well"):
+        bleeding.bleed(frame, np.where(wells == 800.0, np.nan, wells), parts)
 
 
 def test_length_of_a_trail():
@@ -96,7 +115,7 @@ def test_length_of_a_trail():
         light = np.exp(-((x - 15) ** 2 + (y - 1000) ** 2) / (2 * 1.0**2))
         frame = np.rint(electrons * light / light.sum())
         out, lost = bleed(frame, 2e5, 1)
-        rows = bleeding.saturated_pixels(out, 2e5).sum() / 5
+        rows = bleeding.saturated_pixels(out, 2e5, runs(len(out), 1, 0)).sum() / 5
         assert lost == 0
         assert rows == pytest.approx(electrons * 0.95 / 2e5 / 5, rel=0.3)
 

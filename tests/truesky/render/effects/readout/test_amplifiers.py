@@ -18,6 +18,7 @@ from truesky.render.products import fits_files, headers, read_back
 FRAME = np.random.default_rng(1).uniform(0.0, 1e5, (4, 30, 40))
 GAIN = "electron / adu"
 UNITS = {"gain": GAIN, "bias": "adu", "read_noise": "electron", "bias_offset": "adu", "nonlinearity.high": ""}
+VALUES = ("vis.gain", "vis.read_noise", "vis.bias", "vis.full_well")
 OWN = {
     "vis.gain.E": (3.0, GAIN), "vis.gain@3-4.H": (4.0, GAIN), "vis.bias.F": (700.0, "adu"),
     "vis.read_noise.G": (40.0, "electron"), "vis.dark_current@3-4": (0.05, "electron / (s pix)"),
@@ -58,11 +59,12 @@ def test_the_camera_and_the_mission_name_the_same_places():
 
 
 def test_a_scene_without_values_of_its_own_has_numbers():
-    scene = Scene(MISSION, "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
+    alike = resolve(overrides={key: (MISSION.value(key), MISSION.parameter(key).unit) for key in VALUES})
+    scene = Scene(alike, "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
     for key, unit in UNITS.items():
         assert scene.amplifier_values(key, unit) == scene.value(key, unit)
         assert type(scene.amplifier_values(key, unit)) is float
-    one = Scene(resolve(overrides=OWN), "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
+    one = Scene(alike.with_overrides(OWN), "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
     np.testing.assert_array_equal(one.amplifier_values("gain", GAIN), [3.0, 3.48, 3.48, 4.0])
     assert one.dark_rate / scene.dark_rate == pytest.approx(0.05 / MISSION.value("vis.dark_current"))
     # The quietest amplifier tells what is noticed.
@@ -72,10 +74,11 @@ def test_a_scene_without_values_of_its_own_has_numbers():
 
 def test_a_frame_is_read_with_them_and_says_so(tmp_path):
     """A bias in which every amplifier has its own level, noise and gain; its file, and the file's electrons."""
-    mission = resolve(overrides=OWN)
-    detector = small("vis", "3-4", 256)
-    quiet = {"sky": 0.0, "seconds": 0.0, "kind": "bias", "forced": nominal.off(*nominal.COSMIC_RAYS, "bias_structure")}
-    usual = nominal.rendered(detector, [], [], [], **quiet)
+    alike = resolve(overrides={key: (MISSION.value(key), MISSION.parameter(key).unit) for key in VALUES})
+    mission, detector = alike.with_overrides(OWN), small("vis", "3-4", 256)
+    forced = nominal.off(*nominal.COSMIC_RAYS, "bias_structure", "bias_drift", "row_noise")
+    quiet = {"sky": 0.0, "seconds": 0.0, "kind": "bias", "forced": forced}
+    usual = nominal.rendered(detector, [], [], [], mission=alike, **quiet)
     one = nominal.rendered(detector, [], [], [], mission=mission, **quiet)
     gain, bias, noise = (3.0, 3.48, 3.48, 4.0), (1000.0, 700.0, 1000.0, 1000.0), (4.4, 4.4, 40.0, 4.4)
     for q in range(4):
