@@ -23,6 +23,7 @@ from truesky.render.effects.readout import bias_structure, charge_transfer, nonl
 from truesky.render.exposure import truth_maps
 from truesky.render.exposure.rendered_detector import RenderedDetector, random_identity
 from truesky.render.products import calibration_cards
+from truesky.render.psf.centroids import window_rms
 from truesky.request import accuracy
 
 # The saturation level in the header is the mean value of a full pixel minus this number of standard deviations of the
@@ -307,6 +308,7 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *((("CLOUDS", exposure.clouds, "[mag] extinction by clouds, in ZEROPNT"),) if exposure.clouds else ()),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] PSF FWHM including the pixel"),
+        *((("PSFWIN", window_rms(rendered.psf), "[arcsec] rms of window of centroids"),) if rendered.psf else ()),
         ("SEEING", exposure.seeing, "[arcsec] FWHM of the air at zenith and 500 nm"),
         *((("SEEIMAGE", scene.seeing, "[arcsec] FWHM in this band, with telescope"),) if scene.seeing else ()),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
