@@ -2,8 +2,9 @@
 
 Notes
 -----
-Positions are windowed centroids. The window is a Gaussian whose FWHM is the half-light diameter of a point source. The
-columns psf_x and psf_y of the table `rendered_truth` (centroid offsets of the PSF) are defined with the same window.
+Positions are windowed centroids. The window is a Gaussian, whose rms the header states (PSFWIN). The columns psf_x and
+psf_y of the table `rendered_truth` (centroid offsets of the PSF) are defined with the same window. Moments have a window
+whose FWHM is the half-light diameter of a point source, and so have centroids if the header does not state a window.
 
 References
 ----------
@@ -223,9 +224,11 @@ def measure_stars(frame: Frame, sources: Reference, noise: float) -> StarMeasure
     flux = sources.expected[index]
     half = _half_light(growth, flux, radii)
     window = 2.0 * half / FWHM
-    cx, cy, xx, yy, xy, weight = _windowed_moments(cuts, x - first_column, y - first_row, window)
-    variance = noise**2 + np.maximum(flux, 0.0) / (4.0 * np.pi * window**2)
-    error = np.sqrt(8.0 * np.pi * variance) * window**2 / np.maximum(weight, 1.0)
+    centroid_window = float(frame.header.get("PSFWIN", frame.scale * window)) / frame.scale
+    cx, cy, *_, weight = _windowed_moments(cuts, x - first_column, y - first_row, centroid_window)
+    variance = noise**2 + np.maximum(flux, 0.0) / (4.0 * np.pi * centroid_window**2)
+    error = np.sqrt(8.0 * np.pi * variance) * centroid_window**2 / np.maximum(weight, 1.0)
+    _, _, xx, yy, xy, _ = _windowed_moments(cuts, x - first_column, y - first_row, window)
     size = np.sqrt(0.5 * np.maximum(xx + yy, 0.0))
     trace = np.where(xx + yy > 0.0, xx + yy, np.nan)
     snr = flux / np.sqrt(np.maximum(flux, 0.0) + 4.0 * np.pi * window**2 * noise**2)
