@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import scipy
 import sep
 from scipy.spatial import cKDTree
 
@@ -52,8 +53,8 @@ _PARTS = 8
 # Pixels within this radius of a star, in pixels, are never masked or replaced by the mean profile, because their light
 # depends strongly on the star's position within the pixel.
 _CORE = 3.0
-# A pixel is contaminated if it exceeds 1.5 times the median profile of stars by more than this number of standard
-# deviations.
+# A pixel is contaminated if it exceeds 1.5 times the median profile of stars, in this pixel or in one of its neighbours,
+# by more than this number of standard deviations.
 _HIT = 5.0
 
 
@@ -316,10 +317,14 @@ def _replace_contaminated(cuts: Float, neighbour_mask: Bool, flux: Float, noise:
         return cuts
     typical = np.maximum(np.median(cuts / flux[:, None, None], axis=0), 0.0)
     expected = flux[:, None, None] * typical
+    # Stars differ by up to half a pixel in their position within a pixel. Where the profile is steep, a pixel may be as
+    # bright as its neighbours are in the median profile. Without this allowance, stars of VIS lose 0.4 to 1.1 % of their
+    # light.
+    largest = flux[:, None, None] * scipy.ndimage.maximum_filter(typical, 3)
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
     # Do not replace pixels of the core: their values depend on the star's position within the pixel.
     core = np.hypot(axis, axis[:, None]) < _CORE
-    hit = (cuts > expected + _HIT * np.sqrt(noise**2 + expected) + 0.5 * expected) & ~core
+    hit = (cuts > largest + _HIT * np.sqrt(noise**2 + largest) + 0.5 * largest) & ~core
     return np.where(hit | neighbour_mask, expected, cuts)
 
 
