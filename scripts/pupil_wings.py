@@ -6,10 +6,10 @@ Each number is the fraction of a star's light per arcsec^2 at a radius, averaged
 radii, and over the photons of a band for constant f_nu. Aberrations, jitter and charge diffusion are not included: they
 change the light beyond 1" by a few per cent.
 
-The Fourier transform A of the clear pupil is a sum of closed forms: that of the aperture stop, minus that of the
-decentred central stop, minus those of the visible parts of three spider bars. The fraction |A|^2 / (lambda^2 S) of the
-light arrives per steradian, where S is the clear area. Near the star, the sum includes the interference of all parts.
-Farther out, the light of rings and spikes simply adds up on average::
+The Fourier transform A of the clear pupil is a sum of closed forms: the transform of the aperture stop, minus the
+transforms of the decentred central stop and of the visible parts of three spider bars. The fraction
+|A|^2 / (lambda^2 S) of the light arrives per steradian; S is the clear area. Near the star, the sum includes the
+interference of all parts. Farther out, the light of rings and spikes simply adds up on average::
 
     rings    lambda P / (4 pi^3 S theta^3)                              P: perimeter of both circles
     spikes   w^2 l / (pi lambda S theta) sinc^2(w theta / lambda)       of each bar, width w, visible length l
@@ -62,18 +62,18 @@ class Pupil:
         blocked = sum(self.width * length for _, length, _, _ in self.bars)
         self.area = np.pi * (self.radius**2 - self.stop**2) - blocked
 
-    def near(self, theta: float, wavelength: float) -> float:
+    def light_near(self, theta: float, wavelength: float) -> float:
         """Return the mean fraction of the light per steradian at theta (radian) for a wavelength (mm)."""
         turn, q = (np.arange(_ANGLES) + 0.5) * np.pi / _ANGLES, 2.0 * np.pi * theta / wavelength
         qx, qy = q * np.cos(turn), q * np.sin(turn)
         total: Array = _circle(self.radius, q) - _circle(self.stop, q) * np.exp(-1j * qy * self.stop_y)
         for angle, length, x, y in self.bars:
             across, along = qy * np.cos(angle) - qx * np.sin(angle), qx * np.cos(angle) + qy * np.sin(angle)
-            bar = self.width * length * np.sinc(0.5 * self.width * across / np.pi) * np.sinc(0.5 * length * along / np.pi)
-            total = total - bar * np.exp(-1j * (qx * x + qy * y))
+            bar = np.sinc(0.5 * self.width * across / np.pi) * np.sinc(0.5 * length * along / np.pi)
+            total = total - self.width * length * bar * np.exp(-1j * (qx * x + qy * y))
         return float(np.mean(np.abs(total) ** 2)) / (wavelength**2 * self.area)
 
-    def far(self, theta: float, wavelength: float) -> float:
+    def light_far(self, theta: float, wavelength: float) -> float:
         """Return the same without interference of the parts of the pupil."""
         perimeter = 2.0 * np.pi * (self.radius + self.stop)
         rings = wavelength * perimeter / (4.0 * np.pi**3 * self.area * theta**3)
@@ -102,7 +102,7 @@ def profile(pupil: Pupil, waves: Float, radius: float) -> float:
     for wavelength in waves.tolist():
         limit = _NEAR * wavelength / (2.0 * pupil.radius)
         for theta in (np.sqrt(squares) * _ARCSEC).tolist():
-            values.append(pupil.near(theta, wavelength) if theta < limit else pupil.far(theta, wavelength))
+            values.append(pupil.light_near(theta, wavelength) if theta < limit else pupil.light_far(theta, wavelength))
     return float(np.mean(values)) * _ARCSEC**2
 
 

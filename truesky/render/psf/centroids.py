@@ -71,12 +71,11 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
     The windowed centroid is defined by an iteration. It is carried out for the mean colour at the detector's centre;
     other colours and places follow from one more step. For VIS and NISP the error is below 0.1 mas.
     """
-    window, phases = psf.keep(("centroids",), lambda: _moments_by_phase(psf))
+    window, centres, moments = psf.keep(("centroids",), lambda: _moments_by_phase(psf))
     total = np.zeros((2, len(weights)))
-    for centre, moments in phases:
-        shift = _newton_step(matrices.matmul(weights, moments).T, window)
-        total += centre[:, None] + shift
-    x, y = total / len(phases)
+    for centre, of_phase in zip(centres.T, moments, strict=True):
+        total += centre[:, None] + _newton_step(matrices.matmul(weights, of_phase).T, window)
+    x, y = total / len(moments)
     return x, y
 
 
@@ -97,8 +96,8 @@ def mean_centroid(image: Array, samples: int, window: float) -> Float:
     float array, shape (2,)
         Mean over positions within a pixel.
     """
-    plane, count = _prepared([_averaged(image, samples)], samples, window)
-    return np.mean([_centre(plane[0], count, window, phase) for phase in np.ndindex(count, count)], axis=0)
+    (plane,), count = _double_if_narrow([_average_over_pixels(image, samples)], samples, window)
+    return np.asarray(_centres(_by_phase(plane, count), window).mean(axis=1))
 
 
 def _choose_window(psf: Psf) -> float:
@@ -109,35 +108,32 @@ def _choose_window(psf: Psf) -> float:
     # averaged once more, because aperture photometry treats the light as uniform within a pixel.
     image = np.sum(planes[: _colour_count(psf)], axis=0)
     for _ in range(2 if psf.intra_pixel is not None else 1):
-        image = _averaged(image, samples)
+        image = _average_over_pixels(image, samples)
     return _half_light_diameter(image, samples) / _FWHM * psf.pixel_scale
 
 
-def _moments_by_phase(psf: Psf) -> tuple[float, list[tuple[Float, Float]]]:
-    """Return the rms of the window (pixels) and, for each position within a pixel, a centre and moments around it.
+def _moments_by_phase(psf: Psf) -> tuple[float, Float, Float]:
+    """Return the rms of the window (pixels), and centres [2, p] and moments [p, planes, 6] for p positions in a pixel.
 
-    The positions are those for which the pixels lie on samples of the PSF images. The centre (x, y) is the centroid of
-    a source of the mean colour at the centre of the detector. The moments [planes, 6] are those of all basis images.
+    At these positions, the pixels lie on samples of the PSF images. A centre (x, y) is the centroid of a source of the
+    mean colour at the centre of the detector. The basis images have moments around it.
     """
     planes, samples = _sample_planes(psf)
     window = window_rms(psf) / psf.pixel_scale
-    # A PSF without a window of its own may come from a user's file, with its light away from the middle.
+    # A PSF without a fixed window may come from a user's file, with its light away from the middle.
     reach = samples * (_HALF if psf.window is None else int(np.ceil(_REACH * window)) + 2)
     planes = [_middle(plane, reach) for plane in planes]
     if psf.intra_pixel is not None:
-        planes = [_averaged(plane, samples) for plane in planes]
-    planes, samples = _prepared(planes, samples, window)
+        planes = [_average_over_pixels(plane, samples) for plane in planes]
+    planes, samples = _double_if_narrow(planes, samples, window)
     mean = np.sum(planes[: _colour_count(psf)], axis=0, dtype=float)
-    out = []
-    for phase in np.ndindex(samples, samples):
-        centre = _centre(mean, samples, window, phase)
-        moments = [_pixel_moments(plane, samples, window, phase, centre) for plane in planes]
-        out.append((centre, np.stack(moments)))
-    return window, out
+    centres = _centres(_by_phase(mean, samples), window)
+    moments = [_pixel_moments(_by_phase(plane, samples), window, centres) for plane in planes]
+    return window, centres, np.moveaxis(np.stack(moments), -1, 0)
 
 
-def _prepared(planes: list[Array], samples: int, window: float) -> tuple[list[Array], int]:
-    """Return images and their samples per pixel, with twice as many samples if the window (pixels) is narrow."""
+def _double_if_narrow(planes: list[Array], samples: int, window: float) -> tuple[list[Array], int]:
+    """Return images and their samples per pixel, with doubled sampling if the window (pixels) is narrow."""
     if window >= _NARROW:
         return planes, samples
     at = np.arange(-_INTERPOLATION, _INTERPOLATION) + 0.5
@@ -157,22 +153,40 @@ def _prepared(planes: list[Array], samples: int, window: float) -> tuple[list[Ar
     return doubled, 2 * samples
 
 
-def _centre(plane: Array, samples: int, window: float, phase: tuple[int, ...]) -> Float:
-    """Return the windowed centroid (x, y) in pixels from the middle, of the pixels with this `phase` (column, row)."""
-    centre = np.zeros(2)
+def _by_phase(plane: Array, samples: int) -> tuple[Float, Float, Float]:
+    """Return the values of pixels [p, n, n] for p positions of a source within a pixel, and their x and y [p, n].
+
+    x and y are measured in pixels from the middle of the image, which has `samples` samples per pixel. p is the square
+    of `samples`: the pixels lie on samples.
+    """
+    middle = len(plane) // 2
+    reach = (middle - samples + 1) // samples
+    first = np.arange(samples) - samples // 2
+    index = middle + first[:, None] + samples * np.arange(-reach, reach + 1)
+    along = (index - middle) / samples
+    values = np.asarray(plane, float)[index[:, None, :, None], index[None, :, None, :]]
+    return (
+        values.reshape(-1, *values.shape[-2:]), np.tile(along, (samples, 1)), np.repeat(along, samples, axis=0),
+    )  # fmt: skip
+
+
+def _centres(pixels: tuple[Float, Float, Float], window: float) -> Float:
+    """Return the windowed centroids (x, y) [2, p] of the pixels of `_by_phase`; (0, 0) without light in the window."""
+    centres = np.zeros((2, len(pixels[0])))
     for _ in range(_ITERATIONS):
-        moments = _pixel_moments(plane, samples, window, phase, centre)
+        moments = _pixel_moments(pixels, window, centres)
         zeroth, x, y, xx, xy, yy = moments
-        if not zeroth > 0.0:
-            return np.zeros(2)
-        slope = np.array([zeroth - xx / window**2, zeroth - yy / window**2])
+        has_light = zeroth > 0.0
+        safe = np.where(has_light, zeroth, 1.0)
         # Far from the light the first moments grow with the distance, and the step of SourceExtractor is used.
-        is_near = slope.min() > 0.0 and slope.prod() > (xy / window**2) ** 2
-        step = _newton_step(moments, window) if is_near else 2.0 * np.array([x, y]) / zeroth
-        centre = centre + np.clip(step, -window, window)
-        if np.abs(step).max() < _CONVERGED:
+        a, c = zeroth - xx / window**2, zeroth - yy / window**2
+        is_near = (a > 0.0) & (c > 0.0) & (a * c > (xy / window**2) ** 2)
+        newton = _newton_step(np.where(is_near, moments, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])[:, None]), window)
+        step = np.where(is_near, newton, 2.0 * np.stack([x, y]) / safe)
+        centres = np.where(has_light, centres + np.clip(step, -window, window), 0.0)
+        if np.abs(np.where(has_light, step, 0.0)).max() < _CONVERGED:
             break
-    return centre
+    return centres
 
 
 def _newton_step(moments: Float, window: float) -> Float:
@@ -206,7 +220,7 @@ def _middle(plane: Array, reach: int) -> Array:
     return plane[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
 
 
-def _averaged(plane: Array, samples: int) -> Float:
+def _average_over_pixels(plane: Array, samples: int) -> Float:
     return _average_over_pixel(_average_over_pixel(plane, samples, 0), samples, 1)
 
 
@@ -252,20 +266,17 @@ def _half_light_diameter(plane: Array, samples: int) -> float:
     return low + high
 
 
-def _pixel_moments(plane: Array, samples: int, window: float, phase: tuple[int, ...], centre: Float) -> Float:
-    """Return the sums over pixels of light times window times 1, x, y, x^2, x y and y^2 (six numbers).
+def _pixel_moments(pixels: tuple[Float, Float, Float], window: float, centres: Float) -> Float:
+    """Return sums over pixels of light times window times 1, x, y, x^2, x y and y^2: [6, p] for p sets of pixels.
 
-    x and y are measured in pixels from `centre`, which is relative to the middle of the image. The window is a Gaussian
-    about the centre with an rms of `window` pixels. The image has `samples` samples per pixel; every sample with the
-    number `phase` (column, row) modulo `samples` from the middle is a pixel.
+    `pixels` is a result of `_by_phase`. x and y are measured in pixels from `centres`, shape (2, p). The window is a
+    Gaussian about the centre with an rms of `window` pixels.
     """
-    middle = len(plane) // 2
-    factors, cuts = [], []
-    for axis in (0, 1):
-        index = np.arange((middle + phase[axis]) % samples, len(plane), samples)
-        at = (index - middle) / samples - centre[axis]
-        factors.append(np.exp(-0.5 * (at / window) ** 2) * at ** np.arange(3)[:, None])
-        cuts.append(slice(index[0], None, samples))
+    values, *axes = pixels
+    across, up = (
+        np.exp(-0.5 * (at / window) ** 2)[:, None] * at[:, None] ** np.arange(3)[:, None]
+        for at in (axis - centre[:, None] for axis, centre in zip(axes, centres, strict=True))
+    )
     # m[i, j] is the sum of light times window times y^i x^j.
-    m = matrices.matmul(matrices.matmul(factors[1], np.asarray(plane[cuts[1], cuts[0]], float)), factors[0].T)
-    return np.array([m[0, 0], m[0, 1], m[1, 0], m[0, 2], m[1, 1], m[2, 0]])
+    m = np.einsum("pki,ipj->kjp", up, np.einsum("pil,pjl->ipj", values, across))
+    return np.stack([m[0, 0], m[0, 1], m[1, 0], m[0, 2], m[1, 1], m[2, 0]])

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import scipy
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
@@ -309,8 +308,8 @@ def _planes(
         # across the detector are only one per cent of its light, so the variances averaged over the wavelengths are
         # accurate enough for them.
         blur = tuple(np.mean(blurs, axis=0).tolist())
-        # The trace of a spectrum states a position for each wavelength, so each wavelength is centred by itself. An image
-        # is centred as a whole: its centroid depends on the colour of the source.
+        # The trace of a spectrum states a position for each wavelength, so each wavelength is centred. In an image,
+        # the light of the whole band is centred, and the centroid depends on the colour of the source.
         groups = waves[:, None] if light == _SPECTRA else waves[None]
         tilted = [
             [centre_wavefront(nm, group, camera_sampling, (sampling, window), blur, mission) for group in groups]
@@ -467,8 +466,8 @@ def centre_wavefront(
 ) -> Float:
     """Add a tilt to a wavefront, so that the centroid of the PSF lies on the middle sample of its image.
 
-    The centroid is measured in a Gaussian window, on the blurred image averaged over pixels, and averaged over positions
-    within a pixel (psf/centroids.py).
+    The centroid is measured in a Gaussian window on the blurred image with pixels. It is the mean over positions within
+    a pixel (psf/centroids.py).
 
     Parameters
     ----------

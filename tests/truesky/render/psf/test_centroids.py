@@ -90,7 +90,9 @@ def core_of_psf(section, name, band):
     blurs = [euclid._blur_variances(detector, float(wave), MISSION) for wave in waves]
     nm = euclid.wavefront(*euclid._field_position(detector, 0.0, 0.0, MISSION), section, MISSION)
     nm = euclid.centre_wavefront(nm, waves, camera, (scale, window), tuple(np.mean(blurs, axis=0).tolist()), MISSION)
-    images = [euclid._plane(nm, float(wave), camera, scale, blur, MISSION) for wave, blur in zip(waves, blurs, strict=True)]
+    images = [
+        euclid._plane(nm, float(wave), camera, scale, blur, MISSION) for wave, blur in zip(waves, blurs, strict=True)
+    ]
     none = np.zeros((0, *images[0].shape), np.float32)
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
     planes = model.Planes(waves, np.stack(images), none, half, samples=camera.samples)
@@ -155,7 +157,7 @@ def test_the_window_is_that_of_the_mission_or_half_of_the_light():
 
 
 def test_a_wider_window_moves_the_centroid_of_coma():
-    """The light of a faint companion counts fully only in a wide window, where the centroid is the mean of the light."""
+    """The light of a faint companion counts fully only in a wide window, whose centroid is the mean of the light."""
     psf = psf_of(shifted(0.0, 0.0, sigma=0.7) + np.float32(0.1) * shifted(2.5, 0.0, sigma=0.7))
     found = [offsets(replace(psf, window=window), np.ones((1, 1)))[0][0] for window in (0.1, 0.2, 1.0)]
     assert found[0] < 0.5 * found[1]

@@ -28,7 +28,7 @@ _MAGNITUDE = 1.0857
 _APERTURE_FRACTION = 0.8
 # With fewer measured stars than this number, the check is not applicable.
 _MIN_STARS = 8
-# Index, in the list of apertures, of the widest one that is used for total light; beyond it, the light is that of the wings.
+# Index, in the list of apertures, of the widest one that is used for total light, which the wings complete.
 # In wider apertures the error of the sky dominates.
 _JOIN_APERTURE = -3
 # Stars whose brightest pixel is above this fraction of the saturation level are not used, because of nonlinearity.

@@ -3,8 +3,8 @@
 Notes
 -----
 Positions are windowed centroids. The window is a Gaussian, whose rms the header states (PSFWIN). The columns psf_x and
-psf_y of the table `rendered_truth` (centroid offsets of the PSF) are defined with the same window. Moments have a window
-whose FWHM is the half-light diameter of a point source, and so have centroids if the header does not state a window.
+psf_y of the table `rendered_truth` (centroid offsets of the PSF) are defined with the same window. Moments have a
+window whose FWHM is the half-light diameter of a point source, and so have centroids if the header states no window.
 
 References
 ----------
@@ -53,7 +53,7 @@ _PARTS = 8
 # Pixels within this radius of a star, in pixels, are never masked or replaced by the mean profile, because their light
 # depends strongly on the star's position within the pixel.
 _CORE = 3.0
-# A pixel is contaminated if it exceeds 1.5 times the median profile of stars, in this pixel or in one of its neighbours,
+# A pixel is contaminated if it exceeds 1.5 times the median profile of stars, in this pixel or one of its neighbours,
 # by more than this number of standard deviations.
 _HIT = 5.0
 
@@ -317,9 +317,8 @@ def _replace_contaminated(cuts: Float, neighbour_mask: Bool, flux: Float, noise:
         return cuts
     typical = np.maximum(np.median(cuts / flux[:, None, None], axis=0), 0.0)
     expected = flux[:, None, None] * typical
-    # Stars differ by up to half a pixel in their position within a pixel. Where the profile is steep, a pixel may be as
-    # bright as its neighbours are in the median profile. Without this allowance, stars of VIS lose 0.4 to 1.1 % of their
-    # light.
+    # Stars differ by up to half a pixel in their position within a pixel. On a steep profile, a pixel may be as bright
+    # as its neighbours are in the median profile. Without this allowance, stars of VIS lose 0.4 to 1.1 % of their light.
     largest = flux[:, None, None] * scipy.ndimage.maximum_filter(typical, 3)
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
     # Do not replace pixels of the core: their values depend on the star's position within the pixel.

@@ -108,11 +108,11 @@ class Wings:
 
     def profile(self, radius: Float) -> Float:
         """Return the fraction of the total light in a pixel at each radius (pixels, above 0)."""
-        beyond = self.shape[-1] * (radius / self.radii[-1]) ** -self.slope
+        outer = self.shape[-1] * (radius / self.radii[-1]) ** -self.slope
         if len(self.radii) == 1:
-            return np.asarray(self.strength * beyond)
+            return np.asarray(self.strength * outer)
         within = np.exp(np.interp(np.log(radius), np.log(self.radii), np.log(self.shape)))
-        return np.asarray(self.strength * np.where(radius > self.radii[-1], beyond, within))
+        return np.asarray(self.strength * np.where(radius > self.radii[-1], outer, within))
 
     def fraction_beyond(self, radius: float) -> float:
         """Return the fraction of the total light beyond a radius in pixels; 0 beyond the end of the wings."""
@@ -174,7 +174,7 @@ def read_table(path: Path = TABLE) -> dict[str, tuple[tuple[float, float], ...]]
 def typical(frame: Frame) -> Wings:
     """Return typical wings of a ground telescope, or of Euclid in the filter of the frame, with their error.
 
-    The wings of Euclid are those of the table; beyond it they fall as r^-3.
+    The wings of Euclid are in a table; beyond its last radius they fall as r^-3.
     """
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
