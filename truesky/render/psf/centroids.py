@@ -109,7 +109,7 @@ def _choose_window(psf: Psf) -> float:
     image = np.sum(planes[: _colour_count(psf)], axis=0)
     for _ in range(2 if psf.intra_pixel is not None else 1):
         image = _average_over_pixels(image, samples)
-    return _half_light_diameter(image, samples) / _FWHM * psf.pixel_scale
+    return float(_half_light_diameter(image, samples) / _FWHM * psf.pixel_scale)
 
 
 def _moments_by_phase(psf: Psf) -> tuple[float, Float, Float]:
@@ -197,7 +197,7 @@ def _newton_step(moments: Float, window: float) -> Float:
     """
     zeroth, x, y, xx, xy, yy = moments
     a, b, c = zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2
-    return np.stack([c * x - b * y, a * y - b * x]) / (a * c - b * b)
+    return np.asarray(np.stack([c * x - b * y, a * y - b * x]) / (a * c - b * b))
 
 
 def _sample_planes(psf: Psf) -> tuple[list[Array], int]:

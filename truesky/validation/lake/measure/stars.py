@@ -318,7 +318,7 @@ def _replace_contaminated(cuts: Float, neighbour_mask: Bool, flux: Float, noise:
     typical = np.maximum(np.median(cuts / flux[:, None, None], axis=0), 0.0)
     expected = flux[:, None, None] * typical
     # Stars differ by up to half a pixel in their position within a pixel. On a steep profile, a pixel may be as bright
-    # as its neighbours are in the median profile. Without this allowance, stars of VIS lose 0.4 to 1.1 % of their light.
+    # as its neighbours are in the median profile. Otherwise stars of VIS lose 0.4 to 1.1 % of their light.
     largest = flux[:, None, None] * scipy.ndimage.maximum_filter(typical, 3)
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
     # Do not replace pixels of the core: their values depend on the star's position within the pixel.
