@@ -74,6 +74,8 @@ def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
     detector = detectors.detector(scene.name, scenes.SPACE[scene.name][0], mission)
     waves = scenes.scene_psf(scene, 1).planes.wavelength  # type: ignore[union-attr]
     blurs = [euclid._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
+    mean_blur = tuple(np.mean(blurs, axis=0).tolist())
+    window = euclid.centroid_window(scene.name, scenes.SPACE[scene.name][1], mission)
     sign = -1 if detector.upside_down else 1
 
     def compute_psf(place: tuple[float, float]) -> Float:
@@ -81,7 +83,7 @@ def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
             *euclid._field_position(detector, sign * place[0], sign * place[1], mission), detector.section, mission
         )
         scale = detector.pixel_scale / sampled.samples
-        nm = euclid.centre_wavefront(nm, waves, sampled, scale, mission)
+        nm = euclid.centre_wavefront(nm, waves, sampled, (scale, window), mean_blur, mission)
         core = replace(sampled, transform=sampled.core_transform, side=sampled.core_side)
         planes = [euclid._plane(nm, float(w), core, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]

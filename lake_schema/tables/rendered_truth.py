@@ -57,8 +57,21 @@ RENDERED_TRUTH = Table(
         Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),
         _trail("x", "it moves by, with (x, y) in the middle; of very long trails each row is of the part near"),
         _trail("y", "the same along the rows' axis"),
-        _centroid("x", "windowed centroid of a point of its colour there, minus x; null where light is spread out"),
+        _centroid(
+            "x",
+            "centroid of a point of its colour there, in a Gaussian window of the rms `psf_window`, minus x; mean over "
+            "the positions within a pixel; null if light is dispersed",
+        ),
         _centroid("y", "the same along the rows' axis"),
+        Column(
+            "psf_window",
+            "float64",
+            "arcsec",
+            "phys.angSize;instr.det.psf",
+            "rms of the Gaussian window of psf_x and psf_y, as PSFWIN of the header",
+            0.0,
+            nullable=True,
+        ),
         Column(
             "mag",
             "float64",

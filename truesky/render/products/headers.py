@@ -26,6 +26,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.exposure import truth_maps
 from truesky.render.exposure.rendered_detector import RenderedDetector, random_identity
 from truesky.render.products import calibration_cards
+from truesky.render.psf.centroids import window_rms
 from truesky.render.sky import ice
 from truesky.request import accuracy
 
@@ -321,6 +322,7 @@ def _common_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
         *_ageing_cards(rendered),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] PSF FWHM including the pixel"),
+        *((("PSFWIN", window_rms(rendered.psf), "[arcsec] rms of window of centroids"),) if rendered.psf else ()),
         ("SEEING", exposure.seeing, "[arcsec] FWHM of the air at zenith and 500 nm"),
         *((("SEEIMAGE", scene.seeing, "[arcsec] FWHM in this band, with telescope"),) if scene.seeing else ()),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),

@@ -54,11 +54,12 @@ def rows_of_sources(
     pyarrow.Table
         The rows, in the order of the sources.
     """
-    n, psf_x, psf_y = len(sources), None, None
+    n, psf_x, psf_y, window = len(sources), None, None, None
     if psf is not None:
         # The PSF of a source depends on its colour and its place.
         weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
         psf_x, psf_y = centroids.offsets(psf, weights)
+        window = np.full(n, centroids.window_rms(psf))
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
     return RENDERED_TRUTH.build(
         {
@@ -75,6 +76,7 @@ def rows_of_sources(
             "trail_y": trail[:, 1],
             "psf_x": psf_x,
             "psf_y": psf_y,
+            "psf_window": window,
             "mag": _magnitudes(sources.electrons, exposure),
         }
     )

@@ -1,20 +1,19 @@
 """PSF of Euclid's cameras VIS and NISP: diffraction at the pupil with aberrations, pointing jitter, charge diffusion.
 
 The PSF of a source is a sum of images (planes), whose weights depend on the spectrum of the source and on its position.
-The images are stored in the axes of the detector (x along columns, y along rows) and are not averaged over a pixel. For
-VIS an image is centred on the chief ray, the ray through the centre of the pupil, from which coma moves the centroid by
-a few mas. For NISP an image is centred on the centroid of its light.
+The images are stored in the axes of the detector (x along columns, y along rows) and are not averaged over a pixel.
+They are centred on the centroid of the light of the whole band in a Gaussian window, because astrometry is calibrated
+with centroids. Coma moves the centroid from the chief ray, the ray through the centre of the pupil, by a few mas (VIS)
+or tens of mas (NISP), and by 1 (VIS) or 1.5 mas (NISP) more if the window is wider by 0.01 arcsec.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import scipy
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
@@ -23,10 +22,10 @@ from truesky.numerics import cache, cache_labels, matrices
 from truesky.numerics.code_fingerprints import code_key
 from truesky.numerics.compiling import jit
 from truesky.render.camera.detectors import Detector, detectors
-from truesky.render.psf import model, spikes
+from truesky.render.psf import centroids, model, spikes
 from truesky.render.psf.diffraction import diffraction_image, optics_of
 from truesky.render.psf.model import DETAIL, SAMPLES, SIDE, Planes, Psf
-from truesky.render.psf.spikes import Edges
+from truesky.render.psf.spikes import ARCSEC, Edges
 from truesky.render.psf.sub_bands import sub_bands
 
 
@@ -46,9 +45,6 @@ class Sampling:
     core_transform, core_side : int
         Side of the transform (samples) and of the images (pixels) for the changes of the PSF across a detector. They
         are smaller, because only the core of the PSF changes noticeably.
-    window : float
-        Rms of a Gaussian window, arcsec. The PSF is drawn so that the centroid of its light in this window lies at the
-        position of the source. With 0, the chief ray lies at the position of the source instead.
     """
 
     samples: int
@@ -56,24 +52,23 @@ class Sampling:
     transform: int
     core_transform: int
     core_side: int
-    window: float = 0.0
 
 
 VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
 # Sampling of NISP, with five samples per pixel. In band Y the optics transmit spatial frequencies up to 1.84 cycles per
-# pixel, or 0.37 cycles per sample. Coma moves centroids by tens of mas from the chief ray. Since astrometry is
-# calibrated with centroids, the PSF is centred on its centroid in a Gaussian window like that of SourceExtractor (rms
-# 0.2 arcsec).
-NISP = Sampling(5, 256, 2048, 768, 96, window=0.2)
+# pixel, or 0.37 cycles per sample.
+NISP = Sampling(5, 256, 2048, 768, 96)
+# Name of the light of all wavelengths of the grisms, in keys of the mission database and labels of the cache.
+_SPECTRA = "spectra"
 # Allowed numbers of positions on a detector at which the PSF is computed. The values are the degrees of two polynomials
 # in position. The first describes the change of the PSF averaged over the wavelengths, and the second the change of the
 # PSF's derivative with wavelength. Degree 0 stands for no change.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
 # Noll number of defocus, its index in a list of Zernike coefficients. Each list is long enough to have this element.
 _DEFOCUS = 4
-# Half side of the square in which the centroid of a PSF in a Gaussian window is measured, in units of the window's rms.
-# Outside the square the window is treated as 0.
-_WINDOWS = 5.0
+# Half side of the square in which the centroid of a PSF in a Gaussian window is measured, in units of the window's rms;
+# two pixels are added.
+_WINDOWS = 7.0
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
@@ -160,8 +155,31 @@ def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration,
     Psf
         The PSF.
     """
-    planes = _planes(NISP, detector, waves, mission, positions, "spectra")
-    return model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
+    planes = _planes(NISP, detector, waves, mission, positions, _SPECTRA)
+    psf = model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
+    return replace(psf, window=centroid_window(detector.section, _SPECTRA, mission))
+
+
+def centroid_window(section: str, light: str, mission: MissionConfiguration) -> float:
+    """Return the rms of the Gaussian window in which positions of stars are centroids, arcsec.
+
+    Parameters
+    ----------
+    section : str
+        Prefix of the camera's parameters in the mission database, "vis" or "nisp".
+    light : str
+        Name of the passband, or "spectra".
+    mission : MissionConfiguration
+        Mission database (parameters of telescopes and cameras).
+
+    Returns
+    -------
+    float
+        The parameter <section>.<light>.psf.window, or <section>.psf.window if the mission database has no such
+        parameter.
+    """
+    key = f"{section}.{light}.psf.window"
+    return mission.value(key if key in mission else f"{section}.psf.window", "arcsec")
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
@@ -212,7 +230,8 @@ def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: Missio
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     planes = _planes(sampling, detector, waves, mission, positions, band.name)
     psf = model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
-    return replace(psf, edges=_edges(sampling, detector, band, mission))
+    window = centroid_window(detector.section, band.name, mission)
+    return replace(psf, edges=_edges(sampling, detector, band, mission), window=window)
 
 
 def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
@@ -274,25 +293,33 @@ def _planes(
     sampling = detector.pixel_scale / camera_sampling.samples
     wavefronts = np.array([wavefront(*place, section, mission) for place in places])
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
+    window = centroid_window(section, light, mission)
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
         code_key(__name__),
         wavefronts,
         waves,
         repr([(p.key, p.value, p.unit) for p in optics]),
-        repr((camera_sampling, sampling, *blurs)),
+        repr((camera_sampling, sampling, window, *blurs)),
     )
 
     def make() -> dict[str, Array]:
-        coefficients = [centre_wavefront(nm, waves, camera_sampling, sampling, mission) for nm in wavefronts]
-        centre = [
-            _plane(coefficients[0], w, camera_sampling, sampling, blur, mission)
-            for w, blur in zip(waves, blurs, strict=True)
-        ]
         # Jitter and charge diffusion blur the PSF by a Gaussian that depends on wavelength. The changes of the PSF
         # across the detector are only one per cent of its light, so the variances averaged over the wavelengths are
         # accurate enough for them.
         blur = tuple(np.mean(blurs, axis=0).tolist())
+        # The trace of a spectrum states a position for each wavelength, so each wavelength is centred. In an image,
+        # the light of the whole band is centred, and the centroid depends on the colour of the source.
+        groups = waves[:, None] if light == _SPECTRA else waves[None]
+        tilted = [
+            [centre_wavefront(nm, group, camera_sampling, (sampling, window), blur, mission) for group in groups]
+            for nm in wavefronts
+        ]
+        coefficients = np.array([np.resize(nm, (len(waves), nm.shape[-1])) for nm in np.array(tilted)])
+        centre = [
+            _plane(nm, w, camera_sampling, sampling, own_blur, mission)
+            for nm, w, own_blur in zip(coefficients[0], waves, blurs, strict=True)
+        ]
         return {
             "images": np.stack(centre).astype(np.float32),
             "drift": _drift(coefficients, positions, waves, camera_sampling, sampling, blur, mission).astype(
@@ -387,7 +414,7 @@ def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
 
 
 def _drift(
-    coefficients: Sequence[Float],
+    coefficients: Float,
     positions: int,
     waves: Float,
     camera_sampling: Sampling,
@@ -397,10 +424,11 @@ def _drift(
 ) -> Float:
     """Return one image per term of the polynomials that describe how the PSF changes across a detector.
 
-    The images, `Planes.drift`, are in the axes of the focal plane. `coefficients` are the wavefronts (Zernike
-    coefficients in nm by Noll number) at the detector's centre and then at the positions of `_nodes`. The polynomials
-    are fitted to the PSFs at these positions by least squares. `waves` are the wavelengths in Angstrom, `sampling` is
-    the spacing of the image's samples in arcsec, and `blur` are the variances of the blur along x and y in arcsec^2.
+    The images, `Planes.drift`, are in the axes of the focal plane. `coefficients`, shape (places, wavelengths, z), are
+    the wavefronts (Zernike coefficients in nm by Noll number) at the detector's centre and then at the positions of
+    `_nodes`. The polynomials are fitted to the PSFs at these positions by least squares. `waves` are the wavelengths in
+    Angstrom, `sampling` is the spacing of the image's samples in arcsec, and `blur` are the variances of the blur along
+    x and y in arcsec^2.
     """
     powers, weights = _powers(positions), _blur_weights(blur, sampling)
     side = camera_sampling.core_side * camera_sampling.samples + 1
@@ -409,9 +437,9 @@ def _drift(
     side += 2 * _margin(weights)
     mean, slope = np.zeros((2, len(coefficients), side, side))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
-    for wavelength, tilt in zip(waves, redder, strict=True):
+    for w, (wavelength, tilt) in enumerate(zip(waves, redder, strict=True)):
         optics = optics_of(float(wavelength), sampling, mission, camera_sampling.core_transform)
-        for i, nm in enumerate(coefficients):
+        for i, nm in enumerate(coefficients[:, w]):
             image = diffraction_image(nm, optics, side)
             mean[i] += image / len(waves)
             slope[i] += image * tilt
@@ -429,22 +457,30 @@ def _drift(
 
 
 def centre_wavefront(
-    nm: Float, waves: Float, camera_sampling: Sampling, sampling: float, mission: MissionConfiguration
+    nm: Float,
+    waves: Float,
+    camera_sampling: Sampling,
+    widths: tuple[float, float],
+    blur: tuple[float, float],
+    mission: MissionConfiguration,
 ) -> Float:
     """Add a tilt to a wavefront, so that the centroid of the PSF lies on the middle sample of its image.
 
-    The centroid is measured in a Gaussian window, on the image averaged over pixels. Blur by jitter is not included.
+    The centroid is measured in a Gaussian window on the blurred image with pixels. It is the mean over positions within
+    a pixel (psf/centroids.py).
 
     Parameters
     ----------
     nm : float array, shape (z,)
         Zernike coefficients of the wavefront, nm rms; the index is the Noll number.
     waves : float array, shape (w,)
-        Wavelengths, Angstrom.
+        Wavelengths with equal numbers of photons, Angstrom.
     camera_sampling : Sampling
-        Sampling of the camera's PSF images. If its `window` is 0, the wavefront is returned unchanged.
-    sampling : float
-        Spacing of the samples of the image, arcsec.
+        Sampling of the camera's PSF images.
+    widths : (float, float)
+        Spacing of the samples of the image, and rms of the window, arcsec.
+    blur : (float, float)
+        Variances of the blur by jitter and charge diffusion along x and y, arcsec^2.
     mission : MissionConfiguration
         Mission database (parameters of telescopes and cameras).
 
@@ -453,35 +489,25 @@ def centre_wavefront(
     float array, shape (z,)
         Zernike coefficients with the tilt. The error of the centroid is 0.1 mas.
     """
-    if not camera_sampling.window:
-        return nm
-    # The centroid of the light in the whole band is approximated by that of the sum of the images at two wavelengths.
-    # They lie 0.58 of the band's half width below and above its mean wavelength.
-    off = 0.58 * 0.5 * (waves.max() - waves.min())
+    sampling, window_rms = widths
+    # The centroid of the light in the whole band is approximated by that of the sum of the images at two wavelengths,
+    # one standard deviation of the wavelengths below and above their mean.
+    off = float(waves.std())
     optics = [
-        optics_of(float(waves.mean() + part), sampling, mission, camera_sampling.core_transform) for part in (-off, off)
+        optics_of(float(waves.mean()) + part, sampling, mission, camera_sampling.core_transform)
+        for part in sorted({-off, off})
     ]
-    side = 2 * round(_WINDOWS * camera_sampling.window / sampling) + 1
-    axis = sampling * (np.arange(side) - side // 2)
-    window = np.exp(-0.5 * (axis / camera_sampling.window) ** 2)
+    weights = _blur_weights(blur, sampling)
+    samples = camera_sampling.samples
+    pixel = sampling * samples
+    side = 2 * samples * (math.ceil(_WINDOWS * window_rms / pixel) + 2) + 1
 
-    def centroid(coefficients: Float) -> Float:
-        light = np.sum(
-            [diffraction_image(coefficients, pupil_optics, side) for pupil_optics in optics], axis=0, dtype=float
-        )
-        weighted = (
-            scipy.ndimage.uniform_filter(light, camera_sampling.samples, mode="nearest") * window * window[:, None]
-        )
-        return np.asarray(np.array([(weighted * axis).sum(), (weighted * axis[:, None]).sum()]) / weighted.sum())
-
-    tilted_nm, step = nm.copy(), 10.0
-    position = centroid(tilted_nm)
-    tilted_nm[2:4] += step
-    previous, position = position, centroid(tilted_nm)
-    response = (position - previous) / step
-    for _ in range(3):
-        tilted_nm[2:4] -= position / response
-        position = centroid(tilted_nm)
+    light = np.sum([diffraction_image(nm, each, side + 2 * _margin(weights)) for each in optics], axis=0)
+    position = pixel * centroids.mean_centroid(_blur_image(light, weights), samples, window_rms / pixel)
+    # A tilt of 1 nm rms moves the whole image by -2 nm per radius of the pupil, at any wavelength.
+    radius_nm = 0.5e6 * mission.value("plm.aperture_diameter", "mm")
+    tilted_nm = nm.copy()
+    tilted_nm[2:4] += position * ARCSEC * radius_nm / 2.0
     return tilted_nm
 
 

@@ -121,6 +121,9 @@ class Psf:
     derived : dict or None
         Quantities that have been computed from this PSF, such as Fourier transforms, so that many small images with the
         same PSF share them; None to keep none. See `keep`.
+    window : float or None
+        Rms of the Gaussian window in which positions of stars are centroids, arcsec; None for the window that
+        SourceExtractor would choose, whose FWHM is the half-light diameter (see `centroids.window_rms`).
     """
 
     profile: galsim.GSObject
@@ -133,6 +136,7 @@ class Psf:
     intra_pixel: float | None = 0.0
     edges: Edges | None = None
     derived: dict[Any, Any] | None = None
+    window: float | None = None
 
     @property
     def side(self) -> int:

@@ -19,7 +19,7 @@ from astropy.wcs import WCS
 
 from lake_schema.mission.parameter import CAMERAS
 from tests.truesky import nightly
-from tests.truesky.render import fields, nominal
+from tests.truesky.render import fields, infrared, nominal
 from tests.truesky.render.fields import MISSION, small
 from truesky.render.camera import astrometry, observatories
 from truesky.render.camera.detectors import detectors
@@ -200,14 +200,15 @@ def test_stars_are_at_the_positions_of_the_headers(field):
         assert off(field, *np.concatenate(places, axis=1)) < 5.0
 
 
-def extracted(path, kind="FITS_1.0"):
-    """Return a SExtractor catalogue of a file."""
+def extracted(path, kind="FITS_1.0", threshold=30):
+    """Return a SExtractor catalogue of a file; `threshold` is in units of the noise of the sky."""
     command, folder = tool("source-extractor"), path.parent
     (folder / "columns.param").write_text("\n".join(COLUMNS) + "\n")
     out = path.with_suffix(".cat")
     subprocess.run(
         [command, path.name, "-c", "none", "-PARAMETERS_NAME", "columns.param", "-FILTER", "N",
-         "-CATALOG_NAME", out.name, "-CATALOG_TYPE", kind, "-DETECT_THRESH", "30", "-VERBOSE_TYPE", "QUIET"],
+         "-CATALOG_NAME", out.name, "-CATALOG_TYPE", kind, "-DETECT_THRESH", str(threshold), "-VERBOSE_TYPE",
+         "QUIET"],
         cwd=folder, check=True, capture_output=True, timeout=120,
     )  # fmt: skip
     return out
@@ -218,6 +219,45 @@ def test_source_extractor_finds_the_stars(field):
         rows = [table.data for table in tables[1:]]
         places = [np.concatenate([row[key] for row in rows]) for key in COLUMNS[:2]]
     assert off(field, *places) < 5.0
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("camera", "limit"), [("vis", 0.5), ("nisp", 1.0)])
+def test_source_extractor_finds_no_mean_offset(camera, limit, tmp_path):
+    """The WCS points to the centroids of stars: offsets along both axes are 0 in the mean over a lattice, mas.
+
+    The positions of 24 x 24 stars within a pixel form a lattice, so that errors of pixels average out. All effects that
+    do not move charge are in the images, except cosmic rays and hot pixels. NISP is in band J.
+    """
+    n, pitch = 24, 40
+    at = pitch * (np.arange(n) + 0.5) + (np.arange(n) + 0.5) / n
+    x, y = (axis.ravel() for axis in np.meshgrid(at, at))
+    detector = small(camera, "3-4" if camera == "vis" else "DET22", n * pitch)
+    if camera == "vis":
+        quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
+        one = nominal.rendered(detector, np.full(len(x), 19.5), x, y, forced=quiet)
+        field = put(one, tmp_path)
+        with fits.open(extracted(field.path, threshold=5)) as tables:
+            found = np.concatenate([np.array([table.data[key] for key in COLUMNS[:2]]) for table in tables[1:]], axis=1)
+    else:
+        quiet = nominal.off("ramp_cosmic_rays", "dark_map", "persistence")
+        one = infrared.rendered(np.full(len(x), 18.0), x, y, detector, forced=quiet, band="euclid_j")
+        field = put(one, tmp_path)
+        (number,) = (i for i, (header, _) in enumerate(arrays(field.path)) if header["EXTNAME"].endswith("SCI"))
+        science = tmp_path / "science.fits"
+        # Reference pixels at the border would spoil the background there.
+        fits.writeto(science, np.ascontiguousarray(arrays(field.path)[number][1][4:-4, 4:-4]))
+        header = said(field.path)[number]
+        header["CRPIX1"], header["CRPIX2"] = header["CRPIX1"] - 4.0, header["CRPIX2"] - 4.0
+        science.with_suffix(".head").write_text(header.tostring("\n", padding=False) + "\nEND\n")
+        with fits.open(extracted(science, threshold=5)) as tables:
+            found = np.array([tables[1].data[key] for key in COLUMNS[:2]])
+    sky = SkyCoord(*found, unit="deg")
+    nearest, distance, _ = field.stars.match_to_catalog_sky(sky)
+    assert distance.to_value("arcsec").max() < 0.3
+    east, north = (axis.to_value("mas").mean() for axis in field.stars.spherical_offsets_to(sky[nearest]))
+    print(camera, "mas to the east and north:", east, north)
+    assert max(abs(east), abs(north)) < limit
 
 
 def test_source_extractor_reads_the_saturation_and_the_gain(vis):

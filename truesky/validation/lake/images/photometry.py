@@ -28,7 +28,7 @@ _MAGNITUDE = 1.0857
 _APERTURE_FRACTION = 0.8
 # With fewer measured stars than this number, the check is not applicable.
 _MIN_STARS = 8
-# Index, in the list of apertures, of the widest one that is used for total light; the wings beyond it are a power law.
+# Index, in the list of apertures, of the widest one that is used for total light, which the wings complete.
 # In wider apertures the error of the sky dominates.
 _JOIN_APERTURE = -3
 # Stars whose brightest pixel is above this fraction of the saturation level are not used, because of nonlinearity.
@@ -106,7 +106,7 @@ def _lost_fraction(measurements: StarMeasurements, wings: Wings) -> float:
     """Return the fraction of a star's total light that the widest used aperture misses.
 
     The fraction consists of the light beyond this aperture, and of light of the wings inside it that was subtracted
-    as sky. `wings` has the power law of the PSF's wings.
+    as sky.
     """
     join_radius = float(measurements.radii[_JOIN_APERTURE])
     return wings.fraction_beyond(join_radius) + np.pi * join_radius**2 * float(

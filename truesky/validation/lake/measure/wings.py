@@ -1,26 +1,35 @@
-"""Measure the wings of the PSF in a frame (its light at large distances, a power law) from its brightest stars.
+"""Measure the wings of the PSF in a frame (its light at large distances) from its brightest stars.
 
 Notes
 -----
+In space, the wings have the shape that diffraction by the edges of the pupil gives them, from a table by band
+(pupil_wings.csv, written by scripts/pupil_wings.py). They are no power law: spikes keep their height and their width up
+to an angle of wavelength / width of the spider bars, 12" for VIS. Only their strength is fitted. On the ground, wings
+are a power law.
+
 Single pixels are too noisy, so pixels are averaged in rings around the stars. The result is combined with typical wings
 of space or ground telescopes. A frame without bright stars or with an uneven sky therefore has wings with a large error
-(a fifth in space, a half on the ground).
+(a tenth in space, a half on the ground).
 """
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from lake_schema.arrays import Bool, Float, Int
+from lake_schema.errors import BadInput
 from truesky.validation.lake.measure import masks
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.references import Reference
 
-# Slopes (negative exponents of the power law) that are tried in the fit. Far wings fall as r^-3 (diffraction by an
-# obscured aperture) or r^-11/3 (turbulence); nearer wings with diffraction rings are shallower.
+# Slopes (negative exponents of the power law) that are tried in the fit on the ground. Far wings fall as r^-3 (aureole)
+# or r^-11/3 (turbulence).
 _SLOPES = np.arange(2.4, 4.01, 0.05)
 # Typical slope of the wings: their light per pixel falls with radius as r^-slope.
 _TYPICAL_SLOPE = 3.0
@@ -39,13 +48,15 @@ _MAX_RADIUS = 120
 _RINGS = 14
 # A star is not used if it has fewer usable rings than this number.
 _MIN_RINGS = 6
-# Typical wings of Euclid by filter: fraction of the total light per arcsec^2 at 1" (diffraction by edges of the pupil).
-_SPACE = {"euclid_vis": 9.3e-3, "euclid_y": 1.4e-2, "euclid_j": 1.8e-2, "euclid_h": 2.3e-2}
+# Table of the wings of Euclid by filter: fraction of the total light per arcsec^2 by radius in arcsec.
+TABLE = Path(__file__).with_name("pupil_wings.csv")
+# Largest ratio of neighbouring radii in the table. In between, the wings are interpolated as power laws.
+_MAX_STEP = 1.5
 # Typical wings of ground telescopes: fraction of the total light per arcsec^2 at 1". Turbulence and an aureole together
 # fall as r^-3 from 5" to 25".
 _GROUND = 1.5e-2
-# Relative error of the typical wings in space.
-_UNSURE_SPACE = 0.2
+# Relative error of the typical wings in space (assumed: aberrations change them by 3 to 6 % near the core).
+_UNSURE_SPACE = 0.1
 # Relative error of the typical wings on the ground.
 _UNSURE_GROUND = 0.5
 # Largest number of stars around which wings are measured.
@@ -70,52 +81,112 @@ _SPIKE = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Wings:
-    """Wings of a PSF: strength * r^-slope is the fraction of a point source's total light in a pixel at r pixels.
+    """Wings of a PSF: strength * shape is the fraction of a point source's total light in a pixel.
 
     Attributes
     ----------
     strength : float
-        Fraction of the total light in a pixel at a distance of 1 pixel (extrapolated).
+        Factor of the shape. For a single radius of 1 pixel with the value 1, it is the fraction of the total light in a
+        pixel at a distance of 1 pixel (extrapolated).
     slope : float
-        Negative exponent of the power law, larger than 2.
+        Negative exponent of the power law beyond the last radius, or everywhere if there is only one, larger than 2.
     outer_radius : float
         Radius at which the wings end, pixels; infinite in space.
     error : float
         Standard error of the strength.
+    radii, shape : tuple of float
+        Radii in pixels, ascending, and the shape of the wings there, fraction per pixel. Between two radii it is a
+        power law, and constant below the first of several.
     """
 
     strength: float
     slope: float
     outer_radius: float = np.inf
     error: float = 0.0
+    radii: tuple[float, ...] = (1.0,)
+    shape: tuple[float, ...] = (1.0,)
 
     def profile(self, radius: Float) -> Float:
         """Return the fraction of the total light in a pixel at each radius (pixels, above 0)."""
-        return np.asarray(self.strength * radius**-self.slope)
+        outer = self.shape[-1] * (radius / self.radii[-1]) ** -self.slope
+        if len(self.radii) == 1:
+            return np.asarray(self.strength * outer)
+        within = np.exp(np.interp(np.log(radius), np.log(self.radii), np.log(self.shape)))
+        return np.asarray(self.strength * np.where(radius > self.radii[-1], outer, within))
 
     def fraction_beyond(self, radius: float) -> float:
         """Return the fraction of the total light beyond a radius in pixels; 0 beyond the end of the wings."""
-        power = 2.0 - self.slope
-        return float(2.0 * np.pi * self.strength * (radius**power - max(self.outer_radius, radius) ** power) / -power)
+        end = max(self.outer_radius, radius)
+        nodes = [radius, *(node for node in self.radii if radius < node < end)] if len(self.radii) > 1 else [radius]
+        values = replace(self, strength=1.0).profile(np.array(nodes))
+        slopes = np.append(-np.diff(np.log(values)) / np.diff(np.log(nodes)), self.slope)
+        light = 0.0
+        for start, stop, value, slope in zip(nodes, [*nodes[1:], end], values, slopes, strict=True):
+            # Light of a power law between two radii. A slope of 2, for which it is a logarithm, does not occur exactly.
+            power = 2.0 - float(slope) if abs(float(slope) - 2.0) > 1e-9 else 1e-9
+            grown = (stop / start) ** power if np.isfinite(stop) else 0.0
+            light += 2.0 * np.pi * float(value) * start**2 * (grown - 1.0) / power
+        return self.strength * light
+
+
+@lru_cache(maxsize=8)
+def read_table(path: Path = TABLE) -> dict[str, tuple[tuple[float, float], ...]]:
+    """Read a table of wings: for each filter, pairs of a radius (arcsec) and the fraction of the light per arcsec^2.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        CSV file with the column `radius` and a column for each filter.
+
+    Returns
+    -------
+    dict
+        Pairs by ascending radius.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing or not a number above 0, or if radii do not ascend in steps of at most 50 %.
+    """
+    with path.open(newline="") as file:
+        header, *rows = list(csv.reader(file))
+    if header[:1] != ["radius"] or len(header) < 2 or len(rows) < 2:
+        raise BadInput(f"{path}: the columns must be radius and names of filters, with at least two rows")
+    radius = 0.0
+    for line, row in enumerate(rows, start=2):
+        for name, text in zip(header, [*row, *[""] * (len(header) - len(row))], strict=False):
+            try:
+                value = float(text)
+            except ValueError:
+                value = np.nan
+            if not 0.0 < value < np.inf:
+                raise BadInput(f"{path}: line {line}, column {name}: must be a number above 0, got {text!r}")
+        previous, radius = radius, float(row[0])
+        if not previous < radius or (previous and radius > _MAX_STEP * previous):
+            raise BadInput(
+                f"{path}: line {line}, column radius: must be above the radius before, by at most "
+                f"{_MAX_STEP - 1.0:.0%}, got {radius:g} after {previous:g}"
+            )
+    numbers = [[float(text) for text in row] for row in rows]
+    return {name: tuple((row[0], row[column]) for row in numbers) for column, name in enumerate(header) if column}
 
 
 def typical(frame: Frame) -> Wings:
     """Return typical wings of a ground telescope, or of Euclid in the filter of the frame, with their error.
 
-    Notes
-    -----
-    A pupil of area A, whose edges have the total length P, diffracts the fraction lambda P / (4 pi^3 A theta^3) of the
-    light per steradian to the angle theta from the source, averaged over position angles.
-
-    References
-    ----------
-    Born & Wolf 1999, Principles of Optics, sec. 8.8
+    The wings of Euclid are in a table; beyond its last radius they fall as r^-3.
     """
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
         return Wings(strength, _TYPICAL_SLOPE, _GROUND_EXTENT / frame.scale, _UNSURE_GROUND * strength)
-    strength = _SPACE[str(frame.header["FILTER"])] / frame.scale
-    return Wings(strength, _TYPICAL_SLOPE, np.inf, _UNSURE_SPACE * strength)
+    radii, values = zip(*read_table()[str(frame.header["FILTER"])], strict=True)
+    return Wings(
+        1.0,
+        _TYPICAL_SLOPE,
+        error=_UNSURE_SPACE,
+        radii=tuple(radius / frame.scale for radius in radii),
+        shape=tuple(value * frame.scale**2 for value in values),
+    )
 
 
 def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: int) -> Wings:
@@ -158,12 +229,14 @@ def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: i
     expected = typical(frame)
     if len(means) < _MIN_STARS:
         return expected
-    fit = _fit_wings(np.array(means), np.array(weights), np.array(fluxes), np.sqrt(edges[1:] * edges[:-1]))
+    slopes = _SLOPES if len(expected.radii) == 1 else np.array([expected.slope])
+    candidates = [replace(expected, strength=1.0, slope=float(slope)) for slope in slopes]
+    fit = _fit_wings(np.array(means), np.array(weights), np.array(fluxes), edges, candidates)
     # Average the strengths at the radius `reach`: convert the typical strength to the fitted slope at this radius.
     as_steep = float(reach) ** (fit.slope - expected.slope)
     first, second = fit.error**-2, (expected.error * as_steep) ** -2
     strength = (first * fit.strength + second * expected.strength * as_steep) / (first + second)
-    return Wings(max(strength, 0.0), fit.slope, expected.outer_radius, (first + second) ** -0.5)
+    return replace(fit, strength=max(strength, 0.0), error=(first + second) ** -0.5)
 
 
 def _rings(
@@ -222,25 +295,28 @@ def neighbour_mask(sources: Reference, neighbours: Int, across: Int, up: Int, no
     return out
 
 
-def _fit_wings(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings:
-    """Fit the means of rings around n stars with a sky level for each star plus flux x strength x r^-slope.
+def _fit_wings(mean: Float, weight: Float, flux: Float, edges: Float, candidates: list[Wings]) -> Wings:
+    """Fit the means of rings around n stars with a sky level for each star plus flux x strength x shape of the wings.
 
-    `mean` (e- per pixel) and `weight` (inverse variance) have the shape (n, rings); `flux` is in e-, `radius` in
-    pixels. Strength and slope are the same for all stars; the slope is constrained to be near the typical one.
+    `mean` (e- per pixel) and `weight` (inverse variance) have the shape (n, rings); `flux` is in e-. `edges` are the
+    radii of the rings in pixels. The strength is the same for all stars. Returns the best of the candidates, which have
+    the strength 1; their slopes are constrained to be near the typical one.
     """
     total = weight.sum(axis=1, keepdims=True)
     # Subtract the weighted mean over the rings of each star from data and model: this eliminates the sky level.
     offset = mean - (weight * mean).sum(axis=1, keepdims=True) / total
     fits, residuals = [], []
-    for slope in _SLOPES:
-        shape = flux[:, None] * radius**-slope
+    for wings in candidates:
+        light = -np.diff([wings.fraction_beyond(float(edge)) for edge in edges])
+        shape = flux[:, None] * light / (np.pi * np.diff(edges**2))
         bent = shape - (weight * shape).sum(axis=1, keepdims=True) / total
         power = float((weight * bent**2).sum())
         strength = float((weight * bent * offset).sum()) / power
         residuals.append(float((weight * (offset - strength * bent) ** 2).sum()))
-        fits.append(Wings(strength, float(slope), error=power**-0.5))
+        fits.append(replace(wings, strength=strength, error=power**-0.5))
     freedom = max(int((weight > 0.0).sum()) - len(flux) - 2, 1)
     # If the rings scatter more than their noise, reduce their weight compared with the constraint on the slope.
     scale = max(min(residuals) / freedom, 1.0)
-    best = fits[int(np.argmin(np.array(residuals) / scale + ((_SLOPES - _TYPICAL_SLOPE) / _SLOPE_SPREAD) ** 2))]
+    slopes = np.array([wings.slope for wings in candidates])
+    best = fits[int(np.argmin(np.array(residuals) / scale + ((slopes - _TYPICAL_SLOPE) / _SLOPE_SPREAD) ** 2))]
     return replace(best, error=best.error * scale**0.5)
