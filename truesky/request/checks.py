@@ -15,7 +15,7 @@ from lake_schema.tables.exposures import RENDERED_TYPES
 from truesky.cosmology import FIDUCIAL, LIMITS, POWERS, Cosmology
 from truesky.request import instruments
 from truesky.request.files import Ingest
-from truesky.request.schema import MissionChoice, Override, Request, Stars
+from truesky.request.schema import FILE_NAMES, MissionChoice, Override, Request, Stars
 from truesky.request.toml_values import Toml, as_table, number, quote_value, string
 
 # Largest distance in degrees from the area to a pointing that may belong to it.
@@ -52,6 +52,14 @@ def unused_values(table: Toml) -> Iterator[str]:
     for key in _DRAWN_SOURCES if table.get("sources") else ():
         if key in table.get("universe", {}):
             yield f"universe.{key} has no effect: the tables in [sources] contain all sources"
+
+
+def parse_file_names(table: Toml) -> str:
+    """Read the names of files of whole exposures from the section `products`. Raise BadInput without such files."""
+    names = string(table, "products.names", FILE_NAMES, FILE_NAMES[0])
+    if names != FILE_NAMES[0] and table.get("files") != "exposure":
+        raise BadInput(f'products.names = "{names}" names files of whole exposures: write files = "exposure", too')
+    return names
 
 
 def check_places(request: Request) -> None:

@@ -115,7 +115,6 @@ from truesky.request.schema import (
     DENSITY_MODELS,
     EFFECTS,
     FILE_LAYOUTS,
-    FILE_NAMES,
     LADDER,
     LENSING_NSIDES,
     MAX_SHEAR,
@@ -350,18 +349,10 @@ def _products(table: Toml) -> dict[str, Any]:
             "compression": read(_string, table, "products.compression", COMPRESSIONS, "none"),
             "wcs": read(_string, table, "products.wcs", WCS_CONVENTIONS) if "wcs" in table else None,
             "files": read(_string, table, "products.files", FILE_LAYOUTS, "detector"),
-            "file_names": read(_file_names, table),
+            "file_names": read(checks.parse_file_names, table),
             "readout": read(_string, table, "products.readout", READOUTS, "raw"),
         }
     return values
-
-
-def _file_names(table: Toml) -> str:
-    """Read the convention for the names of files of whole exposures. Raise BadInput if there are no such files."""
-    names = _string(table, "products.names", FILE_NAMES, FILE_NAMES[0])
-    if names != FILE_NAMES[0] and table.get("files") != "exposure":
-        raise BadInput(f'products.names = "{names}" names files of whole exposures: write files = "exposure", too')
-    return names
 
 
 def _bodies(table: Toml, folder: Path) -> Path:

@@ -24,9 +24,9 @@ from lake_schema.store.provenance import digest
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import EXPOSURE_FILES
 from truesky.render.camera import detectors
+from truesky.render.channels import level1
 from truesky.render.planning.exposure_chunks import rows as planned_rows
 from truesky.render.products import head_files, headers
-from truesky.render.products.euclid import level1
 from truesky.render.products.keys import part_name
 
 # Keywords in the headers of detector files whose cards go to the primary header of the file with all detectors, if they

@@ -21,7 +21,6 @@ from lake_schema import __version__
 from lake_schema.fits.images import Card
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import GRISM_NAMES, ExposureRow
-from truesky.render.products import headers
 
 # Instrument in the name of a file, by channel. Files of ground cameras keep their names.
 INSTRUMENTS: Mapping[str, str] = {"VIS": "VIS", "NISP-P": "NISP", "NISP-S": "NISP"}
@@ -97,7 +96,7 @@ def exposure_cards(exposure: ExposureRow, detectors: int, mission: MissionConfig
     """
     kind, angle = exposure.image_type, round(exposure.position_angle % 360.0, _DECIMALS)
     is_vis, is_sky = exposure.channel == "VIS", kind in ("science", "deep")
-    end = exposure.mjd + exposure.exposure_time_s / 86400.0
+    end = _MJD_ZERO + timedelta(days=exposure.mjd + exposure.exposure_time_s / 86400.0)
     dither, number = exposure.dither or 1, observation(exposure)
     return (
         ("FITS_DEF", "le1.visRawImage" if is_vis else "le1.nispRawImage", "FITS definition name"),
@@ -109,7 +108,7 @@ def exposure_cards(exposure: ExposureRow, detectors: int, mission: MissionConfig
         ("OBSTYPE", "SPECTROIMAGE" if exposure.channel == "NISP-S" else "IMAGE", "technique"),
         ("SEQID", _sequence(exposure, mission), "sequence of the instrument"),
         ("MJDATE", exposure.mjd, "[d] start of the exposure, MJD (UTC)"),
-        ("DATE-END", headers.iso_date(end), "end of the exposure"),
+        ("DATE-END", end.isoformat(timespec="milliseconds"), "end of the exposure"),
         ("FIELDID", number if exposure.field is None else exposure.field, "field"),
         ("OBS_ID", number, "observation"),
         ("DITHOBS", dither, "dither of the observation, from 1"),

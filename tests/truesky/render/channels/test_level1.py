@@ -9,7 +9,7 @@ from astropy.time import Time
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from tests.truesky.render.fields import exposure
-from truesky.render.products.euclid import level1
+from truesky.render.channels import level1
 
 MISSION = resolve()
 # Names of the raw frames of Q1: the page of IRSA about the release, with the time as [YYYYMMDD]T[HHMMSS.SSSSSS]Z.
