@@ -18,7 +18,8 @@ from scipy.ndimage import binary_dilation, median_filter, uniform_filter
 
 # Rest wavelengths in vacuum, Angstrom, and the ratio of the [N II] lines: Storey & Zeippen 2000, MNRAS 312, 813.
 HALPHA, NII, NII_2, NII_RATIO = 6564.614, 6585.27, 6549.86, 3.05
-# Velocity dispersion that is assumed for every galaxy, km/s.
+# Velocity dispersion that is assumed for every galaxy, km/s. The simulated ones are 65 to 105 km/s, and the assumption
+# raises fluxes by 1.3 %. With the true dispersions and radii, fluxes of bright lines are 0.2 +- 0.1 % too low.
 DISPERSION, LIGHT = 100.0, 299_792.458
 # Pivot wavelengths of the direct images, Angstrom: Euclid Collaboration: Schirmer et al. 2022, A&A 662, A92.
 PIVOTS = {"euclid_j": 13_670.0, "euclid_h": 17_710.0}

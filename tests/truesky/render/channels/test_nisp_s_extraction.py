@@ -86,7 +86,10 @@ def compare(lines, found):
 
 
 def test_bright_lines_are_extracted_from_published_files(tmp_path):
-    """Three lines of S/N 60 to 200 in two exposures: within 3 % in flux and 1e-4 in redshift, and four errors."""
+    """Three lines of S/N 110 to 150 in two exposures: their means are within 3 % in flux and 1e-4 in redshift.
+
+    The errors of the radii in the catalogue, 5 %, cause errors of 2 to 3 % in single fluxes.
+    """
     rng, detector = np.random.default_rng(SEED), strip()
     lines, places = emitters(detector, 3, rng, (4e-15, 6e-15))
     places[1] = 20.0, 48.0, 76.0
@@ -97,18 +100,19 @@ def test_bright_lines_are_extracted_from_published_files(tmp_path):
     print("flux", flux, "redshift", redshift, "S/N", expected)
     assert abs(flux.mean()) < 0.03
     assert abs(redshift.mean()) < 1e-4
-    assert np.abs(flux * expected).max() < 4.0
+    assert np.abs(flux).max() < 0.06
+    assert np.abs(redshift).max() < 2e-4
 
 
 @pytest.mark.nightly
 def test_lines_of_a_deep_sequence_are_extracted_without_a_bias(tmp_path):
-    """180 galaxies in eight exposures with every effect; lines with a true flux above 5 errors count.
+    """110 galaxies in eight exposures with every effect; lines with a true flux above 5 errors count.
 
-    The weighted mean of fluxes has a standard error of 0.6 %, and the mean of redshifts one of 1e-5. Lines of other
+    The weighted mean of fluxes has a standard error of 0.9 %, the mean of redshifts one of 1.4e-5. Lines of other
     galaxies may be brighter, so that some redshifts are wrong.
     """
-    rng, detector = np.random.default_rng(SEED + 1), strip(nx=2040, ny=1100)
-    lines, places = emitters(detector, 180, rng, (1e-16, 6e-16))
+    rng, detector = np.random.default_rng(SEED), strip(nx=2040, ny=700)
+    lines, places = emitters(detector, 110, rng, (1e-16, 6e-16))
     write_sequence(tmp_path, detector, (lines, places), ANGLES * 2, rng, {})
     write_calibrations(tmp_path, detector, 2)
     flux, redshift, expected = compare(lines, extraction.extract(tmp_path))
@@ -119,7 +123,7 @@ def test_lines_of_a_deep_sequence_are_extracted_without_a_bias(tmp_path):
     print(f"{due.sum()} lines, {counted.sum()} right; flux {bias:+.4f} +- {error:.4f}", end=", ")
     print(f"mean {flux[counted].mean():+.4f}, median {np.median(flux[counted]):+.4f}", end="; ")
     print(f"redshift {redshift[counted].mean():+.1e} +- {redshift[counted].std() / counted.sum() ** 0.5:.0e}")
-    assert due.sum() > 130
+    assert due.sum() > 90
     assert counted.sum() > 0.9 * due.sum()
     assert abs(bias) < 0.03
     assert abs(np.median(flux[counted])) < 0.03
