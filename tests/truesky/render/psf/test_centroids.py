@@ -152,7 +152,7 @@ def test_stars_of_a_lattice_are_at_their_position(section, name, band):
 
 @nightly.parametrize(("section", "name", "band"), [("vis", "1-1", "euclid_vis"), ("nisp", "DET11", "euclid_y")], (1,))
 def test_colours_agree_with_the_iteration(section, name, band):
-    """Centroids of sources with other spectra are those of their own images within 0.1 mas, even at the band's edges."""
+    """Centroids of sources with other spectra agree with their images within 0.1 mas, even at the edges of the band."""
     detector, psf = core_of_psf(section, name, band)
     count, samples, mas = len(psf.planes.images), psf.planes.samples, 1000.0 * detector.pixel_scale
     middle, reach = len(psf.planes.images[0]) // 2, 20 * samples
