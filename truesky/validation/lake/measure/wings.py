@@ -74,8 +74,8 @@ _CORE = 6.0
 # A pixel is hit by a cosmic ray if it exceeds the median of its ring by more than this number of standard deviations
 # plus the allowance for spikes.
 _HIT = 4.0
-# Allowance for diffraction rings and spikes when cosmic rays are searched, as a multiple of the mean light in the ring:
-# of the typical wings in space, and of the rough wings on the ground. Spikes of VIS have ten times the mean light at 6
+# Allowance for diffraction rings and spikes when cosmic rays are searched, as a multiple of the mean light in the ring,
+# which typical wings (space) or rough wings (ground) give. Spikes of VIS have ten times the mean light at 6
 # arcsec, but are fainter than the noise there. A larger allowance keeps more cosmic rays in bright inner rings.
 _SPIKE_SPACE, _SPIKE_GROUND = 3.0, 8.0
 
