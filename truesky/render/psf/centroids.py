@@ -242,7 +242,8 @@ def _average_over_pixel(plane: Array, samples: int, axis: int) -> Float:
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
     at = (np.arange(len(weights)) - len(weights) // 2) / samples
     part = 0.5 * samples**2 * (1.0 / 12.0 - float((weights * at**2).sum()))
-    weights = np.convolve(weights, [part, 1.0 - 2.0 * part, part])
+    padded = np.pad(weights, 2)
+    weights = part * padded[:-2] + (1.0 - 2.0 * part) * padded[1:-1] + part * padded[2:]
     return np.asarray(scipy.ndimage.correlate1d(np.asarray(plane, float), weights, axis))
 
 
