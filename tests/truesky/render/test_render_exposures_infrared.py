@@ -117,6 +117,7 @@ def check(root):
     model = galsim.des.DES_PSFEx(str(psfs["000007"])).getPSF(galsim.PositionD(100.0, 100.0))
     with fits.open(files[7]) as units:
         assert 0.3 * model.calculateFWHM() == pytest.approx(units[0].header["PSFFWHM"], rel=0.05)
+        assert units[0].header["PSFWIN"] == 0.21
     assert psfs["000007"].name == "NISP-P_euclid_j_DET22.psf"
 
 

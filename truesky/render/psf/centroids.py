@@ -68,15 +68,13 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
 
     Notes
     -----
-    The windowed centroid is defined by an iteration. It is carried out for the mean colour at the detector's centre;
-    other colours and places follow from one more step. For VIS and NISP the error is below 0.1 mas.
+    The windowed centroid is defined by an iteration. It is carried out for the mean colour at the detector's centre, at
+    each position within a pixel. Other colours and places follow from one more step, with the same ratio of the slopes
+    along x and y. For VIS and NISP the error is below 0.1 mas.
     """
-    window, centres, moments = psf.keep(("centroids",), lambda: _moments_by_phase(psf))
-    total = np.zeros((2, len(weights)))
-    for centre, of_phase in zip(centres.T, moments, strict=True):
-        total += centre[:, None] + _newton_step(matrices.matmul(weights, of_phase).T, window)
-    x, y = total / len(moments)
-    return x, y
+    centre, steps = psf.keep(("centroids",), lambda: _linear_steps(psf))
+    x, y, scale = matrices.matmul(weights, steps).T
+    return centre[0] + x / scale, centre[1] + y / scale
 
 
 def mean_centroid(image: Array, samples: int, window: float) -> Float:
@@ -112,11 +110,11 @@ def _choose_window(psf: Psf) -> float:
     return float(_half_light_diameter(image, samples) / _FWHM * psf.pixel_scale)
 
 
-def _moments_by_phase(psf: Psf) -> tuple[float, Float, Float]:
-    """Return the rms of the window (pixels), and centres [2, p] and moments [p, planes, 6] for p positions in a pixel.
+def _linear_steps(psf: Psf) -> tuple[Float, Float]:
+    """Return the mean centroid (x, y) of a source of the mean colour at the centre of the detector, and steps from it.
 
-    At these positions, the pixels lie on samples of the PSF images. A centre (x, y) is the centroid of a source of the
-    mean colour at the centre of the detector. The basis images have moments around it.
+    The centroid is in pixels. The steps, shape (planes, 3), are contributions of the basis images to x and y, and to
+    the number by which these sums are divided: the mean slope of the first moments, relative to the mean colour.
     """
     planes, samples = _sample_planes(psf)
     window = window_rms(psf) / psf.pixel_scale
@@ -128,8 +126,13 @@ def _moments_by_phase(psf: Psf) -> tuple[float, Float, Float]:
     planes, samples = _double_if_narrow(planes, samples, window)
     mean = np.sum(planes[: _colour_count(psf)], axis=0, dtype=float)
     centres = _centres(_by_phase(mean, samples), window)
-    moments = [_pixel_moments(_by_phase(plane, samples), window, centres) for plane in planes]
-    return window, centres, np.moveaxis(np.stack(moments), -1, 0)
+    slopes = _slopes(_pixel_moments(_by_phase(mean, samples), window, centres), window)
+    total, steps = (slopes[0] + slopes[2]).sum(), []
+    for plane in planes:
+        moments = _pixel_moments(_by_phase(plane, samples), window, centres)
+        along_x, _, along_y = _slopes(moments, window)
+        steps.append([*_balance(moments, slopes).mean(axis=1), (along_x + along_y).sum() / total])
+    return centres.mean(axis=1), np.array(steps)
 
 
 def _double_if_narrow(planes: list[Array], samples: int, window: float) -> tuple[list[Array], int]:
@@ -175,13 +178,13 @@ def _centres(pixels: tuple[Float, Float, Float], window: float) -> Float:
     centres = np.zeros((2, len(pixels[0])))
     for _ in range(_ITERATIONS):
         moments = _pixel_moments(pixels, window, centres)
-        zeroth, x, y, xx, xy, yy = moments
+        zeroth, x, y = moments[:3]
         has_light = zeroth > 0.0
         safe = np.where(has_light, zeroth, 1.0)
         # Far from the light the first moments grow with the distance, and the step of SourceExtractor is used.
-        a, c = zeroth - xx / window**2, zeroth - yy / window**2
-        is_near = (a > 0.0) & (c > 0.0) & (a * c > (xy / window**2) ** 2)
-        newton = _newton_step(np.where(is_near, moments, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])[:, None]), window)
+        a, b, c = _slopes(moments, window)
+        is_near = (a > 0.0) & (c > 0.0) & (a * c > b * b)
+        newton = _balance(moments, np.where(is_near, np.stack([a, b, c]), np.array([1.0, 0.0, 1.0])[:, None]))
         step = np.where(is_near, newton, 2.0 * np.stack([x, y]) / safe)
         centres = np.where(has_light, centres + np.clip(step, -window, window), 0.0)
         if np.abs(np.where(has_light, step, 0.0)).max() < _CONVERGED:
@@ -189,14 +192,18 @@ def _centres(pixels: tuple[Float, Float, Float], window: float) -> Float:
     return centres
 
 
-def _newton_step(moments: Float, window: float) -> Float:
-    """Return the shift (x, y) of a window, in pixels, after which the light in it is balanced, to first order.
+def _slopes(moments: Float, window: float) -> Float:
+    """Return a, b and c [3, p]: first moments (x, y) fall by the matrix ((a, b), (b, c)) times a shift of the window.
 
-    `moments` has the six numbers of `_pixel_moments` along its first axis, and `window` is the rms in pixels. First
-    moments (x, y) of the light in the window fall by the matrix ((a, b), (b, c)) times the shift of the window.
+    `moments` is a result of `_pixel_moments`, and `window` the rms in pixels.
     """
-    zeroth, x, y, xx, xy, yy = moments
-    a, b, c = zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2
+    zeroth, _, _, xx, xy, yy = moments
+    return np.stack([zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2])
+
+
+def _balance(moments: Float, slopes: Float) -> Float:
+    """Return the shift (x, y) of a window, in pixels, after which the light in it is balanced, to first order."""
+    (a, b, c), (_, x, y, *_) = slopes, moments
     return np.asarray(np.stack([c * x - b * y, a * y - b * x]) / (a * c - b * b))
 
 
@@ -235,7 +242,8 @@ def _average_over_pixel(plane: Array, samples: int, axis: int) -> Float:
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
     at = (np.arange(len(weights)) - len(weights) // 2) / samples
     part = 0.5 * samples**2 * (1.0 / 12.0 - float((weights * at**2).sum()))
-    weights = np.convolve(weights, [part, 1.0 - 2.0 * part, part])
+    padded = np.pad(weights, 2)
+    weights = part * padded[:-2] + (1.0 - 2.0 * part) * padded[1:-1] + part * padded[2:]
     return np.asarray(scipy.ndimage.correlate1d(np.asarray(plane, float), weights, axis))
 
 

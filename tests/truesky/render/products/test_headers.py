@@ -11,7 +11,7 @@ from tests.truesky.render import fields, nominal
 from tests.truesky.render.exposure.test_render import render
 from tests.truesky.render.fields import MISSION, small
 from truesky.render.camera import detectors, pointing
-from truesky.render.products import fits_files
+from truesky.render.products import fits_files, truth_table
 from truesky.request.accuracy import SURVEY
 
 IN_EACH = {
@@ -65,6 +65,7 @@ def test_every_array_has_the_keywords_that_tools_need(channel, rice, tmp_path):
         assert (first["RA"], first["DEC"], first["OBJECT"]) == (one.exposure.ra, one.exposure.dec, "test")
         assert first["INSTRUME"] == {"VIS": "VIS", "EXT": "LSSTCam"}[channel]
         assert first.get("AIRMASS") == one.exposure.airmass
+        assert {first["PSFWIN"]} == set(truth_table.truth(one)["psf_window"].to_pylist())
 
 
 def test_sections_of_quadrants_form_the_detector(tmp_path):

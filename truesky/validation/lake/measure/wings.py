@@ -74,9 +74,10 @@ _CORE = 6.0
 # A pixel is hit by a cosmic ray if it exceeds the median of its ring by more than this number of standard deviations
 # plus the allowance for spikes.
 _HIT = 4.0
-# Allowance for diffraction spikes when cosmic rays are searched, as a multiple of the rough wings (light of a source
-# that falls as r^-3).
-_SPIKE = 8.0
+# Allowance for diffraction rings and spikes when cosmic rays are searched, as a multiple of the mean light in the ring,
+# which typical wings (space) or rough wings (ground) give. Spikes of VIS have ten times the mean light at 6
+# arcsec, but are fainter than the noise there. A larger allowance keeps more cosmic rays in bright inner rings.
+_SPIKE_SPACE, _SPIKE_GROUND = 3.0, 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +255,9 @@ def _rings(
     up = np.arange(max(row - outer_radius, 0), min(row + outer_radius + 1, ny))
     cut = frame.linearize(frame.electrons[up[0] : up[-1] + 1, across[0] : across[-1] + 1].astype(float))
     good = ~neighbour_mask(sources, neighbours, across, up, noise) & (cut != 0.0)
+    space = len((wings := typical(frame)).radii) > 1
+    usual = wings.profile(edges[:-1]) if space else _WING * edges[:-1] ** -_TYPICAL_SLOPE
+    spike = _SPIKE_SPACE if space else _SPIKE_GROUND
     ring = np.digitize(np.hypot(across - sources.x[i], (up - sources.y[i])[:, None]), edges) - 1
     mean, weight = np.zeros(len(edges) - 1), np.zeros(len(edges) - 1)
     for k in range(len(mean)):
@@ -263,8 +267,8 @@ def _rings(
             continue
         # Remove cosmic rays, but keep diffraction spikes, whose light belongs to the wings.
         middle = float(np.median(values))
-        wing_signal = sources.expected[i] * _WING * edges[k] ** -_TYPICAL_SLOPE
-        values = values[np.abs(values - middle) < _HIT * np.hypot(noise, np.sqrt(wing_signal)) + _SPIKE * wing_signal]
+        wing_signal = sources.expected[i] * float(usual[k])
+        values = values[np.abs(values - middle) < _HIT * np.hypot(noise, np.sqrt(wing_signal)) + spike * wing_signal]
         mean[k], weight[k] = values.mean(), values.size / (noise**2 + wing_signal)
     return mean, weight
 
