@@ -175,8 +175,8 @@ def read_table(path: Path = TABLE) -> dict[str, tuple[tuple[float, float], ...]]
 def typical(frame: Frame) -> Wings:
     """Return typical wings of a ground telescope, or of Euclid in the filter of the frame, with their error.
 
-    The wings of Euclid are in a table; beyond its last radius they fall as r^-3. A user's own band has those of a band of
-    the same camera, since the free strength of the wings absorbs most of the difference.
+    The wings of Euclid are in a table; beyond its last radius they fall as r^-3. A user's own band has the wings of a
+    band of the same camera, since their free strength absorbs most of the difference.
     """
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
