@@ -90,8 +90,8 @@ def _merge_hits(event: Int, hits: tuple[Int, Int, Int, Frame]) -> tuple[Int, Int
     first = np.flatnonzero(np.append(True, (np.diff(places, axis=1) != 0).any(axis=0))[: len(order)])
     if not len(first):
         return hits
-    kept = order[first]
-    return column[kept], packet[kept], row[kept], np.add.reduceat(charge[order], first)
+    chosen = order[first]
+    return column[chosen], packet[chosen], row[chosen], np.add.reduceat(charge[order], first)
 
 
 def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame, silicon: Traps | None) -> None:
