@@ -146,7 +146,7 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
         yield flat
     counts = np.full(bad_pixels.shape, judged, np.int16)
     combined = CombinedFrame(bad_pixels.astype(np.float32), np.zeros(bad_pixels.shape, np.float32), counts)
-    yield Master("bad_pixels", combined, lake_frames.select_types(frames, ("dark", "flat")), files.flag_cards())
+    yield Master("bad_pixels", combined, [*lake_frames.select_types(frames, ("dark",)), *flats], files.flag_cards())
 
 
 def _group_frames(frames: Sequence[Frame], key: object) -> list[list[Frame]]:

@@ -42,7 +42,7 @@ def of_header(one, keyword):
 
 
 def above_overscan(one):
-    """Return the pixels of the four quadrants in ADU above the overscan of their row."""
+    """Return the pixels of the four quadrants in ADU above the mean of the overscan of their quadrant."""
     raw = one.raw.astype(float)[:, :-ROWS]
     level = raw[:, :, -(OVERSCAN // 2) :].mean(axis=(1, 2), keepdims=True)
     return (raw - level)[:, :, PRESCAN:-OVERSCAN]

@@ -6,7 +6,8 @@ columns. The pattern is the same in every row and in every exposure.
 
 The drift is one offset per amplifier and exposure. It changes slowly with the date, so that exposures within its
 correlation time have almost the same offset. The noise of rows is drawn for each row of each amplifier and exposure.
-Both change prescan and overscan like the pixels, and are removed with the overscan.
+Both change prescan and overscan like the pixels. The drift is removed with the mean of the overscan, and the noise of
+rows with the mean of the overscan of each row.
 """
 
 from __future__ import annotations

@@ -71,8 +71,27 @@ def apply_readout(
             column, row = column % part.shape[1], row % rows
             packet = row + rows_read[event]
             read = packet < len(part)
-            _deposit(part, column[read], packet[read], row[read], charge[read], silicon)
+            hits = column[read], packet[read], row[read], charge[read]
+            if not spread.is_thin:
+                hits = _merge_hits(event[read], hits)
+            _deposit(part, *hits, silicon)
     return out
+
+
+def _merge_hits(event: Int, hits: tuple[Int, Int, Int, Frame]) -> tuple[Int, Int, Int, Frame]:
+    """Add up the charge that a wide track leaves in a pixel from several parts of its path.
+
+    `event` is the index of the track of each hit, and `hits` has the column, packet, row and electrons, as `_deposit`
+    takes them. Each pixel of a track is listed once in the result. Otherwise its parts would fill the same traps.
+    """
+    column, packet, row, charge = hits
+    order = np.lexsort((packet, column, event))
+    places = np.stack([event, column, packet])[:, order]
+    first = np.flatnonzero(np.append(True, (np.diff(places, axis=1) != 0).any(axis=0))[: len(order)])
+    if not len(first):
+        return hits
+    chosen = order[first]
+    return column[chosen], packet[chosen], row[chosen], np.add.reduceat(charge[order], first)
 
 
 def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame, silicon: Traps | None) -> None:

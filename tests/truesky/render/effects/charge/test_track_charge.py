@@ -1,5 +1,6 @@
 """Charge along tracks: thin lines by default, fluctuations of a Moyal distribution, and diffusion."""
 
+from dataclasses import replace
 from hashlib import sha256
 
 import numpy as np
@@ -11,7 +12,7 @@ from lake_schema.mission.configuration import resolve
 from truesky.render.camera import detectors
 from truesky.render.effects.charge import cosmic_rays, track_charge
 from truesky.render.effects.charge.track_charge import THIN, Spread
-from truesky.render.effects.readout import readout_cosmic_rays
+from truesky.render.effects.readout import charge_transfer, readout_cosmic_rays
 from truesky.render.effects.scene import Scene
 
 MISSION = resolve()
@@ -138,3 +139,36 @@ def test_a_request_with_an_impossible_spread_is_refused(key, value):
     name = f"vis.cosmic_rays.{key}"
     with pytest.raises(BadInput, match=rf"vis\.cosmic_rays\.{key}"):
         resolve(overrides={name: (value, MISSION.parameter(name).unit)})
+
+
+def test_traps_see_the_whole_charge_that_a_wide_track_leaves_in_a_pixel():
+    """A dot in the middle of a pixel, and the same charge from eight parts of a short path, lose the same electrons."""
+    traps = charge_transfer.silicon_traps(replace(scene({}), mjd=62318.0), "parallel")
+    one = np.array([200, 300]), np.array([1500, 1500]), np.array([1500, 1500]), np.array([1000.0, 2000.0])
+    parts = tuple(np.repeat(at, 8) for at in one[:3]), np.repeat(one[3] / 8, 8)
+    event = np.repeat([0, 1], 8)
+    merged = readout_cosmic_rays._merge_hits(event, (*parts[0], parts[1]))
+    for found, wanted in zip(merged, one, strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    images = [np.zeros((2066, 400)) for _ in range(3)]
+    for image, hits in zip(images, (one, merged, (*parts[0], parts[1])), strict=True):
+        readout_cosmic_rays._deposit(image, *hits, traps)
+    np.testing.assert_array_equal(images[0], images[1])
+    # Parts that are not added up fill the same traps, and lose much less.
+    lost, lost_by_parts = (one[3].sum() - image[one[1], one[0]].sum() for image in (images[0], images[2]))
+    assert lost > 30.0
+    assert lost_by_parts < 0.6 * lost
+    # The same pixel of two tracks is listed twice, and nothing may be left.
+    twice = readout_cosmic_rays._merge_hits(np.array([0, 1]), tuple(np.repeat(at[:1], 2) for at in one))
+    assert len(twice[0]) == 2
+    none = readout_cosmic_rays._merge_hits(event[:0], tuple(at[:0] for at in one))
+    assert [len(at) for at in none] == [0, 0, 0, 0]
+
+
+def test_a_readout_lists_each_pixel_of_a_wide_track_once(monkeypatch):
+    """Without this, 60 tracks that are 0.3 pixels wide would list most of their pixels two or three times."""
+    listed = []
+    monkeypatch.setattr(readout_cosmic_rays, "_deposit", lambda _, column, packet, *__: listed.append((column, packet)))
+    readout_cosmic_rays.apply_readout(np.zeros((4, 1200, 900)), 60.0, TRACKS, (1200, 10, 640), None, Spread(0.3), rng())
+    for column, packet in listed:
+        assert len(np.unique(np.stack([column, packet]), axis=1).T) > 0.97 * len(column) > 300
