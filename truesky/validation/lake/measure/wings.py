@@ -179,7 +179,9 @@ def typical(frame: Frame) -> Wings:
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
         return Wings(strength, _TYPICAL_SLOPE, _GROUND_EXTENT / frame.scale, _UNSURE_GROUND * strength)
-    radii, values = zip(*read_table()[str(frame.header["FILTER"])], strict=True)
+    table = read_table()
+    # Only VIS observes in passbands of users, which lie within the passband of VIS.
+    radii, values = zip(*table.get(str(frame.header["FILTER"]), table["euclid_vis"]), strict=True)
     return Wings(
         1.0,
         _TYPICAL_SLOPE,
