@@ -28,6 +28,8 @@ INSTRUMENTS: Mapping[str, str] = {"VIS": "VIS", "NISP-P": "NISP", "NISP-S": "NIS
 _MJD_ZERO = datetime(1858, 11, 17)
 # Number by which the observation of a field grows with each visit; surveys have fewer fields.
 _VISIT_STEP = 100_000
+# Number by which the pointing grows with each observation; observations have fewer dithers.
+_POINTING_STEP = 1000
 # Decimals of angles in degrees, which are so exact on every processor.
 _DECIMALS = 6
 # Values of IMG_T1 and SEQID by image type. Image types that are not listed have their names in capitals.
@@ -112,7 +114,7 @@ def exposure_cards(exposure: ExposureRow, detectors: int, mission: MissionConfig
         ("FIELDID", number if exposure.field is None else exposure.field, "field"),
         ("OBS_ID", number, "observation"),
         ("DITHOBS", dither, "dither of the observation, from 1"),
-        ("PTGID", 10 * number + dither, "pointing"),
+        ("PTGID", _POINTING_STEP * number + dither, "pointing"),
         ("PA", angle, "[deg] position angle of the focal plane"),
         ("ORIENTAT", angle, "[deg] position angle of the y axis"),
         ("DATAUNIT", "ADU", "unit of the pixels"),

@@ -72,12 +72,18 @@ def test_numbers_of_an_exposure():
         field=12, visit=2, dither=3, mjd=61000.5, exposure_time_s=560.0, position_angle=-10.0,
     )  # fmt: skip
     assert {key: found[key] for key in ("FIELDID", "OBS_ID", "DITHOBS", "PTGID", "N_CCD")} == {
-        "FIELDID": 12, "OBS_ID": 100012, "DITHOBS": 3, "PTGID": 1000123, "N_CCD": 36,
+        "FIELDID": 12, "OBS_ID": 100012, "DITHOBS": 3, "PTGID": 100012003, "N_CCD": 36,
     }  # fmt: skip
     assert (found["PA"], found["ORIENTAT"], found["MJDATE"], found["DATAUNIT"]) == (350.0, 350.0, 61000.5, "ADU")
     assert found["FITS_DEF"] == "le1.visRawImage"
     ends = Time(found["DATE-END"], scale="utc") - Time(61000.5, format="mjd", scale="utc")
     assert ends.sec == pytest.approx(560.0, abs=1e-3)
+
+
+def test_pointings_have_different_numbers():
+    """A self-calibration has tens of dithers."""
+    numbers = {cards(field=field, visit=1, dither=dither)["PTGID"] for field in (12, 13, 14) for dither in range(1, 61)}
+    assert len(numbers) == 3 * 60
 
 
 def test_wheels_of_nisp():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sep
 
+from lake_schema.mission.bounds import bounds_of_parameter
 from lake_schema.mission.configuration import resolve
 from tests.truesky import nightly
 from tests.truesky.render import nominal
@@ -76,6 +77,18 @@ def test_of_colours_and_places_it_is_between():
 def test_of_a_round_disc_it_is_nothing():
     psf = seeing.moffat_psf(0.73, 3.0, 0.2)
     assert np.abs(offsets(psf, np.ones((3, 1)))).max() < 1e-6
+
+
+@pytest.mark.parametrize(("key", "pixel"), [("vis.psf.window", 0.1), ("nisp.euclid_y.psf.window", 0.3)])
+def test_in_the_narrowest_window_the_centroid_follows_the_light(key, pixel):
+    """In narrower windows the centroid stays at the brightest pixel."""
+    narrowest = max(low for low, *_ in bounds_of_parameter(key)) / pixel
+    axis = (np.arange(161) - 80) / 5.0
+
+    def star(x, y):
+        return np.outer(np.exp(-0.5 * ((axis - y) / 0.6) ** 2), np.exp(-0.5 * ((axis - x) / 0.6) ** 2))
+
+    np.testing.assert_allclose(centroids.mean_centroid(star(0.12, -0.06), 5, narrowest), (0.12, -0.06), atol=1e-3)
 
 
 def core_of_psf(section, name, band):

@@ -95,6 +95,13 @@ def test_points_without_wings():
     assert found.error < 0.05 * wings.typical(of).strength
 
 
+def test_the_wings_in_a_passband_of_a_user_are_those_of_vis():
+    frame_of_user = Frame(
+        np.zeros((2, 2), np.float32), (), None, {**header("euclid_vis"), "FILTER": "mine"}, WCS(naxis=2)
+    )
+    assert wings.typical(frame_of_user) == typical("euclid_vis")
+
+
 @pytest.mark.parametrize(("band", "unsure"), [("euclid_vis", 0.1), ("des_r", 0.5)])
 def test_faint_frames_have_typical_wings(band, unsure):
     of, known = frame(np.random.default_rng(4), Wings(0.0, 3.0), band)
