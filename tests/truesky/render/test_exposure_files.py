@@ -208,7 +208,7 @@ def test_files_have_the_names_and_headers_of_raw_frames_of_euclid(lake, request_
     found = opened(lake)
     start = "20250818T000000.000000Z"
     assert [found[channel][1].name for channel in ("VIS", "NISP-P")] == [
-        f"EUC_LE1_VIS-00001-1-D_{start}.fits", f"EUC_LE1_NISP-00002-1-D_{start}.fits",
+        f"EUC_LE1_VIS-10000001-1-D_{start}.fits", f"EUC_LE1_NISP-10000002-1-D_{start}.fits",
     ]  # fmt: skip
     assert set(archive.exposures(lake)["path"].to_pylist()) == {row["path"] for row, _ in found.values()}
     for channel, (row, path) in found.items():

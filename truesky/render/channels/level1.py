@@ -28,6 +28,8 @@ INSTRUMENTS: Mapping[str, str] = {"VIS": "VIS", "NISP-P": "NISP", "NISP-S": "NIS
 _MJD_ZERO = datetime(1858, 11, 17)
 # Number by which the observation of a field grows with each visit; surveys have fewer fields.
 _VISIT_STEP = 100_000
+# Number added to the number of an exposure without a field, which is its own observation.
+_WITHOUT_FIELD = 10_000_000
 # Number by which the pointing grows with each observation; observations have fewer dithers.
 _POINTING_STEP = 1000
 # Decimals of angles in degrees, which are so exact on every processor.
@@ -49,10 +51,11 @@ _OVERSCANS = (
 def observation(exposure: ExposureRow) -> int:
     """Return the number of the observation (OBS_ID) to which an exposure belongs.
 
-    It is the number of the field plus 100,000 for each earlier visit, or the number of the exposure without a field.
+    It is the number of the field plus 100,000 for each earlier visit. Without a field it is the number of the exposure
+    plus 10,000,000, so that it differs from the numbers of fields.
     """
     if exposure.field is None:
-        return exposure.exposure_id
+        return _WITHOUT_FIELD + exposure.exposure_id
     return exposure.field + _VISIT_STEP * ((exposure.visit or 1) - 1)
 
 

@@ -395,7 +395,9 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
             cloud_mag = clouds.extinction(e.clouds, e.mjd, e.exposure_time_s, night.site.longitude, seed)
             slopes = night_sky.twilight_slopes(night, (e.ra, e.dec), e.position_angle, e.mjd, mission)
     channel = registry.CHANNELS[e.channel]
-    passed = ice.transmission(e.band, e.mjd, mission) if e.camera in SPACE_CAMERAS else 1.0
+    # A zero point of the user contains all losses.
+    has_ice = e.camera in SPACE_CAMERAS and e.zero_point is None
+    passed = ice.transmission(e.band, e.mjd, mission) if has_ice else 1.0
     extinction_mag -= 2.5 * math.log10(passed)
     if e.image_type in _DARK_TYPES or (channel.on_ground and not channel.sees_sky(e.image_type)):
         sky = 0.0

@@ -343,7 +343,7 @@ def _ageing_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     cards: list[Card] = []
     if exposure.camera in SPACE_CAMERAS and scene.mission.value("plm.ice") > 0.0:
         lost = 1.0 - ice.transmission(exposure.band, exposure.mjd, scene.mission)
-        cards.append(("ICELOSS", lost, "fraction of light lost by ice, in ZEROPNT"))
+        cards.append(("ICELOSS", lost, "fraction of light lost by ice at this date"))
     if f"{scene.section}.cti.age" in scene.mission:
         cards.append(("CTIAGE", charge_transfer.age(scene), "traps relative to the end of the mission"))
     return tuple(cards)

@@ -36,7 +36,7 @@ def test_the_name_of_a_file_is_that_of_a_raw_frame():
     spectrum = exposure(channel="NISP-S", camera="nisp", band="nisp_red", mjd=start, field=7, visit=3, dither=4)
     assert level1.file_name(spectrum).startswith("EUC_LE1_NISP-200007-4-D_20240701T001045.")
     alone = exposure(exposure_id=31, mjd=start)
-    assert level1.file_name(alone).startswith("EUC_LE1_VIS-00031-1-D_")
+    assert level1.file_name(alone).startswith("EUC_LE1_VIS-10000031-1-D_")
     repeated = level1.file_name(exposure(exposure_id=31, mjd=start, realisation=2))
     assert repeated == level1.file_name(alone).replace("Z.fits", "Z_02.fits")
     assert Q1_NAME.fullmatch(repeated)

@@ -54,6 +54,8 @@ def test_stars_and_sky_are_dimmed_alike():
     # Numbers that the user gives are those of the detector, whatever the ice.
     given = row(ICY, BEFORE, sky=0.3, zero_point=25.0)
     assert (given["sky"], given["zero_point"]) == (0.3, 25.0)
+    # A zero point of the user contains the loss of the sources, so that the sky is not dimmed either.
+    assert row(ICY, BEFORE, zero_point=25.0)["sky"] == clear["sky"]
 
 
 def test_the_header_has_the_lost_fraction():
