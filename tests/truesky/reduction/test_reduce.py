@@ -1,12 +1,15 @@
 """Test masters and calibrated images of rendered frames of a lake."""
 
+import csv
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from lake_schema import mission
 from lake_schema.fits import images
 from lake_schema.store import layout, read
 from tests.truesky.reduction import lakes
@@ -18,6 +21,19 @@ GAINS = {
     "vis.gain.E": {"value": 3.0, "unit": "electron / adu"},
     "vis.gain@3-4.H": {"value": 4.0, "unit": "electron / adu"},
 }
+# Pixels of the quadrants of a detector of 256 columns.
+QUADRANTS = {
+    "E": np.s_[132:, :128], "F": np.s_[132:, 128:], "G": np.s_[:128, 128:], "H": np.s_[:128, :128],
+}  # fmt: skip
+TABLE = Path(mission.__file__).parent / "models" / "amplifier_values_vis.csv"
+
+
+def table_value(key, quadrant, nominal):
+    """Return a number of a quadrant of 3-4: that of the camera, times the quadrant's number over the table's median."""
+    with TABLE.open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    (own,) = (float(row[key]) for row in rows if (row["detector"], row["amplifier"]) == ("3-4", quadrant))
+    return nominal * own / np.median([float(row[key]) for row in rows])
 
 
 @pytest.fixture(scope="module")
@@ -122,10 +138,12 @@ def test_masters_agree_with_the_detector(made):
     pixels = np.ones(bias[1].data.shape, bool)
     pixels[128:132] = False
     # Noise of the mean of 5 frames: read noise and rounding, which differ between amplifiers.
-    # Quadrants E and F lie above the rows of charge injection, H and G below.
-    gain = np.zeros(pixels.shape)
-    gain[132:, :128], gain[132:, 128:], gain[:128, 128:], gain[:128, :128] = 3.0, 3.48, 3.48, 4.0
-    expected = np.sqrt((4.4**2 + gain**2 / 12) / bias[3].data.clip(1))
+    # Quadrants E and F lie above the rows of charge injection, H and G below. The request sets the gains of E and H.
+    gain, noise = np.zeros(pixels.shape), np.zeros(pixels.shape)
+    for name, part in QUADRANTS.items():
+        gain[part], noise[part] = table_value("gain", name, 3.48), table_value("read_noise", name, 4.4)
+    gain[QUADRANTS["E"]], gain[QUADRANTS["H"]] = 3.0, 4.0
+    expected = np.sqrt((noise**2 + gain**2 / 12) / bias[3].data.clip(1))
     np.testing.assert_allclose(bias[2].data[pixels], expected[pixels], rtol=1e-5)
     # The pattern is the same in every row of a quadrant.
     off = [half - np.median(half, axis=0) for half in (bias[1].data[:128], bias[1].data[132:])]

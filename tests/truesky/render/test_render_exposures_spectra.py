@@ -282,7 +282,8 @@ def test_masters_from_dark_and_flat(rendered, folder, capsys):
     """They have the ramp of the spectra; the lake does not change."""
     before = sorted(path for path in rendered.rglob("*") if path.is_file())
     assert masters.main(["--lake", str(rendered), "--out", str(folder / "masters")]) == 0
-    dark, flat = (line.split(": ") for line in capsys.readouterr().out.strip().splitlines())
+    dark, flat, bad = (line.split(": ") for line in capsys.readouterr().out.strip().splitlines())
+    assert Path(bad[0]).name == "NISP_DET22_bad_pixels.fits"
     assert Path(dark[0]).name == "NISP-S_15-16-11_DET22_dark.fits"
     assert Path(flat[0]).name == "NISP-S_nisp_red_DET22_flat.fits"
     assert float(re.search(r"median (\S+),", dark[1])[1]) == pytest.approx(0.02, abs=0.005)

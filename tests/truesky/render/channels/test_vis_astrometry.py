@@ -30,6 +30,8 @@ OVER, FINE = 10, 11
 PUPIL = 256
 # Standard deviation of the window of sep, pixels.
 WINDOW = 1.2
+# Standard deviation of the window in which stars of VIS are centred (`vis.psf.window`), pixels.
+CENTRED = 1.0
 
 
 # ------------------------------------------------------------------------------------------------ the truth table
@@ -103,9 +105,10 @@ def alone():
 
 
 def oversampled(detector, column, row, side, strength):
-    """Draw a star of flat f_nu at a pixel position with the optics of galsim, 10 times finer than the pixels.
+    """Draw a star of flat f_nu whose chief ray is at a pixel position, with galsim, 10 times finer than the pixels.
 
-    The result is the light [side, side] on the pixels around round(column), round(row).
+    The result is the light [side, side] on the pixels around round(column), round(row), and the centroid of the star in
+    the window of VIS minus the position, pixels.
     """
     # Half width and half height of a detector, arcsec.
     half_x, half_y = 409.6 / 2, 413.2 / 2
@@ -140,7 +143,11 @@ def oversampled(detector, column, row, side, strength):
         fine += gaussian_filter(drawn, blur, mode="constant")
     u = (np.arange(OVER) + 0.5) / (OVER / 2) - 1
     response = 1 - strength * (u[:, None] ** 2 + u**2)
-    return np.einsum("aibj,ij->ab", fine.reshape(side, OVER, side, OVER), response / response.mean())
+    light = np.einsum("aibj,ij->ab", fine.reshape(side, OVER, side, OVER), response / response.mean())
+    # The mean over a pixel of an even number of samples is half a sample too far up.
+    chief = (side * OVER - 1) / 2 - np.array([dx, dy]) * OVER + 0.5
+    seen = uniform_filter(fine, OVER, mode="constant")
+    return light, (np.array(sep.winpos(seen, *chief, OVER * CENTRED)[:2]) - chief) / OVER
 
 
 def centroid(stamp, x, y):
@@ -168,7 +175,9 @@ def differences(detector, columns, rows, side=41):
     for x, y in zip(columns, rows, strict=True):
         x0, y0 = round(x) - half, round(y) - half
         ours = centroid(image[y0 : y0 + side, x0 : x0 + side], x - x0, y - y0)
-        theirs = centroid(oversampled(detector, x, y, side, 0.05), x - x0, y - y0)
+        light, shift = oversampled(detector, x, y, side, 0.05)
+        # Our star has its centroid at the position; galsim's has its chief ray there.
+        theirs = centroid(light, x - x0, y - y0) - shift
         out.append((ours - theirs) / MAS)
     return np.array(out)
 
