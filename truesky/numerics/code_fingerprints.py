@@ -25,7 +25,7 @@ _IRRELEVANT = (
 )  # fmt: skip
 
 # Modules in the packages of `_IRRELEVANT` that do affect the numbers in arrays.
-_RELEVANT = ("truesky.request.accuracy",)
+_RELEVANT = ("truesky.request.accuracy", "lake_schema.mission.ghost_offsets")
 
 
 @lru_cache

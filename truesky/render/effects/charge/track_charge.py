@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import OutOfRange
@@ -148,7 +148,7 @@ def _diffuse(
     for point in range(points):
         along = length * (start + part * (point + 0.5) / points)
         shares = [
-            np.diff(ndtr((edges - (at + step * along - pixel)[:, None]) / sigma), axis=1)
+            np.diff(scipy.special.ndtr((edges - (at + step * along - pixel)[:, None]) / sigma), axis=1)
             for at, step, pixel in ((x, cosine, column), (y, sine, row))
         ]
         weights += shares[1][:, :, None] * shares[0][:, None, :]
