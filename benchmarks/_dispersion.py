@@ -7,6 +7,7 @@ slow method: it uses large and finely sampled stamps, and a separate PSF at each
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -32,10 +33,10 @@ NOISE = 28.0
 ERROR_NAMES = ("background", "flux", "position")
 # Number of sources in the sample with which the settings of the drawing code are chosen.
 NUM_CHOSEN = 18
-# Number of sources in the sample with which the chosen settings are tested.
+# Number of sources in each sample with which the chosen settings are tested.
 NUM_TEST = 36
-# Seed of the sources with which settings are chosen, and seed of the sources with which they are tested.
-_SEEDS = (41, 42)
+# Seed of the sources with which settings are chosen, and seeds of the samples with which they are tested.
+_CHOSEN_SEED, _TEST_SEEDS = 41, (42, 78)
 # Number of sources with which the time of drawing is measured.
 _NUM_TIMED = 400
 # Seed of the sources with which the time of drawing is measured.
@@ -47,7 +48,7 @@ _BRIGHT, _FAINT = 17.0, 23.0
 # Electrons of a source of magnitude 0, for a zero point of 25.3 mag (1 electron per s) and 549.6 s.
 _ZERO = 549.6 * 10 ** (0.4 * 25.3)
 # Parameters of the slow method to which the drawn spectra are compared.
-_TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9)
+TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=10, positions=9)
 # Shape (ny, nx) of the image of one spectrum, pixels.
 _SHAPE = (128, 720)
 # Column and row at which the source of a spectrum would lie on the image without the grism. A random fraction of a
@@ -240,7 +241,8 @@ def measure_settings(
     repeats : int
         Number of repeats of each measurement of time.
     num_chosen, num_test : int, optional
-        Number of sources with which settings are chosen, and number of other sources with which they are tested.
+        Number of sources with which settings are chosen, and number of sources in each of two other samples with which
+        they are tested.
 
     Returns
     -------
@@ -249,11 +251,12 @@ def measure_settings(
         the test sample (the same names with `_held`), and `seconds` (CPU time of 7,400 sources).
     """
     samples = {
-        end: sample_sources(seed, n) for end, seed, n in zip(("", "_held"), _SEEDS, (num_chosen, num_test), strict=True)
+        "": sample_sources(_CHOSEN_SEED, num_chosen),
+        "_held": [source for seed in _TEST_SEEDS for source in sample_sources(seed, num_test)],
     }
-    psf = settings_psf(_TRUTH)
+    psf = settings_psf(TRUTH)
     truths = {
-        end: [draw_images(sample_source, _TRUTH, psf) for sample_source in sample_list]
+        end: [draw_images(sample_source, TRUTH, psf) for sample_source in sample_list]
         for end, sample_list in samples.items()
     }
     table_rows = []
@@ -269,6 +272,12 @@ def measure_settings(
     return table_rows
 
 
+def round_up(error: float) -> float:
+    """Return a positive error with two digits, rounded up, because headers state it as the largest error."""
+    step = 10.0 ** (math.floor(math.log10(error)) - 1)
+    return float(f"{math.ceil(error / step) * step:.2g}")
+
+
 def settings_table(repeats: int = 2) -> str:
     """Measure again the errors and times of the settings with which truesky draws slitless spectra.
 
@@ -280,12 +289,17 @@ def settings_table(repeats: int = 2) -> str:
     measured_rows = measure_settings([draw.settings_from_row(row) for row in current_rows], repeats)
     lines = [
         ",".join(
-            f"{({**row, **measured})[name]:.2g}" if name not in setting_names else f"{row[name]:g}" for name in names
+            f"{row[name]:g}"
+            if name in setting_names
+            else f"{measured[name]:.2g}"
+            if name == "seconds"
+            else f"{round_up(measured[name]):g}"
+            for name in names
         )
         for row, measured in zip(current_rows, measured_rows, strict=True)
     ]
     head = _TABLE_HEADER.format(
-        chosen=NUM_CHOSEN, held=NUM_TEST, bright=_BRIGHT, faint=_FAINT, wide=2 * _BOX[0] + 1, high=2 * _BOX[1] + 1,
-        machine=report.machine(),
+        chosen=NUM_CHOSEN, held=NUM_TEST * len(_TEST_SEEDS), bright=_BRIGHT, faint=_FAINT, wide=2 * _BOX[0] + 1,
+        high=2 * _BOX[1] + 1, machine=report.machine(),
     )  # fmt: skip
     return "\n".join([*head.splitlines(), ",".join(names), *lines]) + "\n"

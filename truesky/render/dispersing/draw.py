@@ -140,7 +140,7 @@ def settings_for(requested: Accuracy) -> Settings:
 
 
 def expected_errors(requested: Accuracy) -> dict[str, float]:
-    """Return the measured errors of the settings for an accuracy, in spectra of 36 sources of H = 17 to 23.
+    """Return the measured errors of the settings for an accuracy, in spectra of 72 sources of H = 17 to 23.
 
     The settings were chosen with other sources. `flux` is the relative error of an emission line, `position` its error
     in pixels, and `background` the largest error of a pixel, as a fraction of its noise.

@@ -12,9 +12,8 @@ from truesky.request.accuracy import PRESETS
 SOURCES, BRIGHT = 36, 7
 
 
-def largest_error(settings, sources):
-    """Return the largest error of a pixel, as a fraction of its noise."""
-    fine = replace(settings, nodes=10)
+def largest_error(settings, sources, fine):
+    """Return the largest difference of a pixel from images with finer settings, as a fraction of its noise."""
     psf, fine_psf = (dispersion.settings_psf(each) for each in (settings, fine))
     images = ((dispersion.draw_images(s, settings, psf), dispersion.draw_images(s, fine, fine_psf), s) for s in sources)
     return max(dispersion.errors(drawn, truth, source)[0] for drawn, truth, source in images)
@@ -24,6 +23,8 @@ def largest_error(settings, sources):
 def test_errors_of_bright_spectra_are_those_that_headers_name(preset):
     sources = sorted(dispersion.sample_sources(78, SOURCES), key=lambda each: -each.source.electrons[0])[:BRIGHT]
     settings, named = draw.settings_for(PRESETS[preset]), draw.expected_errors(PRESETS[preset])["background"]
-    assert largest_error(settings, sources) < named
+    # Errors of wavelengths and of positions partly cancel. The second ones are small at quicklook, and cost time.
+    fine = replace(settings, nodes=10) if preset == "quicklook" else dispersion.TRUTH
+    assert largest_error(settings, sources, fine) < named
     # The test would notice one wavelength less.
-    assert largest_error(replace(settings, nodes=2), sources) > 1.5 * named
+    assert largest_error(replace(settings, nodes=2), sources, fine) > 1.5 * named

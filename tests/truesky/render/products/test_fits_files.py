@@ -136,7 +136,7 @@ def test_the_header_calibrates_the_image(rendered, written):
         ("BUNIT", "adu"),
         ("FILTER", "euclid_vis"),
         ("SEED", "1"),
-        ("DATE-OBS", "2025-10-02T00:00:00.000"),
+        ("DATE-OBS", "2023-07-01T00:00:00.000"),
     ):
         assert header[key] == value
     assert header["ZEROPNT"] == pytest.approx(25.93, abs=0.01)
