@@ -7,7 +7,6 @@ slow method: it uses large and finely sampled stamps, and a separate PSF at each
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -272,12 +271,6 @@ def measure_settings(
     return table_rows
 
 
-def round_up(error: float) -> float:
-    """Return a positive error with two digits, rounded up, because headers state it as the largest error."""
-    step = 10.0 ** (math.floor(math.log10(error)) - 1)
-    return float(f"{math.ceil(error / step) * step:.2g}")
-
-
 def settings_table(repeats: int = 2) -> str:
     """Measure again the errors and times of the settings with which truesky draws slitless spectra.
 
@@ -293,7 +286,7 @@ def settings_table(repeats: int = 2) -> str:
             if name in setting_names
             else f"{measured[name]:.2g}"
             if name == "seconds"
-            else f"{round_up(measured[name]):g}"
+            else f"{report.round_up(measured[name]):g}"
             for name in names
         )
         for row, measured in zip(current_rows, measured_rows, strict=True)

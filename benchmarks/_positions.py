@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks import _errors as errors
 from benchmarks import _scenes as scenes
+from benchmarks import report
 from benchmarks._scenes import NISP, VIS, Scene
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
@@ -145,7 +146,12 @@ def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
     """Return the results of `measure_positions` as the text of a CSV file with a header."""
     header = _TABLE_HEADER.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
     lines = [
-        ",".join(f"{row[name]:.2g}" if name not in _INTEGER_COLUMNS else f"{row[name]:.0f}" for name in row)
+        ",".join(
+            f"{row[name]:.0f}"
+            if name in _INTEGER_COLUMNS
+            else f"{report.round_up(row[name]) if name.endswith('_error') else row[name]:.2g}"
+            for name in row
+        )
         for row in table_rows
     ]
     return "\n".join([header + _COLUMNS, *lines]) + "\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import time
@@ -49,6 +50,12 @@ def options(
     if lake:
         parser.add_argument("--lake", type=Path, metavar="LAKE", help=lake)
     return parser.parse_args(argv)
+
+
+def round_up(error: float) -> float:
+    """Return a positive error with two digits, rounded up, because tables and headers state it as the largest error."""
+    step = 10.0 ** (math.floor(math.log10(error)) - 1)
+    return float(f"{math.ceil(error / step) * step:.2g}")
 
 
 def best_time(work: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
