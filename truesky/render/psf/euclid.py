@@ -176,9 +176,9 @@ def centroid_window(section: str, light: str, mission: MissionConfiguration) -> 
     -------
     float
         The parameter <section>.<light>.psf.window, or <section>.psf.window if the mission database has no such
-        parameter.
+        parameter. For spectra it is <section>.traces.psf.window.
     """
-    key = f"{section}.{light}.psf.window"
+    key = f"{section}.{'traces' if light == _SPECTRA else light}.psf.window"
     return mission.value(key if key in mission else f"{section}.psf.window", "arcsec")
 
 
