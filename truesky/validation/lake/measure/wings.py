@@ -175,17 +175,15 @@ def read_table(path: Path = TABLE) -> dict[str, tuple[tuple[float, float], ...]]
 def typical(frame: Frame) -> Wings:
     """Return typical wings of a ground telescope, or of Euclid in the filter of the frame, with their error.
 
-    The wings of Euclid are in a table; beyond its last radius they fall as r^-3. A user's own band has the wings of a
-    band of the same camera, since their free strength absorbs most of the difference.
+    The wings of Euclid are in a table; beyond its last radius they fall as r^-3. A user's own passband has
+    the wings of VIS, since their free strength absorbs most of the difference.
     """
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
         return Wings(strength, _TYPICAL_SLOPE, _GROUND_EXTENT / frame.scale, _UNSURE_GROUND * strength)
     bands = read_table()
-    band = str(frame.header.get("BAND", frame.header["FILTER"]))
-    if band not in bands:
-        band = "euclid_vis" if frame.header["CHANNEL"] == "VIS" else "euclid_j"
-    radii, values = zip(*bands[band], strict=True)
+    # Only VIS observes in passbands of users.
+    radii, values = zip(*bands.get(str(frame.header["FILTER"]), bands["euclid_vis"]), strict=True)
     return Wings(
         1.0,
         _TYPICAL_SLOPE,

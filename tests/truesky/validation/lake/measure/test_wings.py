@@ -43,11 +43,6 @@ def typical(band):
     return wings.typical(Frame(np.zeros((2, 2), np.float32), (), None, header(band), WCS(naxis=2)))
 
 
-def test_a_users_own_band_has_the_wings_of_its_camera():
-    assert typical("mine") == typical("euclid_j")
-    assert typical("mine") != typical("euclid_h")
-
-
 @nightly.parametrize("slope", [2.8, 3.1], (0,))
 def test_input_power_laws_are_recovered_on_the_ground(slope):
     there = Wings(0.09, slope, outer_radius=250.0)
