@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import sep
@@ -31,10 +32,15 @@ from truesky.render.camera import astrometry
 _MESH = 64
 # Side, in squares, of the median filter that smooths the levels of the sky.
 _MESH_FILTER = 3
+# Side, in pixels, of the squares over which pixels are averaged before the level of the sky is measured.
+_SMOOTHING = 3
 # The Kron radius is measured in an ellipse this many times larger than the isophotal ellipse (A_IMAGE, B_IMAGE).
 _ISOPHOTES = 6.0
 # Size of the elliptical aperture of MAG_AUTO in Kron radii.
 _KRON = 2.5
+# Smallest size of this aperture in units of the isophotal ellipse, the default of SourceExtractor. The Kron radius of
+# faint sources is mostly noise.
+_LEAST_KRON = 3.5
 # Smallest radius, in pixels, of the aperture of MAG_AUTO; below it, a circle of this radius is used.
 _MIN_RADIUS = 1.75
 # Value of `subpix` with which sep computes exact overlaps of pixels and apertures.
@@ -119,57 +125,120 @@ def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limi
     The image is searched in tiles of 2048 x 2048 pixels. At the edge of a tile, a source that extends more than 256
     pixels from its brightest pixel may be truncated or counted twice.
     """
+    return _measure(image, gain, radius, limits, is_windowed=True)[0]
+
+
+def detect_segments(image: ReducedImage, gain: float, radius: float, limits: Limits) -> tuple[dict[str, Array], Int]:
+    """Detect and measure the sources in an image, and return the pixels of each source as well.
+
+    Parameters
+    ----------
+    image : ReducedImage
+        As for `detect_sources`.
+    gain : float
+        Electrons per unit of the image, for the shot noise of fluxes.
+    radius : float
+        Radius of the circular aperture of MAG_APER in pixels.
+    limits : Limits
+        Detection threshold and smallest number of pixels.
+
+    Returns
+    -------
+    measured : dict of str to array
+        The measurements of `detect_sources` without those in a Gaussian window (`xwin`, `ywin`, `window_errors`), which
+        take a third of the time.
+    segments : int32 array, shape (ny, nx)
+        Number of the source to which a pixel belongs, from 1 in the order of the measurements, or 0.
+    """
+    return _measure(image, gain, radius, limits, is_windowed=False)
+
+
+def _measure(
+    image: ReducedImage, gain: float, radius: float, limits: Limits, is_windowed: bool
+) -> tuple[dict[str, Array], Int]:
+    """Return measurements and pixels of the sources, with measurements in a Gaussian window or without."""
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
     above, noise, sky = _subtract_sky(image, masked, limits)
-    sources, segmentation = _extract(above, noise, masked, limits, gain=gain)
+    # The threshold is that of SourceExtractor: the smoothed image against the noise of unsmoothed pixels. With sep's
+    # matched filter a third of the detections would be noise.
+    sources, segmentation = _extract(above, noise, masked, limits, gain=gain, filter_type="conv")
     centres = sources["x"], sources["y"]
     shape = sources["a"], sources["b"], np.clip(sources["theta"], -np.pi / 2, np.pi / 2)
-    common = {"err": noise, "mask": masked, "gain": gain, "subpix": _EXACT}
-    kron, _ = sep.kron_radius(above, *centres, *shape, _ISOPHOTES, mask=masked)
-    kron = _KRON * np.where(np.isfinite(kron) & (kron > 0.0), kron, 1.0)
+    # Pixels of other sources are left out; the mean of the others in the aperture takes their place.
+    chosen_pixels = {"mask": masked, "seg_id": np.arange(1, len(sources) + 1), "segmap": segmentation}
+    common = {"err": noise, "gain": gain, "subpix": _EXACT, **chosen_pixels}
+    kron, _ = sep.kron_radius(above, *centres, *shape, _ISOPHOTES, **chosen_pixels)
+    kron = np.maximum(_KRON * np.where(np.isfinite(kron), kron, 0.0), _LEAST_KRON)
     small = kron * np.sqrt(shape[0] * shape[1]) < _MIN_RADIUS
     auto = sep.sum_ellipse(above, *centres, *shape, kron, **common)
     small_aperture = sep.sum_circle(above, *centres, _MIN_RADIUS, **common)
     aperture = sep.sum_circle(above, *centres, radius, **common)
-    flux, error, auto_flags = (np.where(small, b, a) for a, b in zip(auto, small_aperture, strict=True))
+    flux, error, _ = (np.where(small, b, a) for a, b in zip(auto, small_aperture, strict=True))
     half_light, _ = sep.flux_radius(
-        above, *centres, _ISOPHOTES * shape[0], 0.5, normflux=np.maximum(flux, 1e-20), subpix=5, mask=masked
+        above, *centres, _ISOPHOTES * shape[0], 0.5, normflux=np.maximum(flux, 1e-20), subpix=5, **chosen_pixels
     )
-    window = np.maximum(_WINDOW * half_light, 0.5)
-    xwin, ywin, _ = sep.winpos(above, *centres, window, mask=masked, subpix=_EXACT)
+    windowed = _in_windows((above, noise, masked), gain, centres, half_light) if is_windowed else {}
     bits = _flag_bits(segmentation, image.flags, len(sources))
+    # Pixels of other sources do not count as bad pixels.
+    auto_flags = sep.sum_ellipse(above, *centres, *shape, kron, mask=masked, subpix=1)[2]
     flags = _flags(sources["flag"], auto_flags | aperture[2], auto_flags, bits)
     pixel = np.rint(centres[1]).astype(int), np.rint(centres[0]).astype(int)
-    return {
-        "x": centres[0], "y": centres[1], "xwin": xwin, "ywin": ywin, "a": shape[0], "b": shape[1], "theta": shape[2],
+    measured = {
+        "x": centres[0], "y": centres[1], **windowed, "a": shape[0], "b": shape[1], "theta": shape[2],
         "errors": _errors(sources, flux / np.maximum(error, 1e-20)), "npix": sources["npix"],
-        "window_errors": _window_errors((above, noise, masked), gain, (xwin, ywin), window),
         "fwhm": _fwhm(above, segmentation, sources["peak"]),
         "flux_iso": sources["flux"], "flux_max": sources["peak"], "threshold": sources["thresh"], "kron": kron,
         "flux_auto": flux, "fluxerr_auto": error, "flux_aper": aperture[0], "fluxerr_aper": aperture[1],
         "flux_radius": half_light, "background": sky.back()[pixel], "flags": flags, "imaflags": bits,
     }  # fmt: skip
+    return measured, segmentation
+
+
+def _in_windows(
+    maps: tuple[Array, Array, Bool], gain: float, centres: tuple[Float, Float], half_light: Float
+) -> dict[str, Array]:
+    """Return positions in a Gaussian window, and their errors; for `maps` see `_window_errors`."""
+    window = np.maximum(_WINDOW * half_light, 0.5)
+    xwin, ywin, _ = sep.winpos(maps[0], *centres, window, mask=maps[2], subpix=_EXACT)
+    return {"xwin": xwin, "ywin": ywin, "window_errors": _window_errors(maps, gain, (xwin, ywin), window)}
 
 
 def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
-    """Return the image minus the sky, the rms of the sky (both float32[ny, nx]), and the model of the sky.
+    """Return the image minus the sky, the rms of the sky (both float32[ny, nx]), and the model of the sky's level.
 
     The sky is measured twice. The second time, pixels on and near the sources of a first detection are left out.
     """
     # Delete arrays as soon as possible: each takes a third of a gigabyte for a large detector.
     pixels = np.ascontiguousarray(image.image, np.float32)
-    mesh = {"bw": _MESH, "bh": _MESH, "fw": _MESH_FILTER, "fh": _MESH_FILTER}
     empty = image.weight > 0.0
-    sky = sep.Background(pixels, mask=~empty, **mesh)
-    on_source = _extract(_subtract_background(pixels, sky), _noise(sky), masked, limits, deblend_cont=1.0)[1] > 0
+    sky, noise = _measure_sky(pixels, empty)
+    on_source = _extract(_subtract_background(pixels, sky), noise, masked, limits, deblend_cont=1.0)[1] > 0
     empty &= ~ndimage.binary_dilation(on_source, iterations=_MARGIN)
     del on_source
     if empty.any():
-        sky = sep.Background(pixels, mask=~empty, **mesh)
-    return _subtract_background(pixels, sky), _noise(sky), sky
+        sky, noise = _measure_sky(pixels, empty)
+    return _subtract_background(pixels, sky), noise, sky
 
 
-def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options: float) -> tuple[Array, Array]:
+def _measure_sky(pixels: Array, empty: Bool) -> tuple[sep.Background, Array]:
+    """Return the model of the sky's level, and the rms of the sky, float32[ny, nx], from the pixels that are `empty`.
+
+    The level is that of means of 3 x 3 pixels. Raw pixels are whole numbers of ADU, and sep's estimate of their mode is
+    wrong by up to one ADU, which is a third of the noise of a VIS pixel.
+    """
+    mesh = {"bw": _MESH, "bh": _MESH, "fw": _MESH_FILTER, "fh": _MESH_FILTER}
+    smooth, share = np.where(empty, pixels, np.float32(0.0)), empty.astype(np.float32)
+    for values in (smooth, share):
+        ndimage.uniform_filter(values, _SMOOTHING, output=values)
+    np.divide(smooth, share, out=smooth, where=empty)
+    del share, values
+    sky = sep.Background(smooth, mask=~empty, **mesh)
+    del smooth
+    noise = sep.Background(pixels, mask=~empty, **mesh).rms()
+    return sky, np.asarray(np.maximum(noise, _FLOOR, out=noise))
+
+
+def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options: Any) -> tuple[Array, Array]:
     """Detect sources tile by tile; return the table of sep.extract, and the segmentation map, int32[ny, nx].
 
     The map has the number of the source to which a pixel belongs, from 1, or 0. `above` is the image minus the sky,
@@ -204,11 +273,6 @@ def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options
 def _subtract_background(pixels: Array, sky: sep.Background) -> Array:
     back = sky.back()
     return np.asarray(np.subtract(pixels, back, out=back))
-
-
-def _noise(sky: sep.Background) -> Array:
-    rms = sky.rms()
-    return np.asarray(np.maximum(rms, _FLOOR, out=rms))
 
 
 def _errors(sources: Array, signal: Float) -> Float:

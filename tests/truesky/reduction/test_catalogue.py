@@ -52,6 +52,49 @@ def test_every_star_is_found_once(image, monkeypatch):
     assert off.min(axis=0).max() < 0.2
 
 
+@pytest.mark.parametrize("part", [0.1, 0.35, 0.6, 0.85])
+def test_the_level_of_the_sky_is_right_in_whole_numbers_of_adu(part):
+    """The sample are 512 x 512 pixels with the noise of VIS; 0.25 electrons are 3 errors of the mean of 50 squares.
+
+    The significance is 0.3 %. With the mode of unsmoothed pixels the error would be up to 3.7 electrons.
+    """
+    rng, adu = np.random.default_rng(7), 3.48
+    true = 133.0 + part * adu
+    raw = rng.poisson(true, (512, 512)) + 4.4 * rng.standard_normal((512, 512))
+    pixels = (adu * np.rint(raw / adu)).astype(np.float32)
+    pixels[250:260, 250:260] += 1000.0
+    weight = np.full(pixels.shape, 1.0 / (true + 4.4**2), np.float32)
+    weight[:, 100] = 0.0
+    image = ReducedImage(pixels, weight, np.zeros(pixels.shape, np.uint8))
+    rows, segments = catalogue.detect_segments(image, 1.0, 10.0, catalogue.Limits(threshold=3.0, pixels=9))
+    brightest = np.argmax(rows["flux_auto"])
+    assert rows["background"][brightest] == pytest.approx(true, abs=0.25)
+    assert (segments == brightest + 1).sum() >= 100
+
+
+def test_noise_is_rarely_detected():
+    """The sample is an image of noise with 262,144 pixels; with the threshold of SourceExtractor there are none.
+
+    The significance is beyond 5 sigma: with the matched filter of sep there are 234.
+    """
+    noise = np.random.default_rng(8).standard_normal((SIDE, SIDE)).astype(np.float32)
+    image = ReducedImage(100.0 + NOISE * noise, np.full(noise.shape, NOISE**-2), np.zeros(noise.shape, np.uint8))
+    assert len(catalogue.detect_segments(image, 1.0, 6.0, catalogue.Limits())[0]["x"]) < 10
+
+
+def test_light_of_a_neighbour_does_not_count():
+    """A source beside one that is ten times as bright has its own flux, in the aperture of MAG_AUTO and in a circle."""
+    y, x = np.mgrid[:SIDE, :SIDE]
+    pixels = 100.0 + np.random.default_rng(9).standard_normal((SIDE, SIDE))
+    for column, light in ((250.0, 1e4), (268.0, 1e5)):
+        pixels += light * np.exp(-0.5 * ((x - column) ** 2 + (y - 256.0) ** 2) / 9.0) / (18.0 * np.pi)
+    image = ReducedImage(pixels.astype(np.float32), np.ones((SIDE, SIDE)), np.zeros((SIDE, SIDE), np.uint8))
+    rows = catalogue.detect_segments(image, 1.0, 12.0, catalogue.Limits())[0]
+    faint = np.argmin(np.hypot(rows["x"] - 250.0, rows["y"] - 256.0))
+    for name in ("flux_auto", "flux_aper"):
+        assert rows[name][faint] == pytest.approx(1e4, rel=0.15)
+
+
 def test_errors_of_windowed_positions_are_their_scatter():
     """The sample are 64 stars in 12 images with different noise; the mean squared offset has an error of 4 %."""
     rng, side, found = np.random.default_rng(6), 512, []
