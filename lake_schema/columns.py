@@ -129,6 +129,9 @@ class Table:
         Nested HEALPix order of the cells of a catalogue, each of which has one file. None if rows have no position.
     max_order : int or None
         Highest order of these cells if cells with many rows are divided. None if all cells have the order `order`.
+    pixel_order : int or None
+        HEALPix order of the column `pixel` if a row describes a pixel of the sky, and not a source with a position.
+        Such a catalogue is a HATS map without a margin.
     """
 
     name: str
@@ -138,6 +141,7 @@ class Table:
     key: tuple[str, ...] = ("id",)
     order: int | None = None
     max_order: int | None = None
+    pixel_order: int | None = None
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]
@@ -236,7 +240,8 @@ class Table:
         lines = [f"## {self.name} (version {self.version})", "", self.doc, ""]
         if self.is_catalogue:
             orders = f"{self.order} to {self.max_order}" if self.max_order else str(self.order)
-            lines += [f"HATS catalogue, HEALPix order {orders} files, key `{', '.join(self.key)}`.", ""]
+            kind = "catalogue" if self.pixel_order is None else f"map of order {self.pixel_order}"
+            lines += [f"HATS {kind}, HEALPix order {orders} files, key `{', '.join(self.key)}`.", ""]
         else:
             lines += [f"Key `{', '.join(self.key)}`.", ""]
         lines += ["| column | type | unit | range | null | UCD | meaning |", "|---|---|---|---|---|---|---|"]
@@ -259,12 +264,12 @@ def _format_bound(bound: float | None) -> str:
 def _arrow_array(table: str, column: Column, values: Any, rows: int) -> pa.Array:
     if values is None:
         return pa.nulls(rows, column.arrow_type)
-    if column.mantissa_bits is not None and column.type == "float32":
-        values = round_mantissa(np.asarray(values, np.float32), column.mantissa_bits)
     mask = None
     if isinstance(values, np.ma.MaskedArray):
         mask = np.ma.getmaskarray(values)
         values = values.data
+    if column.mantissa_bits is not None and column.type == "float32":
+        values = round_mantissa(np.asarray(values, np.float32), column.mantissa_bits)
     if isinstance(values, pa.ChunkedArray):
         values = values.combine_chunks()
     try:

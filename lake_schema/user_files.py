@@ -40,8 +40,11 @@ MAX_BYTES = {
     "run log": _GB,
     "master frame": _GB,
     "calibrated image": 16 * _GB,
+    "model": 4 * _GB,
     "manifest": _GB,
 }
+# Beginning of an address, such as s3://, of which a path keeps one slash. The drives of Windows have one letter.
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 # Largest number of characters of a path in an error message; the middle of a longer path is left out.
 _MAX_SHOWN_LENGTH = 200
 # Largest number of characters of a path.
@@ -284,6 +287,8 @@ def check_folder(path: Path) -> Path:
 
     Raise BadInput otherwise. Nothing is created.
     """
+    if _ADDRESS.match(str(path)):
+        raise BadInput(f"{format_path(path)}: files are written to a local folder; give its path, not an address")
     with check_reachable(path):
         if os.path.lexists(path) and not path.is_dir():
             raise BadInput(f"{format_path(path)}: exists and is not a folder")

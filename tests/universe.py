@@ -58,7 +58,10 @@ def rows_of(table, n, seed=0):
     """Return n valid rows of any declared table, with unique identifiers and consistent positions."""
     rng = np.random.default_rng(seed)
     columns = {column.name: _values(column, n, rng) for column in table.columns}
-    if table.is_catalogue:
+    if table.pixel_order is not None:
+        pixel = (1607 << 2 * (table.pixel_order - table.order)) + np.arange(n)
+        columns |= {"_healpix_29": pixel << 2 * (sky.MAX_ORDER - table.pixel_order), "pixel": pixel}
+    elif table.is_catalogue:
         index, ra, dec = sky.random_in_cell(5, 1607, n, rng)
         columns |= {"_healpix_29": index, "ra": ra, "dec": dec}
         kind = columns.get("kind", (table.column("id").lo or 0) >> 60)

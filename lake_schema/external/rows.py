@@ -74,18 +74,19 @@ class RowBatch:
 def find_files(path: Path) -> list[Path]:
     """Return the files of a catalogue: the file at a path, or all Parquet files in a folder, sorted.
 
-    If a folder contains no Parquet files, its HDF5 files are returned. Subfolders are searched, too.
+    If a folder contains no Parquet files, its HDF5 files are returned, and without these its FITS files. Subfolders are
+    searched, too.
 
     Raises
     ------
     BadInput
-        If the file does not exist, its ending is unknown, its contents have another format, or the folder contains
-        neither Parquet nor HDF5 files.
+        If the file does not exist, its ending is unknown, its contents have another format, or the folder contains no
+        such files.
     """
     if _is_folder(path):
         paths = _files_of_folder(path)
         if not paths:
-            raise BadInput(f"{path}: no Parquet or HDF5 file in this folder")
+            raise BadInput(f"{path}: no Parquet, HDF5 or FITS file in this folder")
         return paths
     if path.suffix.lower() not in _ENDINGS:
         endings = spelling.join_words(_ENDINGS)
@@ -231,7 +232,7 @@ def _check_first_line(file: Path, kind: str) -> None:
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
-    """Return the Parquet files in a folder and its subfolders, or without Parquet files the HDF5 files, sorted.
+    """Return the Parquet files in a folder and its subfolders, or else its HDF5 files, or else its FITS files, sorted.
 
     A HATS collection also contains copies of rows near the edges of its cells (margin catalogue), so only the files of
     its primary catalogue are returned.
@@ -246,8 +247,8 @@ def _files_of_folder(folder: Path) -> list[Path]:
         folder = folder / primary
     data_folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
     all_files = sorted(path for path in data_folder.rglob("*") if path.is_file())
-    matching = [path for path in all_files if path.suffix.lower() in _PARQUET]
-    matching = matching or [path for path in all_files if path.suffix.lower() in _HDF5]
+    by_format = ([path for path in all_files if path.suffix.lower() in form] for form in (_PARQUET, _HDF5, _FITS))
+    matching = next(filter(None, by_format), [])
     return [path for path in matching if not path.name.startswith(("_", ".")) and path.stem != "data_thumbnail"]
 
 

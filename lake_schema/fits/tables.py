@@ -108,6 +108,27 @@ def described_table(
     return table
 
 
+def write_partial_map(path: Path, pixels: Array, weights: Array, cards: Sequence[tuple[str, Any, str]]) -> None:
+    """Write a map of a part of the sky as FITS table with the columns PIXEL (int64) and WEIGHT (float32).
+
+    Parameters
+    ----------
+    path : Path
+        File to write. An existing file is replaced when the new one is complete.
+    pixels : int array, shape (n,)
+        Numbers of the HEALPix pixels.
+    weights : array, shape (n,)
+        Values of the pixels.
+    cards : sequence of (str, object, str)
+        Keyword, value and comment of header cards of the table.
+    """
+    columns = fits.Column("PIXEL", "K", array=pixels), fits.Column("WEIGHT", "E", array=np.asarray(weights, np.float32))
+    table = fits.BinTableHDU.from_columns(columns)
+    for keyword, value, comment in cards:
+        table.header[keyword] = (value, comment)
+    write.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), table]))
+
+
 def _check_column_name(name: str, where: str = "") -> None:
     if not (name.isascii() and name.isprintable() and 0 < len(name) <= _MAX_NAME_LENGTH):
         raise BadInput(f"{where}column {name!r} has a name that FITS cannot hold; give it another with AS")

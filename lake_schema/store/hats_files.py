@@ -6,7 +6,9 @@ HATS is the format of partitioned catalogues that lsdb reads. The files of a ver
     <version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
     <version>/<table>_margin/   the same without skymap.fits, for copies of the rows just outside each cell
 
-The margin contains all rows within 10 arcsec of a cell, so that a cross-match loses no pairs at the edges of cells.
+The margin contains all rows within 10 arcsec of a cell, so that a cross-match loses no pairs at the edges of cells. A
+table whose rows are pixels of the sky is a HATS map. It has no margin, and no collection.properties, because a
+collection must not have a map as its primary catalogue.
 """
 
 from __future__ import annotations
@@ -65,10 +67,12 @@ def write_metadata(version: Path, table: Table, receipts: Sequence[Json], border
     """
     cells = [layout.cell_of_file(receipt["part"]) for receipt in receipts]
     root, margin = version / table.name, version / f"{table.name}_margin"
-    borders_by_cell = {cell: receipt["border"] for cell, receipt in zip(cells, receipts, strict=True)}
-    margin_rows = _write_margin(margin, table, borders, borders_by_cell)
     counts = _count_rows_per_cell(version, [receipt["files"][0] for receipt in receipts])
     _write_catalogue(root, table, cells, sum(receipt["rows"] for receipt in receipts), counts)
+    if table.pixel_order is not None:
+        return
+    borders_by_cell = {cell: receipt["border"] for cell, receipt in zip(cells, receipts, strict=True)}
+    margin_rows = _write_margin(margin, table, borders, borders_by_cell)
     _write_catalogue(margin, table, cells, margin_rows, None)
     _write_collection(version, table)
 
@@ -108,18 +112,19 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, cou
     PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
     facts: dict[str, Any] = {
         "total_rows": rows,
-        "ra_column": "ra",
-        "dec_column": "dec",
         "healpix_column": "_healpix_29",
         "healpix_order": sky.MAX_ORDER,
         "npix_suffix": ".parquet",
     }
+    if table.pixel_order is None:
+        facts |= {"ra_column": "ra", "dec_column": "dec"}
     if counts is None:
         facts |= {"catalog_name": f"{table.name}_margin", "catalog_type": "margin"}
         facts |= {"primary_catalog": f"../{table.name}", "margin_threshold": MARGIN_ARCSEC}
     else:
         write_fits_image(counts, get_skymap_file_pointer(root))
-        facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
+        kind = "object" if table.pixel_order is None else "map"
+        facts |= {"catalog_name": table.name, "catalog_type": kind, "skymap_order": _SKYMAP_ORDER}
     provenance = TableProperties.new_provenance_dict(root, builder="truesky")
     provenance["hats_creation_date"] = _DATE
     # Remove the estimated size of the catalogue, which depends on the length of its path: equal tables must give equal

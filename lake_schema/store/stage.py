@@ -128,7 +128,7 @@ def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Js
     files = [_write_file(stage, relative, writer) for relative, writer in writers.items()]
     receipt: dict[str, Any] = {"part": task.name, "rows": rows.num_rows, "files": files, "machine": machine()}
     receipt |= _summarize_rows(rows, table)
-    if table.is_catalogue:
+    if table.is_catalogue and table.pixel_order is None:
         border_rows = hats_files.border_rows(rows, task.name)
         receipt["border"] = _write_file(
             receipts_folder(stage), _flat_name(task.name), lambda target: parquet.write(target, border_rows, table)
@@ -155,9 +155,13 @@ def _check_positions(rows: pa.Table, table: Table, task: Task) -> None:
     first, last = sky.cell_range(*layout.cell_of_file(task.name))
     if index[0] < first or index[-1] >= last:
         raise BadInput(f"{where} holds rows of another cell")
-    wrong = index != sky.healpix_29(rows["ra"].to_numpy(), rows["dec"].to_numpy())
+    if table.pixel_order is None:
+        expected, source = sky.healpix_29(rows["ra"].to_numpy(), rows["dec"].to_numpy()), "ra, dec"
+    else:
+        expected, source = rows["pixel"].to_numpy() << 2 * (sky.MAX_ORDER - table.pixel_order), "pixel"
+    wrong = index != expected
     if wrong.any():
-        raise BadInput(f"{where}: _healpix_29 of row {wrong.argmax()} does not match its ra, dec")
+        raise BadInput(f"{where}: _healpix_29 of row {wrong.argmax()} does not match its {source}")
     if "kind" in table.names:
         wrong = kind_from_id(rows["id"].to_numpy()) != rows["kind"].to_numpy()
         if wrong.any():

@@ -24,14 +24,28 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.strong_lenses import STRONG_LENSES
+    from lake_schema.tables.survey.depth import DEPTH
+    from lake_schema.tables.survey.observed import observed_sources
+    from lake_schema.tables.survey.randoms import RANDOMS
     from lake_schema.tables.tasks import TASKS
     from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
     from lake_schema.tables.validation import VALIDATION
 
     galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
-    skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
+    skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA, observed_sources(bands), RANDOMS]
     plans, images = [MISSION, EXPOSURES, TASKS], [PRODUCTS, RENDERED_TRUTH, RENDERED_SPECTRA, EXPOSURE_FILES]
-    return [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans, *images, VALIDATION]
+    return [
+        *skies,
+        HALO_LIMITS,
+        TEMPLATES,
+        EXTINCTION_LAWS,
+        EMISSION_LINES,
+        PASSBANDS,
+        *plans,
+        *images,
+        DEPTH,
+        VALIDATION,
+    ]
 
 
 def to_markdown() -> str:
@@ -48,13 +62,14 @@ def find_table(name: str, columns: Sequence[str] = ()) -> Table | None:
     name : str
         Name of the table.
     columns : sequence of str, optional
-        Names of the columns that the table has in a lake. They are needed for a table of fluxes only, whose columns
-        f_nu_<band> differ between lakes.
+        Names of the columns that the table has in a lake. They are needed for the tables of fluxes and the table
+        `observed`, whose columns f_nu_<band> and detected_<band> differ between lakes.
 
     Returns
     -------
     Table or None
         The declaration.
     """
-    bands = [column.removeprefix("f_nu_") for column in columns if column.startswith("f_nu_")]
+    prefixes = ("f_nu_", "detected_")
+    bands = [column.removeprefix(prefix) for prefix in prefixes for column in columns if column.startswith(prefix)]
     return next((table for table in all_tables(bands) if table.name == name), None)

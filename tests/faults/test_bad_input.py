@@ -23,8 +23,6 @@ from truesky.catalogue import (
     build_stars,
     build_strong_lenses,
     dust_map,
-    export_gaia,
-    export_galaxies,
     request_checks,
 )
 from truesky.commands import __main__ as truesky
@@ -62,8 +60,8 @@ OF_LAKE = {
     "archive": lambda lake, good: archive.main(["--lake", lake]),
     "archive, failures": lambda lake, good: archive.main(["--lake", lake, "--sql", "SELECT 1"]),
     "coverage": lambda lake, good: coverage.main(["--lake", lake]),
-    "export_gaia": lambda lake, good: export_gaia.main(["--lake", lake, "--out", f"{good}.csv"]),
-    "export_galaxies": lambda lake, good: export_galaxies.main(["--lake", lake, "--out", f"{good}s", "--form", "fits"]),
+    "export, a file": lambda lake, good: truesky.main(["export", "gaia", "--lake", lake, "--out", f"{good}.csv"]),
+    "export": lambda lake, good: truesky.main(["export", "galaxies", "--lake", lake, "--out", f"{good}s"]),
     **{name: (lambda lake, good, name=name: truesky.main([name, lake])) for name in ("verify", "gc", "describe")},
     "mission diff": lambda lake, good: truesky.main(["mission", "diff", ",".join(LADDER), f"{lake}@{0:016}"]),
     "demo": lambda lake, good: demo.main(["--out", lake, "--request", good]),
@@ -81,8 +79,8 @@ OF_TARGET = {
     "explore": lambda out, lake: explore.main(["SELECT 1", "--lake", lake, "--out", out]),
     "archive": lambda out, lake: archive.main(["--lake", lake, "--again", "images/x.fits", "--out", out]),
     "coverage": lambda out, lake: coverage.main(["--lake", lake, "--out", out]),
-    "export_gaia": lambda out, lake: export_gaia.main(["--lake", lake, "--out", out]),
-    "export_galaxies": lambda out, lake: export_galaxies.main(["--lake", lake, "--out", out, "--form", "fits"]),
+    "export, a file": lambda out, lake: truesky.main(["export", "gaia", "--lake", lake, "--out", out]),
+    "export": lambda out, lake: truesky.main(["export", "galaxies", "--lake", lake, "--out", out]),
 }
 
 # Names that files cannot have, or whose reading would not end.

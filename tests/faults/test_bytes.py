@@ -66,7 +66,9 @@ def readers(version, table):
         "columns": lambda: version.rows(some, where=pc.field(names[0]).is_valid()),
         "explorer": asking(version, f'SELECT "{names[-1]}" FROM {version.table}'),
     }
-    if table.is_catalogue:
+    if table.pixel_order is not None:
+        found["cells"] = lambda: version.rows_in_cells([1607], 5, some)
+    elif table.is_catalogue:
         ra, dec = (version.rows()[name].to_numpy()[0] for name in ("ra", "dec"))
         found["cone"] = lambda: version.cone(ra, dec, 0.5, ["id"])
         found["cells"] = lambda: version.rows_in_cells([1607], 5, some)

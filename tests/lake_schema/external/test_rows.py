@@ -37,3 +37,15 @@ def test_the_catalogue_of_a_collection_is_a_folder_in_it(tmp_path, primary):
     (tmp_path / "collection.properties").write_text(f"hats_primary_table_url = {primary}\n")
     with pytest.raises(BadInput, match="is not a folder of the collection"):
         external_rows._files_of_folder(tmp_path)
+
+
+def test_a_folder_has_files_of_one_format(tmp_path):
+    """Parquet files come first, as in HATS catalogues, then HDF5 files, then FITS files."""
+    (tmp_path / "sub").mkdir()
+    for names in (["a.fits", "sub/b.fit"], ["c.hdf5"], ["d.parquet", "sub/e.parq"]):
+        for name in names:
+            (tmp_path / name).touch()
+        assert [str(path.relative_to(tmp_path)) for path in external_rows.find_files(tmp_path)] == names
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BadInput, match="no Parquet, HDF5 or FITS file in this folder"):
+        external_rows.find_files(tmp_path / "empty")
