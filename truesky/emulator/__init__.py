@@ -1,0 +1,1 @@
+"""Emulator: observed catalogues without images, learned from catalogues measured on images."""
