@@ -145,3 +145,45 @@ def sum_shear_products(
                 bin_sums[4] += kappa_i * kappa_j
                 bin_sums[5] += 0.5 * (kappa_i * t_j + kappa_j * t_i)
                 bin_sums[6] += 0.5 * (kappa_i * x_j + kappa_j * x_i)
+
+
+@exact_jit
+def count_pairs_by_angle(
+    cube_starts: Int, cube_pairs: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float
+) -> None:
+    """Count pairs of positions in space by separation, and by the angle between the separation and the line of sight.
+
+    The line of sight of a pair is that to its middle. Pairs outside the separation bins are ignored.
+
+    Parameters
+    ----------
+    cube_starts, cube_pairs : int array
+        Cubes by which positions are sorted, and pairs of adjacent cubes, see `count_pairs`.
+    place : float array, shape (n, 3)
+        Positions relative to the observer.
+    kind : int array, shape (n,)
+        0 or 1, for example galaxies and random positions.
+    patch : int array, shape (n,)
+        Number of the jackknife patch of each position, from 0.
+    edge : float array, shape (b + 1,)
+        Edges of the separation bins as squares, ascending.
+    sums : float array, shape (patches, patches, b, a, 3)
+        Numbers of pairs, to which the pairs are added in place, in a equal bins of the cosine of the angle from 0 to 1.
+        The index of the last axis is the sum of both kinds.
+    """
+    last, angles = edge.size - 1, sums.shape[3]
+    for p in range(cube_pairs.shape[1]):
+        a, b = cube_pairs[0, p], cube_pairs[1, p]
+        for i in range(cube_starts[a], cube_starts[a + 1]):
+            for j in range(i + 1 if a == b else cube_starts[b], cube_starts[b + 1]):
+                dx, dy, dz = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1], place[i, 2] - place[j, 2]
+                square = dx * dx + dy * dy + dz * dz
+                if square >= edge[last] or square < edge[0] or square == 0.0:
+                    continue
+                k = last - 1
+                while square < edge[k]:
+                    k -= 1
+                x, y, z = place[i, 0] + place[j, 0], place[i, 1] + place[j, 1], place[i, 2] + place[j, 2]
+                cosine = abs(dx * x + dy * y + dz * z) / math.sqrt(square * (x * x + y * y + z * z))
+                at = min(int(cosine * angles), angles - 1)
+                sums[patch[i], patch[j], k, at, kind[i] + kind[j]] += 1.0

@@ -69,6 +69,46 @@ def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
     return _sums_with_jackknife(sums)
 
 
+def count_pairs_in_space(place: Float, kind: Int, patch: Int, edges: Float, angles: int) -> Sums:
+    """Count pairs of positions of two kinds by their distance in space and their angle to the line of sight.
+
+    Parameters
+    ----------
+    place : float array, shape (n, 3)
+        Positions relative to the observer, in any unit.
+    kind : int array, shape (n,)
+        Kind of each position, 0 or 1.
+    patch : int array, shape (n,)
+        Number of the jackknife patch of each position, from 0.
+    edges : float array, shape (b + 1,)
+        Edges of the distance bins, in the unit of `place`, ascending.
+    angles : int
+        Number of equal bins of the cosine of the angle, from 0 to 1.
+
+    Returns
+    -------
+    Sums
+        Numbers of pairs of three types, as for `count_pairs`. The second axis has a bin for each distance and angle,
+        with the angle in the inner order.
+    """
+    scale, widest = scale_to_unit_ball(place, edges[-1])
+    order, cube_starts, cube_pairs = _sort_into_cubes(place * scale, widest)
+    n_patches = int(patch.max(initial=-1)) + 1
+    sums = np.zeros((n_patches, n_patches, len(edges) - 1, angles, 3))
+    ordered = np.ascontiguousarray(place[order]), kind[order].astype(np.int64), patch[order].astype(np.int64)
+    compiled_pairs.count_pairs_by_angle(cube_starts, cube_pairs, *ordered, np.asarray(edges, float) ** 2, sums)
+    return _sums_with_jackknife(sums.reshape(n_patches, n_patches, -1, 3))
+
+
+def scale_to_unit_ball(place: Float, largest: float) -> tuple[float, float]:
+    """Return the factor that brings positions into the unit ball, and the angle (rad) whose chord is then `largest`.
+
+    With the factor, `thin_sample` can be used for positions in space, with the angle as the largest separation.
+    """
+    scale = 1.0 / max(float(np.sqrt(np.sum(place**2, 1).max(initial=0.0))), largest)
+    return scale, 2.0 * float(np.arcsin(0.5 * largest * scale))
+
+
 def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Sums:
     """Sum products of shear and convergence over pairs of galaxies, by separation.
 

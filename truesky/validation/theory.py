@@ -236,6 +236,33 @@ def galaxy_power(
     return total
 
 
+def galaxy_convergence_power(cosmology: Cosmology, ell: Float, tracers: Shells, chi: Float, weight: Float) -> Float:
+    """Return the cross spectrum C_l of the density of galaxies and the convergence of sources behind them.
+
+    Parameters
+    ----------
+    cosmology : Cosmology
+        Parameters of the universe.
+    ell : float array, shape (n,)
+        Multipoles l.
+    tracers : Shells
+        Distribution of the galaxies over distance, weighted with their bias.
+    chi, weight : float array, shape (s,)
+        Comoving distances of the sources, Mpc/h, and relative number of sources at each distance.
+
+    Returns
+    -------
+    float array, shape (n,)
+        C_l in Limber's approximation. Magnification of the galaxies is not included.
+    """
+    lens = lensing_weight(cosmology, tracers.chi, chi, weight)
+    rows = [
+        width * share * efficiency / at**2 * matter_power(cosmology, (ell + 0.5) / at, float(cosmology.redshift(at)))
+        for at, width, share, efficiency in zip(tracers.chi, tracers.width, tracers.weight, lens, strict=True)
+    ]
+    return np.asarray(np.sum(rows, axis=0))
+
+
 def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
     """Return the angular correlation function w(theta) that corresponds to an angular power spectrum C_l.
 

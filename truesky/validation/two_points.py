@@ -110,14 +110,14 @@ def angular_correlation(ids: Int, ra: Float, dec: Float, index: Int, field: Fiel
         n_per_patch = np.array([np.bincount(patches, minlength=field.n_patches) for _, patches in samples], float)
         n_without_patch = n_per_patch.sum(1)[:, None] - n_per_patch
         value, jackknife = (
-            _landy_szalay(counts.total, n_per_patch.sum(1)),
-            _landy_szalay(counts.jackknife, n_without_patch.T),
+            landy_szalay(counts.total, n_per_patch.sum(1)),
+            landy_szalay(counts.jackknife, n_without_patch.T),
         )
         parts.append(TwoPointFunction(edge, counts.total[0], value[None], jackknife[:, None]))
     return _join_bins(edges, parts)
 
 
-def _landy_szalay(count: Float, n_points: Float) -> Float:
+def landy_szalay(count: Float, n_points: Float) -> Float:
     """Return w, shape (..., bins), with the estimator of Landy & Szalay.
 
     `count`, shape (..., 3, bins), has the numbers of pairs galaxy-galaxy, galaxy-random and random-random. `n_points`,

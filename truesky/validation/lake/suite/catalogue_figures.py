@@ -63,6 +63,13 @@ def draw_all(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[s
     if limits:
         text = "galaxies: how they cluster on the sky, and non-linear theory with the bias of their halos"
         yield f"{text}. {_ERROR_NOTE}.", _plot_clustering(series, limits)
+    powers = [name for name in series if name.startswith(("power_", "convergence_power_"))]
+    if powers:
+        text = "galaxies: angular power in redshift bins and with the convergence behind them, and theory"
+        yield f"{text}. Errors are those of Gaussian fields.", _plot_power(series, powers)
+    if "multipoles" in series:
+        text = "galaxies: multipoles of the correlation function in redshift space, and linear theory"
+        yield f"{text}. {_ERROR_NOTE}.", _plot_multipoles(series["multipoles"])
     if "shear" in series:
         text = "galaxies: shear correlation functions at 0.8 < z < 1.2, and non-linear theory"
         yield f"{text}. {_ERROR_NOTE}; neighbouring points are not independent.", _plot_shear(series)
@@ -165,6 +172,37 @@ def _plot_shear(series: Mapping[str, Any]) -> Figure:
     right_axes.axhspan(-0.1, 0.1, color="k", alpha=0.08)
     right_axes.set(xscale="log", xlabel="separation, arcmin", ylabel="cross component / $\\xi_+$", ylim=(-0.3, 0.3))
     _plain_ticks(right_axes)
+    return figure
+
+
+def _plot_power(series: Mapping[str, Any], names: Sequence[str]) -> Figure:
+    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for axis, start, label in zip(
+        axes, ("power_", "convergence_power_"), ("C$_l$ of galaxies", "C$_l$ with convergence"), strict=True
+    ):
+        for number, name in enumerate(name for name in names if name.startswith(start)):
+            ell, value, error, expected = series[name]
+            color = f"C{number}"
+            _plot_points(axis, ell, value, error, color, f"z > {name.removeprefix(start)}")
+            axis.plot(ell, expected, "-", lw=1, color=color)
+        axis.set(xscale="log", yscale="log", xlabel="l", ylabel=label)
+        axis.legend()
+    return figure
+
+
+def _plot_multipoles(multipoles: Float) -> Figure:
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    axis = figure.subplots()
+    separation, mono, quad, mono_error, quad_error, *expected = multipoles
+    for name, value, error, theory, color in zip(
+        ("$\\xi_0$", "$\\xi_2$"), (mono, quad), (mono_error, quad_error), expected, _PALETTE, strict=False
+    ):
+        axis.errorbar(separation, separation**2 * value, separation**2 * error, fmt="o", ms=4, color=color, label=name)
+        axis.plot(separation, separation**2 * theory, "-", lw=1, color=color)
+    axis.axhline(0.0, lw=0.8, color="k")
+    axis.set(xlabel="separation s, Mpc/h", ylabel="s$^2$ $\\xi$, (Mpc/h)$^2$")
+    axis.legend()
     return figure
 
 

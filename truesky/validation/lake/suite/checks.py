@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 from truesky.validation.lake.catalogues import (
     angular_clustering,
+    angular_power,
     colours,
     cosmic_shear,
     duplicates,
     observed_sky,
+    redshift_multipoles,
     requirements,
 )
 from truesky.validation.lake.images.astrometry import ASTROMETRY
@@ -79,11 +81,15 @@ FRAME_CHECKS = (
 )
 # Checks that combine the results of all frames: between exposures, and averaged over detectors.
 EXPOSURE_CHECKS = (REPEATABILITY, COMMON_BIAS)
+# Tables of checks that need the area and the masks of a survey.
+_SURVEY = ("galaxies", "depth", "randoms")
 # Checks of the catalogues (tables) of a lake.
 CATALOGUE_CHECKS = (
     CatalogueCheck(observed_sky.NAME, ("galaxies",), observed_sky.measure, "observed.csv"),
     CatalogueCheck(angular_clustering.NAME, ("galaxies",), angular_clustering.measure, angular_clustering.SOURCE),
     CatalogueCheck(cosmic_shear.NAME, ("galaxies",), cosmic_shear.measure, cosmic_shear.SOURCE),
+    CatalogueCheck(angular_power.NAME, _SURVEY, angular_power.measure, angular_power.SOURCE),
+    CatalogueCheck(redshift_multipoles.NAME, _SURVEY, redshift_multipoles.measure, redshift_multipoles.SOURCE),
     CatalogueCheck(colours.NAME, ("galaxies", "galaxy_fluxes"), colours.measure, colours.SOURCE),
     CatalogueCheck(duplicates.NAME, ("galaxies",), _without_series(duplicates.rows), duplicates.SOURCE),
     CatalogueCheck(duplicates.NAME, ("stars",), _without_series(duplicates.rows), duplicates.SOURCE),

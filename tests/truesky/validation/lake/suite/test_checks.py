@@ -4,7 +4,12 @@ import inspect
 
 import pytest
 
-from tests.truesky.validation.lake.catalogues import test_colours, test_two_points
+from tests.truesky.validation.lake.catalogues import (
+    test_angular_power,
+    test_colours,
+    test_redshift_multipoles,
+    test_two_points,
+)
 from tests.truesky.validation.lake.catalogues import test_faults as catalogues
 from tests.truesky.validation.lake.images import (
     test_common_bias,
@@ -49,6 +54,8 @@ FAULTS = {
               (test_two_points.test_one_component_of_shear_with_the_wrong_sign, "one component's sign"),
               (test_two_points.test_shear_of_the_wrong_sign, "the sign of all shear"),
               (test_two_points.test_shear_that_is_half_as_large_again, "shear too large by a half")),
+    "angular_power": ((test_angular_power.test_faults_are_found, "halos of another mass; sign of convergence"),),
+    "redshift_space": ((test_redshift_multipoles.test_galaxies_that_do_not_cluster_fail, "positions drawn anew"),),
     "duplicates": ((catalogues.test_a_duplicated_cell_is_found, "a duplicated cell"),),
     "observed": ((test_observed.test_a_band_whose_magnitudes_are_shifted_in_a_lake, "a band shifted by 0.3 mag"),
                  (test_observed.test_masses_rates_and_lines_that_are_off_in_a_lake, "masses, rates, lines off"),
