@@ -11,7 +11,6 @@ skyCatalogs computes fluxes from the spectra, except in the LSST bands that the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,10 @@ import yaml
 from lake_schema import __version__, sky, user_files
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, read, request_links
+from lake_schema.store import layout
 from lake_schema.units import LIGHT_KM_S, electron_rate
-from truesky.catalogue.exports import stellar_spectra, tophat
+from truesky.catalogue.exports import catalogues, stellar_spectra, tophat
+from truesky.catalogue.exports.catalogues import Catalogue
 from truesky.cosmology import Cosmology, from_facts
 from truesky.fluxes import bulges, inputs, passbands
 from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
@@ -37,38 +37,6 @@ _ROW_GROUP_SIZE = 20_000
 # Smallest half-light radius, arcsec, because GalSim cannot draw a size of 0.
 _MIN_SIZE = 1e-3
 _Maker = Callable[[pa.Table], pa.Table]
-
-
-@dataclass(frozen=True, slots=True)
-class _Catalogue:
-    """A table of sources in the lake, and the table of their fluxes, which has the same rows in the same order.
-
-    Attributes
-    ----------
-    rows : read.Version
-        Table `galaxies` or `stars`.
-    fluxes : read.Version
-        Table `galaxy_fluxes` or `star_fluxes`.
-    bands : list of str
-        LSST bands of the fluxes, such as "lsst_r".
-    """
-
-    rows: read.Version
-    fluxes: read.Version
-    bands: list[str] = field(default_factory=list)
-
-    def read_partition(self, name: str) -> pa.Table:
-        """Return the rows of a partition (file) of the sources, with the columns f_nu_<band> of all bands appended.
-
-        Raises BadInput if the table of fluxes has other rows.
-        """
-        rows = self.rows.rows(partitions=[name])
-        flux_rows = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
-        if not flux_rows["id"].equals(rows["id"]):
-            raise BadInput(f"table {self.fluxes.table}: {name} must have the same rows as table {self.rows.table}")
-        for band in self.bands:
-            rows = rows.append_column(f"f_nu_{band}", flux_rows[f"f_nu_{band}"])
-        return rows
 
 
 def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
@@ -94,10 +62,14 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
         If the lake has no table `galaxies`, if the tables of fluxes are missing, have no LSST band or belong to other
         rows, or if the lake has massive neutrinos or dark energy that is not a cosmological constant.
     """
-    catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
-    if "galaxy" not in catalogues:
+    opened = {
+        kind: _catalogue(lake, table, request)
+        for kind, table in (("galaxy", "galaxies"), ("star", "stars"))
+        if catalogues.has_table(lake, table, request)
+    }
+    if "galaxy" not in opened:
         raise BadInput(f"lake {lake} has no table galaxies")
-    cosmology = from_facts(catalogues["galaxy"].rows.manifest["facts"])
+    cosmology = from_facts(opened["galaxy"].rows.manifest["facts"])
     if not cosmology.has_constant_dark_energy:
         # skyCatalogs computes distances with w = -1, so that fluxes would be wrong.
         raise BadInput(
@@ -107,7 +79,7 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
         raise BadInput(f"lake {lake}: m_nu = {cosmology.m_nu:g}; skyCatalogs has no massive neutrinos")
     folder.mkdir(parents=True, exist_ok=True)
     written, object_types, templates = [], {}, set[int]()
-    for kind, catalogue in catalogues.items():
+    for kind, catalogue in opened.items():
         makers = _galaxy_rows(lake, catalogue) if kind == "galaxy" else _star_rows(lake, catalogue)
         stem = {"galaxy": "galaxy", "star": "pointsource"}[kind]
         for pixel, rows in _by_pixel(catalogue):
@@ -117,8 +89,8 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
             for name, maker in zip((f"{stem}_{number}", f"{stem}_flux_{number}"), makers, strict=True):
                 written.append(_parquet(folder / f"{name}.parquet", rows, maker))
         object_types[kind] = _object_type(kind, stem, from_facts(catalogue.rows.manifest["facts"]))
-    if "star" in catalogues:
-        library = inputs.stellar_library_from_facts(lake, catalogues["star"].fluxes.manifest["facts"])
+    if "star" in opened:
+        library = inputs.stellar_library_from_facts(lake, opened["star"].fluxes.manifest["facts"])
         written += stellar_spectra.write(folder, library, sorted(templates))
     document = folder / "skyCatalog.yaml"
     text = f"# Written by truesky {__version__}\n" + yaml.safe_dump(_document(object_types), sort_keys=False)
@@ -126,30 +98,15 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     return written
 
 
-def _has(lake: Path, kind: str, request: str | None) -> bool:
-    table = {"galaxy": "galaxies", "star": "stars"}[kind]
-    key = (
-        layout.current_key(lake, table)
-        if request is None
-        else request_links.linked_key(lake, request_links.check_request(lake, request), table)
-    )
-    return key is not None
+def _catalogue(lake: Path, table: str, request: str | None) -> Catalogue:
+    catalogue = catalogues.open_catalogue(lake, table, request, "lsst_")
+    if not catalogue.bands:
+        name = catalogues.FLUXES[table]
+        raise BadInput(f"table {name} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
+    return catalogue
 
 
-def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
-    rows = read.version(lake, {"galaxy": "galaxies", "star": "stars"}[kind], request=request)
-    fluxes = read.version(lake, f"{kind}_fluxes", request=request)
-    if fluxes.manifest["facts"].get("input") != rows.key:
-        raise BadInput(
-            f"table {fluxes.table} was computed from another version of {rows.table}: run compute_fluxes first"
-        )
-    bands = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith("f_nu_lsst_")]
-    if not bands:
-        raise BadInput(f"table {fluxes.table} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
-    return _Catalogue(rows, fluxes, bands)
-
-
-def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
+def _by_pixel(catalogue: Catalogue) -> Iterator[tuple[int, pa.Table]]:
     """Yield the nested index and the rows of every HEALPix pixel (Nside 32) that contains sources."""
     for partitions in _group_by_pixel(catalogue.rows.partitions):
         rows = pa.concat_tables([catalogue.read_partition(partition) for partition in partitions])
@@ -171,7 +128,7 @@ def _group_by_pixel(partitions: Iterable[str]) -> list[list[str]]:
     return list(groups.values())
 
 
-def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
+def _galaxy_rows(lake: Path, catalogue: Catalogue) -> tuple[_Maker, _Maker]:
     library = inputs.galaxy_library_from_facts(lake, catalogue.fluxes.manifest["facts"])
     cosmology = from_facts(catalogue.rows.manifest["facts"])
 
@@ -222,7 +179,7 @@ def _shapes(galaxies: pa.Table) -> dict[str, Any]:
     return columns
 
 
-def _star_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
+def _star_rows(lake: Path, catalogue: Catalogue) -> tuple[_Maker, _Maker]:
     library = inputs.stellar_library_from_facts(lake, catalogue.fluxes.manifest["facts"])
 
     def rows(stars: pa.Table) -> pa.Table:

@@ -16,7 +16,6 @@ from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.store import read
 from tests.truesky.catalogue.exports.conftest import BANDS, CELL, DRAWN, STRAYS, bands
-from truesky.catalogue import export_galaxies
 from truesky.catalogue.exports import skycatalogs, stellar_spectra, tophat
 from truesky.cosmology import FIDUCIAL
 from truesky.fluxes import passbands
@@ -30,7 +29,7 @@ NEEDED = ("astropy", "dust_extinction", "galsim", "h5py", "healpy", "lsst-sphgeo
 @pytest.fixture(scope="module")
 def written(lake, tmp_path_factory):
     folder = tmp_path_factory.mktemp("set")
-    return folder, export_galaxies.export(lake, folder, "skycatalogs")
+    return folder, skycatalogs.write(lake, folder)
 
 
 def counts(lake, table):
@@ -63,7 +62,7 @@ def test_other_dark_energy_is_refused(lake, tmp_path, monkeypatch):
     """The package computes distances with a cosmological constant."""
     monkeypatch.setattr(skycatalogs, "from_facts", lambda facts: replace(FIDUCIAL, w0=-0.9))
     with pytest.raises(BadInput, match=r"w0 = -0\.9, wa = 0; skyCatalogs knows w0 = -1, wa = 0 only"):
-        export_galaxies.export(lake, tmp_path / "set", "skycatalogs")
+        skycatalogs.write(lake, tmp_path / "set")
     assert not list(tmp_path.rglob("*.parquet"))
 
 
@@ -71,7 +70,7 @@ def test_massive_neutrinos_are_refused(lake, tmp_path, monkeypatch):
     """The format cannot name them, so that its sigma_8 would be that of another universe."""
     monkeypatch.setattr(skycatalogs, "from_facts", lambda facts: replace(FIDUCIAL, m_nu=0.06))
     with pytest.raises(BadInput, match=r"m_nu = 0\.06; skyCatalogs has no massive neutrinos"):
-        export_galaxies.export(lake, tmp_path / "set", "skycatalogs")
+        skycatalogs.write(lake, tmp_path / "set")
     assert not list(tmp_path.rglob("*.parquet"))
 
 

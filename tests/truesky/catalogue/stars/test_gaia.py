@@ -19,8 +19,10 @@ from lake_schema.tables.gaia import EXPORT, GAIA
 from lake_schema.tables.stars import EPOCH, STARS
 from tests import hats_readers
 from tests.universe import rows_of
-from truesky.catalogue import build_gaia, export_gaia, parameters
+from truesky.catalogue import build_gaia, parameters
+from truesky.catalogue.exports import gaia_archive
 from truesky.catalogue.stars import gaia
+from truesky.commands import __main__ as truesky
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries.vega import vega_magnitude
 from truesky.request.from_toml import from_table
@@ -217,10 +219,14 @@ def test_stars_measured_in_another_cell_are_listed_once(lake):
     assert moved > 300
 
 
+def exported(words):
+    return truesky.main(["export", "gaia", *words])
+
+
 def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
     filled(lake)
     rows = built(lake).rows()
-    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.csv")]) == 0
+    assert exported([str(lake), "--out", str(tmp_path / "gaia.csv")]) == 0
     assert f"{len(rows):,} stars" in capsys.readouterr().out
     text = np.genfromtxt(tmp_path / "gaia.csv", delimiter=",", names=True, dtype=None, encoding=None, max_rows=50)
     names = ["source_id", "ref_epoch", "ra", "dec", "ra_error", "dec_error", "parallax", "parallax_error"]
@@ -229,7 +235,7 @@ def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
     assert text["source_id"].tolist() == rows["id"].to_pylist()[:50]
     assert text["ra"] == pytest.approx(rows["ra"].to_numpy()[:50], abs=1e-12)
     assert set(text["ref_epoch"]) == {2015.5}
-    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.fits")]) == 0
+    assert exported([str(lake), "--out", str(tmp_path / "gaia.fits")]) == 0
     table = fits.getdata(tmp_path / "gaia.fits", 1)
     assert table["source_id"].tolist() == rows["id"].to_pylist()
     colour = table["phot_bp_mean_mag"] - table["phot_rp_mean_mag"]
@@ -237,9 +243,9 @@ def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
     assert known.mean() > 0.9
     assert table["bp_rp"][known] == pytest.approx(colour[known], abs=1e-5)
     assert fits.getheader(tmp_path / "gaia.fits", 1)["TUNIT5"] == "mas"
-    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.txt")]) == 2
+    assert exported([str(lake), "--out", str(tmp_path / "gaia.txt")]) == 2
     assert "must end in .csv" in capsys.readouterr().err
-    assert export_gaia.main(["--lake", str(tmp_path), "--out", str(tmp_path / "g.csv")]) == 2
+    assert exported([str(tmp_path), "--out", str(tmp_path / "g.csv")]) == 2
     assert not (tmp_path / "g.csv").exists()
 
 
@@ -307,7 +313,7 @@ def test_names_of_dr3_in_its_order_and_fluxes_that_are_the_magnitudes(lake, tmp_
     filled(lake)
     rows = built(lake).rows()
     path = tmp_path / "dr3.fits"
-    assert export_gaia.main(["--lake", str(lake), "--out", str(path), "--release", "dr3"]) == 0
+    assert exported([str(lake), "--out", str(path), "--release", "dr3"]) == 0
     table = fits.getdata(path, 1)
     of_five = ["ra", "ra_error", "dec", "dec_error", "parallax", "parallax_error", "parallax_over_error", "pm", "pmra"]
     assert table.names[:13] == ["source_id", "ref_epoch", *of_five, "pmra_error", "pmdec"]
@@ -328,7 +334,7 @@ def test_names_of_dr3_in_its_order_and_fluxes_that_are_the_magnitudes(lake, tmp_
 def test_positions_at_another_epoch_agree_with_astropy(lake, tmp_path):
     filled(lake)
     rows = built(lake).rows()
-    export_gaia.export(lake, tmp_path / "moved.fits", epoch=2027.5)
+    gaia_archive.write(lake, tmp_path / "moved.fits", epoch=2027.5)
     moved = fits.getdata(tmp_path / "moved.fits", 1)
     assert set(moved["ref_epoch"]) == {2027.5}
     there = SkyCoord(
@@ -342,13 +348,13 @@ def test_positions_at_another_epoch_agree_with_astropy(lake, tmp_path):
     assert apart.max() < 1e-2
     assert sky.separation(moved["ra"], moved["dec"], rows["ra"].to_numpy(), rows["dec"].to_numpy()).min() > 0.0
     with pytest.raises(BadInput, match=r"epoch 20275 is not in \[1900, 2100\]"):
-        export_gaia.export(lake, tmp_path / "never.fits", epoch=20275.0)
+        gaia_archive.write(lake, tmp_path / "never.fits", epoch=20275.0)
 
 
 def test_ldac_as_scamp_names_it(lake, tmp_path):
     filled(lake)
     rows = built(lake).rows()
-    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.cat"), "--form", "ldac"]) == 0
+    assert exported([str(lake), "--out", str(tmp_path / "gaia.cat"), "--form", "ldac"]) == 0
     with fits.open(tmp_path / "gaia.cat") as units:
         assert [unit.name for unit in units] == ["PRIMARY", "LDAC_IMHEAD", "LDAC_OBJECTS"]
         found = units["LDAC_OBJECTS"].data
@@ -361,4 +367,4 @@ def test_ldac_as_scamp_names_it(lake, tmp_path):
     assert found["PMALPHA_J2000"] == pytest.approx(rows["pmra"].to_numpy(), rel=1e-6)
     assert found["MAGERR"] == pytest.approx(1.0857 / rows["phot_g_mean_flux_over_error"].to_numpy(), rel=1e-4)
     assert set(found["OBSDATE"]) == {2015.5}
-    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.csv"), "--form", "ldac"]) == 2
+    assert exported([str(lake), "--out", str(tmp_path / "gaia.csv"), "--form", "ldac"]) == 2

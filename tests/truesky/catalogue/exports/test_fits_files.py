@@ -10,8 +10,9 @@ from lake_schema.store import publish, read
 from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
-from truesky.catalogue import export_galaxies
+from truesky.catalogue.exports import fits_files, skycatalogs
 from truesky.catalogue.external import mapping, reading
+from truesky.commands import __main__ as truesky
 from truesky.cosmology import FIDUCIAL
 
 CELL = 8989
@@ -42,7 +43,7 @@ def lake(tmp_path):
 
 
 def test_fits_tables_have_units_and_ucds(lake, tmp_path):
-    (path,) = export_galaxies.export(lake, tmp_path / "out", "fits")
+    (path,) = fits_files.write(lake, GALAXIES, tmp_path / "out")
     assert path.name == f"galaxies_nside32_nest_{CELL}.fits"
     found, rows = Table.read(path), read.version(lake, "galaxies").rows()
     assert found.colnames == GALAXIES.names
@@ -53,7 +54,7 @@ def test_fits_tables_have_units_and_ucds(lake, tmp_path):
 
 
 def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
-    written = export_galaxies.export(lake, tmp_path / "out", "skycatalogs")
+    written = skycatalogs.write(lake, tmp_path / "out")
     pixel = sky.ring_index(5, CELL)
     assert [path.name for path in written] == [
         f"galaxy_{pixel}.parquet",
@@ -75,6 +76,6 @@ def test_fluxes_of_other_galaxies_are_refused(lake, tmp_path, capsys):
     rows = read.version(lake, "galaxy_fluxes").rows()
     part = Task(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
     publish.make_version(lake, Plan(table, {"input": "other"}, (part,)), lambda root, facts: Output(rows))
-    arguments = ["--lake", str(lake), "--out", str(tmp_path / "out"), "--form", "skycatalogs"]
-    assert export_galaxies.main(arguments) == 2
+    arguments = ["export", "galaxies", str(lake), "--out", str(tmp_path / "out"), "--form", "skycatalogs"]
+    assert truesky.main(arguments) == 2
     assert "run compute_fluxes first" in capsys.readouterr().err

@@ -1,13 +1,7 @@
-"""Export the table `gaia`: python -m truesky.catalogue.export_gaia LAKE --out FILE.
-
-table  CSV or FITS with the column names of Gaia's archive; --release dr3 uses DR3's columns in DR3's order
-ldac   FITS_LDAC for SCAMP (ASTREF_CATALOG FILE), with the column names that SCAMP expects
-"""
+"""Write the table `gaia` to a file with the column names of Gaia's archive, or of a reference catalogue for SCAMP."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,53 +10,22 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
 
-from lake_schema import __version__, command, sky, user_files
+from lake_schema import sky, user_files
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.fits.tables import table_to_fits
-from lake_schema.store import layout, read
+from lake_schema.store import read
 from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS
 from truesky.catalogue import parameters
 from truesky.catalogue.exports import ldac
 from truesky.catalogue.stars import gaia
-from truesky.command_line.parser import Parser
 
 RELEASES = {"dr2": EXPORT, "dr3": EXPORT_DR3}
 FORMS = {"table": (".csv", ".fits"), "ldac": (".fits", ".cat", ".ldac")}
 _MAS = np.pi / 180.0 / 3.6e6
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0 success, 1 a problem in the lake, 2 wrong arguments."""
-    parser = Parser(
-        prog="export_gaia",
-        description=__doc__,
-        epilog=f"truesky {__version__}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_lake()
-    parser.add_argument("--name", help="name of the request to export, if the lake contains several")
-    parser.add_argument(
-        "--out", required=True, type=Path, help="file to write: .csv or .fits; for ldac .fits, .cat or .ldac"
-    )
-    parser.add_argument("--form", default="table", choices=FORMS)
-    parser.add_argument(
-        "--release", default="dr2", choices=RELEASES, help="release with the column names; the values are always of DR2"
-    )
-    parser.add_argument("--epoch", type=float, help="year to which positions are moved with the measured proper "
-                        "motions, for programs that ignore proper motions")  # fmt: skip
-    options = parser.parse_args(argv)
-
-    def run_export() -> int:
-        lake, declared = layout.resolve_lake(options.lake), RELEASES[options.release]
-        rows = export(lake, options.out, declared, options.form, options.epoch, options.name)
-        print(f"{options.out}: {rows:,} stars")
-        return 0
-
-    return command.run("export_gaia", run_export)
-
-
-def export(
+def write(
     lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None,
     request: str | None = None,
 ) -> int:  # fmt: skip
@@ -164,7 +127,3 @@ def _advance_positions(rows: pa.Table, years: float) -> tuple[Any, Any]:
     """Return ra and dec (deg) after `years` of the measured proper motion; unknown proper motions count as 0."""
     east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
     return sky.offset_positions(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
-
-
-if __name__ == "__main__":
-    command.exit_with_status(main)
