@@ -13,14 +13,19 @@ from tests import requests
 from truesky.catalogue import build_gaia, build_galaxies, build_stars, build_strong_lenses
 from truesky.commands import demo
 from truesky.commands import run as whole
+from truesky.emulator import build_observed, build_randoms
 from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import from_table
 from truesky.running import submitted_job
+from truesky.survey_maps import build_depth
 
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
-LATER = (compute_fluxes.JOB, build_strong_lenses.JOB, build_gaia.JOB, plan_exposures.JOB, render_exposures.JOB)
+LATER = (
+    compute_fluxes.JOB, build_strong_lenses.JOB, build_gaia.JOB, plan_exposures.JOB, build_depth.JOB,
+    render_exposures.JOB, build_randoms.JOB, build_observed.JOB,
+)  # fmt: skip
 JOBS = FIRST + LATER
 # Four order-5 cells meet here, so that there is something to share out.
 SMALL = requests.text(
@@ -109,9 +114,12 @@ def test_missing_input_tables_are_named(job, tmp_path, capsys):
     missing = {
         "compute_fluxes": "has no tables: run truesky run REQUEST",
         "build_strong_lenses": "has no tables: run truesky run REQUEST",
+        "build_depth": "has no tables: run truesky run REQUEST",
         "build_gaia": "has no tables: run truesky run REQUEST",
         "plan_exposures": "it must have a pointing or an observation",
         "render_exposures": "has no tables: run truesky run REQUEST",
+        "build_randoms": "has no table depth: run truesky depth REQUEST",
+        "build_observed": "--model is required",
     }
     assert missing[job.name] in capsys.readouterr().err
 

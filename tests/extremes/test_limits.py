@@ -198,7 +198,8 @@ def test_all_numbers_of_the_records_of_a_request_are_listed():
         "": Request,
     }  # fmt: skip
     # Numbers of a record that have another key, or that the command line sets.
-    others = {"strong_lens_boost": "strong_lenses.boost", "limit": "seed", "universe.lensing": "universe.lensing.g1",
+    others = {"strong_lens_boost": "strong_lenses.boost", "limit": "seed", "density": "seed", "magnitude": "seed",
+              "universe.lensing": "universe.lensing.g1",
               "observation.macc": "observation.macc (groups)"}  # fmt: skip
     for section, record in sections.items():
         for field in fields(record):

@@ -192,7 +192,7 @@ def test_dependencies_are_pinned_within_their_ranges():
 
 
 # Extras that users install for some commands.
-EXTRAS = ("page", "reduction", "s3")
+EXTRAS = ("maps", "page", "reduction", "s3")
 
 
 def test_the_oldest_versions_are_the_lower_bounds():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from lake_schema import __version__, command
 from lake_schema.errors import PartOfLake
-from truesky.command_line import injection, lakes, mission, reduction, simulation
+from truesky.command_line import exports, injection, lakes, mission, reduction, simulation
 from truesky.command_line.parser import Parser, suggestion
 
 # Groups of commands in the help, with their titles.
@@ -66,7 +66,7 @@ class Command:
 # Options before the name of a command, and names of commands in other programs.
 _OPTIONS = ("--help", "--local", "--version")
 _SYNONYMS = {
-    "export": "sql", "forecast": "check", "ls": "list", "make": "run", "query": "sql", "select": "sql",
+    "forecast": "check", "ls": "list", "make": "run", "query": "sql", "select": "sql",
     "show": "describe", "simulate": "run", "view": "page",
 }  # fmt: skip
 _INSPECTION = ("lake_schema.inspection",)
@@ -100,9 +100,23 @@ COMMANDS = {
         "simulate", "REQUEST LAKE", "plan the exposures only, or print a forecast",
         "requests/demo.toml my_lake --dry-run", simulation.add_plan_arguments, ("truesky.commands.plan",), True,
     ),
+    "depth": Command(
+        "simulate", "REQUEST LAKE", "make maps of depth and masks only",
+        "requests/demo.toml my_lake", simulation.add_job_arguments, ("truesky.survey_maps.build_depth",), True,
+    ),
     "render": Command(
         "simulate", "REQUEST LAKE", "render the planned images only", "requests/demo.toml my_lake --limit 1",
         simulation.add_render_arguments, ("truesky.render.render_exposures",), True,
+    ),
+    "randoms": Command(
+        "simulate", "REQUEST LAKE", "make random points in the area of a band",
+        "requests/demo.toml my_lake --density 30 --band euclid_vis", simulation.add_randoms_arguments,
+        ("truesky.emulator.build_randoms",), True,
+    ),
+    "emulate": Command(
+        "simulate", "REQUEST LAKE", "draw an observed catalogue without images",
+        "requests/demo.toml my_lake --model vis.parquet", simulation.add_emulate_arguments,
+        ("truesky.emulator.build_observed",), True,
     ),
     "inject": Command(
         "simulate", "IMAGE ROWS OUT", "add sources to a calibrated frame of a telescope",
@@ -121,6 +135,11 @@ COMMANDS = {
     "sql": Command(
         "look", "LAKE [QUERY]", "run a SELECT over the tables, or list the tables",
         'my_lake "SELECT count(*) FROM galaxies"', lakes.add_sql_arguments, ("truesky.explore.__main__",),
+    ),
+    "export": Command(
+        "look", "WHAT LAKE", "write catalogues and maps for other programs",
+        "galaxies my_lake --form euclid --out euclid_galaxies", exports.add_export_arguments,
+        ("truesky.commands.export",), extra="maps",
     ),
     "list": Command(
         "look", "LAKE [TABLE]", "list the versions of the tables", "my_lake galaxies --json", lakes.add_list_arguments,
@@ -160,6 +179,10 @@ COMMANDS = {
     "stack": Command(
         "reduce", "FILE ...", "stack calibrated images of one field", "calibrated/*.fits --out stack.fits",
         reduction.add_stack_arguments, ("truesky.reduction.stack",), extra="reduction",
+    ),
+    "train": Command(
+        "reduce", "LAKE", "learn from images how sources are measured", "my_lake --out vis.parquet",
+        reduction.add_train_arguments, ("truesky.emulator.train",), extra="reduction",
     ),
     "gc": Command(
         "manage", "LAKE [TABLE]", "list or remove versions that nothing uses", "my_lake --delete",

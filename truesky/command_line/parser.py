@@ -67,6 +67,21 @@ class Parser(argparse.ArgumentParser):
         self._names_of_positions.append("--request")
         self.add_argument("request", metavar="REQUEST", help=help_text)
 
+    def add_choice(self, name: str, choices: Iterable[str], help_text: str) -> None:
+        """Add a positional argument with a fixed set of values, which precedes the lake.
+
+        Parameters
+        ----------
+        name : str
+            Name of the attribute with the value, such as "what"; in capital letters in the help.
+        choices : iterable of str
+            Allowed values.
+        help_text : str
+            Text of the help.
+        """
+        self._names_of_positions.append(f"--{name}")
+        self.add_argument(name, metavar=name.upper(), choices=tuple(choices), help=help_text)
+
     def add_lake(self, help_text: str = "folder of the lake", is_optional: bool = False) -> None:
         """Add the positional argument LAKE, whose value is a text, or None if it is optional and missing."""
         self._names_of_positions.append("--lake")

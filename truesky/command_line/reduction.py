@@ -43,6 +43,23 @@ def add_reduce_arguments(parser: Parser) -> None:
     parser.add_argument("--least-pixels", type=int, metavar="N", help="pixels of the smallest source (default: 5)")
 
 
+def add_train_arguments(parser: Parser) -> None:
+    """Declare the arguments of `truesky train`."""
+    parser.add_lake("folder of the lake with rendered frames")
+    parser.add_argument("--name", help=_NAME)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="file of the model, .parquet")
+    parser.add_argument("--band", metavar="NAME", help="passband, if the lake has images in several")
+    parser.add_argument("--masters", type=Path, metavar="FOLDER", help="masters (default: ideal calibration)")
+    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
+    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
+    parser.add_argument("--aperture", type=float, metavar="FWHM", help="diameter of MAG_APER (default: 3 FWHM)")
+    parser.add_argument("--threshold", type=float, metavar="SIGMA", help="level of sources (default: 1.5)")
+    parser.add_argument("--least-pixels", type=int, metavar="N", help="pixels of the smallest source (default: 5)")
+    parser.add_argument(
+        "--cosmic-rays", type=float, metavar="SIGMA", help="level of replaced cosmic rays (default: 5; 0: none)"
+    )
+
+
 def add_stack_arguments(parser: Parser) -> None:
     """Declare the arguments of `truesky stack`."""
     parser.add_argument("images", nargs="+", type=Path, metavar="FILE", help="images of `truesky reduce`")

@@ -97,7 +97,7 @@ def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
     Returns
     -------
     UPath
-        Path of the catalogue's folder, with the protocol truesky.
+        Path of the catalogue's folder, with the protocol truesky. The functions `read_hats` open a HATS map.
 
     Raises
     ------
@@ -109,10 +109,11 @@ def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
     if not isinstance(root, s3.ObjectPath):
         raise BadInput(f"lake {lake} is not an address s3://..: lsdb opens a folder by its path")
     version, place = read.version(root, table, request=request), root.store.address
-    if not version.has_file("collection.properties"):
-        raise BadInput(f"table {table} is not a catalogue: version {version.key} has no HATS collection")
+    is_collection = version.has_file("collection.properties")
+    if not is_collection and not version.has_file(f"{table}/hats.properties"):
+        raise BadInput(f"table {table} is not a catalogue: version {version.key} has no HATS files")
     fsspec.register_implementation(_PROTOCOL, Objects, clobber=True)
-    name = root.store.object_path(table, f"v-{version.key}")
+    name = root.store.object_path(table, f"v-{version.key}", *(() if is_collection else (table,)))
     with warnings.catch_warnings():
         # UPath would warn that the protocol truesky has no implementation in UPath itself.
         warnings.simplefilter("ignore")

@@ -58,8 +58,8 @@ def describe_lake(lake: LakeSession) -> Json:
 
 
 def is_catalogue(version: read.Version) -> bool:
-    """Return True if a table has the HEALPix column `_healpix_29`, so its rows have positions on the sky."""
-    return "_healpix_29" in version.schema.names
+    """Return True if the rows of a table are sources with positions on the sky and the HEALPix column `_healpix_29`."""
+    return {"_healpix_29", "ra", "dec"} <= set(version.schema.names)
 
 
 def _describe_column(field: pa.Field) -> Json:

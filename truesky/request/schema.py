@@ -252,6 +252,16 @@ class Request:
     limit : int, optional
         Largest number of detectors to render now, None for all. Set on the command line; the list of planned images
         does not depend on it.
+    density : float
+        Number of random points per arcmin2. Set on the command line.
+    band : str, optional
+        Passband whose area the random points cover, None for the only one. Set on the command line.
+    magnitude : float, optional
+        AB magnitude of the galaxies whose detection random points contain. Set on the command line.
+    model : tuple of str
+        Files of models of detection and measurement. Set on the command line.
+    extrapolate : bool
+        True to use models outside their range of depths. Set on the command line of `truesky emulate`.
     """
 
     name: str
@@ -282,6 +292,11 @@ class Request:
     structure: Structure = _SMOOTH
     detectors: tuple[str, ...] = ()
     limit: int | None = None
+    density: float = 30.0
+    band: str | None = None
+    magnitude: float | None = None
+    model: tuple[str, ...] = ()
+    extrapolate: bool = False
 
     def facts(self, *names: str) -> dict[str, Any]:
         """Return the named fields of the request as JSON values, from which hashes of tables and images are computed.

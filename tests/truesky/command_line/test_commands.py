@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 HEAVY = ("numpy", "pyarrow", "duckdb", "pandas", "pyspark", "scipy", "numba", "astropy", "matplotlib", "shtab")
 WORDS = {
     "mission": ["list"], "push": ["s3://x/y"], "stack": ["--out", "x"], "masters": ["--out", "x"],
-    "reduce": ["--out", "x"],
+    "reduce": ["--out", "x"], "export": ["--out", "x"],
 }  # fmt: skip
 
 
@@ -44,11 +44,11 @@ def test_the_help_lists_every_command_in_a_group():
         assert declared.summary in text
 
 
-def test_the_lake_is_the_first_argument_or_follows_the_request():
+def test_the_lake_is_the_first_argument_or_follows_the_request_or_what_is_exported():
     for name in commands.COMMANDS:
         usage = " ".join(commands.command_parser(name).format_usage().split())
         if "LAKE" in usage and name != "stack":
-            assert re.search(r"\] (REQUEST )?(LAKE|\[LAKE\])", usage), usage
+            assert re.search(r"\] (REQUEST |WHAT )?(LAKE|\[LAKE\])", usage), usage
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,6 @@ def test_request_and_lake_may_be_options_of_a_job():
         ),
         (["sql", "l", "SELECT", "1"], 'truesky sql: the query must be in quotes: write truesky sql l "SELECT 1"'),
         (["--lokal", "plan"], 'truesky: there is no option --lokal; did you mean "--local"?'),
-        (["export", "l"], 'truesky: export is not a command; did you mean "sql"?'),
         (["cache", "--clear"], 'truesky cache: there is no option --clear; did you mean "--prune"?'),
         (["mission", "dif"], "truesky mission: ACTION must be list, diff or camera, got 'dif'; did you mean \"diff\"?"),
         (["mission"], "truesky mission: list, diff or camera is missing; for example: truesky mission list"),

@@ -129,7 +129,7 @@ def test_unknown_commands_are_refused(capsys):
 
 
 _EXTRAS = sorted((name, declared.extra) for name, declared in commands.COMMANDS.items() if declared.extra)
-_OPTIONS = {"masters": ["--out", "x"], "push": ["s3://x/y"], "reduce": ["--out", "x"], "stack": ["--out", "x"]}
+_OPTIONS = {"push": ["s3://x/y"]} | {key: ["--out", "x"] for key in ("export", "masters", "reduce", "stack", "train")}
 
 
 @pytest.mark.parametrize(("word", "extra"), _EXTRAS)
@@ -138,7 +138,8 @@ def test_a_missing_optional_package_is_named_with_its_remedy(word, extra, monkey
         raise ModuleNotFoundError("No module named 'drizzle'", name="drizzle")
 
     monkeypatch.setattr(truesky, "import_module", missing)
-    assert truesky.main([word, "lake", *_OPTIONS.get(word, [])]) == 2
+    words = ["depth", "lake"] if word == "export" else ["lake"]
+    assert truesky.main([word, *words, *_OPTIONS.get(word, [])]) == 2
     assert capsys.readouterr().err == (
         f"truesky: {word} requires the package drizzle, which is not installed: pip install 'truesky[{extra}]'\n"
     )

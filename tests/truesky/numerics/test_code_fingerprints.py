@@ -160,6 +160,8 @@ RECORDS = {
     "truesky.request.files.UserCurves",
     # Only checks use the area of a request, to refuse catalogues outside it.
     "truesky.request.area.Area",
+    # Shapes of galaxies, on which no cached array depends: only the PSF of an exposure is cached.
+    "truesky.request.schema.MAX_SHEAR", "truesky.request.structure.Arms", "truesky.request.structure.Stamps",
     "lake_schema.mission.configuration.MissionConfiguration", "lake_schema.mission.parameter.SPACE_CAMERAS",
     "lake_schema.mission.parameter.Parameter",
     "lake_schema.mission.detector_overrides", "lake_schema.mission.detector_overrides.DetectorPlace",

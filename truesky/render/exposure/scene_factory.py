@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from lake_schema.arrays import Float
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from truesky.render.camera import pointing
@@ -93,6 +96,13 @@ def from_exposure(
     if scene.ramp:
         ramp.mode_of_scene(scene)
     return scene
+
+
+def sky_levels(exposures: Sequence[ExposureRow], detector: Detector) -> Float:
+    """Return the sky in the middle of a detector relative to that at the field centre, for each exposure."""
+    x, y = (float(axis[0, 0]) / 3600.0 for axis in pointing.outline((detector,)))
+    slopes = np.array([(e.sky_slope_x or 0.0, e.sky_slope_y or 0.0) for e in exposures]).reshape(-1, 2)
+    return np.maximum(1.0 + slopes[:, 0] * x + slopes[:, 1] * y, _MIN_SKY)
 
 
 def _sky_plane(exposure: ExposureRow, detector: Detector) -> tuple[float, float, float]:
