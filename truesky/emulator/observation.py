@@ -15,9 +15,6 @@ from truesky.emulator.features import Features, Neighbours
 from truesky.emulator.model import Model
 from truesky.randomness.per_source import PerSourceGenerator
 
-# Fraction of the sources whose place among similar examples is the same in all bands (assumed): the noise of bands is
-# independent, and the correlation of the light that MAG_AUTO misses has not been measured.
-SHARED_FRACTION = 0.0
 # Magnitudes, their errors (mag) and radii (arcsec) are at most these. A detection with hardly any flux has huge ones;
 # source-extractor writes 99 for magnitudes without flux.
 _LARGEST_MAGNITUDE, _LARGEST_RADIUS = 99.0, 1e3
@@ -167,10 +164,10 @@ def band_features(
 def _observe_band(sources: Sources, condition: Conditions, model: Model, pairs: Neighbours, seed: int) -> Observation:
     source_features, psf, radius = band_features(sources, condition, model.band, pairs)
     band_generator = PerSourceGenerator(sources.ids, seed, "emulator", model.band)
-    common = PerSourceGenerator(sources.ids, seed, "emulator.common")
-    nodes = band_generator.random(), band_generator.random(), band_generator.random()
-    place = np.where(common.random() < SHARED_FRACTION, common.random(), band_generator.random())
-    outcomes = model.examples.outcomes.select(lookup.draw(model.lookup, source_features, (*nodes, place)))
+    # The bands are drawn independently: the correlation of their errors has not been measured.
+    draw = band_generator.random
+    numbers = draw(), draw(), draw(), draw()
+    outcomes = model.examples.outcomes.select(lookup.draw(model.lookup, source_features, numbers))
     can_be_seen = condition.is_covered & model.has_examples(source_features)
     values = {field.name: getattr(outcomes, field.name) for field in fields(Outcomes)}
     values |= {name: values[name] & can_be_seen for name in ("detected", "blended")}
