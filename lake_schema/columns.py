@@ -318,7 +318,12 @@ def round_mantissa(values: np.ndarray, bits: int) -> np.ndarray:
     if drop <= 0:
         return values
     raw = values.view(np.uint32)
-    half = np.uint32((1 << (drop - 1)) - 1)
-    odd = (raw >> np.uint32(drop)) & np.uint32(1)
-    rounded = (raw + half + odd) & ~np.uint32((1 << drop) - 1)
-    return np.where(np.isfinite(values), rounded.view(np.float32), values)
+    # Work in place: allocating arrays takes longer than the arithmetic.
+    rounded = raw >> np.uint32(drop)
+    rounded &= np.uint32(1)
+    rounded += np.uint32((1 << (drop - 1)) - 1)
+    rounded += raw
+    rounded &= ~np.uint32((1 << drop) - 1)
+    if not np.isfinite(values).all():
+        np.copyto(rounded, raw, where=~np.isfinite(values))
+    return rounded.view(np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.store import read
-from lake_schema.tables.survey.depth import BRIGHT_STAR, EDGE, GHOST, ORDER, SATURATED, SPIKE
+from lake_schema.tables.survey.depth import BAD_PIXELS, BRIGHT_STAR, EDGE, GHOST, ORDER, SATELLITE, SATURATED, SPIKE
 from truesky.render.camera import pointing
 from truesky.survey_maps.depth_lookup import read_depth_map
 
@@ -24,7 +24,8 @@ _SIDE = 900
 # Colours of the mask bits, from the lowest layer to the highest.
 _COLOURS = (
     (0, "observed", "#dfe7ef"), (EDGE, "edge of a detector", "#9fb3c8"), (BRIGHT_STAR, "halo", "#f2b447"),
-    (SPIKE, "spike", "#c8553d"), (GHOST, "ghost", "#7b2d8b"), (SATURATED, "saturated", "#000000"),
+    (SPIKE, "spike", "#c8553d"), (GHOST, "ghost", "#7b2d8b"), (SATELLITE, "satellite", "#2a9d8f"),
+    (BAD_PIXELS, "bad pixels", "#e9c7c2"), (SATURATED, "saturated", "#000000"),
 )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.strong_lenses import STRONG_LENSES
     from lake_schema.tables.survey.depth import DEPTH
+    from lake_schema.tables.survey.measured_frames import MEASURED_FRAMES
     from lake_schema.tables.survey.observed import observed_sources
     from lake_schema.tables.survey.randoms import RANDOMS
     from lake_schema.tables.tasks import TASKS
@@ -44,6 +45,7 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
         *plans,
         *images,
         DEPTH,
+        MEASURED_FRAMES,
         VALIDATION,
     ]
 

@@ -205,13 +205,18 @@ def _amplifier_read_variance(scene: Scene, applied: Container[str]) -> float | F
     return noise**2 + scene.amplifier_values("gain", "electron / adu") ** 2 / 12.0
 
 
+def is_bad_response(response: Float | Float32) -> Bool:
+    """Return True for responses far from 1, outside 0.7 to 1.3, in an array of any shape."""
+    return np.asarray(~((response > _MIN_RESPONSE) & (response < _MAX_RESPONSE)))
+
+
 def response_flags(flat: CombinedFrame) -> Array:
     """Return the flag bits of each pixel that follow from the master flat, uint8[ny, nx].
 
     RESPONSE marks values outside 0.7 to 1.3. UNSURE marks pixels without an accepted frame, and pixels much brighter
     than their neighbours, which may contain the same star in all flats.
     """
-    flags = np.where((flat.mean > _MIN_RESPONSE) & (flat.mean < _MAX_RESPONSE), 0, RESPONSE).astype(np.uint8)
+    flags = np.where(is_bad_response(flat.mean), RESPONSE, 0).astype(np.uint8)
     # Take the median along rows, then along columns: as robust as a median over the square, in a tenth of the time.
     smooth = ndimage.median_filter(flat.mean, size=(1, _NEIGHBOURHOOD), mode="nearest")
     off = flat.mean - ndimage.median_filter(smooth, size=(_NEIGHBOURHOOD, 1), mode="nearest")

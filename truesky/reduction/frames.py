@@ -6,7 +6,7 @@ used to simulate it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,14 @@ from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back as mission_of
 from lake_schema.store import read
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.inputs import passband_from_facts
 from truesky.reduction import amplifiers
 from truesky.render.camera import detectors
+from truesky.render.effects.readout import quadrants
 from truesky.render.effects.scene import Scene
 from truesky.render.exposure import scene_factory
 from truesky.render.planning import variants
@@ -117,8 +119,78 @@ class Frame:
         """
         if (value := self.card(keyword)) is not None:
             return float(value)
-        headers = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
+        extensions = quadrants.in_plane_order(images.read_images(self.path)[1:])
+        headers = (dict((key, value) for key, value, _ in unit.cards) for unit in extensions)
         return np.array([float(cards[keyword]) for cards in headers])
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSource:
+    """A version of the table `products`, with everything that its raw frames have in common.
+
+    Attributes
+    ----------
+    root : Path
+        Folder of the lake.
+    products : Version
+        Version of the table `products`.
+    mission : MissionConfiguration
+        Mission parameters with which the frames were simulated.
+    flux_facts : mapping
+        Facts of the fluxes from which the frames were simulated.
+    """
+
+    root: Path
+    products: read.Version
+    mission: MissionConfiguration
+    flux_facts: Mapping[str, Any]
+
+    @classmethod
+    def from_products(cls, root: Path, products: read.Version) -> FrameSource:
+        """Read what the frames of a version of the table `products` have in common; `root` is the lake's folder."""
+        inputs = products.manifest["facts"]["inputs"]
+        mission = mission_of(read.version(root, "mission", inputs["mission"]))
+        fluxes = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"])
+        return cls(root, products, mission, fluxes.manifest["facts"])
+
+    def read_exposures(self, numbers: Collection[int]) -> dict[int, ExposureRow]:
+        """Return the rows of the table `exposures` from which frames were rendered, by the numbers of exposures."""
+        exposures = read.version(self.root, "exposures", self.products.manifest["facts"]["inputs"]["exposures"])
+        rows = rows_of_exposures(exposures, numbers).to_pylist()
+        return {row.exposure_id: row for row in map(ExposureRow.from_row, rows)}
+
+    def open_frame(self, row: Mapping[str, Any], exposure: ExposureRow) -> Frame:
+        """Open a raw frame after comparing the sha256 of its files, and read its header.
+
+        Parameters
+        ----------
+        row : mapping
+            Row of the table `products` of a science image.
+        exposure : ExposureRow
+            Exposure of the frame.
+
+        Returns
+        -------
+        Frame
+            The frame.
+
+        Raises
+        ------
+        Damaged
+            If a file is missing or differs from the manifest.
+        """
+        request = self.products.manifest["facts"]["request"]
+        forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
+        variant = variants.variant(exposure.settings, self.mission, Accuracy(**request["accuracy"]), forced)
+        detector = detectors.detector(exposure.camera, row["detector"], variant.mission)
+        scene = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy)
+        band = passband_from_facts(self.root, self.flux_facts, exposure.band)
+        scene = replace(scene, band=band, forced=variant.forced)
+        path = read_back.image_file(self.products, row["path"])
+        cards = read_back.header(path)
+        psf_name = sidecar_files.psf_file(exposure.exposure_id, exposure.channel, exposure.band, row["detector"])
+        psf = self.products.sidecar_path(psf_name) if self.products.has_file(psf_name) else None
+        return Frame(path, exposure, scene, _applied_effects(cards), cards, psf)
 
 
 def from_lake(
@@ -152,16 +224,9 @@ def from_lake(
         If the lake has no table `products` of the request, or no frame of one of the given detectors or exposures.
     """
     version = read.version(root, "products", request=request)
-    inputs = version.manifest["facts"]["inputs"]
+    source = FrameSource.from_products(root, version)
     products = version.rows()
-    planned_rows = rows_of_exposures(
-        read.version(root, "exposures", inputs["exposures"]), products["exposure_id"].unique().to_pylist()
-    )
-    planned = {row.exposure_id: row for row in map(ExposureRow.from_row, planned_rows.to_pylist())}
-    mission = mission_of(read.version(root, "mission", inputs["mission"]))
-    flux_facts = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
-    request_facts, exposure_numbers = version.manifest["facts"]["request"], set(exposures)
-    forced = dict.fromkeys(request_facts["effects"]["on"], True) | dict.fromkeys(request_facts["effects"]["off"], False)
+    planned, exposure_numbers = source.read_exposures(products["exposure_id"].unique().to_pylist()), set(exposures)
     by_detector: dict[tuple[str, str], list[Frame]] = {}
     rows = sorted(products.to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
     for row in rows:
@@ -169,17 +234,8 @@ def from_lake(
             continue
         if exposure_numbers and row["exposure_id"] not in exposure_numbers:
             continue
-        exposure = planned[row["exposure_id"]]
-        variant = variants.variant(exposure.settings, mission, Accuracy(**request_facts["accuracy"]), forced)
-        detector = detectors.detector(exposure.camera, row["detector"], variant.mission)
-        scene = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy)
-        scene = replace(scene, band=passband_from_facts(root, flux_facts, exposure.band), forced=variant.forced)
-        path = read_back.image_file(version, row["path"])
-        cards = read_back.header(path)
-        key = (exposure.camera, row["detector"])
-        psf_name = sidecar_files.psf_file(exposure.exposure_id, exposure.channel, exposure.band, row["detector"])
-        psf = version.sidecar_path(psf_name) if version.has_file(psf_name) else None
-        by_detector.setdefault(key, []).append(Frame(path, exposure, scene, _applied_effects(cards), cards, psf))
+        frame = source.open_frame(row, planned[row["exposure_id"]])
+        by_detector.setdefault((frame.exposure.camera, row["detector"]), []).append(frame)
     for name in detector_names:
         if not any(detector == name for _, detector in by_detector):
             raise BadInput(f"table products: no image of detector {name!r}")

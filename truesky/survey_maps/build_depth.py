@@ -1,4 +1,4 @@
-"""Build the table `depth`, the depth and the masks of the planned exposures of a request.
+"""Build the table `depth`, the depth and the masks of the planned or rendered exposures of a request.
 
 Command: spark-submit jobs/catalogue/build_depth.py --lake LAKE --request REQUEST.
 """
@@ -6,7 +6,7 @@ Command: spark-submit jobs/catalogue/build_depth.py --lake LAKE --request REQUES
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,11 +24,19 @@ from lake_schema.store.provenance import code_version, digest
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.survey.depth import DEPTH, ORDER
 from truesky.catalogue import dust_map
+from truesky.render.channels.image_types import shared_settings
 from truesky.render.planning.mission import mission_of, user_filters
 from truesky.render.planning.variants import mission_lookup
 from truesky.request.schema import Request
 from truesky.running.submitted_job import Job, Step
-from truesky.survey_maps import depth_rows, planned_footprints, star_masks
+from truesky.survey_maps import (
+    depth_rows,
+    measured_frames,
+    planned_footprints,
+    satellite_masks,
+    star_masks,
+    star_places,
+)
 from truesky.survey_maps.depth_rows import MaskFunction
 from truesky.survey_maps.pixel_overlap import PixelGrid
 from truesky.survey_maps.planned_footprints import VALUES, Footprints, SurveyModel, air_ranges, sky_images
@@ -60,8 +68,10 @@ class DepthMaker:
         """
         order, cell = layout.cell_of_file(facts["part"])
         exposures, tasks = (read.version(lake, name, facts[name]) for name in ("exposures", "tasks"))
+        key = facts.get("measured_frames")
+        frames = read.version(lake, "measured_frames", key) if key else None
         pieces = [
-            planned_footprints.read_part(exposures, tasks, part, self.model).select_near(order, cell)
+            planned_footprints.read_part(exposures, tasks, part, self.model, frames).select_near(order, cell)
             for part in facts["plan_parts"]
         ]
         footprints = Footprints(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
@@ -70,34 +80,43 @@ class DepthMaker:
         a_v = dust_map.a_v(dust, *sky.cell_centres(ORDER, grid.first_pixel + np.arange(len(grid.centres))))
         rows: dict[int, ExposureRow] = {}
         for part in facts["plan_parts"]:
-            rows |= planned_footprints.read_exposures(exposures, part, self.model)
-        masks = self._masks(lake, facts, rows) if facts.get("star_fluxes") else None
-        return Output(depth_rows.build(grid, footprints, a_v, masks))
+            rows |= planned_footprints.read_exposures(exposures, part)
+        return Output(depth_rows.build(grid, footprints, a_v, self._masks(lake, facts, rows)))
 
     def _masks(self, lake: Path, facts: Json, rows: Mapping[int, ExposureRow]) -> MaskFunction:
-        """Return the function that predicts the masks of the stars of the lake, for exposures by their numbers."""
-        fluxes = read.version(lake, "star_fluxes", facts["star_fluxes"])
+        """Return the function that predicts masks, for exposures by their numbers.
+
+        It predicts the trails of satellites, and the masks of the stars of the lake.
+        """
+        key = facts.get("star_fluxes")
+        fluxes = read.version(lake, "star_fluxes", key) if key else None
 
         def masks(name: str, footprints: Footprints, grid: PixelGrid) -> Int:
             column = f"f_nu_{name}"
-            if column not in fluxes.schema.names:
-                return np.zeros(len(grid.centres), np.int64)
+            exposures = {number: rows[number] for number in np.unique(footprints.exposure).tolist()}
+            normals = {number: footprints.normals[footprints.exposure == number] for number in exposures}
+            settings = self.model.band(name), self.model.mission
+            trails = satellite_masks.predict(exposures.values(), normals, self.request, settings, grid)
+            if fluxes is None or column not in fluxes.schema.names:
+                return trails
             radius = sky.cell_radius(grid.order) + star_masks.REACH
             star_rows = fluxes.cone(*sky.cell_centre(grid.order, grid.cell), radius, ["ra", "dec", column])
-            stars = star_masks.Stars.from_fluxes(*(star_rows[key].to_numpy() for key in ("ra", "dec", column)))
+            stars = star_places.Stars.from_fluxes(*(star_rows[key].to_numpy() for key in ("ra", "dec", column)))
             time, area = (footprints.values[:, VALUES.index(key)] for key in ("time", "psf_area"))
-            exposures = [rows[number] for number in np.unique(footprints.exposure).tolist()]
-            missions = mission_lookup(self.model.mission)
-            seen_by = star_masks.MaskExposures(
-                exposures, self.model.band(name), missions(exposures[0].settings), float(area.sum() / time.sum())
+            missions, first = mission_lookup(self.model.mission), next(iter(exposures.values()))
+            psf_area = float(area.sum() / time.sum())
+            seen_by = star_places.MaskExposures(
+                list(exposures.values()), self.model.band(name), missions(first.settings), psf_area, footprints
             )
-            return star_masks.predict(stars, seen_by, grid)
+            return trails | star_masks.predict(stars, seen_by, grid)
 
         return masks
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """Plan the making of the table `depth`, with one task per HEALPix cell of order 5 that an exposure touches.
+
+    If the plan has rendered frames, they are measured first, in the table `measured_frames`.
 
     Parameters
     ----------
@@ -109,12 +128,13 @@ def steps(lake: Path, request: Request) -> list[Step]:
     Returns
     -------
     list of Step
-        One step.
+        One step, or two if frames of the plan are rendered.
 
     Raises
     ------
     BadInput
-        If the lake has no plan, or the plan has no image of the sky.
+        If the lake has no plan, or the plan has no image of the sky, has a band with two cameras, or explores
+        parameters.
     """
     exposures, tasks = (read.input_version(lake, name, request.name) for name in ("exposures", "tasks"))
     all_rows = exposures.rows()
@@ -124,10 +144,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
             f"request {request.name}: its plan has no image of the sky in a passband: the area of a depth map is empty"
         )
     mission, (bands, filter_facts) = mission_of(request.mission), user_filters(request)
-    groups = images.group_by(["camera", "band"]).aggregate([("exposure_time_s", "max")]).to_pylist()
-    longest = {f"{row['camera']}:{row['band']}": row["exposure_time_s_max"] for row in groups}
-    counted = SurveyModel("", request.seed, mission, bands, longest, {}).counts(images)
-    air = air_ranges([ExposureRow.from_row(row) for row in counted.to_pylist()])
+    rows = [ExposureRow.from_row(row) for row in images.to_pylist()]
+    _require_one_camera(request.name, rows)
+    air = air_ranges(rows)
     facts = {
         "exposures": exposures.key,
         "tasks": tasks.key,
@@ -135,26 +154,62 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "mission": mission.fingerprint,
         **filter_facts,
         **dust_map.facts(request.ingest.dust),
+        "images": request.facts("effects", "accuracy", "noise_seed"),
         "code": code_version(),
     }
     # Without stars in the lake, masks have no bits of stars.
     if layout.current_key(lake, "star_fluxes") is not None:
         facts["star_fluxes"] = read.input_version(lake, "star_fluxes", request.name).key
-    model = SurveyModel(digest(facts), request.seed, mission, bands, longest, air)
-    parts_by_cell = _plan_parts(tasks, counted["exposure_id"].combine_chunks())
+    measuring = _measuring_step(lake, request, facts, images)
+    if measuring:
+        facts["measured_frames"] = measuring[0].plan.key
+    model = SurveyModel(digest(facts), request.seed, mission, bands, air)
+    parts_by_cell = _plan_parts(tasks, images["exposure_id"].combine_chunks())
     depth_tasks = tuple(
         Task(name, {"part": name, "plan_parts": parts})
         for name, parts in (
             (layout.cell_file(_CELL_ORDER, cell), parts_by_cell[cell]) for cell in sorted(parts_by_cell)
         )
     )
-    return [Step(Plan(DEPTH, facts, depth_tasks), DepthMaker(request, model).make_cell, unit="cell")]
+    return [*measuring, Step(Plan(DEPTH, facts, depth_tasks), DepthMaker(request, model).make_cell, unit="cell")]
+
+
+def _measuring_step(lake: Path, request: Request, facts: Json, counted: pa.Table) -> list[Step]:
+    """Return the step that measures the frames of the counted exposures, or no step without frames."""
+    products = measured_frames.find_frames(lake, request.name, facts)
+    plan = None if products is None else measured_frames.plan(products, counted)
+    if plan is None:
+        return []
+    return [Step(plan, measured_frames.measure_frame, unit="frame")]
+
+
+def _require_one_camera(request: str, exposures: Sequence[ExposureRow]) -> None:
+    """Raise BadInput if a band has exposures of two cameras, or with two combinations of explored parameters.
+
+    The depth of a pixel in a band is one row, for all exposures together. Exposures that differ in explored parameters
+    are alternatives.
+    """
+    cameras = defaultdict(set)
+    for exposure in exposures:
+        cameras[exposure.band].add(exposure.camera)
+    for band, names in sorted(cameras.items()):
+        if len(names) > 1:
+            raise BadInput(
+                f"request {request}: band {band} is observed by {' and '.join(sorted(names))}, but a depth map has one "
+                "camera per band: plan each camera in a separate request"
+            )
+    variants = {shared_settings(exposure.settings) for exposure in exposures}
+    if len(variants) > 1:
+        raise BadInput(
+            f"request {request}: explores {len(variants)} combinations of parameters, but a depth map has one: plan "
+            "without [explore]"
+        )
 
 
 def _plan_parts(tasks: read.Version, counted: pa.Array) -> dict[int, list[str]]:
     """Return the partitions of the plan with detectors near each cell of the sky, by the number of the cell.
 
-    `counted` are the numbers of the exposures that count.
+    `counted` are the numbers of the images of the sky.
     """
     parts = defaultdict(list)
     for part in tasks.partitions:
@@ -165,4 +220,4 @@ def _plan_parts(tasks: read.Version, counted: pa.Array) -> dict[int, list[str]]:
     return parts
 
 
-JOB = Job("build_depth", "Map the depth and the masks of the planned exposures.", steps)
+JOB = Job("build_depth", "Map the depth and the masks of the planned or rendered exposures.", steps)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema import sky
@@ -70,14 +69,37 @@ def read_depth_map(
     BadInput
         If the table has no row of this band in these partitions.
     """
-    rows = version.rows(["pixel", "band", *columns], partitions)
-    chosen = rows.filter(pc.equal(rows["band"], pa.scalar(band)))
-    if not chosen.num_rows:
-        raise BadInput(
-            f"table depth has no band {band} here: it has {', '.join(sorted(set(pc.unique(rows['band']).to_pylist())))}"
-        )
-    chosen = chosen.sort_by("pixel")
-    return DepthMap(band, chosen["pixel"].to_numpy(), {name: chosen[name].to_numpy() for name in columns})
+    depth = read_covered(version, band, columns, partitions)
+    if not len(depth.pixels):
+        where = "" if partitions is None else " in this part of the sky"
+        existing = ", ".join(sorted(_bands(version, partitions)))
+        raise BadInput(f"table depth has no band {band}{where}: it has {existing or 'no rows'}")
+    return depth
+
+
+def read_covered(
+    version: read.Version, band: str, columns: Sequence[str], partitions: Sequence[str] | None = None
+) -> DepthMap:
+    """Read the depth of one band, like `read_depth_map`, but return a map without pixels where the band has no row.
+
+    Parameters
+    ----------
+    version : Version
+        A version of the table `depth`.
+    band : str
+        Name of the passband.
+    columns : sequence of str
+        Names of the columns to read, besides `pixel`.
+    partitions : sequence of str, optional
+        Names of the partitions (one per HEALPix cell) to read. None reads all.
+
+    Returns
+    -------
+    DepthMap
+        The rows of the band, in the order of their pixels.
+    """
+    rows = version.rows(["pixel", *columns], partitions, pc.field("band") == band).sort_by("pixel")
+    return DepthMap(band, rows["pixel"].to_numpy(), {name: rows[name].to_numpy() for name in columns})
 
 
 def choose_bands(version: read.Version, bands: Sequence[str] = ()) -> list[str]:
@@ -85,12 +107,18 @@ def choose_bands(version: read.Version, bands: Sequence[str] = ()) -> list[str]:
 
     Raises BadInput if the table does not have one of the given passbands.
     """
-    existing: set[str] = set()
-    for partition in version.partitions:
-        existing |= set(pc.unique(version.rows(["band"], [partition])["band"]).to_pylist())
+    existing = _bands(version)
     if unknown := [band for band in bands if band not in existing]:
-        raise BadInput(f"table depth has no band {unknown[0]}: it has {', '.join(sorted(existing))}")
+        raise BadInput(f"table depth has no band {unknown[0]}: it has {', '.join(sorted(existing)) or 'no rows'}")
     return list(bands) or sorted(existing)
+
+
+def _bands(version: read.Version, partitions: Sequence[str] | None = None) -> set[str]:
+    """Return the names of the passbands in some partitions (None: all) of a version of the table `depth`."""
+    bands: set[str] = set()
+    for partition in version.partitions if partitions is None else partitions:
+        bands |= set(pc.unique(version.rows(["band"], [partition])["band"]).to_pylist())
+    return bands
 
 
 def read_blocks(version: read.Version, band: str, column: str) -> Iterator[tuple[Int, Array]]:

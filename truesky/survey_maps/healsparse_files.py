@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import manifest, read
 from lake_schema.tables.survey.depth import DEPTH, ORDER
@@ -34,7 +35,7 @@ def write(
     version : Version
         A version of the table `depth`.
     folder : Path
-        Folder of the files, which must exist. A file appears under its name when it is complete.
+        Folder of the files, which is created if needed. A file appears under its name when it is complete.
     bands : sequence of str
         Names of passbands; by default all bands of the table.
     columns : sequence of str
@@ -48,14 +49,16 @@ def write(
     Raises
     ------
     BadInput
-        If the table has no such band, or a column cannot be a map.
+        If the table has no such band, a column cannot be a map, or the folder is a file or not writable.
     """
     import healsparse
 
     if unknown := sorted(set(columns) - set(COLUMNS)):
         raise BadInput(f"column {unknown[0]} of table depth is not one of {', '.join(COLUMNS)}")
+    chosen_bands = choose_bands(version, bands)
+    user_files.check_folder(folder).mkdir(parents=True, exist_ok=True)
     paths = []
-    for band in choose_bands(version, bands):
+    for band in chosen_bands:
         for name in columns:
             value_type = np.dtype(DEPTH.column(name).arrow_type.to_pandas_dtype())
             sky_map = healsparse.HealSparseMap.make_empty(

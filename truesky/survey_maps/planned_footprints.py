@@ -22,7 +22,7 @@ from truesky.fluxes.passbands import Passband
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels.image_types import SKY_TYPES
 from truesky.render.planning.variants import mission_lookup
-from truesky.survey_maps import exposure_noise, psf_sizes
+from truesky.survey_maps import exposure_noise, measured_frames, psf_sizes
 from truesky.survey_maps.pixel_overlap import side_normals
 from truesky.survey_maps.psf_sizes import AirRange
 
@@ -31,9 +31,7 @@ APERTURE_RADIUS = 1.0
 # Channels with images of the sky in a passband. The depth of slitless spectra depends on the lines of a source.
 CHANNELS = ("VIS", "NISP-P", "EXT")
 # Values of each footprint that are summed over the exposures of a pixel, in the order of `Footprints.values`.
-VALUES = ("time", "sky", "seeing", "psf_area", "point", "aperture")
-# Exposures up to this fraction of the longest one of their band are short exposures, which do not count.
-_SHORT = 0.5
+VALUES = ("time", "sky", "seeing", "psf_area", "point", "aperture", "measured_time")
 # Partitions of the plan that a process keeps. One has about 1e5 footprints, which take 20 MB and seconds to read.
 _KEPT_PARTS = 8
 
@@ -55,10 +53,12 @@ class Footprints(NamedTuple):
         Radius of a circle that contains the footprint, radian.
     normals : float array, shape (n, 4, 3)
         Unit vectors normal to the sides, towards the inside.
-    values : float array, shape (n, 6)
+    values : float array, shape (n, 7)
         Exposure time t (s); t times the sky (electrons / s / pixel), the FWHM of the PSF (arcsec) and its effective
         area (arcsec^2); inverse variances of the flux of a point source and in the aperture, relative to the flux of AB
-        magnitude 0.
+        magnitude 0; t if sky and noise were measured on the frame, else 0.
+    measured : object array, shape (n,)
+        Measurements of the frame, or None.
     """
 
     band: Array
@@ -69,6 +69,7 @@ class Footprints(NamedTuple):
     radius: Float
     normals: Float
     values: Float
+    measured: Array
 
     def select(self, chosen: Bool | Int) -> Footprints:
         """Return the footprints with the given flags or indices."""
@@ -97,8 +98,6 @@ class SurveyModel:
         Mission parameters of the request.
     bands : dict of str to Passband
         Passbands of the user, by name.
-    longest : dict of str to float
-        Longest exposure time (s) of each camera and band in the whole plan, by `camera:band`.
     air : dict of str to AirRange
         Ranges of seeing and airmass in the whole plan, by `camera:band:settings`, for ground cameras.
     """
@@ -107,17 +106,7 @@ class SurveyModel:
     seed: int = field(compare=False)
     mission: MissionConfiguration = field(compare=False)
     bands: dict[str, Passband] = field(compare=False)
-    longest: dict[str, float] = field(compare=False)
     air: dict[str, AirRange] = field(compare=False)
-
-    def counts(self, exposures: pa.Table) -> pa.Table:
-        """Return the rows of the table `exposures` that count: images of the sky in a band, without short exposures."""
-        rows = sky_images(exposures)
-        limit = [
-            _SHORT * self.longest[f"{row['camera']}:{row['band']}"]
-            for row in rows.select(["camera", "band"]).to_pylist()
-        ]
-        return rows.filter(pc.greater(rows["exposure_time_s"], pa.array(limit, pa.float64())))
 
     def band(self, name: str) -> Passband:
         """Return a passband of the user or of truesky."""
@@ -149,7 +138,7 @@ def air_ranges(exposures: Sequence[ExposureRow]) -> dict[str, AirRange]:
 
 
 @lru_cache(maxsize=_KEPT_PARTS)
-def read_exposures(exposures: read.Version, part: str, model: SurveyModel) -> dict[int, ExposureRow]:
+def read_exposures(exposures: read.Version, part: str) -> dict[int, ExposureRow]:
     """Read the exposures in a partition of the plan that count for depth maps.
 
     Parameters
@@ -158,20 +147,24 @@ def read_exposures(exposures: read.Version, part: str, model: SurveyModel) -> di
         Version of the table `exposures`.
     part : str
         Name of the partition.
-    model : SurveyModel
-        Settings that determine the depth.
 
     Returns
     -------
     dict of int to ExposureRow
         The exposures by their numbers.
     """
-    counted = model.counts(exposures.rows(partitions=[part])).to_pylist()
-    return {row["exposure_id"]: ExposureRow.from_row(row) for row in counted}
+    rows = sky_images(exposures.rows(partitions=[part])).to_pylist()
+    return {row["exposure_id"]: ExposureRow.from_row(row) for row in rows}
 
 
 @lru_cache(maxsize=_KEPT_PARTS)
-def read_part(exposures: read.Version, tasks: read.Version, part: str, model: SurveyModel) -> Footprints:
+def read_part(
+    exposures: read.Version,
+    tasks: read.Version,
+    part: str,
+    model: SurveyModel,
+    frames: read.Version | None = None,
+) -> Footprints:
     """Read the footprints in a partition of the plan that count for depth maps.
 
     Parameters
@@ -182,19 +175,25 @@ def read_part(exposures: read.Version, tasks: read.Version, part: str, model: Su
         Name of the partition.
     model : SurveyModel
         Settings that determine the depth.
+    frames : Version, optional
+        Version of the table `measured_frames`, whose values replace predicted ones.
 
     Returns
     -------
     Footprints
         The footprints. The last partitions stay in memory, because neighbouring cells of the sky need the same ones.
     """
-    rows = read_exposures(exposures, part, model)
+    rows = read_exposures(exposures, part)
     columns = ["exposure_id", "detector", "ra", "dec", "radius", "s_region"]
     all_tasks = tasks.rows(columns, [part])
     counted_tasks = all_tasks.filter(pc.is_in(all_tasks["exposure_id"], pa.array(rows, pa.int64())))
     counted_tasks = counted_tasks.sort_by([("exposure_id", "ascending"), ("detector", "ascending")])
     exposure_rows = [rows[number] for number in counted_tasks["exposure_id"].to_pylist()]
     names = counted_tasks["detector"].to_pylist()
+    pairs = list(zip(counted_tasks["exposure_id"].to_pylist(), names, strict=True))
+    noise_of_frames = {} if frames is None else measured_frames.read_measured(frames, pairs)
+    measured = np.empty(len(pairs), object)
+    measured[:] = [noise_of_frames.get(pair) for pair in pairs]
     return Footprints(
         np.array([e.band for e in exposure_rows], object),
         np.array([e.camera for e in exposure_rows], object),
@@ -203,17 +202,20 @@ def read_part(exposures: read.Version, tasks: read.Version, part: str, model: Su
         sky.unit_vectors(counted_tasks["ra"].to_numpy(), counted_tasks["dec"].to_numpy()),
         np.radians(counted_tasks["radius"].to_numpy()),
         side_normals(_corners(counted_tasks["s_region"])),
-        _values(exposure_rows, names, model),
+        _values(exposure_rows, names, model, measured),
+        measured,
     )
 
 
 def _corners(regions: pa.ChunkedArray) -> Float:
     """Return the corners of footprints, STC-S polygons of four corners, as float[n, 4, 2] in deg."""
-    words = " ".join(region.split(maxsplit=2)[2] for region in regions.to_pylist())
-    return np.array(words.split(), float).reshape(-1, 4, 2)
+    # "POLYGON ICRS" and eight numbers. Arrow reads numbers from texts faster than numpy, with the same bits.
+    words = pc.list_flatten(pc.split_pattern(regions, " "))
+    numbers = words.filter(pa.array(np.tile(np.arange(10) >= 2, len(regions))))
+    return np.asarray(numbers.cast(pa.float64())).reshape(-1, 4, 2)
 
 
-def _values(exposures: Sequence[ExposureRow], names: Sequence[str], model: SurveyModel) -> Float:
+def _values(exposures: Sequence[ExposureRow], names: Sequence[str], model: SurveyModel, measured: Array) -> Float:
     missions = mission_lookup(model.mission)
     groups = defaultdict(list)
     for i, exposure in enumerate(exposures):
@@ -225,12 +227,17 @@ def _values(exposures: Sequence[ExposureRow], names: Sequence[str], model: Surve
         detectors = {d.name: d for d in camera_detectors.detectors(camera, mission)}
         chosen = [detectors[names[i]] for i in indices]
         level, variance = exposure_noise.variances(group, chosen, mission)
+        in_frame = np.array([measured[i] is not None for i in indices])
+        for row in np.flatnonzero(in_frame).tolist():
+            # The mean of a sky without light may be below 0.
+            level[row], variance[row] = max(measured[indices[row]].sky, 0.0), measured[indices[row]].variance
         scale = np.array([d.pixel_scale for d in chosen])
         area, fwhm = _psf_sizes(group, [names[i] for i in indices], model, mission)
         time = np.array([e.exposure_time_s for e in group])
         signal = time * 10.0 ** (0.4 * np.array([e.zero_point for e in group]))
         inverse = signal**2 * scale**2 / variance
-        columns = (time, time * level, time * fwhm, time * area, inverse / area, inverse / (np.pi * APERTURE_RADIUS**2))
+        depths = inverse / area, inverse / (np.pi * APERTURE_RADIUS**2)
+        columns = (time, time * level, time * fwhm, time * area, *depths, time * in_frame)
         values[indices] = np.stack(columns, axis=1)
     return values
 

@@ -129,8 +129,11 @@ def in_air(
     seeing = np.linspace(low, high, _SEEING_NODES) if high - low > _NARROW else np.array([low])
     airmass = np.array(ranges.airmass if np.ptp(ranges.airmass) > _NARROW else ranges.airmass[:1])
     middle = _middle(camera_detectors.detectors(exposures[0].camera, mission))
+    # The air of an exposure has a random elongation, which its place and date select. Nodes have one place and date, so
+    # that they do not depend on the exposure that a process reads first.
+    node = replace(exposures[0], ra=0.0, dec=0.0, mjd=0.0, zenith=None)
     nodes = [
-        replace(exposures[0], seeing=float(np.exp(s)) / float(x) ** _AIRMASS_POWER, airmass=float(x), zenith=None)
+        replace(node, seeing=float(np.exp(s)) / float(x) ** _AIRMASS_POWER, airmass=float(x))
         for s in seeing
         for x in airmass
     ]

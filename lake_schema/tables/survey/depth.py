@@ -24,10 +24,15 @@ MASK_BITS = (
     (SPIKE, "diffraction spike or bleeding trail of a bright star"),
     (GHOST, "ghost of a bright star"),
     (SATURATED, "saturated pixels of a detector"),
-    (BAD_PIXELS, "pixels of a detector that are masked in every exposure"),
+    (BAD_PIXELS, "bad pixels of the detector on at least 1 % of the area in every exposure"),
     (SATELLITE, "trail of a satellite"),
 )
-ORIGINS = ((0, "plan: expected values of the exposures"), (1, "frames: measured on the images"))
+PLANNED, MEASURED, BOTH = 0, 1, 2
+ORIGINS = (
+    (PLANNED, "plan: expected values of all exposures"),
+    (MEASURED, "frames: sky and noise of all exposures were measured on the images"),
+    (BOTH, "both: sky and noise were measured for some exposures, and are expected for the others"),
+)
 
 DEPTH = Table(
     "depth",

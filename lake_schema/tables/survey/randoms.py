@@ -1,4 +1,4 @@
-"""Declaration of the table `randoms`: uniform random points in the area that a band covers, with depth and masks.
+"""Declaration of the table `randoms`: uniform random points in the areas that bands cover, with depth and masks.
 
 Random points have the geometry of the survey but no clustering. Two-point statistics compare galaxies with them.
 """
@@ -43,8 +43,8 @@ RANDOMS = Table(
             nullable=True,
         ),
     ),
-    "Uniform random points in the area that a band covers, with the depth and masks at each point.",
-    key=("id",),
+    "Uniform random points in the areas that bands cover, with the depth and masks at each point in each band.",
+    key=("id", "band"),
     order=5,
     max_order=8,
 )

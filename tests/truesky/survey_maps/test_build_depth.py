@@ -1,11 +1,14 @@
 """The table `depth` of a small plan, against depths that are computed for one position with the plan's rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.store import read
+from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.survey.depth import BRIGHT_STAR, DEPTH, EDGE, ORDER
 from tests import hats_readers
 from truesky.commands import __main__ as commands
@@ -89,11 +92,33 @@ def test_an_empty_area_is_refused(tmp_path):
         build_depth.steps(tmp_path, wanted)
 
 
-def test_short_exposures_do_not_count(tmp_path):
+def test_short_exposures_count_with_their_weight(tmp_path):
+    """The inverse variances of both exposures are summed: 89.5 s add little to 560 s."""
     short = planned.pointing("VIS", "vis", "euclid_vis", ["3-4"], exposure_time_s=89.5, mjd=60905.1)
-    wanted = planned.request([planned.POINTINGS[0], short])
-    rows = planned.depth(tmp_path, wanted).rows(["exposures"])
-    assert rows["exposures"].to_numpy().max() == 1
+    columns = ["exposures", "exposure_time_s", "depth_point", "covered"]
+    rows = planned.depth(tmp_path, planned.request([planned.POINTINGS[0], short])).rows(columns).to_pandas()
+    rows = rows[rows.covered == 1.0]
+    depth = rows.groupby("exposures").depth_point.median()
+    assert depth.index.tolist() == [1, 2]
+    assert 0.0 < depth[2] - depth[1] < 1.25 * np.log10(1.0 + 89.5 / 560.0)
+    time = rows.groupby("exposures").exposure_time_s.median()
+    assert time[2] - time[1] == pytest.approx(89.5, abs=2.0)
+
+
+def test_two_cameras_in_a_band_are_refused(lake):
+    """Two cameras of the user may have the same band."""
+    exposures = [ExposureRow.from_row(row) for row in read.version(lake, "exposures").rows().to_pylist()]
+    build_depth._require_one_camera("x", exposures)
+    other = [replace(exposure, camera="decam") for exposure in exposures if exposure.band == "lsst_r"]
+    with pytest.raises(BadInput, match="x: band lsst_r is observed by decam and lsstcam, but a depth map has one"):
+        build_depth._require_one_camera("x", [*exposures, *other])
+
+
+def test_explored_parameters_are_refused(tmp_path):
+    wanted = planned.request([planned.POINTINGS[0]], explore={"effects.ghosts": [True, False]})
+    planned.make(tmp_path, wanted)
+    with pytest.raises(BadInput, match="explores 2 combinations of parameters"):
+        build_depth.steps(tmp_path, wanted)
 
 
 def test_hats_opens_the_map(lake, version):

@@ -1,4 +1,4 @@
-"""The depth of a point source, against the flux at which sep finds half of the injected stars."""
+"""The depth of a point source, against the flux at which sep finds half of the stars, in noise and rendered frames."""
 
 import numpy as np
 import pytest
@@ -10,9 +10,9 @@ from truesky.fluxes import passbands
 from truesky.render.camera import detectors
 from truesky.render.channels import registry
 from truesky.render.plan_exposures import plan
-from truesky.survey_maps import exposure_noise, psf_sizes
+from truesky.survey_maps import exposure_noise, frame_noise, psf_sizes
 
-from . import planned
+from . import frames, planned
 
 sep = pytest.importorskip("sep")
 # Stars per image, on a lattice with this spacing (pixels).
@@ -77,3 +77,72 @@ def test_half_of_the_stars_at_the_depth_are_found(channel, camera, name, toleran
     assert found[0] < 0.2
     assert found[-1] > 0.8
     assert abs(2.5 * np.log10(limit)) < tolerance
+
+
+def matched_kernels(psf, phases):
+    """Return the PSF on pixels for phases x phases positions inside a pixel, with sums of squares of 1."""
+    samples, reach = psf.planes.samples, 10
+    fine = scipy.ndimage.uniform_filter(psf.planes.images.mean(axis=0, dtype=float), samples, mode="constant")
+    steps = [round(samples * ((i + 0.5) / phases - 0.5)) for i in range(phases)]
+    grid = len(fine) // 2 + samples * np.arange(-reach, reach + 1)
+    kernels = [fine[np.ix_(grid - dy, grid - dx)] for dy in steps for dx in steps]
+    return [kernel / np.sqrt((kernel**2).sum()) for kernel in kernels]
+
+
+def half_found_flux(ratio, is_found):
+    """Return the flux with a probability of one half, from the most likely cumulative normal distribution."""
+
+    def misfit(parameters):
+        middle, width = parameters
+        chance = np.clip(scipy.special.ndtr((ratio - middle) / abs(width)), 1e-6, 1.0 - 1e-6)
+        return -np.log(np.where(is_found, chance, 1.0 - chance)).sum()
+
+    return float(scipy.optimize.minimize(misfit, [1.0, 0.2], method="Nelder-Mead").x[0])
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("channel", "camera", "name", "phases"),
+    [("EXT", "lsstcam", "R22_S11", 1), ("VIS", "vis", "3-4", 3), ("NISP-P", "nisp", "DET22", 3)],
+)
+def test_half_of_the_stars_at_the_depth_are_found_in_a_rendered_frame(channel, camera, name, phases, tmp_path):
+    """Within 0.05 mag of the depth with the measured noise, for stars that were rendered with all effects.
+
+    VIS and NISP undersample the PSF: the image is filtered with the PSF at 3 x 3 positions inside a pixel, and a
+    detection is a maximum in any of them. With the PSF in the middle of a pixel alone, half of the stars are found
+    0.06 mag brighter in VIS and 0.12 mag brighter in NISP.
+
+    sample: 900 stars. significance: 3 sigma
+    """
+    side, spacing, rng = 1024, 32, np.random.default_rng(5)
+    exposure = frames.exposures(tmp_path / "plan")[channel]
+    detector = frames.section(camera, name, side)
+    band, whole = passbands.load(exposure.band), detectors.detector(camera, name, frames.MISSION)
+    area, _ = psf_sizes.sizes(exposure, whole, band, frames.MISSION, frames.SEED)
+    _, (variance,) = exposure_noise.variances([exposure], [detector], frames.MISSION)
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(spacing, side - spacing, spacing)]))
+    x, y = (axis + rng.uniform(-0.5, 0.5, len(axis)) for axis in (x, y))
+    ratio = rng.uniform(0.5, 1.5, len(x))
+    five_sigma = THRESHOLD * np.sqrt(variance * area) / detector.pixel_scale
+    magnitude = exposure.zero_point - 2.5 * np.log10(ratio * five_sigma / exposure.exposure_time_s)
+    stars = (x, y), frames.magnitudes_to_flux(magnitude)
+    frame, one = frames.rendered(tmp_path, exposure, detector, stars, truth=("cosmic_rays",))
+    hits = one.maps["cosmic_rays"] > np.sqrt(variance) if channel != "NISP-P" else None
+    found = frame_noise.measure(frame, frames.SEED, hits)
+    image = frame_noise.calibrate(frame, frame_noise.ideal_masters(frame, frames.SEED))
+    used = (image.weight > 0.0) & (True if hits is None else ~hits)
+    # The mean sky without the wings of the stars, of which a real field has fewer.
+    noise = image.image - one.noise_free
+    is_noise = used & (np.abs(noise - np.median(noise[used])) < 4.0 * np.sqrt(variance))
+    excess = image.image - noise[is_noise].mean()
+    excess = np.where(used, excess, rng.normal(0.0, np.sqrt(found.variance), excess.shape))
+    psf = registry.CHANNELS[channel].psf(exposure, whole, band, frames.MISSION, 1)
+    kernels = matched_kernels(psf, phases)
+    filtered = np.max([scipy.signal.fftconvolve(excess, k[::-1, ::-1], mode="same") for k in kernels], axis=0)
+    objects = sep.extract(
+        filtered.astype(np.float32), THRESHOLD * float(np.sqrt(found.variance)), minarea=1, filter_kernel=None
+    )
+    tree = scipy.spatial.cKDTree(np.stack([objects["xpeak"], objects["ypeak"]], axis=1))
+    distance, _ = tree.query(np.stack([x, y], axis=1))
+    limit = half_found_flux(ratio, distance < 1.6) / np.sqrt(found.variance / variance)
+    assert abs(2.5 * np.log10(limit)) < 0.05

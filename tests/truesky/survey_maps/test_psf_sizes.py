@@ -85,3 +85,19 @@ def test_seeing_and_airmass_that_differ_by_rounding(exposures):
     both = psf_sizes.in_air([exposure], ranges, passbands.load("lsst_r"), resolve())
     same = psf_sizes.in_air([exposure], AirRange((seeing,) * 2, (airmass,) * 2), passbands.load("lsst_r"), resolve())
     np.testing.assert_array_equal(both, same)
+
+
+def test_nodes_do_not_depend_on_the_first_exposure(exposures, monkeypatch):
+    """Processes read exposures in different orders; the elongation of the air depends on the place and the date."""
+    nodes = []
+
+    def record(exposure, *_):
+        nodes.append((exposure.ra, exposure.dec, exposure.mjd, exposure.zenith, exposure.seeing, exposure.airmass))
+        return 1.0, 1.0
+
+    monkeypatch.setattr(psf_sizes, "_cached_sizes", record)
+    one = exposures["EXT"]
+    for first in (one, replace(one, ra=one.ra + 1.0, dec=0.0, mjd=one.mjd + 2.0, zenith=3.0, seeing=0.9)):
+        psf_sizes.in_air([first], AirRange((0.55, 1.4), (1.0, 1.6)), passbands.load("lsst_r"), resolve())
+    assert nodes[:6] == nodes[6:]
+    assert len(set(nodes)) == 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,10 +176,15 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
     Scaramella et al. 2022, Table 1 (gaps of VIS and NISP); layouts of ground cameras in the mission database.
     """
     camera_detectors = _load_detectors(camera, mission)
-    farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in camera_detectors)
+    farthest = field_radius(camera_detectors)
     scale = camera_detectors[0].pixel_scale
     distortion.require_invertible(camera_detectors[0].distortion_terms, farthest / scale, scale, camera)
     return camera_detectors
+
+
+def field_radius(all_detectors: Sequence[Detector]) -> float:
+    """Return the radius of the circle about the boresight around all detectors of a camera, arcsec."""
+    return max(float(np.hypot(detector.x, detector.y)) + detector.half_diagonal for detector in all_detectors)
 
 
 def _load_detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:

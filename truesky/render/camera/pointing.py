@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float
 from truesky.numerics import matrices
 from truesky.render.camera import distortion
 from truesky.render.camera.detectors import Detector
@@ -82,6 +82,34 @@ def sky_of_plane(
     lon = np.degrees(np.arctan2(to[1], to[0])) % 360.0
     lat = np.degrees(np.arctan2(to[2], np.hypot(to[0], to[1])))
     return lon.reshape(u.shape), lat.reshape(u.shape)
+
+
+def plane_of_sky(places: Float, ra: float, dec: float, position_angle: float) -> tuple[Float, Float, Bool]:
+    """Convert directions to focal-plane coordinates on the tangent plane, the inverse of `sky_of_plane`.
+
+    Parameters
+    ----------
+    places : float array, shape (n, 3)
+        Unit vectors.
+    ra, dec : float
+        Right ascension and declination of the boresight, deg.
+    position_angle : float
+        Angle of the y axis at the boresight, deg from north through east.
+
+    Returns
+    -------
+    x, y : float array, shape (n,)
+        Focal-plane coordinates relative to the boresight, arcsec; x points west if the position angle is 0.
+    is_near : bool array, shape (n,)
+        True for directions less than 60 deg from the boresight. The coordinates of others have no meaning.
+    """
+    to_east, to_north, to_out = ((places * axis.ravel()).sum(axis=-1) for axis in basis(ra, dec))
+    is_near, angle = to_out > 0.5, np.radians(position_angle)
+    to_east, to_north = (
+        np.divide(v, to_out, out=np.zeros_like(v), where=is_near) / ARCSEC for v in (to_east, to_north)
+    )
+    x = to_north * np.sin(angle) - to_east * np.cos(angle)
+    return x, to_east * np.sin(angle) + to_north * np.cos(angle), is_near
 
 
 def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:

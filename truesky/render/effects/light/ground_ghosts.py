@@ -8,6 +8,7 @@ annulus into an ellipse are neglected, and so is light from stars that are too f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.camera.detectors import detectors
+from truesky.render.camera.detectors import detectors, field_radius
 from truesky.render.effects.effect import Effect, copy_frame
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.psf.aberrations import Telescope
@@ -146,6 +147,38 @@ def _ghosts(scene: Scene) -> list[_Ghost]:
     return ghosts
 
 
+def in_focal_plane(
+    scene: Scene, x: Float, y: Float, electrons: Float, reach: float
+) -> Iterator[tuple[Float, Float, Float, Float]]:
+    """Yield the ghosts of stars in the focal plane, for each pair of reflecting surfaces.
+
+    Parameters
+    ----------
+    scene : Scene
+        Settings of the exposure, with its passband.
+    x, y : float array, shape (n,)
+        Positions of the stars in the focal plane, arcsec.
+    electrons : float array, shape (n,)
+        Electrons expected from each star.
+    reach : float
+        Radius of the circle around all detectors of the camera, arcsec.
+
+    Yields
+    ------
+    x, y : float array, shape (n,)
+        Centres of the ghosts in the focal plane, arcsec.
+    radius : float array, shape (n,)
+        Outer radii, pixels.
+    level : float array, shape (n,)
+        Electrons per pixel.
+    """
+    distance_ratio = np.hypot(x, y) / reach
+    for ghost in _ghosts(scene):
+        centre, radius, passed = (np.interp(distance_ratio, ghost.distance, values) for values in ghost[1:])
+        level = _level(_Ghost(distance_ratio, centre, radius, passed), 1.0, scene) * electrons
+        yield centre * x, centre * y, radius, level
+
+
 def parameters(scene: Scene) -> tuple[Annuli, float]:
     """Return the parameters of `apply`: the ghosts of the bright stars of a scene, and the hole of the pupil.
 
@@ -155,14 +188,10 @@ def parameters(scene: Scene) -> tuple[Annuli, float]:
     if detector is None:
         return Annuli(*np.zeros((4, 0))), _hole(scene)
     first_column, first_row = (scene.window.column, scene.window.row) if scene.window is not None else (0, 0)
-    x, y = detector.focal_plane_place(lights.column + first_column, lights.row + first_row)
-    all_detectors = detectors(scene.section.rpartition(".")[2], scene.mission)
-    reach = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in all_detectors)
-    distance_ratio = np.hypot(x, y) / reach
-    for ghost in _ghosts(scene):
-        centre, radius, passed = (np.interp(distance_ratio, ghost.distance, values) for values in ghost[1:])
-        column, row = detector.pixel_place(centre * x, centre * y)
-        level = _level(_Ghost(distance_ratio, centre, radius, passed), 1.0, scene) * lights.electrons
+    places = detector.focal_plane_place(lights.column + first_column, lights.row + first_row)
+    reach = field_radius(detectors(scene.section.rpartition(".")[2], scene.mission))
+    for x, y, radius, level in in_focal_plane(scene, *places, lights.electrons, reach):
+        column, row = detector.pixel_place(x, y)
         is_visible = level > scene.noticeable_mean_electrons
         for place, side in ((column, detector.nx), (row, detector.ny)):
             is_visible &= (place > -radius - 1.0) & (place < side + radius)

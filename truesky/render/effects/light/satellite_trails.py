@@ -6,6 +6,7 @@ satellites: each receives the part of a trail that crosses it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,8 @@ _MAX_SIGMA = 3.0
 # Exponent of the Moffat profile of the seeing.
 _BETA = 3.0
 _ARCSEC = np.pi / 180.0 / 3600.0
+# Mission parameter with the number of satellites per second and degree of the field's diameter.
+_RATE = "survey.satellites.rate"
 
 
 class Satellites(NamedTuple):
@@ -71,6 +74,24 @@ class Blur(NamedTuple):
     seeing: float
     outer: float
     inner: float
+
+
+class Trail(NamedTuple):
+    """Trail of a satellite over the field.
+
+    Attributes
+    ----------
+    direction : float
+        Angle in radians from the x axis of the focal plane towards the y axis, from 0 to pi.
+    offset : float
+        Smallest distance from the boresight in arcsec, positive on the left of the direction.
+    electrons : float
+        Electrons per pixel of trail length.
+    """
+
+    direction: float
+    offset: float
+    electrons: float
 
 
 def apply(
@@ -116,22 +137,68 @@ def apply(
     The profile across a trail is sampled in steps of 1/8 pixel, with an error of 1e-3 of its height. Satellites that
     tumble or flare are not modelled.
     """
-    if not 0.0 <= satellites.number < 1e4:
-        raise OutOfRange("satellites of an exposure", satellites.number, 0.0, 1e4)
     out, trail_profile = copy_frame(frame, out), profile(blur)
-    for _ in range(int(rng.poisson(satellites.number))):
-        direction, offset, deviate = np.pi * rng.random(), radius * (2.0 * rng.random() - 1.0), rng.standard_normal()
-        fainter = satellites.spread * float(np.clip(deviate, -_MAX_SIGMA, _MAX_SIGMA))
+    for direction, offset, electrons in draw_trails(satellites, radius, rng):
         if not _may_touch(direction, offset, detector, len(trail_profile) / _SUBSAMPLES):
             continue
         column, row = _path(direction, offset, radius, detector, frame.shape)
-        table = satellites.electrons * 10.0 ** (-0.4 * fainter) * trail_profile
+        table = electrons * trail_profile
         steep = np.abs(row[-1] - row[0]) > np.abs(column[-1] - column[0])
         along, across = (row, column) if steep else (column, row)
         if along[0] > along[-1]:
             along, across = along[::-1], across[::-1]
         _add_trail(out.T if steep else out, along, across, table)
     return out
+
+
+def draw_trails(satellites: Satellites, radius: float, rng: np.random.Generator) -> Iterator[Trail]:
+    """Draw the trails of the random satellites of an exposure.
+
+    Parameters
+    ----------
+    satellites : Satellites
+        Mean number and brightness of satellites.
+    radius : float
+        Radius of the circle around the field in arcsec.
+    rng : numpy.random.Generator
+        Random generator of the exposure.
+
+    Yields
+    ------
+    Trail
+        Each trail that crosses the circle.
+
+    Raises
+    ------
+    OutOfRange
+        If `satellites.number` is negative, 1e4 or more, or NaN.
+    """
+    if not 0.0 <= satellites.number < 1e4:
+        raise OutOfRange("satellites of an exposure", satellites.number, 0.0, 1e4)
+    for _ in range(int(rng.poisson(satellites.number))):
+        direction, offset, deviate = np.pi * rng.random(), radius * (2.0 * rng.random() - 1.0), rng.standard_normal()
+        fainter = satellites.spread * float(np.clip(deviate, -_MAX_SIGMA, _MAX_SIGMA))
+        yield Trail(direction, offset, satellites.electrons * 10.0 ** (-0.4 * fainter))
+
+
+def half_width(trail: Trail, blur: Blur, limit: float) -> float:
+    """Return the distance from a trail, in pixels, up to which it is brighter than a limit.
+
+    Parameters
+    ----------
+    trail : Trail
+        The trail.
+    blur : Blur
+        Blur of the trail.
+    limit : float
+        Electrons of a pixel.
+
+    Returns
+    -------
+    float
+        The distance; 0 if the whole trail is fainter.
+    """
+    return float(np.count_nonzero(trail.electrons * profile(blur) > limit)) / _SUBSAMPLES
 
 
 def _may_touch(direction: float, offset: float, detector: Detector | None, width: float) -> bool:
@@ -245,11 +312,33 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
     scene has no detector.
     """
     mission, d = scene.mission, scene.detector
-    rate = mission.value("survey.satellites.rate", "1 / (deg s)")
-    if rate == 0.0 or d is None:
+    if mission.value(_RATE, "1 / (deg s)") == 0.0 or d is None:
         return Satellites(0.0, 0.0, 0.0), Blur(3.0, 0.0, 0.0), d, 1.0
-    all_detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], mission)
-    radius = max(float(np.hypot(detector.x, detector.y)) + detector.half_diagonal for detector in all_detectors)
+    radius = camera_detectors.field_radius(camera_detectors.detectors(scene.section.rpartition(".")[2], mission))
+    satellites, blur = in_field(scene, d, radius)
+    return satellites, blur, d, radius
+
+
+def in_field(scene: Scene, detector: Detector, radius: float) -> tuple[Satellites, Blur]:
+    """Return the mean number and brightness of the satellites in an exposure, and the blur of their trails.
+
+    Parameters
+    ----------
+    scene : Scene
+        Settings of the exposure.
+    detector : Detector
+        A detector of the camera.
+    radius : float
+        Radius of the circle around all detectors, arcsec.
+
+    Returns
+    -------
+    Satellites
+        Number and brightness.
+    Blur
+        Blur in pixels of the detector.
+    """
+    mission, d = scene.mission, detector
     magnitude, spread = (mission.value(f"survey.satellites.{key}", "mag") for key in ("magnitude", "magnitude_spread"))
     # Time in seconds in which a satellite moves by one pixel.
     seconds = d.pixel_scale / mission.value("survey.satellites.speed", "arcsec / s")
@@ -257,8 +346,8 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
     outer = 0.5 * scene.value("aperture_diameter", "m") / mission.value("survey.satellites.distance", "m") / _ARCSEC
     inner = outer * mission.value("survey.satellites.obscuration")
     pixels = (size / d.pixel_scale for size in (max(scene.seeing, d.pixel_scale), outer, inner))
-    count = rate * 2.0 * radius / 3600.0 * scene.exposure_time_s
-    return Satellites(count, float(electrons), spread), Blur(*pixels), d, radius
+    count = mission.value(_RATE, "1 / (deg s)") * 2.0 * radius / 3600.0 * scene.exposure_time_s
+    return Satellites(count, float(electrons), spread), Blur(*pixels)
 
 
 def _contribution(scene: Scene) -> float:
